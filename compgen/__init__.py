@@ -3,7 +3,7 @@
 Each stage is a function on plain data, without side effects: :func:`load_machine`, :func:`read_lengths`,
 :func:`identify`, :func:`fit`, :func:`export`, :func:`read_tables`, :func:`verify`, :func:`predict`.
 
-The names are loaded on first use, so that a program that needs one of them does not wait for all.
+Each name is loaded on first use: a program that needs only one does not wait for the rest.
 """
 
 import sys
@@ -30,7 +30,7 @@ _HOMES = {
     "compgen.plugins": "load_plugins",
     "compgen.simulate": "read_scenario simulate write_simulation",
 }
-#: Names that were public until 0.1; they stay where they are defined.
+#: Names that were public until 0.1; they remain in the modules that define them.
 _DEPRECATED = {
     "compgen.data.error_table": "format_reversal",
     "compgen.data.deviations": "format_deviations",
@@ -43,13 +43,13 @@ _DEPRECATED = {
     "compgen.plan": "PlannedStations suggest",
     "compgen.simulate": "Scenario Simulation",
 }
-#: Version in which the deprecated names go.
+#: Version that removes the deprecated names.
 _REMOVED_IN = "0.3"
 __all__ = sorted(name for names in _HOMES.values() for name in names.split())
 
 
 def _deprecated(name: str, home: str) -> property:
-    """A name that is loaded as the others, with a warning that names its replacement."""
+    """Load a deprecated name like the others, with a warning that gives its replacement."""
     found = on_first_use(name, home)
 
     def load(package: ModuleType) -> Any:

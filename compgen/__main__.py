@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C while the program is still being loaded ends it as it does later."""
+    """Run the command line; Ctrl-C also ends it cleanly while it is still loading."""
     try:
         from compgen.cli import main as command_line
     except KeyboardInterrupt:

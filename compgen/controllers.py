@@ -1,7 +1,7 @@
-"""Former home of the plug-in interface; it goes with the next minor version. Use :mod:`compgen.controls`.
+"""Former home of the plug-in interface; the next minor version removes it. Use :mod:`compgen.controls`.
 
-A control of the former interface is one object for all machines: every method takes the machine and the settings. Here
-are its base class, and the adapter that makes a class of :mod:`compgen.controls` of such a control.
+A control of the former interface is one object for all machines: every method takes the machine and the settings. This
+module has its base class, and the adapter that turns such a control into a class of :mod:`compgen.controls`.
 """
 
 import inspect
@@ -29,7 +29,7 @@ __all__ = ["CONTROLLERS", "AnyController", "Controller", "Monomial", "SourceFile
 
 
 class Controller(ABC, Generic[Settings, Tables]):
-    """The former base class; for what a method returns see that of the same name in :mod:`compgen.controls`."""
+    """The former base class; the method of the same name in :mod:`compgen.controls` says what each returns."""
 
     name: str
     anchored: bool = False
@@ -74,7 +74,7 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return the largest error of rounding, mm."""
 
     def missing(self, machine: Machine, settings: Settings) -> InputError | None:
-        """Return the error of a setting that only an export needs."""
+        """Return what is wrong with a setting that only an export needs."""
         return None
 
     def basis_of(self, machine: Machine, settings: Settings, errors: ErrorTable, tables: Tables) -> list[Term]:
@@ -90,11 +90,11 @@ class Controller(ABC, Generic[Settings, Tables]):
     def contradictions(
         self, machine: Machine, settings: Settings, tables: Tables, files: Sequence[SourceFile]
     ) -> list[str]:
-        """Return where files that are not needed say something else."""
+        """Return where files that are not needed disagree."""
         return []
 
     def remarks(self, machine: Machine, settings: Settings, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
-        """Return what reading assumed or passed over."""
+        """Return what reading assumed or ignored."""
         return []
 
     def keeping_others(
@@ -126,11 +126,11 @@ class Controller(ABC, Generic[Settings, Tables]):
         return []
 
     def left_out(self, machine: Machine, settings: Settings, errors: ErrorTable) -> list[str]:
-        """Return what the tables have no room for."""
+        """Return what the tables cannot express."""
         return []
 
     def reservations(self, machine: Machine, settings: Settings, tables: Tables) -> list[str]:
-        """Return what the verdict must say."""
+        """Return the reservations of the verdict."""
         return []
 
     def other_readings(self, settings: Settings, tables: Tables) -> dict[str, Settings]:
@@ -181,12 +181,12 @@ def _bound(former: AnyController, name: str) -> Callable[..., Any]:
 
 warnings.warn(
     "compgen.controllers is now compgen.controls (base, grids and terms: compgen.controls.shared), and a control there is "
-    "bound to its machine, see docs/tutorial-control.md; the former interface goes with the next minor version",
+    "bound to its machine, see docs/tutorial-control.md; the next minor version removes the former interface",
     DeprecationWarning,
     stacklevel=2,
 )
 for _part, _names in ((base, {"Controller": Controller, "AnyController": AnyController}), (grids, {}), (terms, {})):
-    # a module that is found here needs no folder of the former name
+    # a module registered here needs no folder of the former name
     _former = ModuleType(f"{__name__}.{_part.__name__.rpartition('.')[2]}", _part.__doc__)
     vars(_former).update({**vars(_part), **_names, "__name__": _former.__name__})
     sys.modules[_former.__name__] = _former

@@ -1,4 +1,4 @@
-"""Former home of the reader of settings: import :mod:`compgen.data.toml_files`. Goes with the next minor version."""
+"""Former home of the reader of settings: import :mod:`compgen.data.toml_files`. The next minor version removes it."""
 
 import sys
 import warnings
@@ -8,7 +8,7 @@ from compgen.data import toml_files as tomlio
 __all__ = ["tomlio"]
 
 warnings.warn(
-    "compgen.core.tomlio is now compgen.data.toml_files; the old name goes with the next minor version",
+    "compgen.core.tomlio is now compgen.data.toml_files; the next minor version removes the old name",
     DeprecationWarning,
     stacklevel=2,
 )

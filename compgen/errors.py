@@ -29,7 +29,7 @@ class InputError(CompgenError, ValueError):
     Parameters
     ----------
     message : what was given, what is allowed, what to do.
-    file, line, field : where it stands, as far as it is known; they are put in front of the message.
+    file, line, field : where it is, as far as known; they are put in front of the message.
 
     Examples
     --------
@@ -57,7 +57,7 @@ class InputError(CompgenError, ValueError):
 
 
 class UndeterminedError(CompgenError):
-    """The data do not determine what was asked for; ``combinations`` says in words what is missing.
+    """The data do not determine the requested unknowns; ``combinations`` says in words what is missing.
 
     Examples
     --------
@@ -81,7 +81,7 @@ class UndeterminedError(CompgenError):
 
 
 class ConvergenceError(CompgenError):
-    """An iteration did not reach its optimum; nothing that it produced may be used.
+    """An iteration did not converge; its result must not be used.
 
     Examples
     --------

@@ -58,7 +58,7 @@ class ControllerResult:
 class RunResult(Drawable):
     """Outcome of :func:`run`; ``accepted`` is True if every control's tables are.
 
-    ``earlier_report`` says where the report of the tables that were in the folder before is kept.
+    ``earlier_report`` is the path to which the report of the earlier tables in the folder was moved.
 
     Examples
     --------
@@ -161,14 +161,14 @@ def identification_files(
     return {**files, "identify.json": json.dumps(summary, indent=2) + "\n"}
 
 
-#: What only some identifications write.
+#: Files that only some identifications write.
 SOME_WRITE = ("stations.csv", "measured.deviations.csv", "identified.reversal.csv", covariance.FILE_NAME)
 
 
 def add_identification(output: OutputFolder, files: Mapping[str, str | bytes]) -> None:
-    """Add the files of an identification; those of an earlier one that have no successor are set aside.
+    """Add the files of an identification; files of an earlier one that are not replaced are set aside.
 
-    Else the reversal or the covariance of one measurement would be taken for that of the next.
+    Otherwise the reversal or the covariance of one measurement would be mistaken for that of the next.
     """
     for name, content in files.items():
         output.add(name, content)
@@ -178,12 +178,12 @@ def add_identification(output: OutputFolder, files: Mapping[str, str | bytes]) -
 
 
 def identified_reversal(result: Identification) -> ReversalCurves | None:
-    """Return the reversals that are far beyond their uncertainty and worth a table; None if there is none.
+    """Return the reversals that are well above their uncertainty and worth a table; None if there are none.
 
-    Backlash of the machine file that was taken out of the readings is part of them.
+    They include the backlash of the machine file, which was removed from the readings.
     """
     found = result.reversal_curves
-    # a reversal belongs to curves that are the means of both directions, so the readings must have been brought to that mean
+    # a reversal belongs to curves that are the mean of both directions, so the readings must refer to that mean
     if found is None and result.reversal is not None and result.reversal.removed:
         curves = {}
         for name, axis in result.reversal.axes.items():
@@ -228,8 +228,8 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
     """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
 
     The verification moves the exact model with the ``identified`` errors, not with the fitted ones that made the
-    tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``; what the export itself could not hold (a
-    limit that binds) is a reason too.
+    tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``; what the export itself could not express
+    (an active limit) is a reason, too.
     """
     OutputFolder(folder)
     exported = tables.export(
@@ -256,7 +256,7 @@ def verified_export(
 ) -> Verification:
     """Verify what the written files contain; InputError if they cannot be read.
 
-    What the export itself could not hold (a limit that binds) is a reason too.
+    What the export itself could not express (an active limit) is a reason, too.
     """
     with working_folder() as staging:
         output = OutputFolder(staging)
@@ -281,7 +281,7 @@ def identify_bare(
     """Identify the machine without the tables that were active while it was measured, if there were any.
 
     Errors that another program identified are used as given. ``corrections["active_tables"]`` of the result says what
-    was taken out.
+    was removed.
     """
     if active is None and not isinstance(measurement, ErrorTable | MixedMeasurement):
         return identify_measurement(machine, measurement, options)
@@ -297,8 +297,8 @@ def identify_bare(
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
     if active is None or not isinstance(measurement, Lengths | Deviations):
         raise InputError(
-            "tables that were active (--active) can be taken out of lengths and deviations only; measure anything else with "
-            "the compensation off, and say so (no --active; in `volcomp recal` active_table = none or measured_with = bare)"
+            "active tables (--active) can be removed from lengths and deviations only; measure anything else with "
+            "the compensation off, and state it (no --active; in `volcomp recal` active_table = none or measured_with = bare)"
         )
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)
@@ -322,7 +322,7 @@ def _write_results(
     Returns
     -------
     tuple
-        the result of each control, and where the report of the tables that were there before is kept.
+        the result of each control, and the path to which the report of the earlier tables was moved.
     """
     results = []
     for sub_folder, (exported, verification, beside) in checked.items():
@@ -344,7 +344,7 @@ def failure_reported(folder: str | Path) -> Iterator[None]:
     """Write ``identify.json`` where the data do not determine the errors, or no optimum is found, and pass the error on.
 
     No error curve is written then; ``identified`` is false and the file gives the reason. A folder with the results of
-    an earlier run is left as it is: a mixture of both would be taken for one result.
+    an earlier run is left unchanged: a mixture of both could be mistaken for one result.
     """
     try:
         yield
@@ -388,13 +388,13 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     identify_options, fit_options : how the errors are identified and the curves are fitted.
     templates : a folder of the user's own templates, searched before the shipped ones.
     allow_unverified : export formats that no public document fully describes.
-    active : tables that were active while the machine was measured; the new ones take their place.
+    active : tables that were active during the measurement; the new ones replace them.
     instrument : the instrument file of six-DOF readings.
     stated : squareness, backlash and scales that are known without a file.
-    limits : what the steps of the tables must not exceed.
-    allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation, and no reason to
-        refuse the tables.
-    progress : is told the name of each step as it begins.
+    limits : limits for the steps of the tables.
+    allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation instead of a
+        reason to refuse the tables.
+    progress : called with the name of each step when it begins.
 
     Raises
     ------
@@ -420,7 +420,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
 
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
-        raise InputError("no controller was given; name at least one")
+        raise InputError("no controller was given; give at least one")
     for name, sub_folder in sub_folders.items():  # wrong settings are found before the work begins
         OutputFolder(Path(folder) / sub_folder)
         controller_named(name).read_settings(machine)
@@ -438,7 +438,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
     reversal = identified_reversal(identification)
-    source = str(machine.source or machine.name)  # the command that looks for what the model lacks
+    source = str(machine.source or machine.name)  # for the command that searches for the missing effect
     words = ["diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
     diagnosis = shlex.join(["volcomp", *words])
     checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
@@ -454,7 +454,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
             reversal=reversal,
         )
         verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
-        # what speaks against the measurement; what blocks is a reason against the tables, too
+        # findings on the measurement; those that block are also reasons against the tables
         before, after = verification.before_rigid_removed, verification.after_rigid_removed
         taken = (
             tables.taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None

@@ -1,4 +1,4 @@
-"""The registries that plug-ins may add to, one line each."""
+"""The registries that plug-ins add to."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from compgen.tables.render import check_templates
 
 
 def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
-    """Return the class of the control and what is wrong with it; one of the former interface gets its adapter."""
+    """Return the class of the control and its problems; a control of the former interface gets its adapter."""
     code: Any = thing if inspect.isclass(thing) else type(thing)
     former = next((item for item in code.__mro__ if "bound_form" in vars(item)), None)
     interface = former or Controller
@@ -34,10 +34,10 @@ def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
             return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
     own = getattr(code, "name", None)
     if own != name:
-        problems.append(f"{code.__name__}.name has to be {name!r}, it is {'missing' if own is None else repr(own)}")
+        problems.append(f"{code.__name__}.name must be {name!r}, but is {'missing' if own is None else repr(own)}")
     for item in ("anchored", "bidirectional"):
         if not isinstance(getattr(code, item), bool):
-            problems.append(f"{code.__name__}.{item} has to be True or False")
+            problems.append(f"{code.__name__}.{item} must be True or False")
     if code.bidirectional is True and code.with_reversal is interface.with_reversal:
         arguments = ", ".join(_arguments(interface, "with_reversal"))
         problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
@@ -58,7 +58,7 @@ def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
 
 
 def _method_problems(code: type, interface: type) -> list[str]:
-    """Methods that the class lacks or that cannot be called as those of the interface."""
+    """Return the methods that the class lacks, or that cannot be called like those of the interface."""
     problems = []
     abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
     missing = [item for item in vars(interface) if item in abstract]
@@ -78,7 +78,7 @@ def _method_problems(code: type, interface: type) -> list[str]:
     return problems
 
 
-#: What the class of a control is called with.
+#: The arguments of the class of a control.
 _BINDING = ("machine", "settings")
 
 
@@ -103,7 +103,7 @@ def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) ->
     ----------
     paths : ``.py`` files or package folders that hold ``CONTROLLERS``, ``EFFECTS``, ``FAMILIES`` or
         ``INSTRUMENTS``.
-    installed : also those of installed distributions; one that is broken is left out with a warning.
+    installed : also those of installed distributions; a broken one is skipped with a warning.
 
     Raises
     ------
@@ -134,7 +134,7 @@ class WithPlugins:
     paths: tuple[str, ...]
 
     def __call__(self, item: Any) -> Any:
-        """Load the plug-ins, unless they are, and call the function."""
+        """Load the plug-ins unless they are loaded, and call the function."""
         _load_once(self.paths)
         return self.function(item)
 
@@ -145,6 +145,6 @@ def _load_once(paths: tuple[str, ...]) -> None:
 
 
 def with_plugins(function: Callable[[Any], Any]) -> WithPlugins:
-    """Return the function with the plug-ins that were loaded from paths."""
+    """Wrap the function with the plug-ins that were loaded from paths."""
     origins = {origin for kind in KINDS for origin in kind.origins.values() if origin.startswith(PATH_ORIGIN)}
     return WithPlugins(function, tuple(sorted(origin.removeprefix(PATH_ORIGIN) for origin in origins)))

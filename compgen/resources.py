@@ -13,7 +13,7 @@ from typing import Any
 def data_folder(kind: str) -> Path:
     """Return the folder of shipped data, ``kind`` being ``"templates"`` or ``"machines"``.
 
-    In a wheel it lies inside the package (``_data``), in a checkout or an editable install next to it.
+    In a wheel it is inside the package (``_data``), in a checkout or an editable install next to it.
     """
     package = Path(__file__).resolve().parent
     candidates = (package / "_data" / kind, package.parent / kind)
@@ -24,7 +24,7 @@ def data_folder(kind: str) -> Path:
 
 
 def program_version() -> str:
-    """Return the version of compgen that runs."""
+    """Return the version of the running compgen."""
     from importlib.metadata import PackageNotFoundError, version  # takes as long to load as the rest of the help
 
     try:
@@ -44,7 +44,7 @@ def on_first_use(name: str, home: str) -> property:
         return getattr(import_module(home), name)
 
     def keep(package: ModuleType, value: Any) -> None:
-        # the import system sets every sub-module as an attribute of its package; the public name stays what it is
+        # the import system sets every sub-module as an attribute of its package; the public name must keep its meaning
         if not isinstance(value, ModuleType):
             raise AttributeError(f"{package.__name__}.{name} cannot be replaced; it belongs to {home}")
 
@@ -52,9 +52,9 @@ def on_first_use(name: str, home: str) -> property:
 
 
 def load_on_first_use(package: str, names: Iterable[str]) -> None:
-    """Let a room import what it exports on first use; a command should not wait for what it does not need.
+    """Let a room import its public names on first use; a command should not wait for what it does not need.
 
-    The homes of the names are those that the ``if TYPE_CHECKING`` block of its ``__init__`` gives.
+    The ``if TYPE_CHECKING`` block of its ``__init__`` gives the modules of the names.
     """
     import ast
 

@@ -32,7 +32,7 @@ def main(folder: Path) -> None:
     """Print the residual of every control's files in ``folder``."""
     machine = compgen.load_machine("zha-gantry")
     truth = compgen.read_errors(HERE / "zha-gantry.truth.errors.csv")
-    print("against the truth, 2000 random points (as it stands):")
+    print("against the truth, 2000 random points (reference point fixed):")
     for path in sorted(folder.glob("*/manifest.json")):
         figures = residuals(residual_mm(machine, truth, path.parent))
         print(f"  {path.parent.name:16s} max {figures.max_um:9.2f} um   rms {figures.rms_um:9.2f} um")

@@ -1,4 +1,4 @@
-"""Accuracy figures of the standards, with uncertainty, and before against after."""
+"""Accuracy figures of the standards, with uncertainty, and comparison of before and after."""
 
 from typing import TYPE_CHECKING
 

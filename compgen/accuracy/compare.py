@@ -1,4 +1,4 @@
-"""Before against after, and predicted against measured: points are paired, gauges made equal, improvements tested."""
+"""Comparison of before and after, and of predicted and measured: points paired, gauges aligned, changes tested."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ from compgen.errors import InputError
 from compgen.kinematics.first_order import observable_errors, tool_of
 from compgen.kinematics.gauge import LEVER_MM, gauge_changes, gauge_directions, gauge_part
 
-# The same points before and after: matched, or refused with what differs, or brought together as the user says.
+# The same points before and after: matched, or refused with the difference, or aligned as the user chooses.
 
 
-#: Ways to bring different points together.
+#: Ways to align different points.
 ALIGN = ("common", "interpolate", "model")
 #: Positions closer than this are the same one, mm.
 SAME_MM = 1e-3
 
 
 def refuse(what: str, before: Sequence[object], after: Sequence[object], ways: str) -> InputError:
-    """Return the error that says what the two do not share."""
+    """Return the error that says what the two do not have in common."""
     only_before, only_after = [x for x in before if x not in set(after)], [x for x in after if x not in set(before)]
     parts = []
     for name, only in (("BEFORE", only_before), ("AFTER", only_after)):
@@ -74,13 +74,13 @@ def refuse(what: str, before: Sequence[object], after: Sequence[object], ways: s
 
 
 def paired_errors(before: ErrorSource, after: ErrorSource, align: str | None) -> tuple[ErrorSource, ErrorSource, str]:
-    """Return both sources with the same errors at the same positions, and what was done in words.
+    """Return both sources with the same errors at the same positions, and in words what was done.
 
     Raises
     ------
     InputError
-        if they differ and ``align`` does not say what to do: ``"common"`` keeps the errors and positions that both have,
-        ``"interpolate"`` takes both linearly at all positions of both within the range that both know.
+        if they differ and ``align`` is not given: ``"common"`` keeps the errors and positions that both have,
+        ``"interpolate"`` interpolates both linearly at all positions of both within the common range.
     """
     first, second = before.errors, after.errors
     if first.names != second.names and align != "common":
@@ -101,13 +101,13 @@ def paired_errors(before: ErrorSource, after: ErrorSource, align: str | None) ->
             if n in first.curves and not _same(first.curves[n].position_mm, second.curves[n].position_mm)
         )
         texts = [[f"{x:g} mm" for x in table.curves[name].position_mm] for table in (first, second)]
-        ways = "--align interpolate takes both linearly at all positions of both, --align common those that both have"
+        ways = "--align interpolate compares both at all positions of both, --align common at those that both have"
         raise refuse(f"positions of {name}", texts[0], texts[1], ways)
     nodes = {
         name: _joined(first.curves[name], second.curves[name], str(align)) for name in names if name in first.curves
     }
     text = (
-        "linear between positions, all of both within the range that both know"
+        "interpolated linearly at all positions of both within the common range"
         if align == "interpolate"
         else (f"only what both have: {', '.join(names)}, at common positions")
     )
@@ -133,7 +133,7 @@ def _joined(first: Curve, second: Curve, align: str) -> FloatArray:
 
 
 def resampled(source: ErrorSource, names: Sequence[str], nodes_mm: dict[str, FloatArray]) -> ErrorSource:
-    """Return some errors of a source, linear between its positions, at new ones; the covariance follows."""
+    """Return some errors of a source, interpolated linearly at new positions; with the covariance."""
     curves, squareness, factors = {}, {}, []
     for name, rows in source.errors.rows().items():
         if name not in names:
@@ -157,7 +157,7 @@ def resampled(source: ErrorSource, names: Sequence[str], nodes_mm: dict[str, Flo
 
 @dataclass(frozen=True)
 class MeasuredField:
-    """Deviations as a field, repeats averaged; ``keys`` tells the points apart, ``measured`` the components (3,)."""
+    """Deviations as a field, repeats averaged; ``keys`` identify the points, ``measured`` the components (3,)."""
 
     field: ErrorField
     keys: tuple[tuple[float, ...], ...]
@@ -175,10 +175,10 @@ def measured_field(machine: Machine, deviations: Deviations, u_um: float | None 
 
     Parameters
     ----------
-    machine : its tool offset counts where the file has none.
+    machine : its tool offset is used if the file has none.
     deviations : the measurement; repeats at a point are averaged.
-    u_um : standard uncertainty of each component in um; default that of the file, else from the scatter of repeats
-        (pooled), else unknown.
+    u_um : standard uncertainty of each component in um; default: that of the file, otherwise from the scatter of
+        repeats (pooled), otherwise unknown.
     """
     tool = tool_of(machine, deviations.tool_mm)
     tools = np.broadcast_to(tool, deviations.position_mm.shape)
@@ -214,7 +214,7 @@ def _means(index: NDArray[np.int64], values: FloatArray, count: FloatArray) -> F
 def paired_fields(
     before: MeasuredField, after: MeasuredField, align: str | None
 ) -> tuple[MeasuredField, MeasuredField, str]:
-    """Return both at the same points; InputError if these differ and ``align`` is not ``"common"``."""
+    """Return both at the same points; InputError if they differ and ``align`` is not ``"common"``."""
     if before.measured != after.measured:
         raise InputError(
             "BEFORE and AFTER do not measure the same components dx, dy, dz; measure the same, or identify both"
@@ -224,7 +224,7 @@ def paired_fields(
     same = len(common) == len(before.keys) == len(after.keys)
     if not same and align != "common" or not common:
         texts = [[_shown(key) for key in side.keys] for side in (before, after)]
-        ways = "--align common takes those that both have, --align model compares the errors identified from each"
+        ways = "--align common compares those that both have, --align model compares the errors identified from each"
         raise refuse("points", texts[0], texts[1], ways)
     text = f"same {len(common)} points" if same else f"only the {len(common)} points that both have"
     return before.at(common), after.at(common), text
@@ -237,7 +237,7 @@ def _shown(key: tuple[float, ...]) -> str:
 
 
 def check_same_positions(before: Lengths, after: Lengths, align: str | None) -> str:
-    """Tracer lengths of the same targets: the stations may differ, the positions not, unless ``align`` is ``"model"``."""
+    """Compare tracer lengths to the same targets: stations may differ, positions only if ``align`` is ``"model"``."""
     sets = []
     for lengths in (before, after):
         tools = np.zeros_like(lengths.position_mm) if lengths.tool_mm is None else lengths.tool_mm
@@ -259,8 +259,8 @@ def paired_runs(
 ) -> tuple[RunStatistics, RunStatistics, str]:
     """Return both at the same targets.
 
-    ``"common"`` keeps the targets that both have; ``"interpolate"`` takes means and estimators of AFTER linearly at the
-    targets of BEFORE that lie within its range.
+    ``"common"`` keeps the targets that both have; ``"interpolate"`` interpolates means and estimators of AFTER at the
+    targets of BEFORE within its range.
     """
     first, second = before.position_mm, after.position_mm
     if len(first) == len(second) and bool(np.all(np.abs(first - second) <= SAME_TARGET_MM)):
@@ -270,21 +270,21 @@ def paired_runs(
         rows, columns = np.nonzero(near)
         if len(rows) < 2:
             raise InputError(
-                f"{axis}: BEFORE and AFTER have {len(rows)} targets in common; two are needed", field="--align"
+                f"{axis}: BEFORE and AFTER have {len(rows)} targets in common; at least two are needed", field="--align"
             )
         return _picked(before, rows), _picked(after, columns), f"{axis}: the {len(rows)} targets that both have"
     if align == "interpolate":
         rows = np.flatnonzero((first >= second[0]) & (first <= second[-1]))
         if len(rows) < 2:
-            raise InputError(f"{axis}: fewer than two targets of BEFORE lie within AFTER", field="--align")
+            raise InputError(f"{axis}: fewer than two targets of BEFORE are within AFTER", field="--align")
         at = first[rows]
         values = np.vstack([np.interp(at, second, row) for row in after.values])
         count = np.vstack([np.interp(at, second, row) for row in after.count])
-        text = f"{axis}: AFTER taken linearly at {len(rows)} targets of BEFORE"
+        text = f"{axis}: AFTER interpolated at {len(rows)} targets of BEFORE"
         return _picked(before, rows), RunStatistics(at, values, count), text
     texts = [[f"{x:g} mm" for x in side] for side in (first, second)]
     ways = (
-        "--align common takes the targets that both have, --align interpolate takes AFTER linearly at those of BEFORE"
+        "--align common compares the targets that both have, --align interpolate interpolates AFTER at those of BEFORE"
     )
     raise refuse(f"targets of {axis}", texts[0], texts[1], ways)
 
@@ -293,25 +293,25 @@ def _picked(statistics: RunStatistics, rows: np.ndarray) -> RunStatistics:
     return RunStatistics(statistics.position_mm[rows], statistics.values[:, rows], statistics.count[:, rows])
 
 
-# One gauge for all tables that are compared: what no measurement shows must not count as a change.
+# One gauge for all tables that are compared: what no measurement can show must not count as a change.
 #
-# Constants and slopes of curves can be traded for squareness and a placement of the workpiece without any effect on the
-# machine (:mod:`compgen.kinematics.gauge`). Both sides of a comparison are brought to the same choice, each by itself:
-# straightness zero at both ends of the travel, positioning and angular errors zero at the reference point, the rest in the
-# squareness.
+# Constants and slopes of curves are interchangeable with squareness and a placement of the workpiece, without any
+# effect on the machine (:mod:`compgen.kinematics.gauge`). Both sides of a comparison are brought to the same choice:
+# straightness zero at both ends of the travel, positioning and angular errors zero at the reference point, the rest in
+# the squareness.
 
 
 def in_common_gauge(source: ErrorSource) -> ErrorSource:
-    """Return the source in the common gauge: the same E = C P up to a rigid motion; the covariance follows.
+    """Return the source in the common gauge: the same E = C P up to a rigid motion; with the covariance.
 
-    Angular errors that one tool does not show are left alone: who states them knows them from elsewhere.
+    Angular errors that one tool does not show are left unchanged: they are known from another source.
     """
     machine, errors = source.machine, source.errors
     shown = observable_errors(machine)
     names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
     values, factor = errors.values(), source.factor
     changes = gauge_changes(gauge_directions(machine, names), *errors.labels())
-    # what takes from the values that which the common gauge makes zero; angles times a lever, mm
+    # removes from the values what the common gauge makes zero; angles times a lever, mm
     blocks = [np.zeros((0, len(values)))]
     for name in (name for name in names if name in errors.curves):
         error, axis = error_named(name), machine.axes[error_named(name).axis]
@@ -325,13 +325,13 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
     return replace(source, errors=errors.with_values(values - part @ values), factor=factor)
 
 
-# Before against after, and predicted against measured: improvement with its significance.
+# Before and after, predicted and measured: improvement with its significance.
 
 
 Overall = Literal["better", "worse", "not separated", "smaller", "larger", "same"]
-#: Figures that decide over a volume, over axis runs (the first that is there), and over errors of single axes.
+#: Decisive figures of a volume, of axis runs (the first available), and of errors of single axes.
 DECISIVE_VOLUME = ("rms", "max")
-#: Share of components beyond k = 2 by chance, points at which components are looked at one by one, and what counts as 0.
+#: Share of components beyond k = 2 by chance, points at which components are tested one by one, and what counts as 0.
 CHANCE, MOST_SINGLE, EXACT_MM = 0.05, 300, 1e-9
 DECISIVE_RUNS = ("A", "E", "A_up", "A_down", "E_up", "E_down")
 #: A positioning test of an axis or of a diagonal.
@@ -344,16 +344,16 @@ class CompareOptions:
 
     Parameters
     ----------
-    align : how to bring different points together: ``"common"``, ``"interpolate"``, ``"model"``; None refuses them.
+    align : how to align different points: ``"common"``, ``"interpolate"``, ``"model"``; None refuses them.
     alignment : of the volume; None is ``"axes"`` for errors, ``"as-given"`` for measured positions.
     line : reference line of straightness and squareness.
     edition : of ISO 230-2.
-    budgets : what the set-up adds to the uncertainties of axis runs, by axis.
+    budgets : contribution of the set-up to the uncertainties of axis runs, by axis.
     """
 
     align: str | None = option(
         None,
-        "How to bring different points together: common keeps those that both have, interpolate takes them linearly, "
+        "How to align different points: common keeps those that both have, interpolate interpolates linearly, "
         "model compares the errors identified from each. Default: different points are refused.",
         choices=ALIGN,
     )
@@ -365,7 +365,7 @@ class CompareOptions:
     )
     line: str = option("ls", "Reference line of straightness.", choices=tuple(LINES))
     edition: int = option(
-        LATEST, "Edition of ISO 230-2; that of 1988 has 3 s in place of 2 s.", choices=tuple(map(str, EDITIONS))
+        LATEST, "Edition of ISO 230-2; that of 1988 has 3 s instead of 2 s.", choices=tuple(map(str, EDITIONS))
     )
     budgets: Mapping[str, SetupBudget] | None = None
 
@@ -376,11 +376,11 @@ class PredictionAgreement:
 
     Parameters
     ----------
-    figures : figures of both fields; those of the measured one hold the noise of the measurement.
-    difference : figures of measured minus predicted, and the difference at single points decides:
-    beyond : share of its components with E_n above 1, (k = 2); nan where an uncertainty is not known.
+    figures : figures of both fields; those of the measured one include the noise of the measurement.
+    difference : figures of measured minus predicted; the difference at single points decides.
+    beyond : share of its components with E_n above 1, (k = 2); nan if an uncertainty is unknown.
     allowed : the largest share that chance explains: 5 % and twice its standard deviation for that many components.
-    components : how many components were looked at.
+    components : how many components were tested.
     """
 
     figures: Mapping[str, ComparedFigure]
@@ -413,7 +413,7 @@ class PredictionAgreement:
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Drawable):
-    """Figures before and after by group and key, those that decide, and in words what was compared and how."""
+    """Figures before and after by group and key, the decisive ones, and in words what was compared and how."""
 
     kind: str
     groups: Mapping[str, Mapping[str, ComparedFigure]]
@@ -423,14 +423,14 @@ class Comparison(Drawable):
 
     @property
     def verdict(self) -> Overall:
-        """Worse if a decisive figure is, else better if one is, else the strongest of the other words."""
+        """Worse if a decisive figure is, otherwise better if one is, otherwise the strongest of the other words."""
         found = [self.groups[group][key].verdict for group, key in self.decisive]
         order: tuple[Overall, ...] = ("worse", "larger", "better", "not separated", "smaller", "same")
         return next((word for word in order if word in found), "same")
 
     @property
     def improved(self) -> bool:
-        """Whether the machine got better: significantly, or smaller where no uncertainty is known."""
+        """Whether the machine improved: significantly, or with smaller figures if no uncertainty is known."""
         return self.verdict in ("better", "smaller")
 
     def summary(self) -> dict[str, Any]:
@@ -473,7 +473,7 @@ class Comparison(Drawable):
 def paired_figures(
     before: Mapping[str, Mapping[str, Figure]], after: Mapping[str, Mapping[str, Figure]]
 ) -> dict[str, dict[str, ComparedFigure]]:
-    """Put figures before and after side by side, those that both have."""
+    """Pair the figures before and after that both have."""
     return {
         group: {key: ComparedFigure(item, after[group][key]) for key, item in figures.items() if key in after[group]}
         for group, figures in before.items()
@@ -484,9 +484,9 @@ def paired_figures(
 def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOptions | None = None) -> Comparison:
     """Compare two sets of errors of one machine: per volume, axis, diagonal and error.
 
-    Both are gauge-aligned first (:func:`compgen.accuracy.compare.in_common_gauge`), so that what no measurement shows does
-    not count as a change of single errors. The volume is that of the errors as they are, in the stated alignment, on which
-    the gauge has no influence.
+    Both are gauge-aligned first (:func:`compgen.accuracy.compare.in_common_gauge`), so that what no measurement shows
+    does not count as a change of single errors. The volume is evaluated from the unchanged errors, in the stated
+    alignment, which the gauge does not affect.
 
     Raises
     ------
@@ -504,7 +504,7 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
             upper[axis] = min(upper[axis], curve.position_mm[-1])
     if not (np.allclose(lower, machine.lower_mm) and np.allclose(upper, machine.upper_mm)):
         machine = narrowed(machine, lower, upper)
-        cut.append("the curves end within the travel; the volume is the part that they know")
+        cut.append("the curves end within the travel; the volume is the part that they cover")
     first, second = replace(first, machine=machine), replace(second, machine=machine)
     fields = volume_fields(machine, (first, second), chosen.alignment or "axes")
     gauged = [in_common_gauge(source) for source in (first, second)]
@@ -521,11 +521,11 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
 
 
 def uncertainty_statements(*known: bool) -> list[str]:
-    """Say what the verdicts rest on; ``known``: whether each side has uncertainties."""
+    """Return the basis of the verdicts; ``known``: whether each side has uncertainties."""
     if all(known):
         return [
-            f"uncertainties: k = {COVERAGE:g}; 'better' needs bands that separate (then En > 1); what both measurements "
-            "share is counted in both"
+            f"uncertainties: k = {COVERAGE:g}; 'better' requires intervals that do not overlap (then En > 1); "
+            "contributions common to both measurements are counted in both"
         ]
     return ["no uncertainty is known for at least one side: figures are smaller or larger, never 'better' or 'worse'"]
 
@@ -533,14 +533,12 @@ def uncertainty_statements(*known: bool) -> list[str]:
 def compare_fields(
     machine: Machine, before: MeasuredField, after: MeasuredField, options: CompareOptions | None = None
 ) -> Comparison:
-    """Compare measured positions point by point; InputError for different points unless aligned."""
+    """Compare measured positions point by point; InputError for different points that are not aligned."""
     chosen = options or CompareOptions()
     first, second, text = paired_fields(before, after, chosen.align)
     alignment, measured = chosen.alignment or "as-given", first.measured
     if alignment != "as-given" and not all(measured):
-        raise InputError(
-            "a rigid motion can be taken out only where dx, dy and dz were measured; take --alignment as-given"
-        )
+        raise InputError("a rigid motion can be removed only if dx, dy and dz were measured; use --alignment as-given")
     sides = [aligned(machine, side.field, alignment) for side in (first, second)]
     gone = [f"V_{axis}" for axis, there in zip("XYZ", measured, strict=True) if not there]
     groups = []
@@ -560,7 +558,7 @@ def compare_fields(
 def compare_runs(
     before: Mapping[str, RunStatistics], after: Mapping[str, RunStatistics], options: CompareOptions | None = None
 ) -> Comparison:
-    """Compare positioning runs axis by axis (ISO 230-2, VDI/DGQ 3441); constants of a set-up drop out of all figures."""
+    """Compare positioning runs axis by axis (ISO 230-2, VDI/DGQ 3441); constants of a set-up cancel in all figures."""
     return _compare_tests(
         ("axis runs", "axes"), before, after, options or CompareOptions(), paired_runs, accuracy_of_runs
     )
@@ -574,11 +572,9 @@ def _compare_tests(
     pair: Callable[[str, _Test, _Test, str | None], tuple[_Test, _Test, str]],
     evaluate: Callable[[Mapping[str, _Test], int, Mapping[str, SetupBudget] | None], Accuracy],
 ) -> Comparison:
-    """Compare tests of the axes or diagonals that both sides have: pair the positions, evaluate both sides, decide."""
+    """Compare tests of the axes or diagonals that both sides have."""
     if options.align == "model" or options.alignment is not None:
-        raise InputError(
-            f"{what[0]} have no rigid motion and no model to align by; --align common or interpolate is possible"
-        )
+        raise InputError(f"{what[0]} cannot be aligned by a rigid motion or a model; use --align common or interpolate")
     names = [name for name in before if name in after]
     if set(before) != set(after) and (options.align != "common" or not names):
         raise InputError(
@@ -589,7 +585,7 @@ def _compare_tests(
     first = evaluate({name: item[0] for name, item in pairs.items()}, options.edition, options.budgets)
     second = evaluate({name: item[1] for name, item in pairs.items()}, options.edition, options.budgets)
     groups = paired_figures(first.groups, second.groups)
-    # Ed and Bd of the diagonals decide; without them the first figure that each axis or diagonal has
+    # Ed and Bd of the diagonals decide; without them the first available figure of each axis or diagonal
     decisive = tuple(("diagonals", key) for key in groups.get("diagonals", {}))
     if not decisive:
         decisive = tuple((name, next(key for key in DECISIVE_RUNS if key in groups[name])) for name in names)
@@ -599,7 +595,7 @@ def _compare_tests(
 
 
 def agreement(predicted: ErrorField, measured: ErrorField) -> PredictionAgreement:
-    """Compare a predicted field with the measured one at the same points, both aligned alike."""
+    """Compare a predicted field with the measured one at the same points, in the same alignment."""
     first, second = (volume_figures(field, field.thinned(MOST_IN_PAIRS)) for field in (predicted, measured))
 
     def spread(weight: np.ndarray) -> float:
@@ -624,7 +620,7 @@ def agreement(predicted: ErrorField, measured: ErrorField) -> PredictionAgreemen
     return PredictionAgreement(figures, {key: difference[key] for key in ("max", "rms", "p95")}, beyond, allowed, count)
 
 
-# Measured diagonals before against after (ISO 230-6).
+# Measured diagonals before and after (ISO 230-6).
 
 
 def compare_diagonals(
@@ -633,7 +629,7 @@ def compare_diagonals(
     after: Mapping[str, DiagonalRun],
     options: CompareOptions | None = None,
 ) -> Comparison:
-    """Compare measured diagonals; Ed and Bd decide, or E of every diagonal where the four are not complete.
+    """Compare measured diagonals; Ed and Bd decide, or E of every diagonal if not all four were measured.
 
     Raises
     ------
@@ -647,7 +643,7 @@ def compare_diagonals(
 def _paired(
     name: str, before: DiagonalRun, after: DiagonalRun, align: str | None
 ) -> tuple[DiagonalRun, DiagonalRun, str]:
-    """Both at the same positions; distances of AFTER count from the start of BEFORE."""
+    """Return both at the same positions; distances of AFTER are counted from the start of BEFORE."""
     offset = after.start_mm - before.start_mm
     along = float(offset @ before.unit)
     across = [offset - along * before.unit, after.end_mm - before.end_mm]

@@ -1,8 +1,9 @@
-"""Measured diagonals (ISO 230-6): each evaluated as ISO 230-2 has it, and the largest of the four body diagonals.
+"""Measured diagonals (ISO 230-6): each evaluated as in ISO 230-2, and the largest of the four body diagonals.
 
-With the deviations of the measured from the commanded distance along a diagonal: E, B, M, R of each diagonal as along an
-axis; E_d and B_d are the largest E and B of the four body diagonals. Face diagonals are evaluated one by one. Differences of the
-diagonals' lengths indicate squareness: NPP - PPP = 2 EC0Y X Y / L over a box X, Y, Z with the diagonal L.
+From the deviations of the measured from the commanded distance along a diagonal: E, B, M, R of each diagonal as along
+an axis; E_d and B_d are the largest E and B of the four body diagonals. Face diagonals are evaluated one by one.
+Differences of the diagonals' lengths indicate squareness: NPP - PPP = 2 EC0Y X Y / L over a box X, Y, Z with the
+diagonal L.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from compgen.kinematics.first_order import c_matrix
 
 #: Figures of ISO 230-2 that are not evaluated along diagonals.
 _NOT_ALONG = ("A", "A_up", "A_down")
-#: Corners of the boxes of two diagonals this close are the same, mm.
+#: Corners of the boxes of two diagonals closer than this are the same, mm.
 SAME_CORNER_MM = 0.01
 NO_PROOF = "errors of opposite sign cancel on a diagonal: four equal diagonals do not prove a good machine"
 
@@ -66,13 +67,13 @@ def diagonal_runs(machine: Machine, diagonals: Diagonals) -> dict[str, DiagonalR
     Raises
     ------
     InputError
-        for positions outside the travel, and for a direction that was measured at some positions only.
+        for positions outside the travel, and for a direction measured at only some positions.
     """
     for axis, values in enumerate(diagonals.position_mm.T):
         low, high = machine.axes[axis].range_mm
         for row in np.flatnonzero((values < low - 1e-3) | (values > high + 1e-3))[:1].tolist():
             file, line = diagonals.origin[row] if diagonals.origin else (None, None)
-            text = f"{AXES[axis]} = {values[row]:g} mm lies outside the travel {low:g} to {high:g} mm"
+            text = f"{AXES[axis]} = {values[row]:g} mm is outside the travel {low:g} to {high:g} mm"
             raise InputError(text, file=file, line=line, field=f"column {AXES[axis].lower()}_mm")
     found = {}
     for name in diagonals.names:
@@ -94,15 +95,15 @@ def accuracy_of_diagonals(
     edition: int = LATEST,
     budgets: Mapping[str, SetupBudget] | None = None,
 ) -> Accuracy:
-    """Return the figures of each diagonal, of all four (``Ed``, ``Bd``), and what they indicate of squareness.
+    """Return the figures of each diagonal, of all four (``Ed``, ``Bd``), and the squareness that they indicate.
 
     Parameters
     ----------
-    machine : says how squareness errors act.
+    machine : defines how squareness errors act.
     runs : by name.
     edition : of ISO 230-2.
-    budgets : what the set-up adds to the uncertainties, by axis; along a diagonal expansions count by the squares of
-        its direction cosines.
+    budgets : contribution of the set-up to the uncertainties, by axis; along a diagonal expansions are weighted by the
+    squares of its direction cosines.
     """
     groups: dict[str, dict[str, Figure]] = {}
     targets = {}
@@ -128,7 +129,7 @@ def accuracy_of_diagonals(
     if missing:
         statements.append(f"Ed, Bd: not given; all four body diagonals are needed, {', '.join(missing)} missing")
     elif other:
-        statements.append(f"Ed, Bd: not given; {', '.join(other)} belong to another box than PPP")
+        statements.append(f"Ed, Bd: not given; {', '.join(other)} belong to a different box than PPP")
     else:
         together["diagonals"], remarks = _largest(runs, groups)
         together["squareness indication"] = _squareness(machine, runs, groups)
@@ -149,7 +150,7 @@ def budget_along(run: DiagonalRun, budgets: Mapping[str, SetupBudget]) -> SetupB
 def _described(run: DiagonalRun) -> str:
     ends = " to ".join(f"({', '.join(f'{value:g}' for value in point)})" for point in (run.start_mm, run.end_mm))
     ways = "both directions" if run.statistics.bidirectional else (
-        "in its direction only" if MEAN_UP in run.statistics.directions else "against its direction only"
+        "only in its direction" if MEAN_UP in run.statistics.directions else "only against its direction"
     )  # fmt: skip
     return f"{run.name}: {ends} mm, {run.length_mm:g} mm, {len(run.statistics.position_mm)} positions, {ways}"
 
@@ -157,10 +158,10 @@ def _described(run: DiagonalRun) -> str:
 def _largest(
     runs: Mapping[str, DiagonalRun], groups: Mapping[str, Mapping[str, Figure]]
 ) -> tuple[dict[str, Figure], list[str]]:
-    """Ed and Bd, or why they cannot be given."""
+    """Return Ed and Bd, or why they cannot be given."""
     one_way = [name for name in BODY_DIAGONALS if not runs[name].statistics.bidirectional]
     if one_way:
-        return {}, [f"Ed, Bd: not given; {', '.join(one_way)} measured in one direction only"]
+        return {}, [f"Ed, Bd: not given; {', '.join(one_way)} measured in only one direction"]
     found = {}
     for symbol, key, text in (("Ed", "E", "systematic error"), ("Bd", "B", "reversal error")):
         worst = max(BODY_DIAGONALS, key=lambda name: groups[name][key].value)
@@ -179,7 +180,7 @@ _SQUARENESS_TEXT = (
 def _squareness(
     machine: Machine, runs: Mapping[str, DiagonalRun], groups: Mapping[str, Mapping[str, Figure]]
 ) -> dict[str, Figure]:
-    """Solve the four length deviations for what all share and the three squareness errors.
+    """Solve the four length deviations for their common part and the three squareness errors.
 
     D = c + u . (C(end) - C(start)) P with P the squareness errors alone: four equations, four unknowns.
     """

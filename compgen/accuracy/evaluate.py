@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 # Straightness against a stated reference line, and squareness of two reference lines (ISO 230-1).
 #
-# Straightness error: largest positive plus size of the largest negative distance from the reference line. The line is
-# through the end points, of least squares, or the one of the minimum zone. What the line takes out of straightness belongs
-# to squareness: squareness is the deviation of the angle between two reference lines from 90 degrees, and both together
-# leave the volumetric error as it is.
+# Straightness error: largest positive plus size of the largest negative distance from the reference line. The line
+# passes through the end points, or is that of least squares or of the minimum zone. What the line removes from
+# straightness belongs to squareness: squareness is the deviation of the angle between two reference lines from 90
+# degrees, and both together leave the volumetric error unchanged.
 
 
 #: Reference lines by the names of the command line.
@@ -94,11 +94,11 @@ def _check(position_mm: FloatArray, line: str) -> None:
     if line not in LINES:
         raise InputError(f"{line!r} is not a reference line; use one of {', '.join(LINES)}")
     if len(position_mm) < 2:
-        raise InputError("straightness needs values at two positions or more")
+        raise InputError("straightness needs values at two or more positions")
 
 
 def _contacts(position_mm: FloatArray, rest: FloatArray) -> tuple[int, int, int, float]:
-    """Two points on one side of the zone, the one between them on the other, and the sign of the other side."""
+    """Return two points on one side of the zone, the one between them on the other, and the sign of the other side."""
     half = 0.5 * float(np.ptp(rest))
     tolerance = 1e-9 * max(half, 1e-12) + 1e-15
     for side in (1.0, -1.0):
@@ -111,7 +111,7 @@ def _contacts(position_mm: FloatArray, rest: FloatArray) -> tuple[int, int, int,
     return first, last, int(np.argmin(rest)), -1.0
 
 
-# Figures of identified errors: each curve by itself, squareness, axes, diagonals, orientation.
+# Figures of identified errors: single curves, squareness, axes, diagonals, orientation.
 
 
 #: Points along a diagonal.
@@ -123,9 +123,9 @@ SQUARENESS_LINES = {"EC0Y": (1, 0, 0, 1), "EB0Z": (2, 0, 0, 2), "EA0Z": (2, 1, 1
 def error_figures(source: ErrorSource, line: str = "ls") -> dict[str, Figure]:
     """Return one figure for each error of the table, by its name.
 
-    Straightness counts from the reference line ``line``; positioning and angular errors as their range over the travel;
-    squareness as it is in the table, against the lines ``line`` of its straightness curves. None of these depends on
-    the constants, nor straightness and squareness together on the lines, that a table may have.
+    Straightness refers to the reference line ``line``; positioning and angular errors are given as their range over the
+    travel; squareness of the table is taken between the lines ``line`` of its straightness curves. None of these
+    depends on constants in a table, nor straightness and squareness together on lines in it.
     """
     found = {}
     for name in source.errors.curves:
@@ -158,8 +158,8 @@ def _curve_figure(source: ErrorSource, name: str, line: str) -> Figure:
 def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figure:
     """Return a squareness error (urad) between the reference lines of its two axes.
 
-    To the value of the table come the slopes that the reference lines have in the straightness curves: moving a line from
-    a curve into the squareness changes neither this figure nor the volumetric error.
+    The slopes of the reference lines of the straightness curves are added to the value of the table: moving a line from
+    a curve to the squareness changes neither this figure nor the volumetric error.
     """
     value = source.errors.squareness[name][0]
     gradient = source.value_gradient(name, np.ones(1))
@@ -245,8 +245,8 @@ def diagonal_deviation(machine: Machine, error_mm: FloatArray, points_mm: FloatA
 def orientation_figures(source: ErrorSource) -> dict[str, Figure]:
     """Return the ranges of the tool's orientation V_A, V_B, V_C over the volume (ISO 230-1), urad.
 
-    The tool turns against the workpiece by the sum of the angular errors of all axes, so each range is the sum of the
-    ranges of three curves; constants and squareness do not turn the tool from place to place.
+    The tool rotates relative to the workpiece by the sum of the angular errors of all axes, so each range is the sum of
+    the ranges of three curves; constants and squareness do not change the orientation over the volume.
     """
     found = {}
     for letter in "ABC":
@@ -260,7 +260,7 @@ def orientation_figures(source: ErrorSource) -> dict[str, Figure]:
             gradient = part if gradient is None else gradient + part
         u = math.nan if gradient is None else source.u_of(gradient)
         missing = [name for name in names if name not in present]
-        without = f"; without {', '.join(missing)}, which the table does not hold" if missing else ""
+        without = f"; without {', '.join(missing)}, which the table lacks" if missing else ""
         meaning = f"volumetric accuracy V_{letter}: range of the tool's orientation about {letter}{without}; ISO 230-1"
         found[f"V_{letter}"] = Figure(value / RAD_PER_URAD, u / RAD_PER_URAD, "urad", meaning)
     return found
@@ -279,23 +279,21 @@ Term = tuple[tuple[int, int], float, float]
 
 @dataclass(frozen=True)
 class KnownReversal:
-    """Reversal of a machine, None where it is not known; ``text`` says where it comes from or why there is none."""
+    """Reversal of a machine, None if unknown; ``text`` gives its source or why there is none."""
 
     curves: ReversalCurves | None
     text: str
 
 
 def identified_reversal(found: Identification) -> KnownReversal:
-    """Return the reversal that readings show, with its uncertainty, whether or not it is worth a table."""
+    """Return the reversal in the readings, with its uncertainty, whether or not it is worth a table."""
     if found.reversal_curves is not None:
         return KnownReversal(found.reversal_curves, "reversal: identified, over the position of each axis")
     if found.reversal is None:
         if found.method in ("joint", "two-step", "deviations"):
-            return KnownReversal(
-                None, "reversal: not known: the file tells of no position that was approached from both directions"
-            )
+            return KnownReversal(None, "reversal: unknown: no position in the file was approached from both directions")
         return KnownReversal(
-            None, "reversal: not known: none exceeds its uncertainty, or only one direction was measured"
+            None, "reversal: unknown: none exceeds its uncertainty, or only one direction was measured"
         )
     curves = {}
     for name, axis in found.reversal.axes.items():
@@ -307,7 +305,7 @@ def identified_reversal(found: Identification) -> KnownReversal:
 def reversal_beside(path: Path) -> KnownReversal:
     """Return the reversal that belongs to an errors file.
 
-    It is in ``NAME.reversal.csv``, for fitted errors in the identified one; what is not worth a table is in
+    It is in ``NAME.reversal.csv``, for fitted errors in that of the identified ones; a reversal not worth a table is in
     ``identify.json`` in the same folder.
     """
     stem = path.name.removesuffix(".errors.csv")
@@ -316,7 +314,7 @@ def reversal_beside(path: Path) -> KnownReversal:
     curves = {}
     whole = path.parent / "identify.json"
     if stem in ("identified", "fitted") and whole.is_file():
-        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # another file of that name
+        with contextlib.suppress(ValueError, KeyError, TypeError, AttributeError):  # an unrelated file of that name
             read = {}
             for name, item in (json.loads(read_text(whole)).get("reversal") or {}).get("axes", {}).items():
                 for component, (value, u) in enumerate(zip(item["vector_um"], item["u_um"], strict=True)):
@@ -325,17 +323,17 @@ def reversal_beside(path: Path) -> KnownReversal:
             curves = read
     if named is None and not curves:
         return KnownReversal(
-            None, f"reversal: not known: errors are means of both directions, {names[-1]} is not there"
+            None, f"reversal: unknown: errors are means of both directions, and {names[-1]} does not exist"
         )
     where = " and ".join([*([named.name] if named else []), *(["identify.json"] if curves else [])])
     curves |= {} if named is None else read_reversal(named).curves
-    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a direction that is not there counts as zero")
+    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a missing direction counts as zero")
 
 
 def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:
     """Return ``B_X``, ``B_mean_X``, ``E_X`` ... of the axes whose reversal is known, and of the body diagonals.
 
-    Values of the reversal count as independent of each other and of the errors.
+    Values of the reversal are taken as independent of each other and of the errors.
     """
     found: dict[str, Figure] = {}
     for axis, letter in enumerate(AXES):
@@ -376,7 +374,7 @@ def _value(reversal: ReversalCurves, terms: Sequence[Term]) -> float:
 
 
 def _figure(reversal: ReversalCurves, terms: Sequence[Term], value_mm: float, u_mm: float, meaning: str) -> Figure:
-    """A figure of a value with its own uncertainty plus a sum of reversal values; nan where one is not known."""
+    """Return a figure: a value with its uncertainty plus a sum of reversal values; nan if one is unknown."""
     square = 0.0
     for key in dict.fromkeys(key for key, _, _ in terms):
         curve = reversal.curves[key]
@@ -396,7 +394,7 @@ def _largest(reversal: ReversalCurves, terms: Sequence[Sequence[Term]], meaning:
 def _both_ways(
     field: ErrorField, unit: FloatArray, reversal: ReversalCurves, terms: Sequence[Sequence[Term]], meaning: str
 ) -> Figure:
-    """Range of mean +/- half the reversal over points, along a direction."""
+    """Return the range of mean +/- half the reversal over points, along a direction."""
     along = field.error_mm @ unit
     half = 0.5 * np.array([_value(reversal, item) for item in terms])
     both = np.concatenate([along + half, along - half])
@@ -412,7 +410,7 @@ def _both_ways(
 # All figures of a machine from its errors, or of its axes from positioning runs.
 
 
-#: Points of the volume, and of the smaller grid on which pairs of points are looked at.
+#: Points of the volume, and of the smaller grid for pairs of points.
 MOST_POINTS, MOST_IN_PAIRS = 20_000, 1_750
 
 Groups = Mapping[str, Mapping[str, Figure]]
@@ -422,8 +420,8 @@ Groups = Mapping[str, Mapping[str, Figure]]
 class Accuracy(Drawable):
     """Figures by group (``volume``, ``orientation``, ``axes``, ``diagonals``, ``errors``, ``X`` ...) and key.
 
-    ``statements`` says in words what they refer to: alignment, reference line, tool offset, edition. ``targets`` has the
-    values at each target of groups that stem from runs (:class:`compgen.accuracy.positioning.PositioningTest`).
+    ``statements`` says in words what they refer to: alignment, reference line, tool offset, edition. ``targets`` has
+    the values at each target of groups from axis runs (:class:`compgen.accuracy.positioning.PositioningTest`).
     """
 
     groups: Groups
@@ -489,7 +487,7 @@ def accuracy_of_errors(
     source : errors and their uncertainty.
     alignment : how the volume is aligned, see :func:`compgen.accuracy.field.aligned`.
     line : reference line of straightness and squareness: ``"ls"``, ``"end-point"``, ``"minzone"``.
-    reversal : what the axes do differently in their two directions, where it is known.
+    reversal : reversal of the axes, if known.
     """
     ((full, pairs),) = volume_fields(source.machine, (source,), alignment)
     groups = {"volume": volume_figures(full, pairs), **groups_of_errors(source, line)}
@@ -502,7 +500,7 @@ def accuracy_of_errors(
 
 
 def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figure]]:
-    """Return the groups of figures other than the volume's."""
+    """Return the groups of figures other than those of the volume."""
     return {
         "orientation": orientation_figures(source),
         "axes": axis_figures(source),
@@ -512,7 +510,7 @@ def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figu
 
 
 def statements_of(machine: Machine, field: ErrorField, line: str) -> tuple[str, ...]:
-    """Say what the figures of a volume refer to."""
+    """Return in words what the figures of a volume refer to."""
     tool = ", ".join(f"{value:g}" for value in machine.tool_offset_mm)
     ranges = ", ".join(f"{low:g} ... {high:g}" for low, high in (axis.range_mm for axis in machine.axes))
     return (
@@ -525,7 +523,7 @@ def statements_of(machine: Machine, field: ErrorField, line: str) -> tuple[str, 
 
 
 def narrowed(machine: Machine, lower_mm: FloatArray, upper_mm: FloatArray) -> Machine:
-    """Return the machine with its travel cut to what is known of it; the reference point moves inside."""
+    """Return the machine with its travel reduced to the known part; the reference point is moved inside."""
     axes = []
     for k, axis in enumerate(machine.axes):
         low, high = max(axis.range_mm[0], float(lower_mm[k])), min(axis.range_mm[1], float(upper_mm[k]))

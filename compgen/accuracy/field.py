@@ -41,7 +41,7 @@ class Figure:
     Parameters
     ----------
     value : the figure.
-    u : its standard uncertainty, nan where it is not known.
+    u : its standard uncertainty, nan if unknown.
     unit : "um" or "urad".
     meaning : what it is, and the standard that defines it.
     contributions : standard uncertainties by source; their root sum of squares is ``u``.
@@ -79,7 +79,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class ComparedFigure:
-    """The same figure before and after; sizes count, so -12 urad to +3 urad is an improvement by 4."""
+    """The same figure before and after; magnitudes are compared: -12 urad to +3 urad is an improvement by a factor of 4."""
 
     before: Figure
     after: Figure
@@ -94,7 +94,7 @@ class ComparedFigure:
 
     @property
     def u_factor(self) -> float:
-        """Standard uncertainty of the factor, to first order; nan where it is not known."""
+        """Standard uncertainty of the factor, to first order; nan if unknown."""
         before, after = abs(self.before.value), abs(self.after.value)
         if before == 0.0 or after == 0.0:
             return math.nan
@@ -113,12 +113,12 @@ class ComparedFigure:
 
     @property
     def separated(self) -> bool:
-        """Whether the bands value +/- U of both do not meet; E_n is above 1 then."""
+        """Whether the intervals value +/- U of both do not overlap; E_n is then above 1."""
         return abs(self.gain) > self.before.expanded + self.after.expanded
 
     @property
     def verdict(self) -> Verdict:
-        """Say "better" or "worse" only where the bands separate; without uncertainties "smaller", "larger", "same"."""
+        """Return "better" or "worse" only if the intervals do not overlap; without uncertainties "smaller", "larger", "same"."""
         if math.isnan(self.en):
             return "same" if self.gain == 0.0 else "smaller" if self.gain > 0.0 else "larger"
         if not self.separated:
@@ -139,11 +139,11 @@ class ComparedFigure:
 
 # Fields of position errors: how they are aligned, and the figures of a volume with their uncertainty.
 #
-# Every figure is taken as a linear functional of the field near its present value: sum(weight * error) over few points. So
-# its uncertainty is that of the functional, from the joint covariance of what the field is made of, alignment included.
+# Every figure is linearised in the field: sum(weight * error) over a few points. Its uncertainty is that of this linear
+# functional, from the joint covariance of the data behind the field, alignment included.
 
 
-#: Standard uncertainty (mm) of sum(weight * error) for weights (n, 3); nan if it is not known.
+#: Standard uncertainty (mm) of sum(weight * error) for weights (n, 3); nan if unknown.
 Spread = Callable[[FloatArray], float]
 Alignment = Literal["as-given", "axes", "best-fit"]
 
@@ -152,10 +152,10 @@ _SAME_MM = 1e-6
 
 @dataclass(frozen=True)
 class ErrorField:
-    """Position errors (n, 3) of the tool tip at commanded positions (n, 3), mm, and how well they are known.
+    """Position errors (n, 3) of the tool tip at commanded positions (n, 3), mm, and their uncertainty.
 
-    ``tip_mm`` is where the tip should be (position and tool offset), (n, 3); a rigid motion turns about it.
-    ``alignment`` says in words what was taken out.
+    ``tip_mm`` is where the tip should be (position and tool offset), (n, 3); rigid rotations are about it.
+    ``alignment`` says in words what was removed.
     """
 
     position_mm: FloatArray
@@ -186,7 +186,7 @@ class ErrorField:
 
 
 def unknown_spread(_: FloatArray) -> float:
-    """Spread of a field whose uncertainty is not known."""
+    """Spread of a field whose uncertainty is unknown."""
     return math.nan
 
 
@@ -215,17 +215,17 @@ def aligned(machine: Machine, field: ErrorField, alignment: Alignment) -> ErrorF
     Parameters
     ----------
     machine : its reference point and squareness reference say which axis lines the alignment ``"axes"`` uses.
-    field : any field; for ``"axes"`` it must hold the reference point and the ends of the lines through it.
-    alignment : ``"as-given"``; ``"axes"``: zero at the reference point, primary axis X (Y if squareness counts from Y) and
-        secondary axis Y (X) straight between their ends; ``"best-fit"``: the best rigid motion (least squares over all
-        points, finite rotation) is taken out.
+    field : any field; for ``"axes"`` it must contain the reference point and the ends of the lines through it.
+    alignment : ``"as-given"``; ``"axes"``: zero at the reference point, primary axis X (Y if it is the squareness
+        reference) and secondary axis Y (X) straight between their ends; ``"best-fit"``: the best rigid motion (least
+        squares over all points, finite rotation) is removed.
     """
     if alignment == "as-given":
         return field
     if alignment == "axes":
         return _to_axes(machine, field)
     error = without_rigid_motion(field.tip_mm, field.error_mm)
-    return _without(field, small_motion(field.tip_mm), error, "best-fit rigid motion taken out (least squares)")
+    return _without(field, small_motion(field.tip_mm), error, "best-fit rigid motion removed (least squares)")
 
 
 def axis_lines(machine: Machine) -> FloatArray:
@@ -244,7 +244,7 @@ def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
         if distance[rows[-1]] > _SAME_MM:
             where = ", ".join(f"{value:g}" for value in point)
             raise InputError(
-                f"the alignment to the axes needs the point ({where}) mm, which is missing; take --alignment as-given or best-fit"
+                f"the alignment to the axes needs the point ({where}) mm, which is missing; use --alignment as-given or best-fit"
             )
     parameters = np.zeros((6, len(field), 3))
     first, second = (0, 1) if machine.squareness_reference == "X" else (1, 0)
@@ -271,12 +271,12 @@ def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
 
 
 def volume_figures(field: ErrorField, pairs: ErrorField | None = None) -> dict[str, Figure]:
-    """Return the figures of a volume: ISO 230-1 ranges V_X, V_Y, V_Z, and ours, labelled as such.
+    """Return the figures of a volume: ISO 230-1 ranges V_X, V_Y, V_Z, and non-standard ones, labelled as such.
 
     Parameters
     ----------
     field : the errors over the volume, aligned.
-    pairs : a smaller set of points among which the largest length error is looked for; default the field itself.
+    pairs : a smaller set of points among which the largest length error is searched; default: the field itself.
     """
     where = f"over {len(field)} points, {field.alignment}"
     found = {}
@@ -313,7 +313,7 @@ def _figure(field: ErrorField, value_mm: float, weight: FloatArray, meaning: str
 
 
 def _at(field: ErrorField, row: int, toward: FloatArray | None = None) -> FloatArray:
-    """Weights that read off the length of the error at one point, or its part along ``toward`` (3,)."""
+    """Return the weights that give the length of the error at one point, or its part along ``toward`` (3,)."""
     weight = np.zeros_like(field.error_mm)
     vector = field.error_mm[row] if toward is None else toward
     size = float(np.linalg.norm(vector))
@@ -322,7 +322,7 @@ def _at(field: ErrorField, row: int, toward: FloatArray | None = None) -> FloatA
 
 
 def _between(field: ErrorField) -> dict[str, Figure]:
-    """Largest difference of two error vectors, and the largest error of a length between two points."""
+    """Return the largest difference of two error vectors, and the largest error of a length between two points."""
     difference, length = _largest_pairs(field)
     where = f"any two of {len(field)} points"
     i, j = difference
@@ -352,7 +352,7 @@ def _place(field: ErrorField, row: int) -> str:
 
 
 def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Rows of the pair with the largest difference of vectors, and of that with the largest length error."""
+    """Return the rows of the pair with the largest difference of vectors, and of the pair with the largest length error."""
     best = [(-1.0, (0, 0)), (-1.0, (0, 0))]
     tip, error = field.tip_mm, field.error_mm
     for first in range(0, len(tip), block):
@@ -367,7 +367,7 @@ def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int],
             gain += line * apart
             line += apart
             after += line * line
-        # |line + apart| - |line| without the loss of digits that the difference of two roots has
+        # |line + apart| - |line| without the cancellation of the difference of two roots
         before, after, gain = np.sqrt(before), np.sqrt(after), 2.0 * gain + squares
         sizes = np.abs(np.divide(gain, before + after, out=np.zeros_like(gain), where=(before + after) > 0.0))
         for k, values in enumerate((squares, sizes)):
@@ -378,7 +378,7 @@ def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int],
     return best[0][1], best[1][1]
 
 
-# Errors of a machine with what is known of their uncertainty, as a source of fields at any points.
+# Errors of a machine with their uncertainty, if known, as a source of fields at any points.
 
 
 #: What tables of a control add to the command at points, (n, 3), mm.
@@ -389,9 +389,9 @@ Correction = Callable[[Points], FloatArray]
 class ErrorSource:
     """Errors of a machine; ``factor`` (k, r) has F F^T as the covariance of the k values in the order of the table.
 
-    ``factor`` is None where the uncertainty is not known. ``correction`` is what active tables add: the field is then that
-    of the machine with them. ``exact`` moves the exact model, for fields that are compared with measured ones; a correction
-    always does.
+    ``factor`` is None if the uncertainty is unknown. ``correction`` is what active tables add: the field is then that
+    of the machine with them. ``exact`` uses the exact model, for fields that are compared with measured ones; so does a
+    correction.
     """
 
     machine: Machine
@@ -454,7 +454,7 @@ class ErrorSource:
 def error_source(
     machine: Machine, errors: ErrorTable, covariance: Covariance | None = None, correction: Correction | None = None
 ) -> ErrorSource:
-    """Return a source; without a covariance the values of the table count as independent with their own uncertainties.
+    """Return a source; without a covariance the values of the table are independent, with their uncertainties.
 
     The uncertainty is known only if every value has one.
     """
@@ -463,7 +463,7 @@ def error_source(
 
 
 def grid_points(machine: Machine, levels_mm: tuple[FloatArray, ...]) -> FloatArray:
-    """Points (n, 3) of a full grid, with the points that the alignment to the axes needs added where they are missing."""
+    """Return points (n, 3) of a full grid, plus the points for the alignment to the axes if they are missing."""
     grid = full_grid(levels_mm).reshape(-1, 3)
     extra = [p for p in axis_lines(machine) if np.max(np.abs(grid - p), axis=1).min() > 1e-6]
     return np.concatenate([grid, np.array(extra)]) if extra else grid

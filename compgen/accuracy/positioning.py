@@ -17,27 +17,27 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
 from compgen.errors import InputError
 
-# What a positioning test's set-up adds to the uncertainty of its figures, in the manner of ISO/TR 230-9.
+# Contribution of the set-up of a positioning test to the uncertainty of its figures, in the manner of ISO/TR 230-9.
 #
-# The sources are those that ISO 230-2 (Annex A) and ISO/TR 230-9 name: device, misalignment, temperature, expansion
-# coefficient, drift of the environment (EVE). How they act on a figure follows from the figure itself (its derivative by
-# every mean); the printed shortcut formulas of these documents are not used.
+# The sources are those of ISO 230-2 (Annex A) and ISO/TR 230-9: device, misalignment, temperature, expansion
+# coefficient, drift of the environment (EVE). How they act on a figure follows from its derivative by every mean; the
+# simplified formulas printed in these documents are not used.
 
 
 @dataclass(frozen=True)
 class SetupBudget:
-    """Standard uncertainties (k = 1) of what all readings of one axis share, and of single means.
+    """Standard uncertainties (k = 1) of the common inputs of all readings of one axis, and of single means.
 
     Parameters
     ----------
-    device_um : of the device for each mean of a target and direction by itself (resolution, stability), um.
+    device_um : of the device for each single mean of a target and direction (resolution, stability), um.
     device_ppm : of its length scale (wavelength, air), 1e-6.
     misalignment_mrad : of the angle between beam and axis, in each of two directions, mrad; a cosine error.
     temperature_k : of the axis' temperature, K; acts with ``expansion_um_per_m_k``.
     expansion_um_per_m_k : coefficient of expansion of the axis.
     u_expansion_um_per_m_k : its standard uncertainty; acts with ``from_20_k``.
-    from_20_k : how far the axis was from 20 degC, K.
-    drift_um : of each mean by the drift of the environment (EVE) during the test, um.
+    from_20_k : deviation of the axis temperature from 20 degC, K.
+    drift_um : of each mean, due to the drift of the environment (EVE) during the test, um.
     """
 
     device_um: float = option(
@@ -63,15 +63,15 @@ class SetupBudget:
         "Axis runs: standard uncertainty of the coefficient of expansion, um/(m K) (acts with --from-20-k).",
         name="--u-expansion-um-per-m-k",
     )
-    from_20_k: float = option(0.0, "How far the axis was from 20 degC, K.", name="--from-20-k")
+    from_20_k: float = option(0.0, "Deviation of the axis temperature from 20 degC, K.", name="--from-20-k")
     drift_um: float = option(
         0.0,
-        "Axis runs: standard uncertainty of each mean by drift of the environment (EVE), um.",
+        "Axis runs: standard uncertainty of each mean due to drift of the environment (EVE), um.",
         name="--u-drift-um",
     )
 
     def contributions(self, position_mm: FloatArray, weight: FloatArray) -> Iterator[tuple[str, float]]:
-        """Yield source and standard uncertainty (mm) of sum(weight * mean), which is how a figure follows the means.
+        """Yield source and standard uncertainty (mm) of sum(weight * mean), the linearised figure.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ NO_BUDGET = SetupBudget()
 # Statistics of positioning runs at each target, and figures as combinations of them.
 
 
-#: Targets closer than this are the same one, mm.
+#: Targets closer than this are the same target, mm.
 SAME_TARGET_MM = 1e-4
 #: Rows of the statistics: means of positive and negative approach, then the estimators of both.
 MEAN_UP, MEAN_DOWN, S_UP, S_DOWN = range(4)
@@ -137,12 +137,12 @@ class RunStatistics:
 
 
 def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm: FloatArray) -> RunStatistics:
-    """Return the statistics of readings (n,) at targets (n,) that were reached in directions (n,), +1 or -1.
+    """Return the statistics of readings (n,) at targets (n,) reached in directions (n,), +1 or -1.
 
     Raises
     ------
     InputError
-        if a direction was measured at some of the targets only, or there are fewer than two targets.
+        if a direction was measured at only some targets, or there are fewer than two targets.
     """
     readings = np.asarray(position_mm, dtype=np.float64)
     order = np.argsort(readings, kind="stable")
@@ -168,7 +168,7 @@ def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm:
 
 
 def axis_statistics(runs: AxisRuns) -> dict[str, RunStatistics]:
-    """Return the statistics of every measured axis by its letter; InputError names the axis."""
+    """Return the statistics of every measured axis by letter; InputError gives the axis."""
     found = {}
     for axis in runs.axes:
         own = runs.axis == axis
@@ -217,8 +217,8 @@ def spread(candidates: Sequence[Combination], lower: Sequence[Combination] | Non
 def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: SetupBudget = NO_BUDGET) -> Figure:
     """Return a combination in um with its standard uncertainty.
 
-    The scatter gives s^2 / n for a mean and s^2 (1 - c4^2) for an estimator s (normal readings); the rest is the
-    budget's. A single reading has no scatter: u is nan then.
+    The scatter gives s^2 / n for a mean and s^2 (1 - c4^2) for an estimator s (normal readings); the rest comes from
+    the budget. A single reading has no scatter: u is then nan.
     """
     counts, scatter = statistics.count, statistics.values[2:]
     # variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2
@@ -246,9 +246,9 @@ def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: S
 #     E(u) = max - min of m_i(u),  E = max - min of the means of both directions together
 #     A(u) = max [m_i(u) + k s_i(u)] - min [m_i(u) - k s_i(u)],  A = the same over both directions together
 #
-# k is 2 since the edition of 1997 and was 3 in that of 1988. The edition of 2014 says "error" where the earlier ones say
-# "deviation" or "value"; the formulas did not change. Two slips of public programs give other numbers: R as the larger of
-# R(u) and R(d), and E as the larger or smaller of E(u) and E(d).
+# k is 2 since the edition of 1997 and was 3 in that of 1988. The edition of 2014 says "error" where the earlier ones
+# say "deviation" or "value"; the formulas are the same. Two mistakes of public programs give other numbers: R as the
+# larger of R(u) and R(d), and E as the larger or smaller of E(u) and E(d).
 
 
 #: Coverage factor by edition.
@@ -261,11 +261,11 @@ _SIGNS = {MEAN_UP: "up", MEAN_DOWN: "down"}
 class PositioningTest:
     """Figures of one axis (um) by key, and the values at each target.
 
-    Keys: ``B``, ``B_mean``, ``M``, ``R``, ``R_up``, ``R_down``, ``E``, ``E_up``, ``E_down``, ``A``, ``A_up``, ``A_down``
-    as far as the runs show them: both directions for those without an ending, at least two runs for R and A.
+    Keys: ``B``, ``B_mean``, ``M``, ``R``, ``R_up``, ``R_down``, ``E``, ``E_up``, ``E_down``, ``A``, ``A_up``,
+    ``A_down`` as far as the runs show them: both directions for those without an ending, at least two runs for R and A.
     ``targets`` has the columns position_mm, mean_up_um, mean_down_um, s_up_um, s_down_um, B_um, mean_um, R_um, R_up_um,
-    R_down_um, and from the scatter the standard uncertainties u_mean_up_um, u_mean_down_um, u_B_um (shared sources left
-    out), each (m,), nan where unknown.
+    R_down_um, and from the scatter the standard uncertainties u_mean_up_um, u_mean_down_um, u_B_um (without common
+    sources), each (m,), nan if unknown.
     """
 
     edition: int
@@ -283,7 +283,7 @@ def positioning_test(
     ----------
     statistics : means and estimators at the targets.
     edition : 1988, 1997, 2006 or 2014.
-    budget : what the set-up adds to the uncertainties.
+    budget : contribution of the set-up to the uncertainties.
     """
     if edition not in EDITIONS:
         raise InputError(f"edition {edition} of ISO 230-2 is not available; use {' or '.join(map(str, EDITIONS))}")
@@ -299,7 +299,7 @@ def positioning_test(
         key: figure(statistics, item, f"{meaning}, ISO 230-2:{edition}", budget)
         for key, (item, meaning) in found.items()
     }
-    # what must hold between the figures whatever the readings are; if it does not, this is a bug, not bad input
+    # relations between the figures for any readings; a violation is a bug, not bad input
     for pair in ("A E", "A A_up", "A A_down", "E E_up", "E E_down", "E M", "R R_up", "R R_down", "R B"):
         large, small = pair.split()
         if large in figures and small in figures:
@@ -351,7 +351,7 @@ def _both_ways(statistics: RunStatistics, k: float) -> dict[str, tuple[Combinati
         accuracy = spread(_means(statistics, ways, k), _means(statistics, ways, -k))
         signs = np.sign(statistics.values[MEAN_UP] - statistics.values[MEAN_DOWN]).tolist()
         widths = []
-        for i, sign in enumerate(signs):  # R_i as the largest of its three candidates
+        for i, sign in enumerate(signs):  # R_i is the largest of its three candidates
             both = [(k, S_UP, i), (k, S_DOWN, i), (sign, MEAN_UP, i), (-sign, MEAN_DOWN, i)]
             parts = (both, [(2.0 * k, S_UP, i)], [(2.0 * k, S_DOWN, i)])
             widths.append(largest([combine(statistics, part) for part in parts]))
@@ -395,7 +395,7 @@ def vdi_3441(statistics: RunStatistics, budget: SetupBudget = NO_BUDGET) -> dict
     Raises
     ------
     InputError
-        if a direction is missing or nothing was repeated: the guideline knows no such test.
+        if a direction is missing or nothing was repeated: the guideline has no such test.
     """
     if not (statistics.bidirectional and statistics.repeated):
         raise InputError("VDI/DGQ 3441 needs both directions, each repeated at every target")
@@ -426,13 +426,13 @@ def vdi_3441(statistics: RunStatistics, budget: SetupBudget = NO_BUDGET) -> dict
 def accuracy_of_runs(
     statistics: Mapping[str, RunStatistics], edition: int = LATEST, budgets: Mapping[str, SetupBudget] | None = None
 ) -> Accuracy:
-    """Return ISO 230-2 and, where the runs allow it, VDI/DGQ 3441 of every axis; groups are the axes' letters.
+    """Return ISO 230-2 and, if the runs allow it, VDI/DGQ 3441 of every axis; groups are the letters of the axes.
 
     Parameters
     ----------
     statistics : by axis.
     edition : of ISO 230-2.
-    budgets : what the set-up adds to the uncertainties, by axis.
+    budgets : contribution of the set-up to the uncertainties, by axis.
     """
     groups: dict[str, dict[str, Figure]] = {}
     targets = {}

@@ -1,4 +1,4 @@
-"""The two sides of a comparison: what each file contains, and which comparison fits the two."""
+"""The two sides of a comparison: what each file contains, and which comparison applies."""
 
 from __future__ import annotations
 
@@ -51,19 +51,19 @@ from compgen.tables import ReadTables
 # What the two sides of a comparison can be: error files, measurements of any kind, predictions.
 
 
-#: Bytes that tell what a file is.
+#: Bytes that identify the kind of a file.
 _LOOKED_AT = 1_000_000
 #: Reads the files of one measurement, with the constants of a six-DOF instrument.
 Reader = Callable[[Sequence[str | Path], Path | None], "Measurement | ErrorTable"]
 PREDICTED_COLUMNS = ("ex_um", "ey_um", "ez_um")
 
 
-NOT_KNOWN = KnownReversal(None, "reversal: not known: errors are means of both directions")
+NOT_KNOWN = KnownReversal(None, "reversal: unknown: errors are means of both directions")
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side as it was read: ``kind`` in words, and of the rest what that kind has.
+    """One side as read: ``kind`` in words, and the data of that kind.
 
     ``deviations`` and ``lengths`` are identified when errors are requested (:meth:`errors`); ``predicted`` is a field at
     points.
@@ -111,17 +111,19 @@ def read_side(
     Parameters
     ----------
     machine : the machine.
-    path : the file; its columns tell what it is. For a folder: the errors that were identified there.
+    path : the file; its columns identify its kind. For a folder: the errors identified there.
     instrument : constants of a six-DOF instrument, for ``*.sixdof.csv``.
-    u_um : standard uncertainty of measured deviations, um; default the file's own.
-    reader : of measurements; that of :mod:`compgen.foreign` takes foreign files as well.
+    u_um : standard uncertainty of measured deviations, um; default: that of the file.
+    reader : of measurements; that of :mod:`compgen.foreign` reads foreign files, too.
     """
     source = Path(path)
-    if source.is_dir():  # of a command that wrote its errors there
+    if source.is_dir():  # of a command that wrote its errors
         source = source / "identified.errors.csv"
         if not source.is_file():
             raise InputError("is a folder without identified.errors.csv; give a file", file=source.parent)
-    text = read_bytes(source, _LOOKED_AT).decode("utf-8-sig", errors="replace")  # to tell the kind; readers are strict
+    text = read_bytes(source, _LOOKED_AT).decode(
+        "utf-8-sig", errors="replace"
+    )  # only to detect the kind; the readers are strict
     header = names_in_header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
@@ -149,7 +151,7 @@ def read_side(
 
 
 def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
-    """Return the covariance file that an errors file names, if it is there and belongs to it; warn if it does not."""
+    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match."""
     name = errors.metadata.get("covariance")
     beside = path.parent / name if name else None
     if beside is None or not beside.is_file():
@@ -157,7 +159,9 @@ def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
     found = read_covariance(beside)
     if found.errors_sha256 == sha256_of(read_bytes(path)):
         return found
-    message = f"{beside} belongs to another version of {path.name}; u_value counts, independent from node to node"
+    message = (
+        f"{beside} belongs to another version of {path.name}; u_value is used instead, independent from node to node"
+    )
     warnings.warn(message, CompgenWarning, stacklevel=2)
     return None
 
@@ -175,15 +179,17 @@ def _read_predicted(machine: Machine, path: Path) -> ErrorField:
     if "tool_x_mm" in table.columns:
         tool = np.column_stack([table.numbers(f"tool_{k}_mm") for k in "xyz"])
         if np.max(np.abs(tool - np.array(machine.tool_offset_mm))) > 1e-6:
-            raise InputError("has a tool offset that differs from the machine's; predict with the machine's", file=path)
+            raise InputError(
+                "has a tool offset that differs from the machine file; predict with that of the machine file", file=path
+            )
     return ErrorField(position, position + tool, error, lambda _: 0.0)
 
 
-# Two sides of a comparison brought together: by their kind, or as prediction and measurement.
+# Comparison of two sides: by their kind, or as prediction and measurement.
 
 
 def compare_sides(before: Side, after: Side, options: CompareOptions) -> Comparison:
-    """Compare two sides of like kind: axis runs, diagonals, measured positions, or errors (given, or identified first).
+    """Compare two sides of the same kind: axis runs, diagonals, measured positions, or errors (given, or identified first).
 
     Raises
     ------
@@ -202,7 +208,7 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
     for alone, name in (("runs", "axis runs"), ("diagonals", "measured diagonals")):
         if getattr(before, alone) is not None or getattr(after, alone) is not None:
             raise InputError(
-                f"BEFORE contains {before.kind}, AFTER {after.kind}; {name} can be compared with {name} only"
+                f"BEFORE contains {before.kind}, AFTER {after.kind}; {name} can only be compared with {name}"
             )
     if options.align != "model" and (before.deviations is not None or after.deviations is not None):
         return _at_positions(before, after, options)
@@ -230,15 +236,15 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
 
 
 def _at_positions(before: Side, after: Side, options: CompareOptions) -> Comparison:
-    """Points against points, or against errors; and the errors identified from each side, where they follow from the points."""
+    """Compare points with points or errors; also the errors identified from each side, if the points determine them."""
     if before.deviations is None or after.deviations is None:
-        # errors on one side, taken at the positions that were measured on the other
+        # errors on one side, evaluated at the positions measured on the other
         measured = _own_tool(after if before.deviations is None else before)
         other = before if before.deviations is None else after
         taken = replace(measured, field=_predicted_at(other, measured.field))
         sides = (taken, measured) if other is before else (measured, taken)
         found = compare_fields(before.machine, *sides, options)
-        text = f"{other.path.name}: errors, the exact model moved with them to the measured positions"
+        text = f"{other.path.name}: errors, evaluated with the exact model at the measured positions"
         return replace(found, statements=(text, *found.statements))
     found = compare_fields(before.machine, before.measured(), after.measured(), options)
     try:
@@ -246,7 +252,7 @@ def _at_positions(before: Side, after: Side, options: CompareOptions) -> Compari
         assert first is not None and second is not None
         errors = compare_errors(first, second, replace(options, align=None, alignment=None))
     except (UndeterminedError, InputError) as error:
-        text = f"single errors are not compared: they do not follow from these points ({str(error).partition(';')[0]})"
+        text = f"single errors are not compared: these points do not determine them ({str(error).partition(';')[0]})"
         return replace(found, statements=(*found.statements, text))
     rest = {name: group for name, group in errors.groups.items() if name != "volume"}
     text = "axes, diagonals and single errors: identified from the points of each side; " + errors.statements[-2]
@@ -254,16 +260,16 @@ def _at_positions(before: Side, after: Side, options: CompareOptions) -> Compari
 
 
 def compare_prediction(predicted: Side, measured: Side, options: CompareOptions) -> Comparison:
-    """Compare a prediction (errors, or errors at points) with what was measured; verdict by the agreement."""
+    """Compare a prediction (errors, or errors at points) with a measurement; the verdict is their agreement."""
     first, second = _both_fields(predicted, measured, options)
     found = agreement(first, second)
     statements: tuple[str, ...] = (
-        f"prediction {predicted.path.name} against {measured.kind}",
+        f"prediction {predicted.path.name} and {measured.kind}",
         f"{len(first)} points, {first.alignment}",
     )
     if predicted.predicted is not None:
-        text = "a list of predicted points has no uncertainty: that of the measurement alone counts"
-        statements = (*statements, f"{text}; where squareness is large, predict with --exact")
+        text = "a list of predicted points has no uncertainty: only that of the measurement is used"
+        statements = (*statements, f"{text}; if squareness errors are large, predict with --exact")
     return Comparison("prediction", {"volume": dict(found.figures)}, (), statements, found)
 
 
@@ -288,13 +294,13 @@ def with_prediction(
 
 
 def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tuple[ErrorField, ErrorField]:
-    """Predicted and measured field at the same points, aligned alike."""
+    """Return the predicted and the measured field at the same points, in the same alignment."""
     machine = predicted.machine
     for side in (measured, predicted):
         if side.runs is not None or side.diagonals is not None:
             raise InputError(f"{side.kind} cannot be compared with a prediction of errors", file=side.path)
     if measured.predicted is not None:
-        raise InputError("AFTER is a prediction too; expected a measurement", file=measured.path)
+        raise InputError("AFTER is also a prediction; expected a measurement", file=measured.path)
     alignment: Alignment = options.alignment or ("as-given" if measured.deviations is not None else "axes")
     if predicted.predicted is not None:
         alignment = options.alignment or "as-given"
@@ -323,14 +329,14 @@ def _own_tool(side: Side) -> MeasuredField:
     offset = found.field.tip_mm - found.field.position_mm - np.array(side.machine.tool_offset_mm)
     if float(np.max(np.abs(offset))) > 1e-6:
         raise InputError(
-            "was measured with a tool offset that differs from the machine's, which the prediction uses",
+            "was measured with a tool offset other than that of the machine file, which the prediction uses",
             file=side.path,
         )
     return found
 
 
 def _predicted_at(predicted: Side, measured: ErrorField) -> ErrorField:
-    """Predicted field at the measured points; a list of points must hold every one of them."""
+    """Return the predicted field at the measured points; a list of points must contain all of them."""
     if predicted.predicted is None:
         return _exact(predicted).field(measured.position_mm)
     given = predicted.predicted

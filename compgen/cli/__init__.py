@@ -1,7 +1,8 @@
 """The command line: ``volcomp --help``.
 
-This module knows the names of the commands and one line about each. The module that holds a command is imported when
-the command runs, and with it what the command needs; ``volcomp --help`` and the completion of a shell load neither.
+This module has only the names of the commands and a line of help for each. The module that holds a command is imported
+when the command runs, and with it what the command needs; ``volcomp --help`` and the completion of a shell load
+neither.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ _COMMANDS = {
         "diagnose": "Find where model and measurement disagree, and name the missing effect.",
     },
     "table_commands": {
-        "options": "Show what each option of a control would buy, by level and by control.",
+        "options": "Show what each option of a control would gain, by level and by control.",
         "export": "Export errors to the files of a control, with manifest.json and preflight.md.",
         "read": "Read controller files, emulate the control, and write the correction at each point.",
         "verify": "Verify controller files against the errors of the machine.",
         "diff": "Compare two sets of tables by what they do: A minus B at the tool, in um.",
-        "merge": "Merge old tables and new errors to one set of tables.",
-        "crash-test": "Feed wrong tables to the verification, and see that each is rejected.",
+        "merge": "Merge old tables and new errors into one set of tables.",
+        "crash-test": "Feed wrong tables to the verification and check that each is rejected.",
     },
     "plan_commands": {
         "plan": "Plan a measurement: what it will determine, and how well.",
@@ -59,7 +60,7 @@ _COMMANDS = {
         "machines": "List the machines with their travel (mm).",
         "effects": "List the effects other than the geometric errors.",
         "instruments": "List the instruments that compgen simulates.",
-        "import": "Show what a file of another program holds, and write it as a contract file.",
+        "import": "Show what a file of another program contains, and convert it to the native format.",
     },
     "fleet_commands": {
         "recal": "Scheduled recalibration: new measurements become proposed tables.",
@@ -77,7 +78,7 @@ class Unloaded(click.Command):
 
     @cached_property
     def loaded(self) -> click.Command:
-        """The command itself; its module is imported now."""
+        """Import the module of the command and return the command."""
         module = import_module(f"compgen.cli.{self.module}")
         command = getattr(module, f"{str(self.name).replace('-', '_')}_command")
         assert isinstance(command, click.Command)
@@ -85,7 +86,7 @@ class Unloaded(click.Command):
 
 
 class CommandTable(click.Group):
-    """A group of commands that are imported when they are called; its help and completion need their names only."""
+    """A group that imports each command when it is called; help and completion need only the names."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -96,7 +97,7 @@ class CommandTable(click.Group):
 
 
 def _show_version(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    """Print the version, also where the package runs from a folder that was never installed, and stop."""
+    """Print the version and stop; works for a package that was never installed, too."""
     if value and not context.resilient_parsing:
         from compgen.resources import program_version
 
@@ -129,7 +130,7 @@ def cli(context: click.Context) -> None:
     Example:
       volcomp run zha-gantry lengths.csv --controller isg-csv --out tables/
     """
-    if any(group.startswith("compgen.") for group in entry_points().groups):  # else there is no plug-in to look for
+    if any(group.startswith("compgen.") for group in entry_points().groups):  # else there are no plug-ins
         load_for(context, installed=True)
 
 

@@ -33,16 +33,16 @@ from compgen.tables import read_tables
 
 
 def evaluation_options(*without: str) -> Callable[[Command], Command]:
-    """Add how the figures are evaluated; the command receives ``options``, ``budget`` and how to read files."""
+    """Add the options of the evaluation; the command receives ``options``, ``budget`` and a reader of files."""
 
     def decorate(command: Command) -> Command:
         decorated: Any = options_of(SetupBudget, "budget", build=_budget)(command)
-        text = "Axis of an instrument's file that does not say it."
+        text = "Axis of an instrument's file that does not state it."
         decorated = click.option("--axis", type=click.Choice(AXES, case_sensitive=False), help=text)(decorated)
         text = "Standard uncertainty of measured deviations, um."
         decorated = click.option("--u-deviation-um", type=NUMBER, help=text)(decorated)
         decorated = instrument_option(decorated)
-        text = "Take the best-fit rigid motion out of the volume (default: stays)."
+        text = "Remove the best-fit rigid motion from the volume (default: keep it)."
         decorated = click.option("--remove-rigid-motion", is_flag=True, help=text)(decorated)
         return options_of(CompareOptions, "options", without=without, read={"edition": int})(decorated)  # type: ignore[no-any-return]
 
@@ -58,10 +58,10 @@ def _budget(**values: float) -> SetupBudget:
 
 
 def _completed(options: CompareOptions, machine: Machine, budget: SetupBudget, *, rigid: bool) -> CompareOptions:
-    """The options with the budget of each axis, by its own expansion, and the alignment that --remove-rigid-motion means."""
+    """Return the options with the budget of each axis (its own expansion) and the alignment of --remove-rigid-motion."""
     if rigid and options.alignment is not None:
         given = f"--alignment {options.alignment} and --remove-rigid-motion"
-        raise InputError(f"{given} cannot be combined; give one of them")
+        raise InputError(f"{given} cannot be combined; give only one")
     budgets = {}
     for axis, item in zip(AXES, machine.axes, strict=True):
         known = item.expansion_um_per_m_k
@@ -99,10 +99,10 @@ def accuracy_command(
 ) -> int:
     """Evaluate one measurement or error file by the standards, each figure with its uncertainty.
 
-    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6, *.circle.csv ISO 230-4; errors (reversal
-    from NAME.reversal.csv beside them, or a folder that identify or run wrote), tracer lengths, measured positions and
-    six-DOF readings (identified first) give ISO 230-1 volumetric ranges, ISO 230-6 diagonals, straightness, squareness.
-    Values in um and urad. Writes accuracy.json and accuracy.txt to DIR.
+    FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6, *.circle.csv ISO 230-4; errors
+    (reversal from NAME.reversal.csv in the same folder, or a folder that identify or run wrote), tracer lengths,
+    measured positions and six-DOF readings (identified first) give ISO 230-1 volumetric ranges, ISO 230-6
+    diagonals, straightness, squareness. Values in um and urad. Writes accuracy.json and accuracy.txt to DIR.
 
     \b
     Example:
@@ -142,14 +142,14 @@ def accuracy_command(
     multiple=True,
     metavar="FILE",
     type=PATH,
-    help="Controller files active during AFTER: what they predict on the errors BEFORE is compared with AFTER as well.",
+    help="Controller files active during AFTER: the result they predict from the errors BEFORE is compared with AFTER, too.",
 )
 @click.option("--controller", metavar="NAME", help="Control that --tables belong to.")
 @click.option(
     "--expect",
     type=click.Choice(["better", "not-worse"]),
     default="better",
-    help="What exit code 0 needs (default better).",
+    help="What exit code 0 requires (default better).",
 )
 @evaluation_options()
 @out_option
@@ -173,12 +173,12 @@ def compare_command(
 ) -> int:
     """Compare before and after: improvement factors with uncertainty, per volume, axis and error.
 
-    BEFORE and AFTER are two error files (*.errors.csv, um and urad), or two measurements of a kind: *.axis.csv,
+    BEFORE and AFTER are two error files (*.errors.csv, um and urad), or two measurements of the same kind: *.axis.csv,
     *.diagonals.csv, *.deviations.csv, *.lengths.csv or *.sixdof.csv (the last two are identified first). Both need the
-    same points. A figure is "better" only where the bands value +/- U (k = 2) separate (then En > 1).
+    same points. A figure is "better" only if the intervals value +/- U (k = 2) do not overlap (then En > 1).
 
-    Exit code 0: better (or smaller, where no uncertainty is known), and a prediction agrees; else 1. Writes compare.json
-    and compare.txt to DIR.
+    Exit code 0: better (or smaller, if no uncertainty is known), and a prediction agrees; otherwise 1. Writes
+    compare.json and compare.txt to DIR.
 
     \b
     Example:
@@ -186,7 +186,7 @@ def compare_command(
     """
     OutputFolder(out)
     if bool(tables) != (controller is not None):
-        raise InputError("--tables and --controller belong together; give both or neither")
+        raise InputError("--tables and --controller must be given together")
     if predicted and tables:
         raise InputError(
             "--predicted cannot be combined with --tables: with --tables the emulator makes the prediction"

@@ -24,25 +24,25 @@ from compgen.errors import CompgenError, CompgenWarning, InputError
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
-#: In bash the bare word compgen is a builtin that does nothing; the program has a second name for that reason.
+#: In bash, compgen is a builtin that prints nothing; hence the second name of the program.
 PROGRAM_NAMES = ("compgen", "volcomp")
-#: Exit codes beyond the contract's, as shells use them; they state no result.
+#: Exit codes outside the contract, as shells use them; they say nothing about a result.
 STOPPED, READER_GONE = 130, 141
 
 
 class FiniteNumber(click.ParamType):  # type: ignore[type-arg]  # generic from click 8.4 on
-    """A finite number; zero, or of a size that a number in a file may have."""
+    """A finite number: zero, or within the range of numbers in files."""
 
     name = "float"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the number; wrong usage for anything else."""
+        """Return the number; anything else is wrong usage."""
         from compgen.data import toml_files
 
         try:
             return toml_files.number(float(value))
         except ValueError as error:
-            what = error if str(error).startswith("a finite") else "a number is expected"
+            what = error if str(error).startswith("expected a finite") else "expected a number"
             self.fail(f"{value!r}: {what}", param, ctx)
 
 
@@ -86,7 +86,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             if isinstance(error, getattr(click.exceptions, "NoArgsIsHelpError", ())):  # click 8.2 and later
                 error.show()
                 return 2
-            # as click does, with the place where help is to be had
+            # like click, with the command that shows help
             hint = f"; see '{context.command_path} --help'" if context is not None else ""
             return _fail(error.format_message().rstrip(".") + hint, 2, words)
         except (click.Abort, KeyboardInterrupt):
@@ -98,7 +98,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             return _fail(str(error), error.exit_code, words)
         except MemoryError:
             return _fail("not enough memory for this input", 3, words)
-        except Exception as error:  # the last line of defence: exit code 3 of the contract
+        except Exception as error:  # last resort: exit code 3 of the contract
             if os.environ.get("COMPGEN_TRACEBACK"):
                 traceback.print_exc()
             place = traceback.extract_tb(error.__traceback__)[-1]
@@ -114,7 +114,7 @@ def _fail(message: str, code: int, words: Sequence[str]) -> int:
 
 
 def load_for(context: click.Context, paths: Sequence[Path] = (), *, installed: bool = False) -> None:
-    """Load plug-ins for one command; they are gone when it is done."""
+    """Load plug-ins for one command and unload them when it ends."""
     from compgen.data.registry import restored
     from compgen.plugins import KINDS, load_plugins
 
@@ -150,10 +150,10 @@ def fleet_options(command: Command) -> Command:
     @functools.wraps(command)
     def wrapper(*args: Any, workers: int | None, cluster: str | None, **options: Any) -> Any:
         if workers is not None and cluster is not None:
-            raise InputError("--workers cannot be combined with --cluster: --workers is for processes of this machine")
+            raise InputError("--workers cannot be combined with --cluster: --workers starts processes on this computer")
         return command(*args, workers=workers or 1, cluster=cluster, **options)
 
-    text = "Processes on this machine that share the work; the results stay the same, byte for byte. Default: 1."
+    text = "Processes on this computer that share the work; the results are identical, byte for byte. Default: 1."
     decorated: Any = wrapper
     decorated = click.option("--workers", type=click.IntRange(1, 256), metavar="N", help=text)(decorated)
     text = "Scheduler of an existing Dask cluster that does the work, e.g. tcp://10.0.0.5:8786; needs compgen[cluster]."
@@ -162,7 +162,7 @@ def fleet_options(command: Command) -> Command:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[threading.Event]:
-    """Yield what is set by the first SIGTERM or Ctrl-C; a second one is KeyboardInterrupt."""
+    """Yield an event that the first SIGTERM or Ctrl-C sets; a second one raises KeyboardInterrupt."""
     stop = threading.Event()
 
     def ask(*_: object) -> None:
@@ -171,7 +171,7 @@ def stopped_by_signals() -> Iterator[threading.Event]:
         stop.set()
 
     before: dict[int, Any] = {}
-    with suppress(ValueError):  # outside the main thread signals are somebody else's
+    with suppress(ValueError):  # only the main thread may handle signals
         for number in (signal.SIGTERM, signal.SIGINT):
             before[number] = signal.signal(number, ask)
     try:

@@ -24,7 +24,7 @@ from compgen.instruments.sixdof_instrument import read_instrument
 from compgen.instruments.sixdof_readings import read_sixdof
 from compgen.kinematics.kernel_switch import one_thread
 
-# ``volcomp diagnose --each``: every measurement by itself, in this process, in several, or on a cluster.
+# ``volcomp diagnose --each``: every measurement separately, in this process, in several, or on a cluster.
 
 
 Show = Callable[[str], None]
@@ -32,14 +32,14 @@ Show = Callable[[str], None]
 
 @dataclass(frozen=True)
 class DiagnoseRequest:
-    """How to diagnose measurements; it can be sent to another process."""
+    """How to diagnose measurements; can be sent to another process."""
 
     machine: Machine
     options: DiagnoseOptions
     instrument: Path | None
 
     def __call__(self, path: Path) -> DiagnosedMeasurement:
-        """Diagnose one measurement; what cannot be used becomes part of what was found."""
+        """Diagnose one measurement; a file that cannot be used is part of the result."""
         try:
             with one_thread():
                 found, contents = diagnosed(self, (path,), lambda _: None)
@@ -74,11 +74,13 @@ def diagnosed(
 def diagnose_each(
     request: DiagnoseRequest, measurements: Sequence[Path], out: Path, spread: tuple[int, str | None], *, as_json: bool
 ) -> int:
-    """Diagnose every measurement into a folder of its own; the exit code is 1 if any is not acceptable."""
+    """Diagnose every measurement into its own folder; the exit code is 1 if any is not acceptable."""
     names = [path.name.split(".")[0] for path in measurements]
     twice = sorted({name for name in names if names.count(name) > 1 or not name})
     if twice:
-        raise InputError(f"the folder {twice[0]!r} would hold two diagnoses; rename the measurements", field="--each")
+        raise InputError(
+            f"the folder {twice[0]!r} would receive two diagnoses; rename the measurements", field="--each"
+        )
     results: list[dict[str, Any]] = []
     with mapper(*spread) as share:
         for name, path, found in zip(names, measurements, share(request, measurements), strict=True):
@@ -109,7 +111,7 @@ def _names(text: str) -> tuple[str, ...]:
 @options_of(DiagnoseOptions, "options", read={"effects": _names, "against": read_error_file})
 @instrument_option
 @click.option(
-    "--each", is_flag=True, help="Diagnose each measurement on its own, into a folder of --out with its name."
+    "--each", is_flag=True, help="Diagnose each measurement separately, into a folder of --out with its name."
 )
 @fleet_options
 @json_option
@@ -124,16 +126,16 @@ def diagnose_command(
     cluster: str | None,
     as_json: bool,
 ) -> int:
-    """Find where model and measurement disagree, name the missing effect, add it, and see the gap shrink.
+    """Find where model and measurement disagree, name the missing effect, add it, and check that the misfit shrinks.
 
     MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv or *.axis.csv files (um), or *.sixdof.csv files (mm) with
-    --instrument, which are checked for errors of the instrument itself. Writes diagnosis.json,
-    diagnosis.md, pages with pictures (index.html), and extended.toml: the machine with the effects that were found, to be
-    given to the next command in place of MACHINE. Axis runs (ISO 230-2): also removed.csv, what was taken off each reading.
+    --instrument, which are checked for errors of the instrument itself. Writes diagnosis.json, diagnosis.md, pages with
+    pictures (index.html), and extended.toml: the machine with the effects that were found, to be used as MACHINE in the
+    next command. For axis runs (ISO 230-2) also removed.csv: what was subtracted from each reading.
 
-    --each diagnoses every file on its own; --workers and --cluster distribute them.
+    --each diagnoses every file separately; --workers and --cluster distribute them.
 
-    Exit code 1: it cannot be decided, or the gap does not shrink on lines that were left out.
+    Exit code 1: not decidable, or the misfit does not shrink on lines that were left out.
 
     \b
     Example:

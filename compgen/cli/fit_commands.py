@@ -41,9 +41,9 @@ def fit_command(
 ) -> int:
     """Fit smooth curves: straightness zero at both ends, positioning and angles zero at the reference point.
 
-    ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant Vendor;
-    mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that
-    volcomp identify wrote is in the folder of ERRORS, its correlations count, else nodes are independent.
+    ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant
+    Vendor; mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that volcomp identify wrote is in
+    the folder of ERRORS, its correlations are used; otherwise nodes are independent.
 
     \b
     Example:

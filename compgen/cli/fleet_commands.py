@@ -1,4 +1,4 @@
-"""``volcomp recal`` and ``serve``; what a command needs is imported when it runs."""
+"""``volcomp recal`` and ``serve``; each command imports what it needs when it runs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from compgen.fleet.store import Store
 
 
-# ``volcomp recal``: run, watch, status, history; what a command needs is imported when it runs.
+# ``volcomp recal``: run, watch, status and history.
 
 
 JOB = "recal.toml"
@@ -46,10 +46,10 @@ NEEDED = {"sqlalchemy": "SQLAlchemy", "alembic": "alembic", "apscheduler": "APSc
 
 @click.group("recal")
 def recal_command() -> None:
-    """Scheduled recalibration: new measurements become proposed tables, a person approves, everything can be undone.
+    """Scheduled recalibration: new measurements become proposed tables, a person approves them, and each step can be undone.
 
-    The job file (--job, default recal.toml) says which machines, from which inbox, when, by which rules. Limits are in
-    um, temperatures in degC, ages in days. Exit codes: 0 all is well (tables may wait for approval), 1 something is held
+    The job file (--job, default recal.toml) lists the machines, their inboxes, schedules and rules. Limits are in um,
+    temperatures in degC, ages in days. Exit codes: 0 no problem (tables may wait for approval), 1 something is held
     back or failed, 2 wrong usage, job file or store, 3 internal error.
 
     \b
@@ -62,7 +62,7 @@ def recal_command() -> None:
 
 
 def needed() -> None:
-    """Say what is not installed, if anything is not."""
+    """Raise InputError that lists the distributions that are not installed, if any."""
     import importlib.util
 
     missing = [name for module, name in NEEDED.items() if importlib.util.find_spec(module) is None]
@@ -78,7 +78,7 @@ log_option = click.option(
     default="auto",
     show_default=True,
     type=click.Choice(["auto", "json", "text"]),
-    help="Form of the logs on stderr; auto: words on a terminal, else one JSON object per line.",
+    help="Format of the logs on stderr; auto: text on a terminal, otherwise one JSON object per line.",
 )
 
 
@@ -127,8 +127,8 @@ def run_command(
 ) -> int:
     """Read the inboxes of MACHINES (default: all) once, process new measurements, publish the tables.
 
-    The same inbox gives the same state, however often it is run. A machine that fails does not stop the others. On
-    SIGTERM or Ctrl-C the measurements that are being processed are finished; exit code 130.
+    The same inbox gives the same state, however often it is run. If one machine fails, the others continue. On SIGTERM
+    or Ctrl-C the measurements in progress are finished; exit code 130.
 
     \b
     Example:
@@ -183,8 +183,8 @@ def watch_command(
 ) -> int:
     """Keep running: every machine by its schedule (without one every 5 minutes), until SIGTERM or Ctrl-C.
 
-    Changes of the job file are picked up; a faulty one is reported, and the previous one stays in force. On a signal
-    the measurements that are being processed are finished.
+    Changes of the job file take effect; a faulty job file is reported, and the previous one remains in use. On a signal
+    the measurements in progress are finished.
 
     \b
     Example:
@@ -215,7 +215,7 @@ def watch_command(
 def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
     """Show the state of each of MACHINES (default: all): active version, versions that wait, last measurement, problems.
 
-    Exit code 1 if the newest tables of any are held back, or its last measurement failed.
+    Exit code 1 if the newest tables of a machine are held back, or its last measurement failed.
 
     \b
     Example:
@@ -258,10 +258,10 @@ def print_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 @click.argument("machine", required=False)
 @job_option
 @click.option("--drift", is_flag=True, help="Show how MACHINE drifts instead: changes, trends, forecasts, steps.")
-@click.option("--report", default=None, metavar="FILE", type=PATH, help="Write the drift as a page, with pictures.")
+@click.option("--report", default=None, metavar="FILE", type=PATH, help="Write the drift as an HTML page with charts.")
 @json_option
 def history_command(machine: str | None, job: Job, drift: bool, report: Path | None, as_json: bool) -> int:
-    """Show everything that happened to MACHINE (default all): measurements, failures, decisions with who and why.
+    """Show the history of MACHINE (default: all): measurements, failures, and decisions with the person and the reason.
 
     \b
     Example:
@@ -301,17 +301,19 @@ def who_option(*, reason: bool) -> Callable[[Command], Command]:
     """Add --actor and --reason."""
 
     def decorate(command: Command) -> Command:
-        text = "Why; kept in the history." if reason else "Why; kept in the history; required with --override."
+        text = "Reason, kept in the history." if reason else "Reason, kept in the history; required with --override."
         given = {"required": True} if reason else {"default": ""}  # a default of None would count as given
         why = click.option("--reason", metavar="TEXT", help=text, **given)
-        who = click.option("--actor", default=None, metavar="NAME", help="Who decides; default: your login name.")
+        who = click.option(
+            "--actor", default=None, metavar="NAME", help="Person who decides; default: your login name."
+        )
         return who(why(command))
 
     return decorate
 
 
 def actor_of(name: str | None) -> str:
-    """Return the name of who decides: the one given, else the login name."""
+    """Return the name of the person who decides: the one given, otherwise the login name."""
     try:
         return name or getpass.getuser()
     except (KeyError, OSError) as error:
@@ -322,7 +324,7 @@ def actor_of(name: str | None) -> str:
 @click.argument("machine")
 @click.argument("version", type=click.IntRange(1), required=False)
 @job_option
-@click.option("--override", is_flag=True, help="Also a version that the policy holds back; needs --reason.")
+@click.option("--override", is_flag=True, help="Approve a version even if the policy holds it back; needs --reason.")
 @who_option(reason=False)
 @json_option
 def approve_command(
@@ -330,8 +332,9 @@ def approve_command(
 ) -> int:
     """Make VERSION of MACHINE's tables active.
 
-    Without VERSION the only one that waits is shown and asked about, on a terminal; elsewhere name the VERSION that you
-    looked at, as another one may wait by now. Tables that the round trip did not accept can never be approved.
+    Without VERSION, on a terminal, the only version that waits is shown and must be confirmed; elsewhere give the
+    VERSION that you checked, because another one may be waiting by now. Tables that the round trip did not accept can
+    never be approved.
 
     \b
     Example:
@@ -347,12 +350,12 @@ def approve_command(
 
 
 def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
-    """Return the version that waits and the active one (0: none), after a person has seen both and said yes.
+    """Return the version that waits and the active one (0: none), after a person has seen and confirmed both.
 
     Raises
     ------
     InputError
-        where nobody can be asked: what waits now need not be what somebody looked at before.
+        without a terminal: the version that waits now may not be the one that somebody checked before.
     """
     from compgen.data.messages import visible
     from compgen.fleet import decisions
@@ -364,7 +367,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
     what += measured.measured_at.isoformat(timespec="minutes")
     if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):
         raise InputError(
-            f"{what}, waits; without a terminal, name the version: volcomp recal approve {name} {table.version}",
+            f"{what}, waits; without a terminal, give the version: volcomp recal approve {name} {table.version}",
             field="VERSION",
         )
     active = decisions.active_table(store, machine)
@@ -420,10 +423,11 @@ def rollback_command(machine: str, job: Job, to: int | None, actor: str | None, 
 @who_option(reason=True)
 @json_option
 def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
-    """Give the output folder of MACHINE to this store, after the store was lost, emptied or replaced by an older backup.
+    """Make this store the owner of MACHINE's output folder, after the store was lost, emptied or replaced by an older backup.
 
-    What the folder holds is moved to SET-ASIDE-1 (2, ...) inside it, and the store publishes its own versions. From then
-    on it does not know which tables are active: the next measurement must say so, or a version must be approved.
+    The contents of the folder are moved to SET-ASIDE-1 (2, ...) inside it, and the store publishes its own versions.
+    After that it does not know which tables are active: the next measurement must state it, or a version must be
+    approved.
 
     \b
     Example:
@@ -436,7 +440,7 @@ def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_jso
         print_json({"accepted": True, "machine": machine, "set_aside": None if moved is None else str(moved)})
     else:
         what = "there was nothing to set aside" if moved is None else f"its contents are now in {moved}"
-        say(f"{machine}: the folder belongs to this store now; {what}")
+        say(f"{machine}: the folder now belongs to this store; {what}")
     return 0
 
 
@@ -466,7 +470,7 @@ def show_drift(store: Store, job: Job, machine: str | None, report: Path | None,
     from compgen.fleet.drift import DriftSettings, drift_of_store, moment_of
 
     if machine is None:
-        raise InputError("--drift and --report need one machine; give its name")
+        raise InputError("--drift and --report are for one machine; give its name")
     found = drift_of_store(store, store.machine(machine), DriftSettings(job.machine(machine).tolerances))
     paths = [] if report is None else [str(_write(report, found))]
     if as_json:
@@ -507,7 +511,7 @@ def _write(path: Path, drift: Drift) -> Path:
 def recheck_command(
     machine: str, stations: str, request: RequestedChange, points: Path | None, job: Job, as_json: bool
 ) -> int:
-    """Find the fewest points at which tracers would see a change of one error of MACHINE since its last calibration.
+    """Find the fewest points at which tracers detect a change of one error of MACHINE since its last calibration.
 
     \b
     Example:
@@ -529,7 +533,7 @@ def recheck_command(
     change, u, smallest = (size / name.si_per_unit for size in (request.size, found.u, found.smallest))
     say(
         f"{len(found.position_mm)} points, {found.readings} readings: {name.name} to {u:.2f} {name.unit} (standard "
-        f"uncertainty); {change:g} {name.unit} is seen with power {found.power:.2f}, {smallest:.2f} {name.unit} with "
+        f"uncertainty); {change:g} {name.unit} is detected with power {found.power:.2f}, {smallest:.2f} {name.unit} with "
         f"{request.power:g}"
     )
     for place in found.position_mm.tolist():
@@ -543,13 +547,13 @@ def recheck_command(
 @click.argument("machine")
 @click.argument("version", type=click.IntRange(1))
 @job_option
-@click.option("--undo", is_flag=True, help="Take an exclusion back.")
+@click.option("--undo", is_flag=True, help="Undo an exclusion.")
 @who_option(reason=True)
 @json_option
 def exclude_command(
     machine: str, version: int, job: Job, undo: bool, actor: str | None, reason: str, as_json: bool
 ) -> int:
-    """Leave the measurement behind VERSION of MACHINE's tables, which was wrong, out of the drift.
+    """Exclude the wrong measurement behind VERSION of MACHINE's tables from the drift.
 
     Nothing is deleted; the history records who, when and why. Roll an active version back first.
 
@@ -582,9 +586,10 @@ def exclude_command(
 def reprocess_command(
     machine: str, given: dict[str, Any], job: Job, actor: str | None, reason: str, as_json: bool
 ) -> int:
-    """Identify and export again from a stored measurement of MACHINE, as job, machine and instrument files say now.
+    """Identify and export again from a stored measurement of MACHINE, with the present job, machine and instrument files.
 
-    Earlier versions are kept: a new version is proposed and judged as any other. Exit code 1 if it is held back or refused.
+    Earlier versions are kept: a new version is proposed and judged like any other. Exit code 1 if it is held back or
+    refused.
 
     \b
     Example:
@@ -607,7 +612,7 @@ def reprocess_command(
     return done.exit_code
 
 
-# ``volcomp recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the store as a whole.
+# ``volcomp recal add``, ``export-units``, ``backup`` and ``restore``: the job file, its units, the whole store.
 
 
 #: Keys of a machine that ``recal add`` takes; the others are written into the job file by hand.
@@ -619,10 +624,10 @@ ADDED_KEYS = (
 @recal_command.command("export-units")
 @job_option
 @click.option("--out", required=True, metavar="DIR", type=PATH, help="Folder for the files.")
-@click.option("--program", default=None, metavar="PATH", help="The compgen command; default: the one that runs now.")
+@click.option("--program", default=None, metavar="PATH", help="The compgen command; default: the one that is running.")
 @json_option
 def export_units_command(job: Job, out: Path, program: str | None, as_json: bool) -> int:
-    """Write systemd service and timer units and crontab lines that drive `volcomp recal run` by the job's schedules.
+    """Write systemd service and timer units and crontab lines that start `volcomp recal run` by the job's schedules.
 
     \b
     Example:
@@ -644,7 +649,7 @@ def export_units_command(job: Job, out: Path, program: str | None, as_json: bool
 @job_option
 @json_option
 def backup_command(file: Path, job: Job, as_json: bool) -> int:
-    """Write a copy of the whole store to FILE, as it is at one moment, while others may be working with it.
+    """Write a consistent copy of the whole store to FILE; others may use the store meanwhile.
 
     \b
     Example:
@@ -686,7 +691,7 @@ def _copied(counts: dict[str, int], as_json: bool) -> int:
 @job_file_option
 @json_option
 def add_command(name: str, job_file: Path, as_json: bool, keys: dict[str, Any]) -> int:
-    """Add the machine NAME to the job file, which is made if it does not exist; paths are relative to it.
+    """Add the machine NAME to the job file, which is created if it does not exist; paths are relative to it.
 
     \b
     Example:
@@ -719,7 +724,7 @@ def _missing(error: ImportError) -> InputError:
 def serve_command(context: click.Context, store: str | None, given: dict[str, Any], log: str) -> int:
     """Show the fleet in a browser: history, drift, before and after of proposed tables.
 
-    It only reads, and only this computer reaches it, unless options say otherwise. Runs until SIGTERM or Ctrl-C.
+    By default it is read-only and reachable from this computer only. Runs until SIGTERM or Ctrl-C.
 
     \b
     Example:
@@ -740,7 +745,7 @@ def serve_command(context: click.Context, store: str | None, given: dict[str, An
 
 
 def _store_url(store: str | None, job: Path | None) -> str:
-    """Return the store that is meant; decisions and pages must speak of the same one."""
+    """Return the store of --store or --job; decisions and pages must use the same one."""
     if job is None:
         if store is None:
             raise click.UsageError("give --store URL or --job FILE")
@@ -751,7 +756,7 @@ def _store_url(store: str | None, job: Path | None) -> str:
     given = url if store is None else store if "://" in store else f"sqlite:///{Path(store).absolute()}"
     if given != url:
         raise InputError(
-            f"{shown(given)} is not the store of {job}, which is {shown(url)}; leave --store out", field="--store"
+            f"{shown(given)} is not the store of {job}, which is {shown(url)}; omit --store", field="--store"
         )
     return url
 
@@ -777,11 +782,11 @@ _store_option = click.option("--store", metavar="URL", help="SQLite store; the f
 @_users_option
 @_store_option
 @click.option("--password-stdin", is_flag=True, help="Read the password from the first line of stdin.")
-@click.option("--reader", is_flag=True, help="The user reads what --private shows, and decides nothing.")
+@click.option("--reader", is_flag=True, help="The user may read what --private shows, but not decide.")
 def add_user(name: str, users: Path | None, store: str | None, password_stdin: bool, reader: bool) -> int:
-    """Add a user, or change password and rights, which ends the user's sessions.
+    """Add a user, or change password and rights; a change ends the user's sessions.
 
-    The password is asked for twice and kept as an Argon2id hash only.
+    The password is prompted for twice and stored only as an Argon2id hash.
 
     \b
     Example:
@@ -805,7 +810,7 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
 @_users_option
 @_store_option
 def remove_user(name: str, users: Path | None, store: str | None) -> int:
-    """Remove a user; sessions of that name end at once.
+    """Remove a user; the user's sessions end at once.
 
     \b
     Example:

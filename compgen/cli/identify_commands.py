@@ -73,17 +73,18 @@ def identify_command(
     """Identify error curves, squareness and stations from tracer lengths, or errors from measured positions.
 
     Writes identified.errors.csv (um, urad, standard uncertainties) with identified.covariance.npz, stations.csv and
-    identify.json to DIR. The uncertainties hold the readings' noise and the inputs given by --u-.... Without
-    --u-length-um the comments u_length_um and u_length_um_per_m of the file count, else 0.1 um + 0.15 um/m.
+    identify.json to DIR. The uncertainties include the noise of the readings and the inputs given by --u-.... Without
+    --u-length-um the comments u_length_um and u_length_um_per_m of the file apply, otherwise 0.1 um + 0.15 um/m.
 
     MEASUREMENTS are *.lengths.csv (mm) or *.deviations.csv files (dx_um, dy_um, dz_um: measured minus commanded; the
-    placement of their frame is found as well). --method two-step also writes measured.deviations.csv. With --stations
-    one or two stations are enough if they determine the errors of the machine file; if not, the combinations that stay
-    open are named in identify.json and no error is written.
+    placement of their frame is identified, too). --method two-step also writes measured.deviations.csv. With --stations
+    one or two stations are enough if they determine the errors of the machine file; if not, identify.json lists the
+    undetermined combinations and no error is written.
 
-    *.sixdof.csv files hold raw readings of a six-DOF laser instrument (mm); --instrument describes it. All 21 errors come
-    from them, without stations.csv. Given with lengths or deviations of the same machine, both are compared and averaged; exit
-    code 1 and a warning name the errors that disagree. --workers and --cluster distribute the replicates of --self-check.
+    *.sixdof.csv files contain raw readings of a six-DOF laser instrument (mm); --instrument describes it. They give all
+    21 errors, without stations.csv. Together with lengths or deviations of the same machine, both are compared and
+    averaged; exit code 1 and a warning list the errors that disagree. --workers and --cluster distribute the replicates
+    of --self-check.
 
     \b
     Example:

@@ -1,4 +1,4 @@
-"""``volcomp controllers``, ``machines``, ``effects``, ``instruments``: what is available. ``volcomp import``: foreign files."""
+"""``volcomp controllers``, ``machines``, ``effects``, ``instruments``: what is available; ``import``: foreign files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULA
 from compgen.report.cards import card_summary, card_text, control_card, effect_card_text
 from compgen.tables import Format, load_format
 
-# ``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is there.
+# ``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is available.
 
 
 @click.command("controllers")
@@ -46,9 +46,9 @@ from compgen.tables import Format, load_format
 def controllers_command(name: str | None, as_json: bool) -> int:
     """List the controls that compgen writes, what they can express, and how well their format is documented.
 
-    With NAME: the card of one control: what it can express, the settings of the machine file (units in their names:
-    mm, um) with defaults, limits, sources, and what no public document settles. Nothing is computed; the units of each
-    control's numbers (mm, rad, counts) are in its preflight.md.
+    With NAME: the card of one control: what it can express, its settings in the machine file (units in their names: mm,
+    um) with defaults, limits, sources, and what no public document settles. Nothing is computed; the units of the
+    numbers in its files (mm, rad, counts) are in its preflight.md.
 
     \b
     Example:
@@ -87,8 +87,9 @@ def _listed(card: Format) -> dict[str, object]:
 def effects_command(name: str | None, as_json: bool) -> int:
     """List the effects other than the geometric errors: what diagnose looks for, simulate makes, and a machine file may name.
 
-    With NAME: the card of one effect: equation, source, columns that it needs, parameters (units in their names: um, urad,
-    ppm), what data may confuse it with, and the measurement that separates them. Effects of plug-ins are listed too.
+    With NAME: the card of one effect: equation, source, columns that it needs, parameters (units in their names: um,
+    urad, ppm), the effects that it can be confused with, and the measurement that separates them. Effects of plug-ins
+    are listed too.
 
     \b
     Example:
@@ -122,7 +123,7 @@ def effects_command(name: str | None, as_json: bool) -> int:
 
 
 def _effect_origins() -> dict[str, str]:
-    """Plug-in of each effect that comes from one."""
+    """Return the plug-in of each effect that comes from one."""
     found: dict[str, str] = {}
     for family, origin in EFFECT_FAMILIES.origins.items():
         found |= {effect.card.name: origin for effect in FAMILIES[family].members((ANY_STATION,))}
@@ -147,7 +148,7 @@ def instruments_command(as_json: bool) -> int:
 
 
 def _readers(kind: Kind) -> dict[str, dict[str, str | None]]:
-    """First line of the docstring of every reader of a registry, and the plug-in that it came from."""
+    """Return the first line of the docstring of every reader of a registry, and its plug-in."""
     return {
         name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.origins.get(name)}
         for name, reader in sorted(kind.registry.items())
@@ -172,8 +173,8 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     for name, path in sorted(files.items()):
         try:
             machine = open_machine(str(path), whole=True)
-        except InputError as error:  # the others are listed all the same
-            warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=1)
+        except InputError as error:  # the others are still listed
+            warnings.warn(f"machine file not listed: {error}", CompgenWarning, stacklevel=1)
             continue
         travel = ", ".join(f"{axis.range_mm[0]:g} ... {axis.range_mm[1]:g}" for axis in machine.axes)
         names = modelled_errors(machine)
@@ -184,17 +185,17 @@ def machines_command(machines: tuple[Path, ...], as_json: bool) -> int:
     return 0
 
 
-# ``volcomp import``: what a foreign file holds, before anything is computed, and its contract file.
+# ``volcomp import``: what a foreign file contains, and its conversion to the native format.
 
 
 @click.command("import")
 @click.argument("file", type=PATH)
 @options_of(ImportOptions, "given")
-@click.option("--machine", metavar="MACHINE", help="Machine whose travel the positions are checked against.")
+@click.option("--machine", metavar="MACHINE", help="Check the positions against the travel of this machine.")
 @click.option(
     "--machines", multiple=True, type=PATH, help="Additional folder with machine files (may be given several times)."
 )
-@click.option("--out", metavar="DIR", type=PATH, help="Folder for the contract file; without it nothing is written.")
+@click.option("--out", metavar="DIR", type=PATH, help="Folder for the native file; without it nothing is written.")
 @json_option
 def import_command(
     file: Path,
@@ -204,13 +205,13 @@ def import_command(
     out: Path | None,
     as_json: bool,
 ) -> int:
-    """Show what a measurement or error file of another program holds, and write it as a contract file.
+    """Show what a measurement or error file of another program contains, and convert it to the native format.
 
     Renishaw .rtl, .rta, .rts (text) and .rtx (captures), Etalon exchange files, ISO 230-2 .dat files of ecmc, tables as
-    text (any separator, decimal comma or point) and Excel workbooks (.xlsx). Shown are axis, targets, runs,
-    directions, unit, sign, instrument, and what the file leaves open. Deviations are measured minus commanded; units in
-    the written file are mm, um and urad. A file of compgen's own format is shown as well, and copied with --out. Nothing is
-    written while a question is open: answer it by an option. Exit code 2 then, if --out was given.
+    text (any separator, decimal comma or point) and Excel workbooks (.xlsx). It shows axis, targets, runs, directions,
+    unit, sign, instrument, and what the file leaves open. Deviations are measured minus commanded; units in the written
+    file are mm, um and urad. A native file is shown, too, and copied with --out. Nothing is written while a question is
+    open: answer it with an option; the exit code is then 2, if --out was given.
 
     \b
     Example:
@@ -223,10 +224,10 @@ def import_command(
     if kind is not None:
         answered = [item for item in fields(given) if getattr(given, item.name)]
         if answered:
-            message = f"is already in compgen's own format ({kind}); nothing is converted, so this option has no effect"
+            message = f"is already in the native format ({kind}); nothing is converted, so this option has no effect"
             raise InputError(message, file=file, field=option_name(answered[0]))
         understood, data = describe_native(file, kind)
-        note = "is already in compgen's own format: the other commands read it directly"
+        note = "is already in the native format: the other commands read it directly"
         summary: dict[str, Any] = {"file": str(file), "format": "compgen", "kind": kind, "understood": understood, "doubts": [],
                    "notes": [note]}  # fmt: skip
     else:
@@ -254,18 +255,18 @@ def import_command(
         for path in summary["files"]:
             say(f"  {path}")
         if summary["doubts"]:
-            say("nothing is written while questions are open; answer them by options")
+            say("nothing is written while questions are open; answer them with options")
     return 2 if against or (target is not None and summary["doubts"]) else 0
 
 
 def outside_travel(machine: Machine, data: object) -> list[str]:
-    """Say which positions of an imported file lie outside the travel of a machine, one line for each axis."""
+    """Return the positions of an imported file that are outside the travel of a machine, one line for each axis."""
     found = []
     for axis, values in _positions(data).items():
         low, high = machine.axes[axis].range_mm
         if len(values) and (values.min() < low - 1e-3 or values.max() > high + 1e-3):
             found.append(
-                f"positions of {AXES[axis]} go from {values.min():g} to {values.max():g} mm, the travel of {machine.name} from "
+                f"positions of {AXES[axis]} range from {values.min():g} to {values.max():g} mm, but {machine.name} travels from "
                 f"{low:g} to {high:g} mm: another unit, zero or axis?"
             )
     return found

@@ -70,9 +70,9 @@ Progress = Callable[[str], None]
 @machine_argument
 @click.option("--stations", required=True, type=PATH, help="CSV: station, x_mm, y_mm, z_mm.")
 @click.option("--points", type=PATH, help="*.points.csv (mm); a point listed twice is measured twice.")
-@click.option("--grid", is_flag=True, help="All nodes of the machine as points, in place of --points.")
+@click.option("--grid", is_flag=True, help="Use all nodes of the machine as points, instead of --points.")
 @options_of(IdentifyOptions, "readings", only=("u_length_um", "u_length_um_per_m"))
-@click.option("--suggest", "search", is_flag=True, help="Search better places for the stations.")
+@click.option("--suggest", "search", is_flag=True, help="Search for better places of the stations.")
 @click.option(
     "--box", multiple=True, metavar="LABEL:XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX", help="Where a station may be placed, mm."
 )
@@ -112,9 +112,9 @@ def plan_command(
     """Plan a measurement: what it will determine, and how well, before anything is measured.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
-    suggested.stations.csv, with --target-um proposed.points.csv (mm). Names the effects other than the geometric errors
-    that the plan can never see (volcomp effects), and what to measure in addition. Without --u-length-um
-    0.1 um + 0.15 um/m is assumed. Exit code 1 if an unknown is not determined, or no trajectory reaches the target.
+    suggested.stations.csv, with --target-um proposed.points.csv (mm). Lists the effects other than the geometric errors
+    that the plan cannot show (volcomp effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15
+    um/m is assumed. Exit code 1 if an unknown is undetermined, or no trajectory reaches the target.
 
     \b
     Example:
@@ -124,7 +124,7 @@ def plan_command(
     noise = planned_noise(readings)
     given, where = read_stations(stations), _points(machine, points, grid=grid)
     if (box or boxes) and not search:
-        raise InputError("--box and --boxes need --suggest: they say where it may place a station")
+        raise InputError("--box and --boxes need --suggest: they limit where it places a station")
     allowed = read_boxes(boxes) if boxes else {}
     for text in box:
         label, place = box_from_text(text)
@@ -201,14 +201,14 @@ def _write(
 @machine_argument
 @click.option("--scenario", required=True, type=PATH, help="Scenario TOML; see docs/files.md.")
 @out_option
-@click.option("--seed", type=click.IntRange(min=0), help="Seed; default: that of the scenario.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed; default: the seed in the scenario.")
 @json_option
 def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | None, as_json: bool) -> int:
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
-    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv in place of lengths, one with "axis-laser"
-    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um). A laser-tracer with rate_hz reads while the machine moves and
-    writes *.lengths.npz, the binary form of lengths.
+    A scenario whose instrument has type = "sixdof" writes *.sixdof.csv instead of lengths, one with "axis-laser"
+    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um). A laser-tracer with rate_hz reads while the machine moves
+    and writes *.lengths.npz, the binary form of lengths.
 
     \b
     Example:
@@ -245,7 +245,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
 @click.argument("errors", type=PATH)
 @click.option("--points", required=True, type=PATH, help="*.points.csv (mm).")
 @click.option("--out", required=True, metavar="FILE", type=PATH, help="CSV file for the result.")
-@click.option("--exact", is_flag=True, help="Finite rotations along the chain in place of E = C P.")
+@click.option("--exact", is_flag=True, help="Use finite rotations along the chain instead of E = C P.")
 @click.option(
     "--uncertainty",
     is_flag=False,
@@ -260,9 +260,9 @@ def predict_command(
     """Predict the error of the tool tip at given points: E = C P, or the exact model.
 
     ERRORS is an *.errors.csv file (um, urad). With --exact the effects of the machine file that move the tip are added
-    where the points hold their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
-    ex_um, ey_um, ez_um, and with --uncertainty
-    u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that volcomp identify wrote.
+    if the points have their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
+    ex_um, ey_um, ez_um, and with --uncertainty u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that
+    volcomp identify wrote.
 
     \b
     Example:
@@ -275,8 +275,8 @@ def predict_command(
         name = table.metadata.get("covariance")
         if not uncertainty and name is None:
             raise InputError(
-                "names no covariance file (# covariance = ...), so --uncertainty knows none; only the files of compgen "
-                "identify and run have one: give it by --uncertainty FILE",
+                "refers to no covariance file (# covariance = ...), which --uncertainty needs; only files of volcomp "
+                "identify and run do: give the file with --uncertainty FILE",
                 file=errors,
             )
         covariance = read_covariance(uncertainty or errors.parent / str(name), errors)
@@ -303,9 +303,9 @@ def predict_command(
 
 
 def _effects_mm(machine: Machine, points: Points) -> FloatArray:
-    """How the effects of the machine file move the tip at the points, (n, 3), mm; warns of columns that are missing."""
+    """Return how the effects of the machine file move the tip at the points, (n, 3), mm; warn of missing columns."""
     moved_mm, missing = displacement_of(active_effects(machine), readings_of_points(machine, points))
     if missing:
-        message = f"the points lack the columns of {', '.join(missing)}: left out (volcomp effects NAME lists them)"
+        message = f"the points lack the columns of {', '.join(missing)}: not included (volcomp effects NAME lists the columns)"
         warnings.warn(message, CompgenWarning, stacklevel=2)
     return moved_mm

@@ -53,18 +53,18 @@ if TYPE_CHECKING:
     "certificate",
     metavar="FILE",
     type=PATH,
-    help="Laboratory, customer, persons, dates (TOML): write dcc.xml too; default: DIR/certificate.toml if there.",
+    help="Laboratory, customer, persons, dates (TOML): write dcc.xml, too; default: DIR/certificate.toml if it exists.",
 )
 @click.option(
     "--dcc-schema",
     "schema",
     metavar="FILE",
     type=PATH,
-    help="dcc.xsd of PTB on this disk: write dcc.xml only if it is valid by it.",
+    help="Local copy of dcc.xsd (PTB): write dcc.xml only if it validates.",
 )
 @json_option
 def report_command(folder: Path, out: Path | None, certificate: Path | None, schema: Path | None, as_json: bool) -> int:
-    """Make the report of a folder that run, identify, verify or compare wrote, from its files alone.
+    """Make the report of a folder that run, identify, verify or compare wrote, from the files in it.
 
     Writes report.html (one file, no network; print it to PDF from a browser), report.json (its numbers), dossier.md and
     dossier.json (documentation), calibration.json (results in the order of a calibration certificate), and with --dcc
@@ -80,7 +80,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     OutputFolder(out or folder)
     beside = folder / "certificate.toml"
     source = certificate or (beside if beside.is_file() else None)
-    also: Further | None = None  # what makes dcc.xml
+    also: Further | None = None  # writes dcc.xml
     remark = ""
     if source is None and schema is not None:
         raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
@@ -92,7 +92,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
         also = partial(certificate_files, options=stated, schema=rules)
         remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
         if rules is not None:
-            remark = f"dcc.xml: DCC {rules.version}, valid by {rules.path}"
+            remark = f"dcc.xml: DCC {rules.version}, valid against {rules.path}"
     with progress(quiet=as_json) as show:
         show("drawing the report")
         report, paths = write_report(folder, out, also)
@@ -107,7 +107,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
 
 
 def report_beside(folder: Path) -> Path | None:
-    """Write the report of a finished command into its folder; a report that fails does not undo the result."""
+    """Write the report of a finished command into its folder; if this fails, the result remains."""
     from compgen.report.html import write_report
 
     try:
@@ -138,11 +138,11 @@ def report_beside(folder: Path) -> Path | None:
 @click.option(
     "--allow-misfit",
     is_flag=True,
-    help="Accept tables, with reservations, although the residuals of the readings are above a third of what the tables "
-    "take away, or a step or a drift explains most of them. Without it the exit code is 1.",
+    help="Accept tables, with reservations, although the residuals of the readings exceed a third of what the tables "
+    "correct, or a step or a drift explains most of them. Without it the exit code is 1.",
 )
 @explain_option
-@click.option("--no-report", is_flag=True, help="Write no report.html, and none of the files that belong to it.")
+@click.option("--no-report", is_flag=True, help="Write neither report.html nor the files that belong to it.")
 @json_option
 def run_command(
     machine: Machine,
@@ -164,9 +164,9 @@ def run_command(
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
 
-    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm)
-    or *.deviations.csv files, or *.sixdof.csv with --instrument FILE. With several --controller each gets its own
-    sub-folder of DIR. report.html in DIR shows everything; --no-report leaves it out.
+    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm) or
+    *.deviations.csv files, or *.sixdof.csv with --instrument FILE. With several --controller each gets its own
+    sub-folder of DIR. report.html in DIR shows everything; --no-report omits it.
 
     \b
     Example:
@@ -192,7 +192,7 @@ def run_command(
         if not no_report:
             show("drawing the report")
         report = None if no_report else report_beside(out)
-    if report is not None:  # the new one takes its place; without it the earlier one is kept as PREVIOUS-...
+    if report is not None:  # a new report replaces it; otherwise the earlier one is kept as PREVIOUS-...
         for path in result.earlier_report:
             path.unlink(missing_ok=True)
     if explain:

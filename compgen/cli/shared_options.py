@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they give to a command: a machine, tables, limits, workers."""
+"""Options that several commands share, and the objects they pass on: a machine, tables, limits, workers."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def controller_option(*, multiple: bool = False) -> Callable[[Command], Command]
 
 @contextmanager
 def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
-    """Yield a ``map`` over so many processes of this machine, or over a cluster; ``map`` itself for one."""
+    """Yield a ``map`` over this number of local processes, or over a cluster; the builtin ``map`` for one."""
     if workers == 1 and cluster is None:
         yield map
         return
@@ -141,24 +141,24 @@ def limits_option(command: Command) -> Command:
     return options_of(SafetyLimits, "limits")(command)
 
 
-# Where the fit and the verification find the covariance of an errors file.
+# The covariance of an errors file, for fit and verification.
 
 
 def covariance_options(command: Command) -> Command:
     """Add --covariance and --independent."""
-    text = "Covariance of ERRORS (default: the file that it names, if that belongs to it)."
-    none = click.option("--independent", is_flag=True, help="Use no covariance: u_value, node by node.")
+    text = "Covariance of ERRORS (default: the file that it refers to, if it matches)."
+    none = click.option("--independent", is_flag=True, help="Use no covariance; only u_value of each node.")
     return path_option("--covariance", text)(none(command))
 
 
 def covariance_of(errors: Path, table: ErrorTable, given: Path | None, *, independent: bool) -> Covariance | None:
-    """Return the covariance of an errors file: the one given, else the one that it names, else None.
+    """Return the covariance of an errors file: the one given, otherwise the one it refers to, otherwise None.
 
     A file that belongs to other errors is not used, with a warning.
     """
     if independent:
         if given is not None:
-            raise InputError("--covariance cannot be combined with --independent; give one of them")
+            raise InputError("--covariance cannot be combined with --independent; give only one")
         return None
     if given is not None:
         return read_covariance(given, errors)
@@ -177,7 +177,7 @@ def covariance_of(errors: Path, table: ErrorTable, given: Path | None, *, indepe
     return None
 
 
-# Options that say where tables have to be best: the work zone, and the tools.
+# Options that say where tables must be most accurate: work zone and tools.
 
 
 def emphasis_options(command: Command) -> Command:
@@ -197,25 +197,25 @@ def emphasis_options(command: Command) -> Command:
     zone_option = click.option(
         "--zone",
         metavar="RANGES",
-        help="Work zone (mm) that counts more, e.g. X=-400:0,Y=100:300; default: work_zone_mm of the machine file.",
+        help="Work zone (mm) with more weight, e.g. X=-400:0,Y=100:300; default: work_zone_mm of the machine file.",
     )
     weight_option = click.option(
         "--zone-weight",
         metavar="W",
         type=click.FloatRange(1.0, MOST_ZONE_WEIGHT),
-        help=f"How much more a coordinate in it counts, default {ZONE_WEIGHT:g}; {MOST_ZONE_WEIGHT:g}: the zone all but alone.",
+        help=f"Weight of a coordinate in the work zone, default {ZONE_WEIGHT:g}; {MOST_ZONE_WEIGHT:g}: almost only the zone.",
     )
     tools_option = click.option(
         "--tools",
         metavar="X,Y,Z",
         multiple=True,
-        help="Tool offset (mm) that the tables have to suit; several times for several tools, which count alike.",
+        help="Tool offset (mm) to optimise the tables for; several times for several tools of equal weight.",
     )
     return zone_option(weight_option(tools_option(wrapper)))  # type: ignore[return-value]
 
 
 def emphasised(machine: Machine, zone: str | None, zone_weight: float | None, tools: tuple[str, ...]) -> Machine:
-    """Return the machine with the work zone and tools of the command line, where they are given."""
+    """Return the machine with the work zone and the tools of the command line, if given."""
     known = machine.emphasis
     zone_mm = known.zone_mm if zone is None else zone_of(zone, [axis.range_mm for axis in machine.axes])
     if zone_weight is not None and not any(zone_mm):
@@ -256,12 +256,10 @@ def active_options(*names: str) -> Callable[[Command], Command]:
                 machine = keeping_others(machine, _names(target), tables)
             return command(*args, machine=machine, active=tables, **options)
 
-        help_text = (
-            "Table file that was active while the machine was measured (may be given several times): its effect is "
-        )
-        help_text += "taken out, and the new table takes its place."
+        help_text = "Table file that was active during the measurement (may be given several times): its effect is "
+        help_text += "removed, and the new table replaces it."
         option = path_option("--active", help_text, multiple=True)(wrapper)
-        text = "Name of the control that the active tables belong to; default: the one that --controller names."
+        text = "Name of the control that the active tables belong to; default: the one given by --controller."
         named = click.option("--active-controller", *names, "active_controller", metavar="NAME", help=text)
         return named(option)  # type: ignore[return-value]
 
@@ -269,7 +267,7 @@ def active_options(*names: str) -> Callable[[Command], Command]:
 
 
 def _names(target: Any) -> list[str]:
-    """Names of the controls that are written."""
+    """Return the names of the controls to write."""
     return [target] if isinstance(target, str) else list(dict.fromkeys(target or ()))
 
 
@@ -282,17 +280,17 @@ def _active(machine: Machine, paths: tuple[Path, ...], name: str | None, target:
 
     targets = _names(target)
     if name is None and len(targets) != 1:
-        raise InputError("--active: which control do the tables belong to? Add --active-controller NAME")
+        raise InputError("--active: the control of the tables is not clear; add --active-controller NAME")
     return read_active(machine, paths, name or targets[0])
 
 
-# Options that name a file of the user's own control, whose style or empty tables the export follows.
+# Options for a file saved on the user's control; the export follows its style or fills its empty tables.
 
 
 _SAMPLES = {
-    "style_from": "A file of your own control (may be given several times, e.g. parameters and pitch data): the export follows "
-    "its style, and keeps the points and parameters that it shows, those of other axes above all.",
-    "template_from": "An empty table saved on your own control; the export fills in its values.",
+    "style_from": "A file saved on your control (may be given several times, e.g. parameters and pitch data): the export follows "
+    "its style, and keeps the points and parameters in it, above all those of other axes.",
+    "template_from": "An empty table saved on your control; the export fills in its values.",
 }
 
 
@@ -343,26 +341,26 @@ def with_samples(
     return machine
 
 
-# Options of one meaning everywhere.
+# Options with the same meaning in all commands.
 
 
 instrument_option = path_option(
     "--instrument", "Constants and set-up of a six-DOF laser instrument (TOML), for *.sixdof.csv files."
 )
-templates_option = path_option("--templates", "Folder of your own templates, searched first.", metavar="DIR")
+templates_option = path_option("--templates", "Folder with your templates, searched first.", metavar="DIR")
 unverified_option = click.option(
     "--allow-unverified", is_flag=True, help="Export formats that no public document fully describes."
 )
 reversal_option = path_option(
     "--reversal",
-    "*.reversal.csv (um): what each axis does differently in its two directions; becomes tables of one direction "
+    "*.reversal.csv (um): the reversal value of each axis along its travel; becomes direction-dependent tables "
     "(default: backlash and lost motion of the machine file).",
 )
 points_option = path_option("--points", "*.points.csv (mm); default: a grid over the volume.")
 explain_option = click.option(
     "--explain",
     is_flag=True,
-    help="Write explain.md: what the table corrects, what stays and why, what the next option would buy, limits used.",
+    help="Write explain.md: what the table corrects, what remains and why, what the next option would gain, limits used.",
 )
 measurements_argument = click.argument("measurements", nargs=-1, type=PATH)
 errors_argument = click.argument("errors", type=PATH)

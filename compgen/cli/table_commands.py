@@ -60,15 +60,15 @@ from compgen.tables.verification import verification_files
 
 
 TOOL_HELP = (
-    "Tool offset X,Y,Z in mm to consider in addition to the machine's own; may be given several times. Default: 0, "
+    "Tool offset X,Y,Z in mm in addition to that of the machine file; may be given several times. Default: 0, "
     "-100 and -200 mm along Z."
 )
 ZONE_HELP = "The part of the travel that counts, mm, e.g. X=-400:0,Y=100:300; default: all."
-OPTIONS_REVERSAL_HELP = "*.reversal.csv (um): what each axis does differently in its two directions."
+OPTIONS_REVERSAL_HELP = "*.reversal.csv (um): the reversal value of each axis along its travel."
 
 
 def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path | None) -> None:
-    """Write explain.md beside the tables of every control of a run."""
+    """Write explain.md next to the tables of every control of a run."""
     reversal = identified_reversal(result.identification)
     several = len(result.results) > 1
     files: dict[str, str | bytes] = {}
@@ -98,11 +98,12 @@ def options_command(
     out: Path | None,
     as_json: bool,
 ) -> int:
-    """Show what each option of a control would buy: the error that remains by level, and by control.
+    """Show what each option of a control would gain: the error that remains, by level and by control.
 
-    ERRORS is an *.errors.csv file (um, urad). Levels: no table; positioning; + straightness; + squareness; + products of
-    tables; full volumetric; + direction-dependent (with --reversal). Beside them the file of every control, exported and
-    read back, and which errors stay with tools of other lengths. Figures in um; DIR gets options.json and options.md.
+    ERRORS is an *.errors.csv file (um, urad). Levels: no table; positioning; + straightness; + squareness; + products
+    of tables; full volumetric; + direction-dependent (with --reversal). Also the file of every control, exported and
+    read back, and the errors that remain with tools of other lengths. Figures in um; DIR gets options.json and
+    options.md.
 
     \b
     Example:
@@ -160,10 +161,10 @@ def export_command(
     """Export errors to the files of a control, with manifest.json and preflight.md.
 
     ERRORS is an *.errors.csv file (um, urad), usually the fitted one, or the exchange file of a laser tracer's software
-    (Etalon, variant Vendor; mm, rad). The files are read back and verified against ERRORS as `verify` does it, with
-    result.json and volume.csv beside them. Files that are not acceptable, or break a limit of the control, are
-    written as NOT-ACCEPTED-... (exit code 1). check/check-program.md says what to read at five positions of the machine.
-    With --active ERRORS are those of the machine with its old tables; bare.errors.csv gets those without.
+    (Etalon, variant Vendor; mm, rad). The files are read back and verified against ERRORS as by `verify`, which adds
+    result.json and volume.csv. Files that are not acceptable, or exceed a limit of the control, are written as
+    NOT-ACCEPTED-... (exit code 1). check/check-program.md says what the machine should read at five positions. With
+    --active, ERRORS belong to the machine with its old tables; bare.errors.csv gets those without.
 
     \b
     Example:
@@ -325,7 +326,7 @@ class ManyAgainst(click.Command):
 @click.option("--against", multiple=True, required=True, metavar="B...", type=PATH, help="Set B.")
 @controller_option()
 @sample_options
-@click.option("--controller-b", metavar="NAME", help="Control of set B; default: that of A.")
+@click.option("--controller-b", metavar="NAME", help="Control of set B; default: the control of A.")
 @points_option
 @click.option("--fail-above", type=NUMBER, metavar="UM", help="Exit code 1 if the largest difference exceeds UM um.")
 @out_option
@@ -343,8 +344,8 @@ def diff_command(
 ) -> int:
     """Compare two sets of tables by what they do: A minus B at the tool, in um, over the volume.
 
-    Writes diff.json and difference.csv (both corrections and their difference at each point) to DIR. Text that differs
-    without changing a correction does not count. Exit code 0 even if they differ, unless --fail-above is exceeded.
+    Writes diff.json and difference.csv (both corrections and their difference at each point) to DIR. Text differences
+    that do not change a correction are ignored. Exit code 0 even if they differ, unless --fail-above is exceeded.
 
     \b
     Example:
@@ -372,7 +373,9 @@ def diff_command(
 @click.argument("old", nargs=-1, required=True, metavar="OLD...", type=PATH)
 @controller_option()
 @sample_options
-@click.option("--controller-old", metavar="NAME", help="Control of the old tables; default: that of the new.")
+@click.option(
+    "--controller-old", metavar="NAME", help="Control of the old tables; default: the control of the new ones."
+)
 @click.option(
     "--errors",
     required=True,
@@ -394,7 +397,7 @@ def merge_command(
     limits: SafetyLimits,
     as_json: bool,
 ) -> int:
-    """Merge old tables and new errors to one set of tables: what was active and what is left, together.
+    """Merge old tables and new errors into one set of tables: what the old ones correct plus what is left.
 
     Writes the controller files, manifest.json, preflight.md, result.json, the check program, merge.json and
     merged.errors.csv (the errors of the machine without tables) to DIR. Exit code 1 if the tables are not acceptable.
@@ -439,7 +442,7 @@ def merge_command(
     "controllers",
     multiple=True,
     metavar="NAME",
-    help="Name of a control, may be given several times; default: all that the machine file has the settings for.",
+    help="Name of a control, may be given several times; default: all that have settings in the machine file.",
 )
 @click.option(
     "--entries",
@@ -453,12 +456,12 @@ def merge_command(
 def crash_test_command(
     machine: Machine, errors: Path, controllers: tuple[str, ...], entries: int, as_json: bool
 ) -> int:
-    """Feed wrong tables to the verification: signs, axes and units, and see that each is rejected.
+    """Feed wrong tables to the verification (signs, axes, units) and check that each is rejected.
 
-    ERRORS is an *.errors.csv file (um, urad). Tried are the 47 wrong signed permutations of the axes, of the
-    correction and of the whole frame, um for mm, degrees for radians, errors for corrections, and single numbers of the
-    tables, each changed so that the tip moves by more than 1 um and 3 % of the largest correction without its linear
-    part. Nothing is written. Exit code 1 if any wrong table is accepted, or the right one is not.
+    ERRORS is an *.errors.csv file (um, urad). The wrong tables are: the 47 wrong signed permutations of the axes, of
+    the correction and of the whole frame; um for mm; degrees for radians; errors for corrections; and single numbers of
+    the tables, each changed until the tip moves by more than 1 um and 3 % of the largest correction without its linear
+    part. Nothing is written. Exit code 1 if a wrong table is accepted, or the right one rejected.
 
     \b
     Example:
@@ -480,7 +483,7 @@ def crash_test_command(
 
 
 def _usable(machine: Machine, chosen: tuple[str, ...]) -> list[str]:
-    """Return the chosen controls, or all whose settings are complete; the others are named on stderr."""
+    """Return the chosen controls, or all whose settings are complete; the others are listed on stderr."""
     if chosen:
         return list(dict.fromkeys(chosen))
     usable = []
@@ -488,7 +491,7 @@ def _usable(machine: Machine, chosen: tuple[str, ...]) -> list[str]:
         try:
             control.read_settings(machine)
         except InputError as error:
-            complain(f"{name} is left out: {error}")
+            complain(f"{name} is skipped: {error}")
         else:
             usable.append(name)
     if not usable:

@@ -1,4 +1,4 @@
-"""Text for people, through rich: tables, messages, progress; loaded by the first command or message that needs it."""
+"""Output for people, through rich: tables, messages, progress; loaded when a command first needs it."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from rich.text import Text
 from compgen.cli.common import print_json
 from compgen.data.messages import visible
 
-#: Tables into a pipe or a file get the width that they need, not that of an unknown terminal.
+#: Tables in a pipe or a file get the width they need, not the width of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
 
 
 class Terminal(Console):
-    """A console that shows the control characters of names, reasons and files as escapes: no text commands a terminal."""
+    """A console that escapes control characters in names, reasons and files: no text may control the terminal."""
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Turn text into what is shown; printing and the cells of tables come through here."""
+        """Convert text to what is shown; printing and the cells of tables use it."""
         return super().render_str(visible(text), **options)
 
 
-# emoji=False: rich would turn the place file.csv:100: into a picture
+# emoji=False: rich would turn the location file.csv:100: into a symbol
 stdout = Terminal(highlight=False, emoji=False, markup=False, width=PIPE_WIDTH)
 stderr = Terminal(stderr=True, highlight=False, emoji=False, markup=False)
 
@@ -44,7 +44,7 @@ def say_paths(paths: Iterable[object]) -> None:
 
 
 def answer(as_json: bool, data: Any, *shown: Any) -> None:
-    """Print a result: ``data`` as the one JSON object on stdout, or what is ``shown`` to people, tables and lines."""
+    """Print a result: ``data`` as one JSON object on stdout, or the tables and lines ``shown`` to people."""
     if as_json:
         print_json(data)
         return
@@ -53,12 +53,12 @@ def answer(as_json: bool, data: Any, *shown: Any) -> None:
 
 
 def complain(text: str, style: str | None = "yellow") -> None:
-    """Print a warning on stderr, or with style "red" what is wrong."""
+    """Print a warning on stderr; with style "red" an error."""
     stderr.print(text, style=style, soft_wrap=True)
 
 
 def table_of(headings: Sequence[str], rows: Iterable[Sequence[str]], **options: Any) -> Table:
-    """Return rows of text below their headings; long cells are folded, none is cut."""
+    """Return rows of text below their headings; long cells are wrapped, never cut."""
     table = Table(box=box.SIMPLE, **options)
     for heading in headings:
         table.add_column(heading, overflow="fold")
@@ -69,7 +69,7 @@ def table_of(headings: Sequence[str], rows: Iterable[Sequence[str]], **options: 
 
 @contextmanager
 def progress(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show the current step on a terminal; say nothing into a pipe."""
+    """Show the current step on a terminal; nothing in a pipe."""
     if quiet or not stderr.is_terminal:
         yield lambda _: None
         return

@@ -99,7 +99,7 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
     records = list(read_records(file))
     parameters, data = parted(records)
     if not data:
-        raise file.fail("holds no compensation data; punch the table of three-dimensional compensation", 1)
+        raise file.fail("contains no compensation data; punch the table of three-dimensional compensation", 1)
     form = form_of(data[0])
     for before, record in zip(data, data[1:], strict=False):
         if form_of(record) != form:
@@ -259,10 +259,12 @@ def _rows(file: SourceFile) -> tuple[dict[str, tuple[str, int]], list[Row]]:
             if len(rows) > MOST_ROWS:
                 raise file.fail(f"has more than {MOST_ROWS} rows; a table has fewer", line)
     if not rows:
-        raise file.fail("holds no vertex", len(file.text.splitlines()) or 1)
+        raise file.fail("contains no vertex", len(file.text.splitlines()) or 1)
     declared = keys.get("rows", ("none", 1))
     if declared[0] != str(len(rows)):
-        raise file.fail(f"declares {one_line(declared[0])} rows but holds {len(rows)}: is it truncated?", declared[1])
+        raise file.fail(
+            f"declares {one_line(declared[0])} rows but contains {len(rows)}: is it truncated?", declared[1]
+        )
     if not file.text.endswith(("\n", "\r")):
         raise file.fail("the last line has no line end: the file is truncated", rows[-1][3])
     return keys, rows
@@ -542,12 +544,12 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             parameters[record.number] = words[0][1], record
         shape = self._frame(file, parameters) if parameters else beside
         if shape is None:
-            raise file.fail("holds no parameters 10800 to 10814; give VOLUME.csv as well, which has the grid")
+            raise file.fail("contains no parameters 10800 to 10814; give VOLUME.csv as well, which has the grid")
         values = self._values(file, data)
         size = int(np.prod(shape.counts.shape[:3]))
         if len(values) != size:
             raise file.fail(
-                f"holds {len(values)} points, the grid has {size}: is it truncated?", data[-1].line if data else 1
+                f"contains {len(values)} points, the grid has {size}: is it truncated?", data[-1].line if data else 1
             )
         counts = np.zeros(shape.counts.shape, dtype=np.int64)
         for number, index in shape.numbered(self.settings.order):
@@ -603,7 +605,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             else:
                 found.append(numbers)
         if not found or len(found[-1]) != 3:
-            raise file.fail("holds no complete point: is it truncated?", data[-1].line if data else 1)
+            raise file.fail("contains no complete point: is it truncated?", data[-1].line if data else 1)
         return found
 
     def _parameters(self, table: VolumeTable) -> dict[int, str]:

@@ -56,11 +56,11 @@ INTERVAL_QUANTUM_MM = Decimal("0.001")
 def _spans(value: Any) -> tuple[tuple[int, int], ...]:
     """A list of blocks of numbers."""
     if not isinstance(value, list):
-        raise ValueError("a list of blocks of numbers [[first, last], ...] is expected")
+        raise ValueError("expected a list of blocks of numbers [[first, last], ...]")
     number = whole(0, MOST_NUMBER)
     for item in value:
         if not isinstance(item, list) or len(item) != 2 or number(item[0]) > number(item[1]):
-            raise ValueError("blocks of numbers [first, last], the lower one first, are expected")
+            raise ValueError("expected blocks of numbers [first, last], the lower one first")
     return tuple((first, last) for first, last in value)
 
 
@@ -387,7 +387,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     blocks = tuple(_block(settings, texts[0], axis, found.axes, points) for axis in range(3))
     if not any(blocks):
         numbers = ", ".join(f"A{number}" for number in settings.axis_numbers)
-        raise texts[0].fail(f"holds none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
+        raise texts[0].fail(f"contains none of the parameters 3620 to 3624 for the axes {numbers}; punch them as well")
     others, turns = _other_axes(settings, found.axes, points)
     return PitchTables(blocks, others, turns, remarks=_remarks(settings, found, others))
 

@@ -103,7 +103,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
                     raise file.fail(message, number)
                 yield Record(int(found[1]), found[2], file, number, len(found[1]), found[1].startswith("0"))
     if marks == 0:
-        raise file.fail("holds no '%'; a FANUC file begins and ends with one")
+        raise file.fail("contains no '%'; a FANUC file begins and ends with one")
     if inside:
         raise file.fail("the last '%' is missing: the file is truncated", len(lines))
 
@@ -352,7 +352,7 @@ class Sample:
         if found is None:
             return None
         if not re.fullmatch("[01]{8}", found[0]):
-            raise found[1].fail(f"{found[0]} is given for A{number}; eight binary digits are expected, bit 7 first")
+            raise found[1].fail(f"{found[0]} is given for A{number}; expected eight binary digits, bit 7 first")
         return found[0]
 
 
@@ -613,7 +613,7 @@ def path_value(record: Record, path: int) -> str | None:
     if len(words) == 1 and words[0][0] == "P":
         return words[0][1]
     if not words or len(words) % 2 or any(word[0] != "LP"[k % 2] for k, word in enumerate(words)):
-        raise record.fail("a single value word P is expected, e.g. P2, or pairs of a path word L and P, e.g. L1P2L2P0")
+        raise record.fail("expected a single value word P, e.g. P2, or pairs of a path word L and P, e.g. L1P2L2P0")
     values = {record.whole(one[1], 1, 99): value[1] for one, value in zip(words[::2], words[1::2], strict=True)}
     if 2 * len(values) != len(words):
         raise record.fail("a path is given twice")
@@ -627,7 +627,9 @@ def punched_file(path: Path) -> SourceFile:
         return SourceFile(path, content.decode("ascii"))
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise SourceFile(path, "").fail("holds a byte that is not ASCII; a punched file is ASCII text", line) from None
+        raise SourceFile(path, "").fail(
+            "contains a byte that is not ASCII; a punched file is ASCII text", line
+        ) from None
 
 
 def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
@@ -636,7 +638,7 @@ def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
     points = [record for record in records if is_point(record)]
     others = [record for record in records if not is_point(record)]
     if not records:
-        raise file.fail("holds no record; punch the parameters and the pitch error data of the control", 1)
+        raise file.fail("contains no record; punch the parameters and the pitch error data of the control", 1)
     style = frame_of(file, records, points)
     style = spacing_of(style, records)
     style = _parameter_style(style, [record for record in others if _is_pitch_parameter(record)])

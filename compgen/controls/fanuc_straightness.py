@@ -56,7 +56,7 @@ SECTIONS = 100
 def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
     """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
     if not isinstance(value, list) or not value or any(item not in [*ACROSS] for item in value):
-        raise ValueError(f"a list of {', '.join(map(repr, ACROSS))} is expected")
+        raise ValueError(f"expected a list of {', '.join(map(repr, ACROSS))}")
     found = tuple(ACROSS[item] for item in value)
     if len({moving for _, moving in found}) < len(found):
         raise ValueError("each moving axis can be given once only: the control keeps four points for each moving axis")
@@ -436,7 +436,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             raise apart[0]
         if not entries:
             raise texts[0].fail(
-                "holds no moving axis (parameters 5711 to 5713); punch the parameters from 5711 on as well"
+                "contains no moving axis (parameters 5711 to 5713); punch the parameters from 5711 on as well"
             )
         moving = [entry.moving for entry in entries]
         for k, entry in enumerate(entries):

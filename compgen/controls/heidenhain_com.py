@@ -71,7 +71,7 @@ MOST_ENTRIES = 256
 def name_on_control(value: Any) -> str:
     """The name of an axis, which is that of a column too."""
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9_]{1,12}", value, re.ASCII):
-        raise ValueError("a name of letters and digits is expected")
+        raise ValueError("expected a name of letters and digits")
     return value
 
 
@@ -87,7 +87,7 @@ def check_names(section: toml_files.Section, names: tuple[str, str, str]) -> Non
 def _position(value: Any) -> Decimal:
     exact = Decimal(repr(toml_files.number(value)))
     if exact % SPACING_UNIT_MM or abs(exact) >= 10**7:
-        raise ValueError(f"a position in whole multiples of {SPACING_UNIT_MM} mm is expected")
+        raise ValueError(f"expected a position in whole multiples of {SPACING_UNIT_MM} mm")
     return exact
 
 
@@ -646,7 +646,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         for row in table.rows:
             mark = row.cells.get(ACTIVE)
             if mark not in (None, "*"):
-                raise table.file.fail(f"column {ACTIVE} holds {str(mark)[:20]!r}; expected '*' or nothing", row.line)
+                raise table.file.fail(f"column {ACTIVE} contains {str(mark)[:20]!r}; expected '*' or nothing", row.line)
             named = {}
             for column, cell in row.cells.items():
                 if column in (NUMBER_COLUMN, ACTIVE):
@@ -678,7 +678,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
     def _com_table(self, axis: int, table: TextTable) -> ComTable:
         """Read the entries of one .COM file over an input axis."""
         if len(table.rows) < 2:
-            raise table.file.fail(f"holds {len(table.rows)} entries; expected at least 2", table.header_line)
+            raise table.file.fail(f"contains {len(table.rows)} entries; expected at least 2", table.header_line)
         positions = self._positions(axis, table)
         filled: dict[int, tuple[Decimal, ...]] = {}
         backlash = None

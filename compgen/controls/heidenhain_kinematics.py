@@ -131,7 +131,7 @@ def _positions(table: TextTable) -> tuple[Decimal, ...]:
         if found[k] <= found[k - 1]:
             raise table.file.fail(f"{POSITION} {found[k]} does not lie above {found[k - 1]}", table.rows[k].line)
     if len(found) < 2:
-        raise table.file.fail(f"holds {len(found)} entries; expected at least 2", table.header_line)
+        raise table.file.fail(f"contains {len(found)} entries; expected at least 2", table.header_line)
     return found
 
 

@@ -208,7 +208,7 @@ def template_layout(path: Path, kind: str) -> ComLayout:
         text = content.decode("ascii")
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
-        raise InputError("holds a byte that is not ASCII", file=path, line=line) from None
+        raise InputError("contains a byte that is not ASCII", file=path, line=line) from None
     file = SourceFile(path, text)
     table = read_table(file)
     if table.kind != kind:
@@ -216,7 +216,7 @@ def template_layout(path: Path, kind: str) -> ComLayout:
     for row in table.rows:
         filled = [cell for name, cell in row.cells.items() if name != NUMBER_COLUMN and cell.strip("-+0.")]
         if filled:
-            message = f"holds {one_line(filled[0])[:20]!r}; expected a table without values as a template"
+            message = f"contains {one_line(filled[0])[:20]!r}; expected a table without values as a template"
             raise file.fail(message, row.line)
     ends = [line.endswith("\r") for line in file.text.split("\n")[:-1]]
     if len(set(ends)) > 1:

@@ -130,7 +130,7 @@ def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGr
             message = f"{item.name} is not zero, but the model has only {', '.join(ISO_NAMES)}; express it by these"
             raise item.source.fail(message, item.line)
     if not fields:
-        raise parameters[0].source.fail("holds none of the 21 errors of three linear axes", parameters[0].line)
+        raise parameters[0].source.fail("contains none of the 21 errors of three linear axes", parameters[0].line)
     return {name: fields[name] for name in ERROR_NAMES if name in fields}, constants
 
 
@@ -215,7 +215,7 @@ def parse_list(source: SourceFile) -> ListFile:
     files = {int(key[5:-1]): value for key, (value, _) in entries.items() if key.startswith("file[")}
     formats = {int(key[12:-1]): value.upper() for key, (value, _) in entries.items() if key.startswith("file_format[")}
     if not files:
-        raise source.fail("names no parameter file: file[0] is missing; was the list cut?")
+        raise source.fail("names no parameter file: file[0] is missing; is the list truncated?")
     known = choice("GRID", "AUTO")  # other modes interpolate in a way that is not documented in public
     axes = tuple(_take(source, entries, letter, _whole(1, 65535), None) for letter in "xyz")
     return ListFile(
@@ -263,7 +263,7 @@ def _take(
 def _whole(lowest: int, highest: int) -> Callable[[str], int]:
     def check(value: str) -> int:
         if not re.fullmatch(r"[0-9]{1,6}", value) or not lowest <= int(value) <= highest:
-            raise ValueError(f"a whole number from {lowest} to {highest} is expected")
+            raise ValueError(f"expected a whole number from {lowest} to {highest}")
         return int(value)
 
     return check
@@ -273,7 +273,7 @@ def _whole(lowest: int, highest: int) -> Callable[[str], int]:
 def axis_letters(value: object) -> str:
     """Return some of the letters X, Y, Z, each once, in that order; ValueError for anything else."""
     if not isinstance(value, str) or len(set(value)) != len(value) or not set(value) <= set("XYZ"):
-        raise ValueError("some of the letters X, Y, Z, each once, are expected")
+        raise ValueError("expected some of the letters X, Y, Z, each at most once")
     return "".join(sorted(value))
 
 
@@ -284,7 +284,7 @@ def axis_letters(value: object) -> str:
 def folder_of_control(value: object) -> str:
     """A folder on the control, with a slash at its end; empty for none."""
     if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
-        raise ValueError("a folder on the control is expected: printable ASCII without blanks and '#'")
+        raise ValueError("expected a folder on the control: printable ASCII without blanks and '#'")
     if not value or value[-1] in "\\/":
         return value
     return value + ("\\" if "\\" in value or ":" in value else "/")
@@ -693,7 +693,7 @@ def _blocks(source: SourceFile) -> list[list[_Row]]:
             blocks[-1].append((line, text.split()))
     filled = [block for block in blocks if block]
     if not filled:
-        raise source.fail("holds no block; is it the right file, or was it cut?")
+        raise source.fail("contains no block; is it the right file, or is it truncated?")
     return filled
 
 
@@ -702,7 +702,7 @@ def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
     (header_line, names), rows = block[0], block[1:]
     _check_header(source, header_line, names)
     if not rows:
-        raise source.fail(f"the block {' '.join(names)[:60]!r} has no rows; was the file cut?", header_line)
+        raise source.fail(f"the block {' '.join(names)[:60]!r} has no rows; is the file truncated?", header_line)
     for line, words in rows:
         if len(words) != len(names):
             raise source.fail(f"has {len(words)} columns, its header in line {header_line} has {len(names)}", line)
@@ -822,7 +822,7 @@ def parse_etalon(source: SourceFile) -> ParameterFile:
         if exponent is None and uses_exponent([word for word in text.split() if word[0] in "+-.0123456789"]):
             exponent = line
     if sections and sections[-1].open:
-        raise source.fail(f"[{sections[-1].name}] has no closing brace: the file was cut", sections[-1].line)
+        raise source.fail(f"[{sections[-1].name}] has no closing brace: the file is truncated", sections[-1].line)
     records = sum(len(section.rows) if section.grid else 1 for section in sections)
     parameters = []
     for section in sections:
@@ -831,7 +831,7 @@ def parse_etalon(source: SourceFile) -> ParameterFile:
             parameters.append(ErrorParameter(name, ParameterGrid((), (), np.array(section.value)), source, line))
             continue
         if not section.rows:
-            raise source.fail(f"[{name}] has no values; was the file cut?", line)
+            raise source.fail(f"[{name}] has no values; is the file truncated?", line)
         if name in ISO_NAMES and ISO_NAMES[name] in SQUARENESS_NAMES:
             raise source.fail(f"[{name}] is a constant; expected 'VALUE = number'", line)
         pairs = np.array([[floating(source, at, word, name) for word in words] for at, words in section.rows])

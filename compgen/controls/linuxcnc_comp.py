@@ -200,9 +200,9 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
             raise source.fail("is blank, and LinuxCNC stops reading there without a word; take the line out", blank)
         rows.append(_row(source, line, text, rows))
         if not ended:
-            raise source.fail("the last line has no line end; was the file cut?", line)
+            raise source.fail("the last line has no line end; is the file truncated?", line)
     if not rows:
-        raise source.fail("holds no row; is it the right file, or was it cut?", 1)
+        raise source.fail("contains no row; is it the right file, or is it truncated?", 1)
     nominal, forward, reverse = np.array(rows).T
     # positions that would be read as trims, and trims that would be read as positions, are mistakes of many mm
     span = float(np.ptp(nominal))
@@ -341,7 +341,7 @@ _LAST_LETTER = re.compile(r"((?<=[a-z0-9])[XYZ]|(?<=[_.-])[xyzXYZ])$")
 def _positive3(value: Any) -> tuple[float, float, float]:
     x, y, z = toml_files.vector3(value)
     if min(x, y, z) <= 0:
-        raise ValueError("three numbers above zero, for X, Y and Z, are expected")
+        raise ValueError("expected three numbers above zero, for X, Y and Z")
     return x, y, z
 
 

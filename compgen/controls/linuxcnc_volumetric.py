@@ -230,7 +230,7 @@ class _WordReader:
         while word is None:
             following = next(self._lines, None)
             if following is None:
-                raise self.source.fail(f"expected {what}, but the file ends: it was cut", self.line)
+                raise self.source.fail(f"expected {what}, but the file ends: it is truncated", self.line)
             self._words = iter(self._split(*following))
             word = next(self._words, None)
         self.taken.append(word)
@@ -312,7 +312,7 @@ def parse_volcomp(source: SourceFile) -> VolTable:
 def _unit(words: _WordReader) -> str:
     word = words.take("a unit")
     if word not in MM_PER_UNIT:
-        raise words.source.fail(f"{word[:SHOWN]!r} is not a unit; mm or inch is expected", words.line)
+        raise words.source.fail(f"{word[:SHOWN]!r} is not a unit; expected mm or inch", words.line)
     return word
 
 
@@ -351,7 +351,7 @@ def _check_trailer(source: SourceFile, words: _WordReader) -> None:
             raise source.fail(f"{message}: it was changed or damaged; export it again", line)
         found = True
     if not found:
-        raise source.fail("there is no 'crc32 XXXXXXXX' behind 'end': the file was cut", words.line)
+        raise source.fail("there is no 'crc32 XXXXXXXX' behind 'end': the file is truncated", words.line)
 
 
 # How the numbers of a ``volkins`` table are written, their checksum, and the files that stand beside a table.
@@ -443,14 +443,14 @@ def is_companion(source: SourceFile) -> bool:
 
 
 def check_companion(source: SourceFile) -> None:
-    """Raise InputError if INI, HAL, C source or licence text does not end with its last line: it was cut."""
+    """Raise InputError if INI, HAL, C source or licence text does not end with its last line: it is truncated."""
     last = source.text.rstrip().rpartition("\n")[2]
     whole = (
         last == _LICENCE_ENDS if source.path.name.endswith(LICENCE) else last.startswith(("# end of ", "// end of "))
     )
     if not whole or not source.text.endswith("\n"):
         raise source.fail(
-            "does not end with its last line ('... end of ...'): the file was cut", source.text.count("\n") + 1
+            "does not end with its last line ('... end of ...'): the file is truncated", source.text.count("\n") + 1
         )
 
 
@@ -553,7 +553,7 @@ def _coordinates(value: Any) -> str:
     """One letter of an axis for each joint, X, Y and Z among them."""
     letters = str(value).upper() if isinstance(value, str) else ""
     if set(letters) - set(_AXIS_LETTERS) or not set(AXES) <= set(letters) or len(letters) > _MOST_JOINTS:
-        raise ValueError(f"the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}, is expected")
+        raise ValueError(f"expected the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}")
     return letters
 
 

@@ -84,14 +84,14 @@ class ParameterEntry:
     def whole(self, low: int, high: int) -> int:
         """Return the value as a whole number within limits."""
         if not _WHOLE.fullmatch(self.value) or not low <= int(self.value) <= high:
-            raise self.fail(f"{one_line(self.value)[:30]!r} is given; a whole number from {low} to {high} is expected")
+            raise self.fail(f"{one_line(self.value)[:30]!r} is given; expected a whole number from {low} to {high}")
         return int(self.value)
 
     def interval_mm(self) -> Decimal:
         """Return the value as a division interval, mm."""
         if not _DECIMAL.fullmatch(self.value) or not Decimal(self.value):
             raise self.fail(
-                f"{one_line(self.value)[:30]!r} is given; an interval in mm as a plain decimal number is expected"
+                f"{one_line(self.value)[:30]!r} is given; expected an interval in mm as a plain decimal number"
             )
         return Decimal(self.value)
 
@@ -126,7 +126,7 @@ def _row(file: SourceFile, line: int, text: str) -> ParameterEntry:
         raise file.fail(f"{one_line(cells[0])[:30]!r} is not the number of a parameter such as #4101", line)
     if len(cells) < 3:
         raise file.fail(
-            f"#{number}: number, value and meaning are expected, separated by commas (is the file cut?)", line
+            f"#{number}: expected number, value and meaning, separated by commas (is the file truncated?)", line
         )
     return ParameterEntry(int(number), cells[1], file, line)
 
@@ -140,7 +140,9 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
     lines = [raw.strip(" \t\r") for raw in file.text.removeprefix("\ufeff").split("\n")]
     inside = [number for number, text in enumerate(lines, start=1) if text]
     if len(inside) < 2 or lines[inside[0] - 1] != "%" or lines[inside[-1] - 1] != "%":
-        raise file.fail("the '%' at its beginning or end is missing: is the file cut?", inside[-1] if inside else 1)
+        raise file.fail(
+            "the '%' at its beginning or end is missing: is the file truncated?", inside[-1] if inside else 1
+        )
     found, passed_over = [], 0
     for line in inside[1:-1]:
         text = lines[line - 1]
@@ -157,7 +159,7 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
             if all(entry.number != UNIT for entry in found):
                 found.append(ParameterEntry(UNIT, record[3].strip(), file, line))
         elif re.match(r"N\s*[45]\d{3}(?!\d)", text):
-            raise file.fail(f"{one_line(text[:30])!r} is not understood; a record such as N4101P-2 is expected", line)
+            raise file.fail(f"{one_line(text[:30])!r} is not understood; expected a record such as N4101P-2", line)
         else:
             passed_over += not text.startswith(";")
     return found, passed_over
@@ -217,12 +219,12 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
     if not paths:
         return ControlFile()
     if len(paths) > 1:
-        raise InputError("one parameter file of the control (ALL.PRM) is expected", file=paths[1])
+        raise InputError("expected one parameter file of the control (ALL.PRM)", file=paths[1])
     content = read_bytes(paths[0])
     file = SourceFile(paths[0], content.decode("ascii", errors="replace"))
     if "\ufffd" in file.text:
         line = file.text[: file.text.index("\ufffd")].count("\n") + 1
-        raise file.fail("holds a byte that is not ASCII; a parameter file is ASCII text", line)
+        raise file.fail("contains a byte that is not ASCII; a parameter file is ASCII text", line)
     if not is_parameter_file(file):
         raise file.fail("is not a parameter file of the control (ALL.PRM): the first line is not '%'", 1)
     entries = by_number(file_entries(file)[0])
@@ -239,7 +241,7 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
         if not any(names):
             continue
         if len(present) < len(expected) or not all(names):
-            message = f"set {index + 1} is not complete: #{BASE + shift} to #{INTERVAL + shift} are expected"
+            message = f"set {index + 1} is not complete; expected #{BASE + shift} to #{INTERVAL + shift}"
             raise present[0].fail(message)
         reference, negative, positive, scale = (entry.whole(0, 99999) for entry in present[2:6])
         low, high = sorted((negative, positive))
@@ -267,14 +269,14 @@ def _across(value: Any) -> tuple[tuple[int, int], ...]:
     if isinstance(value, bool):
         return tuple(ACROSS.values()) if value else ()
     if not isinstance(value, list) or any(item not in [*ACROSS] for item in value) or len(set(value)) < len(value):
-        raise ValueError(f"true, false or a list of {', '.join(map(repr, ACROSS))} is expected")
+        raise ValueError(f"expected true, false or a list of {', '.join(map(repr, ACROSS))}")
     return tuple(ACROSS[item] for item in value)
 
 
 @accepts({"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9]{0,3}$"})
 def _name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9]{0,3}", value, re.ASCII):
-        raise ValueError("a name of at most four letters and digits is expected")
+        raise ValueError("expected a name of at most four letters and digits")
     return value
 
 
@@ -517,7 +519,7 @@ def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> M
     own = [file for file in texts if is_parameter_file(file)]
     sheets = [file for file in texts if not is_parameter_file(file)]
     if len(own) > 1:
-        raise own[1].fail("a second parameter file; one is expected")
+        raise own[1].fail("a second parameter file; expected one")
     if not own:
         return _sets_of(settings, sheets[0], by_number([entry for file in sheets for entry in sheet_entries(file)]))
     entries, passed_over = file_entries(own[0])
@@ -546,7 +548,7 @@ def _sets_of(
         sets += [] if table is None else [table]
         others += [] if name is None else [(f"set {number} of {name[0]}", *name[1])]
     if not sets:
-        raise file.fail(f"holds no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
+        raise file.fail(f"contains no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
     if passed_over is None:
         return MitsubishiTables(tuple(sets))
     system = "absolute values" if absolute else "increments"

@@ -131,7 +131,7 @@ def _read(source: SourceFile) -> FieldGrid | ErrorTable:
         try:
             data = json.loads(source.text, parse_constant=_refused, object_pairs_hook=_pairs)
         except json.JSONDecodeError as error:
-            raise source.fail(f"is not valid JSON: {error.msg}; was it cut?", error.lineno) from None
+            raise source.fail(f"is not valid JSON: {error.msg}; is it truncated?", error.lineno) from None
         except (ValueError, RecursionError) as error:
             raise source.fail(f"is not usable JSON: {one_line(error)[:200]}", 1) from None
         if (
@@ -233,7 +233,7 @@ def _curves_json(source: SourceFile, data: Mapping[str, Any]) -> ErrorTable:
             raise _fail(source, label, f"{len(nodes)} positions, {len(values)} values")
         curves[name] = Curve(nodes, values * error.si_per_unit, np.full(len(nodes), np.nan))
     if not curves and not squareness:
-        raise _fail(source, "errors", "holds no error")
+        raise _fail(source, "errors", "contains no error")
     return ErrorTable(curves, squareness)
 
 

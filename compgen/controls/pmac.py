@@ -354,9 +354,11 @@ def _read(source: SourceFile) -> _DownloadReader:
     count = len(reader.tables) + len(reader.backlash)
     declared = next((m for text in source.text.split("\n")[:50] if (m := _DECLARED.match(text[:200].strip()))), None)
     if declared and int(declared.group(1)) != count:
-        raise source.fail(f"declares {declared.group(1)} tables but holds {count}: it was cut or edited by hand")
+        raise source.fail(
+            f"declares {declared.group(1)} tables but contains {count}: it is truncated or was edited by hand"
+        )
     if declared and (reader.enabled is None or not source.text.endswith("\n")):
-        raise source.fail("has no I51 at its end: it was cut")
+        raise source.fail("has no I51 at its end: it is truncated")
     return reader
 
 
@@ -365,9 +367,9 @@ def _complete(reader: _DownloadReader, line: int) -> _DownloadReader:
     if reader.open is not None:
         table = reader.open
         have = f"{len(table.entries)} of {table.count} entries"
-        raise reader.source.fail(f"the table in line {table.line} has {have}: the file was cut", line)
+        raise reader.source.fail(f"the table in line {table.line} has {have}: the file is truncated", line)
     if not reader.tables and not reader.backlash:
-        raise reader.source.fail("holds no compensation table")
+        raise reader.source.fail("contains no compensation table")
     return reader
 
 
@@ -388,12 +390,12 @@ def _scales(value: Any) -> tuple[float, float, float]:
     """Counts per mm: one number for all axes, or a table with X, Y and Z; none is zero."""
     if isinstance(value, dict):
         if set(value) != set(AXES):
-            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
+            raise ValueError("expected one number, or a table { X = ..., Y = ..., Z = ... }")
         x, y, z = (toml_files.number(value[axis]) for axis in AXES)
     else:
         x = y = z = toml_files.number(value)
     if not np.all(np.array([x, y, z])):
-        raise ValueError("counts per mm other than zero are expected")
+        raise ValueError("expected counts per mm other than zero")
     return x, y, z
 
 
@@ -685,7 +687,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             named = "; ".join(f"motor {t.motor} (uses {_listed(_motors(t))})" for t in apart)
             remarks.append(f"tables of motors that are no axis of the machine file, kept apart: {named}")
         if not kept.tables and not kept.backlash:
-            raise files[0].fail(f"holds no table of the motors {_listed(known)}; {remarks[-1]}")
+            raise files[0].fail(f"contains no table of the motors {_listed(known)}; {remarks[-1]}")
         return kept, remarks
 
     def emulate(self, tables: PmacTables, points: Points) -> FloatArray:

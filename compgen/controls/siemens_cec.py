@@ -346,7 +346,7 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
         elif index in found:
             found[index] = replace(found[index], weight=item.number())
         elif item.number() != 0:
-            raise item.fail(f"the files hold no table {index}")
+            raise item.fail(f"the files contain no table {index}")
     return CecTables(found)
 
 
@@ -400,7 +400,7 @@ def foreign_cec_tables(
     if not found:
         listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
         raise next(iter(parts.values())).source.fail(
-            f"holds no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
+            f"contains no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
         )
     return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
 

@@ -139,7 +139,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         cec_items = [item for item in items if item.variable in CEC_VARIABLES]
         for found, array, what in ((eec_items, "AA_ENC_COMP", "encoder"), (cec_items, "AN_CEC", "cross")):
             if not any(item.variable == array for item in found):
-                raise files[-1].fail(f"the files hold no {what} tables (${array}); give both AX_EEC and NC_CEC")
+                raise files[-1].fail(f"the files contain no {what} tables (${array}); give both AX_EEC and NC_CEC")
         return CecEecTables(
             cec_tables_from(cec_items, files, self.settings), eec_tables_from(eec_items, self.settings.eec)
         )
@@ -154,7 +154,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         )
         for part, array, what in ((cec_part, "AN_CEC", "cross"), (eec_part, "AA_ENC_COMP", "encoder")):
             if not any(item.variable == array for item in part.items):
-                raise files[-1].fail(f"the files hold no {what} tables (${array}); give all that the control holds")
+                raise files[-1].fail(f"the files contain no {what} tables (${array}); give all that the control holds")
         cec = foreign_cec_tables(cec_part, self.machine, self.settings, findings)
         eec = foreign_eec_tables(eec_part, self.machine, self.settings.eec, findings)
         return CecEecTables(cec, eec), findings.statements()

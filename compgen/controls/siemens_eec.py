@@ -292,7 +292,7 @@ def foreign_eec_tables(
     if not tables:
         said = [*findings.apart, *findings.notes]
         raise next(iter(parts.values())).source.fail(
-            f"holds no table that acts for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
+            f"contains no table that acts for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
             f"file{': ' if said else ''}{'; '.join(said)}"
         )
     return EecTables(dict(sorted(tables.items())))

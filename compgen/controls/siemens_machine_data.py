@@ -103,7 +103,7 @@ def _encoders(value: Any) -> Encoders:
     """Measuring systems of the axes: 0 or 1, a list of both, or a table of these by axis (0 for one that is absent)."""
     if isinstance(value, dict):
         if not set(value) <= set(AXES):
-            raise ValueError("0, 1, [0, 1], or a table of these with the keys X, Y, Z is expected")
+            raise ValueError("expected 0, 1, [0, 1], or a table of these with the keys X, Y, Z")
         x, y, z = (_encoders_of_axis(value.get(axis, 0)) for axis in AXES)
         return x, y, z
     all_axes = _encoders_of_axis(value)
@@ -114,14 +114,14 @@ def _encoders_of_axis(value: Any) -> tuple[int, ...]:
     items = value if isinstance(value, list) else [value]
     whole = all(isinstance(item, int) and not isinstance(item, bool) and item in (0, 1) for item in items)
     if not items or not whole or len(set(items)) != len(items):
-        raise ValueError("0 (measuring system 1), 1 (measuring system 2) or [0, 1] is expected")
+        raise ValueError("expected 0 (measuring system 1), 1 (measuring system 2) or [0, 1]")
     return tuple(sorted(items))
 
 
 @accepts({"type": "string", "pattern": "^[A-Za-z_][A-Za-z0-9_]{0,31}$"})
 def _axis_name(value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value.upper()) or not value.isascii():
-        raise ValueError("an axis name of letters, digits and '_', e.g. 'AX1' or 'X1', is expected")
+        raise ValueError("expected an axis name of letters, digits and '_', e.g. 'AX1' or 'X1'")
     return value.upper()
 
 
@@ -129,7 +129,7 @@ def _axis_name(value: Any) -> str:
 def _table_indices(value: Any) -> tuple[int, ...]:
     index = whole(0, 999)
     if not isinstance(value, list) or len({index(item) for item in value}) != len(value):
-        raise ValueError("a list of different table indices, e.g. [6, 7], is expected")
+        raise ValueError("expected a list of different table indices, e.g. [6, 7]")
     return tuple(sorted(value))
 
 
@@ -138,7 +138,7 @@ def _per_axis(value: Any) -> tuple[float, float, float]:
     """One number above zero for all axes, or a table with X, Y and Z."""
     if isinstance(value, dict):
         if set(value) != set(AXES):
-            raise ValueError("one number, or a table { X = ..., Y = ..., Z = ... }, is expected")
+            raise ValueError("expected one number, or a table { X = ..., Y = ..., Z = ... }")
         x, y, z = (positive(value[axis]) for axis in AXES)
         return x, y, z
     number = positive(value)
@@ -324,7 +324,7 @@ def checked_encoder_settings(settings: Encoder, section: Section, machine: Machi
     active = [own[:1] for own in settings.encoders] if stated is None else stated
     for letter, one, own in zip(AXES, active, settings.encoders, strict=True):
         if len(one) != 1 or one[0] not in own:
-            raise section.fail("active_encoder", f"one of the encoders of {letter}, {list(own)}, is expected")
+            raise section.fail("active_encoder", f"expected one of the encoders of {letter}, {list(own)}")
     known = profile.eec_nodes_documented or f"{prefix}max_points" in section
     x, y, z = (one[0] for one in active)
     return replace(settings, active=(x, y, z), eec_nodes_known=known)

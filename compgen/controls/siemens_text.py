@@ -131,7 +131,7 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
                 path = f"{first.source.path}, " if first.source is not source else ""
                 raise item.fail(f"is assigned a second time; the first is in {path}line {first.line}")
     if not any(item.variable not in SWITCHES for item in seen.values()):
-        raise files[0].fail("holds no table") if files else InputError("no file was given")
+        raise files[0].fail("contains no table") if files else InputError("no file was given")
     return list(seen.values())
 
 
@@ -483,7 +483,7 @@ def foreign_assignments(
                     )
     if not any(item.variable not in SWITCHES for item in items.values()):
         wanted = " or ".join(f"${name}" for name in tables if name in ("AN_CEC", "AA_ENC_COMP"))
-        raise files[0].fail(f"holds no table ({wanted})")
+        raise files[0].fail(f"contains no table ({wanted})")
     return ArchiveAssignments(list(items.values()), machine_data)
 
 
@@ -522,7 +522,7 @@ def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], 
     last = found[-1]
     ends = (_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in last.lines)
     if last.kind == "INI" and not any(ends):
-        message = f"the archive ends within {last.name}.INI: it was cut, and its switches are not all there"
+        message = f"the archive ends within {last.name}.INI: it is truncated, and its switches are not all there"
         raise source.fail(message, last.lines[-1][0])
     return chosen, True
 

@@ -261,7 +261,7 @@ class _Body:
         entry = self.scalars.get((structure, name))
         if entry is None:
             if default is None:
-                raise self.source.fail(f"{structure}.{name} is missing; was the file cut?")
+                raise self.source.fail(f"{structure}.{name} is missing; is the file truncated?")
             return default
         return self.value(f"{structure}.{name}", entry)
 
@@ -303,7 +303,7 @@ class _Body:
             result[index] = self.value(_label(structure, name, index), entry)
         if len(entries) != result.size:
             missing = next(index for index in np.ndindex(*shape) if index not in entries)
-            raise self.source.fail(f"{_label(structure, name, missing)} is missing; was the file cut?")
+            raise self.source.fail(f"{_label(structure, name, missing)} is missing; is the file truncated?")
         return result
 
 
@@ -337,7 +337,7 @@ def parse_axis_list(
             _take(body, line, code.strip())
             count += 1
     if not count:
-        raise source.fail("holds no entry; is it the right file?")
+        raise source.fail("contains no entry; is it the right file?")
     check_complete(source, count, "entries")
     older = ("kopf", "achs_nr") not in body.scalars and ("kopf", "log_achs_nr") in body.scalars
     key = "log_achs_nr" if older else "achs_nr"
@@ -495,7 +495,7 @@ _DIFFER = "gives {} for X, Y, Z; three different ones are needed"
 @accepts({"type": "string", "pattern": f"^{_NAME.pattern}$"})
 def _axis_name(value: Any) -> str:
     if not isinstance(value, str) or not _NAME.fullmatch(value):
-        raise ValueError("an axis name of letters, digits, '_' and '-' is expected")
+        raise ValueError("expected an axis name of letters, digits, '_' and '-'")
     return value
 
 
@@ -503,7 +503,7 @@ def _axis_name(value: Any) -> str:
 def plane_masters(value: Any) -> tuple[int, int] | None:
     """The first and second master of a plane by their letters, e.g. "XZ"; None for "none"."""
     if not isinstance(value, str) or value not in _PLANES:
-        raise ValueError(f"two different letters, first and second master, are expected: {', '.join(_PLANES)}")
+        raise ValueError(f"expected two different letters, first and second master: {', '.join(_PLANES)}")
     return _PLANES[value]
 
 
@@ -667,7 +667,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         foreign = Findings()
         tables = self._parsed(files, foreign)
         if not any(item != AxisList() for item in tables.lists.values()):
-            raise files[0].fail("; ".join(["holds no table of an axis of the machine file", *foreign.statements()]))
+            raise files[0].fail("; ".join(["contains no table of an axis of the machine file", *foreign.statements()]))
         return tables, foreign.statements()
 
     def _parsed(self, files: Sequence[SourceFile], foreign: Findings | None) -> TwincatTables:

@@ -1,1 +1,1 @@
-"""Names, units, tables and files: what every stage shares."""
+"""Names, units, tables and files: what all rooms share."""

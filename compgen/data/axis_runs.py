@@ -20,16 +20,16 @@ from compgen.errors import InputError
 
 @dataclass(frozen=True)
 class AxisRuns:
-    """Actual minus target position along the axis that moves, n readings.
+    """Actual minus target position along the moving axis, n readings.
 
     Parameters
     ----------
     axis : axis of each reading, 0, 1, 2 for X, Y, Z, shape (n,).
     position_mm : target positions, shape (n,).
     direction : direction of approach, +1 or -1, shape (n,).
-    run : number of the run; the two ways of a cycle may have the same, shape (n,).
+    run : number of the run; both directions of a cycle may have the same, shape (n,).
     deviation_mm : actual minus target, shape (n,).
-    covariates : further numbers by column name (time_s, temp_..._c), each of shape (n,); nan where a file lacks one.
+    covariates : other numbers by column name (time_s, temp_..._c), each of shape (n,); nan if a file lacks one.
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each row, for messages.
     """
@@ -60,7 +60,7 @@ _AXIS_RUNS = Schema(
         DIRECTION,
         RUN,
         RUN_DEVIATION,
-        # time, number of the reading in the order of time, time at rest before it, speed on the way to it
+        # time, number of the reading in order of time, dwell before it, speed before it
         Field("covariates", ("time_s", "order", "dwell_s", "feed_mm_min"), presence="covariates"),
     )
 )
@@ -72,20 +72,20 @@ def read_axis_runs(files: str | Path | Sequence[str | Path]) -> AxisRuns:
     Raises
     ------
     InputError
-        for an axis that is not X, Y, Z, a direction that is not 1 or -1, a reading that comes twice.
+        for an axis that is not X, Y, Z, a direction that is not 1 or -1, a duplicate reading.
     """
     return join_axis_runs([AxisRuns(**_AXIS_RUNS.values(table)) for table in _AXIS_RUNS.read_tables(files)])
 
 
 def join_axis_runs(parts: Sequence[AxisRuns]) -> AxisRuns:
-    """Return several records as one; InputError for a reading that comes twice."""
+    """Return several records as one; InputError for a duplicate reading."""
     runs = _AXIS_RUNS.joined(parts)
     check_single(runs)
     return runs
 
 
 def check_single(runs: AxisRuns) -> None:
-    """One axis has one reading for each target, direction and run; InputError that names the second one."""
+    """Check that there is one reading for each axis, target, direction and run; InputError at the second one."""
     keys = list(
         zip(runs.axis.tolist(), runs.position_mm.tolist(), runs.direction.tolist(), runs.run.tolist(), strict=True)
     )
@@ -96,7 +96,7 @@ def check_single(runs: AxisRuns) -> None:
 
 
 def _second(runs: AxisRuns | Diagonals, rows: tuple[int, int], what: str, field: str | None = None) -> InputError:
-    """The error about a reading that came before, with both places."""
+    """Return the error about a duplicate reading, with both places."""
     first, row = rows
     where = f"{runs.origin[first][0]}:{runs.origin[first][1]}" if runs.origin else "an earlier row"
     return fail_at(runs.origin, row, f"{what} already appears in {where}; number the runs", field)
@@ -120,7 +120,7 @@ FACE_DIAGONALS = {
     "0NP": (0, -1, 1),
 }
 DIAGONALS = {**BODY_DIAGONALS, **FACE_DIAGONALS}
-#: How far from the line between its ends a commanded position may lie, mm.
+#: Largest distance of a commanded position from the line between the ends, mm.
 OFF_LINE_MM = 0.01
 
 
@@ -132,10 +132,10 @@ class Diagonals:
     ----------
     name : diagonal of each reading (PPP ... NNP, PP0 ...), n long.
     position_mm : commanded positions, shape (n, 3).
-    direction : +1 from the start of the diagonal to its end as its name says, -1 back, shape (n,).
-    run : number of the run; the two ways of a cycle may have the same, shape (n,).
-    deviation_mm : measured minus commanded distance; a constant for each diagonal does not count, shape (n,).
-    covariates : further numbers by column name (time_s, temp_..._c), each of shape (n,); nan where a file lacks one.
+    direction : +1 from the start of the diagonal to its end as in its name, -1 back, shape (n,).
+    run : number of the run; both directions of a cycle may have the same, shape (n,).
+    deviation_mm : measured minus commanded distance; a constant for each diagonal has no meaning, shape (n,).
+    covariates : other numbers by column name (time_s, temp_..._c), each of shape (n,); nan if a file lacks one.
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each row, for messages.
     """
@@ -155,7 +155,7 @@ class Diagonals:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Diagonals that were measured, the body diagonals first."""
+        """Measured diagonals, the body diagonals first."""
         return tuple(name for name in DIAGONALS if name in set(self.name))
 
     def rows(self, name: str) -> NDArray[np.int64]:
@@ -190,8 +190,8 @@ def read_diagonals(files: str | Path | Sequence[str | Path]) -> Diagonals:
     Raises
     ------
     InputError
-        for an unknown diagonal, a direction that is not 1 or -1, a reading that comes twice, positions that do not lie on
-        a line in the direction that the name of the diagonal says.
+        for an unknown diagonal, a direction that is not 1 or -1, a duplicate reading, positions that are not on a line
+        in the direction in the name of the diagonal.
     """
     found = _DIAGONALS.joined([Diagonals(**_DIAGONALS.values(table)) for table in _DIAGONALS.read_tables(files)])
     found = replace(found, name=tuple(found.name))
@@ -206,14 +206,14 @@ def read_diagonals(files: str | Path | Sequence[str | Path]) -> Diagonals:
 
 
 def along_mm(position_mm: FloatArray, name: str) -> FloatArray:
-    """Distance (n,) of positions (n, 3) on a diagonal from its start: the one that comes first in the name's direction."""
+    """Return the distance (n,) of positions (n, 3) on a diagonal from its start, the first in the direction of the name."""
     signs = np.array(DIAGONALS[name], dtype=np.float64)
     start = position_mm[int(np.argmin(position_mm @ signs))]
     return np.asarray(np.linalg.norm(position_mm - start, axis=1))
 
 
 def check_lines(diagonals: Diagonals) -> None:
-    """Every diagonal lies on a line in the direction of its name; InputError that names the first position that does not."""
+    """Check that every diagonal is a line in the direction of its name; InputError at the first position off it."""
     for name in diagonals.names:
         rows = diagonals.rows(name)
         points, signs = diagonals.position_mm[rows], np.array(DIAGONALS[name], dtype=np.float64)
@@ -221,14 +221,14 @@ def check_lines(diagonals: Diagonals) -> None:
         way = points[order[-1]] - points[order[0]]
         if np.any(np.sign(np.where(np.abs(way) <= OFF_LINE_MM, 0.0, way)) != signs):
             ends = " to ".join(_place(points[order[k]]) for k in (0, -1))
-            text = f"{name} goes from {ends}; its letters say the directions of X, Y, Z (P up, N down, 0 does not move)"
+            text = f"{name} runs from {ends}; its letters are the directions of X, Y, Z (P positive, N negative, 0 no motion)"
             raise fail_at(diagonals.origin, int(rows[order[-1]]), text, "column diagonal")
         unit = way / np.linalg.norm(way)
         apart = points - points[order[0]]
         off = np.linalg.norm(apart - np.outer(apart @ unit, unit), axis=1)
         if off.max() > OFF_LINE_MM:
             row = int(np.argmax(off))
-            text = f"{_place(points[row])} lies {off[row]:.3g} mm off the line between the ends of {name}"
+            text = f"{_place(points[row])} is {off[row]:.3g} mm off the line between the ends of {name}"
             raise fail_at(diagonals.origin, int(rows[row]), text, "column diagonal")
 
 

@@ -1,9 +1,9 @@
 """Charts as SVG for pages: axes with round numbers, lines, points, bands, bars and heat maps.
 
-Everything is drawn here, so a page needs no plotting library, prints well and can be read without a script. Coordinates are
-those of the data; :class:`Plot` maps them to the picture. Colours are roles (``line``, ``before`` ...), CSS variables that
-the style sheet ``templates/_report/style.css`` gives a light and a dark value. ``templates/_report/charts.js`` adds zoom
-to every element of the class ``axes``.
+A page needs no plotting library, prints well and can be read without a script. Coordinates are those of the data;
+:class:`Plot` maps them to the picture. Colours are roles (``line``, ``before`` ...): CSS variables with a light and a dark
+value in the style sheet ``templates/_report/style.css``. ``templates/_report/charts.js`` adds zoom to every element of
+the class ``axes``.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from compgen.resources import data_folder
 
-#: What a colour is for.
+#: Roles of colours.
 ROLES = ("ink", "muted", "grid", "line", "band", "fit", "table", "before", "after", "c0", "c1", "c2", "c3", "c4", "c5")
-#: Roles of lines that are drawn next to each other.
+#: Roles of lines in one picture.
 CYCLE = ("c0", "c1", "c2", "c3", "c4", "c5")
-#: Units as pages write them.
+#: Units as written on pages.
 LABEL = {"um": "µm", "urad": "µrad"}
-#: Width and height of a picture and the part of it that the axes take (left, top, right, bottom), for pages that show
-#: several pictures in a row. All have the same width, so all have letters of the same size.
+#: Width and height of a picture and the part for the axes (left, top, right, bottom), for pages with several pictures
+#: in a row. All have the same width, hence text of the same size.
 SIZE, BOX = (250.0, 150.0), (46.0, 10.0, 243.0, 121.0)
 FONT = 9.0
 DASHED, DOTTED = "5 3", "2 2"
-#: Colours of heat maps from the smallest to the largest value: cividis, which is even in brightness for any kind of colour
+#: Colours of heat maps from the smallest to the largest value: cividis, uniform in brightness for any kind of colour
 #: vision (Nunez, Anderton and Renslow 2018).
 HEAT = ("00224e", "1a386f", "434e6c", "61656f", "7d7c78", "9b9476", "bcae6c", "dec958", "fee838")
 #: Colours from negative over zero to positive (Moreland 2009).
@@ -44,7 +44,7 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn picture: markup, heading, a word on what it shows, and the data that the script of the page shows."""
+    """A drawn picture: markup, heading, a note, and the data for the script of the page."""
 
     key: str
     title: str
@@ -86,7 +86,7 @@ def tick_texts(values: Sequence[float]) -> list[str]:
 
 
 def limits_of(*values: ArrayLike, margin: float = 0.07, zero: bool = False) -> tuple[float, float]:
-    """Return the limits of an axis that shows all finite values, and zero if asked for, with a margin."""
+    """Return the limits of an axis that shows all finite values, and zero if requested, with a margin."""
     known = np.concatenate([np.ravel(np.asarray(part, dtype=np.float64)) for part in (*values, [0.0] * zero)])
     known = known[np.isfinite(known)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
@@ -97,8 +97,8 @@ def limits_of(*values: ArrayLike, margin: float = 0.07, zero: bool = False) -> t
 class Plot:
     """Axes in a picture: a rectangle ``box`` (left, top, right, bottom) of it with limits in units of the data.
 
-    Ticks are (value, text); without them round numbers are chosen, and people can zoom. ``bare`` axes have neither ticks
-    nor lines.
+    Ticks are (value, text); without them round numbers are chosen, and the axes can be zoomed. ``bare`` axes have
+    neither ticks nor lines.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class Plot:
 
     @property
     def data(self) -> dict[str, Any]:
-        """Where the axes are in the picture and their limits, for the script of the page."""
+        """Place of the axes in the picture and their limits, for the script of the page."""
         return {"frame": list(self.box), "limits": [*self.x, *self.y]}
 
     def _px(self, x: ArrayLike, y: ArrayLike) -> tuple[Values, Values]:
@@ -129,7 +129,7 @@ class Plot:
         return across, bottom - (np.asarray(y, dtype=np.float64) - y0) / (y1 - y0) * (bottom - top)
 
     def _stroke(self, path: str, role: str, width: float, more: str = "") -> None:
-        # Lines keep their width when the picture is made larger, and when its part is.
+        # Lines keep their width when the picture or its axes are enlarged.
         self.drawn.append(
             f'<path d="{path}" fill="none" vector-effect="non-scaling-stroke" '
             f'style="stroke:var(--{role});stroke-width:{width:g}{more}"/>'
@@ -151,7 +151,7 @@ class Plot:
         """Draw round or square points."""
         px, py = (np.ravel(part) for part in np.broadcast_arrays(*self._px(x, y)))
         known = np.isfinite(px + py)
-        # A line without length with round or square ends: it keeps its form when one axis is stretched.
+        # A line without length with round or square ends: it keeps its shape when one axis is stretched.
         path = "".join(f"M{a:.2f} {b:.2f}h0" for a, b in zip(px[known].tolist(), py[known].tolist(), strict=True))
         self._stroke(path, role, size, f";stroke-linecap:{'square' if square else 'round'}")
 
@@ -212,7 +212,7 @@ class Plot:
         steps = 16
         index = np.rint(np.clip(shares, 0.0, 1.0) * steps).astype(int)
         found = _colours(np.arange(steps + 1) / steps, colours)
-        for k in sorted(range(steps + 1), key=lambda k: abs(k - steps / 2)):  # the ends of the scale lie on top
+        for k in sorted(range(steps + 1), key=lambda k: abs(k - steps / 2)):  # the ends of the scale are on top
             rgb = found[k]
             if (index == k).any():
                 self.dots(x[index == k], y[index == k], "ink", size=size)
@@ -226,7 +226,7 @@ class Plot:
         self.drawn.append(_text(float(px) + shift[0], float(py) + shift[1], text, anchor))
 
     def layer(self, name: str, start: int) -> None:
-        """Make what was drawn since ``start`` (an earlier ``len(drawn)``) a layer that the page can show and hide."""
+        """Turn what was drawn since ``start`` (an earlier ``len(drawn)``) into a layer that the page can show and hide."""
         self.drawn[start:] = [f'<g class="layer layer-{name}">', *self.drawn[start:], "</g>"]
 
     def markup(self) -> str:
@@ -238,7 +238,7 @@ class Plot:
         size = f'x="{left:g}" y="{top:g}" width="{right - left:g}" height="{bottom - top:g}"'
         view = f'viewBox="{left:g} {top:g} {right - left:g} {bottom - top:g}"'
         parts = [f'<g class="axes"{head}>', *([] if self.bare else [f'<g class="scale">{self._scale()}</g>'])]
-        # An svg within the svg cuts off what lies outside its box.
+        # A nested svg clips what is outside its box.
         parts += [f'<svg {size} {view} preserveAspectRatio="none"><g class="drawn">', *self.drawn, "</g></svg>"]
         if x_label:
             parts.append(_text(0.5 * (left + right), bottom + 2.6 * FONT, x_label, "middle"))
@@ -279,8 +279,8 @@ def svg(key: str, title: str, plots: Sequence[Plot], size: tuple[float, float] =
     Parameters
     ----------
     key : unique on the page; put before every id.
-    title : what the picture shows, for readers that do not see it.
-    more : further SVG, e.g. of :func:`legend`.
+    title : contents of the picture, for screen readers.
+    more : additional SVG, e.g. of :func:`legend`.
     """
     head = f'<svg class="plot" viewBox="0 0 {size[0]:g} {size[1]:g}" font-size="{FONT:g}" role="img"'
     return Markup(
@@ -309,12 +309,12 @@ def colour_bar(
     marks = _labelled(None, limits, (bottom - top) / 24)
     places = [(float(bar._px(0.0, value)[1]), text) for value, text in marks]
     numbers = "".join(_text(left + 11.0, place + 0.35 * FONT, text, "start") for place, text in places)
-    # Only the picture of the bar: it is no axes that could be zoomed.
+    # Only an image of the bar: it has no axes to zoom.
     return "".join(bar.drawn) + numbers + _text(left + 4.0, top - 3.0, label, "middle")
 
 
 def picture_grid(pictures: Sequence[Picture], kind: str = "") -> str:
-    """Return pictures as HTML, side by side as far as there is room; ``kind`` is "wide" for one across the page."""
+    """Return pictures as HTML, side by side if there is room; ``kind`` is "wide" for the full width of the page."""
     return '<div class="grid">{}</div>'.format(
         "\n".join(
             f'<figure class="picture {kind}" id="figure-{item.key}" tabindex="0"><figcaption>{escape(item.title)} '
@@ -336,7 +336,7 @@ def page_assets(*scripts: str) -> tuple[Markup, Markup, str]:
 
 
 def rounded(values: ArrayLike, digits: int = 4) -> list[Any]:
-    """Return numbers with ``digits`` significant digits for the data of a page; None for what is not a number.
+    """Return numbers with ``digits`` significant digits for the data of a page; None for non-numbers.
 
     >>> rounded([0.0, 123.456, -0.0012344, float("nan")])
     [0.0, 123.5, -0.001234, None]
@@ -353,7 +353,7 @@ def rounded(values: ArrayLike, digits: int = 4) -> list[Any]:
 def _labelled(
     given: Sequence[tuple[float, str]] | None, limits: tuple[float, float], room: float
 ) -> Sequence[tuple[float, str]]:
-    """The ticks that were given, else round numbers, as many as there is room for."""
+    """Return the given ticks, otherwise as many round numbers as there is room for."""
     if given is not None:
         return given
     places = ticks(*limits, max(2, min(6, int(room))))
@@ -370,7 +370,7 @@ def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:
 
 
 def _colours(shares: Values, colours: Sequence[str]) -> NDArray[np.uint8]:
-    """Red, green and blue (..., 3), interpolated between colours at even distances."""
+    """Return red, green and blue (..., 3), interpolated between equidistant colours."""
     rgb = np.array([list(bytes.fromhex(text)) for text in colours], dtype=np.float64)
     at = np.clip(shares, 0.0, 1.0) * (len(rgb) - 1)
     found = np.stack([np.interp(at, np.arange(len(rgb)), rgb[:, k]) for k in range(3)], axis=-1)

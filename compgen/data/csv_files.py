@@ -1,7 +1,8 @@
 """The CSV dialect of native files: comma, a header, ``# key = value`` comments, strict numbers.
 
-A text is split into fields (:func:`parse_plain` for files as programs write them, :func:`parse_any` for all others),
-becomes a :class:`CsvTable` whose columns are checked as they are asked for, and :func:`format_csv` writes the same dialect.
+A text is split into fields (:func:`parse_plain` for files written by programs, :func:`parse_any` for all others) and
+becomes a :class:`CsvTable` whose columns are checked when they are requested; :func:`format_csv` writes the same
+dialect.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from compgen.data.messages import doubled, nearest, visible_line
 from compgen.data.names import LARGEST, SMALLEST
 from compgen.errors import CompgenWarning, InputError
 
-#: Quotes, comments and all white space of ASCII but the line feed.
+#: Quotes, comments and all ASCII white space except the line feed.
 _NOT_PLAIN = '"#\0\r\t\v\f \x1c\x1d\x1e\x1f'
 
 
 @dataclass(frozen=True)
 class CsvFile:
-    """The contents of a file: its header, and the fields either by row or, one after the other, in ``flat``."""
+    """The contents of a file: its header, and the fields either by row or in sequence in ``flat``."""
 
     header_line: int
     header: list[str]
@@ -47,7 +48,7 @@ class CsvFile:
 
 
 def parse_plain(content: str) -> CsvFile | None:
-    """Read a file as programs write it, several times faster than :func:`parse_any`; None if it is not one.
+    """Read a file written by a program, several times faster than :func:`parse_any`; None for other files.
 
     Such a file is ASCII without quotes or spaces below its header, has at least two columns, the
     same number in each row, no comment between rows, and ends with a line end.
@@ -85,7 +86,7 @@ def _note_metadata(line: str, metadata: dict[str, str]) -> bool:
     """Whether a stripped line is a comment or empty; a comment ``# key = value`` goes to ``metadata``."""
     if line.startswith("#"):
         key, equals, value = line.lstrip("#").partition("=")
-        if equals and value.strip():  # a date that nobody filled in is not a date
+        if equals and value.strip():  # an empty value is not set
             metadata[key.strip()] = value.strip()
         return True
     return not line
@@ -103,7 +104,7 @@ def parse_any(source: Path, content: str) -> CsvFile:
     if not data:
         return CsvFile(0, [], [], metadata, rows=[])
     if "\0" in content:
-        raise InputError("holds NUL bytes; it is not a text file", file=source)
+        raise InputError("contains NUL bytes; it is not a text file", file=source)
     reader = csv.reader(data, strict=True, skipinitialspace=True)
     try:
         parsed = list(reader)
@@ -111,7 +112,7 @@ def parse_any(source: Path, content: str) -> CsvFile:
         line_number = numbers[max(reader.line_num, 1) - 1]
         raise InputError(f"is not readable as CSV: {error}", file=source, line=line_number) from error
     if len(parsed) != len(data):
-        raise InputError("a quoted field runs over a line end; write each row on one line", file=source)
+        raise InputError("a quoted field contains a line end; write each row on one line", file=source)
     header = [name.strip() for name in parsed[0]]
     return CsvFile(numbers[0], header, numbers[1:], metadata, rows=parsed[1:])
 
@@ -122,10 +123,10 @@ def parse_any(source: Path, content: str) -> CsvFile:
 FloatArray = NDArray[np.float64]
 _LARGEST_LABEL = 2.0**53
 _ROWS_AT_ONCE = 10_000
-#: A spreadsheet takes a cell that begins so for a formula, and in a comment what follows a comma.
+#: A spreadsheet interprets a cell with such a beginning as a formula, in a comment also after a comma.
 _FORMULA = re.compile(r"'*[=+\-@]")
 _IN_COMMENT = re.compile(r"(?<=[,;])(?=[=+\-@])")
-#: Columns that a header may have; characters of it that a message shows; columns left out that are named each.
+#: Limits: columns of a header; characters of it in a message; ignored columns that are listed.
 MOST_COLUMNS, _SHOWN, _NAMED = 10_000, 200, 20
 
 
@@ -146,11 +147,11 @@ class CsvTable:
         return len(self.lines)
 
     def fail(self, row: int, column: str, message: str) -> InputError:
-        """Return the error that points at one cell."""
+        """Return the error about one cell."""
         return InputError(message, file=self.path, line=self.lines[row], field=f"column {column}")
 
     def text(self, column: str) -> list[str]:
-        """Return a column of labels, as :func:`format_csv` was given them; an empty cell is an error."""
+        """Return a column of labels, as passed to :func:`format_csv`; an empty cell is an error."""
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if not cell:
@@ -162,9 +163,7 @@ class CsvTable:
         found = self.text(column)
         if "=" in "".join(found):
             row = next(k for k, name in enumerate(found) if "=" in name)
-            raise self.fail(
-                row, column, f"{visible_line(found[row])[:40]!r} is not a name: '=' is not allowed; leave it out"
-            )
+            raise self.fail(row, column, f"{visible_line(found[row])[:40]!r} is not a valid name; remove the '='")
         return found
 
     def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
@@ -176,17 +175,17 @@ class CsvTable:
         except ValueError:
             raise self._bad_number(column, filled) from None
         together = "".join(filled)
-        if "_" in together or not together.isascii():  # Python reads 1_000 and digits of other scripts; a file may not
+        if (
+            "_" in together or not together.isascii()
+        ):  # Python accepts 1_000 and digits of other scripts; files must not have them
             raise self._bad_number(column, filled)
         if not (np.abs(values) <= most).all():
             row = next((k for k in range(len(cells)) if cells[k] and not abs(values[k]) <= most), None)
             if row is not None:
                 finite = math.isfinite(values[row])
-                what = (
-                    f"is larger than {most:g}, the largest number that is read" if finite else "is not a finite number"
-                )
+                what = f"is larger than {most:g}, the largest number allowed" if finite else "is not a finite number"
                 raise self.fail(row, column, f"{cells[row]!r} {what}")
-        values[np.abs(values) < SMALLEST] = 0.0  # nobody measured that, and its square would be no number
+        values[np.abs(values) < SMALLEST] = 0.0  # too small for a measured value, and its square would underflow
         return values
 
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
@@ -194,7 +193,7 @@ class CsvTable:
             if not _is_number(cell):
                 what = "is empty" if not cell else f"{visible_line(cell)[:40]!r} is not a number"
                 return self.fail(row, column, f"{what}; expected a number with '.' as decimal point")
-        return InputError("holds text; expected numbers", file=self.path, field=f"column {column}")
+        return InputError("contains text; expected numbers", file=self.path, field=f"column {column}")
 
     def labels(self, column: str) -> NDArray[np.int64]:
         """Return a column of whole-number labels, shape (rows,)."""
@@ -290,27 +289,27 @@ def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
 
 def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
     if len(header) > MOST_COLUMNS:
-        message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are read: is this a table?"
+        message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are allowed: is this a table?"
         raise InputError(message, file=source, line=line)
     twice = doubled(header)
     if twice is not None:
-        raise InputError(f"the header names {_shown(twice)!r} twice", file=source, line=line)
+        raise InputError(f"the header contains {_shown(twice)!r} twice", file=source, line=line)
     missing = [name for name in required if name not in header]
     if missing:
         needed, present = ", ".join(required), _shown(", ".join(header))
         hint = "; separate columns by commas" if len(header) == 1 and re.search(r"[;\t]", header[0]) else ""
-        message = f"column {missing[0]!r} is missing; needed are {needed}; the header has {present}{hint}"
+        message = f"column {missing[0]!r} is missing; required are {needed}; the header has {present}{hint}"
         raise InputError(message, file=source, line=line)
 
 
 def _check_complete(source: Path, content: str, file: CsvFile) -> None:
-    """A file that was cut is refused: by what it declares, or by a shorter last number without line end.
+    """Refuse a truncated file: by its declared rows, or by a shorter last number without line end.
 
-    A file that declares its rows was written by a program and ends with a line end; one that does not may lack it.
+    A file that declares its rows was written by a program and ends with a line end; other files may lack it.
     """
     declared, count, last_line = file.metadata.get("rows"), len(file.lines), file.lines[-1]
     if declared is not None and declared != str(count):
-        raise InputError(f"declares {visible_line(declared)} rows but holds {count}: is it truncated?", file=source)
+        raise InputError(f"declares {visible_line(declared)} rows but contains {count}: is it truncated?", file=source)
     if content.endswith(("\n", "\r")):
         return
     if declared is not None:
@@ -329,8 +328,8 @@ def format_csv(
 ) -> str:
     """Return CSV text with ``# key = value`` comments, the number of rows among them, and a final line end.
 
-    Numbers are written with ``decimals`` digits after the point (6 if not given), text as it is; but a label that a
-    spreadsheet would take for a formula gets an apostrophe before it, which :meth:`CsvTable.text` takes off again.
+    Numbers are written with ``decimals`` digits after the point (6 if not given), text unchanged; but a label that a
+    spreadsheet would interpret as a formula gets an apostrophe before it, which :meth:`CsvTable.text` removes again.
     """
     digits = decimals or {}
     parts = [_template(values, digits.get(name, 6)) for name, values in columns.items()]

@@ -1,4 +1,4 @@
-"""Positions measured against commanded ones: deviations, and features of parts."""
+"""Measured against commanded positions: deviations, and features of parts."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ __all__ = [
     "setups_of",
 ]
 
-# Positions measured against commanded ones: ``*.deviations.csv``.
+# Measured against commanded positions: ``*.deviations.csv``.
 
 
 @dataclass(frozen=True)
 class RoughPose:
-    """Where a frame lies in another: measured - ``measured_mm`` = ``rotation`` (nominal - ``nominal_mm``), (3,), (3, 3)."""
+    """Pose of a frame in another: measured - ``measured_mm`` = ``rotation`` (nominal - ``nominal_mm``), (3,), (3, 3)."""
 
     nominal_mm: FloatArray
     measured_mm: FloatArray
@@ -61,14 +61,14 @@ class Deviations(Displayed):
     ----------
     position_mm : commanded positions, shape (n, 3).
     deviation_mm : actual tip minus (position + tool offset), shape (n, 3); nan for a component that was not measured.
-    u_mm : standard uncertainty of each component, shape (n, 3), or None if it is not known.
-    tool_mm : tool offset of each row, shape (n, 3), or None for the machine's own.
+    u_mm : standard uncertainty of each component, shape (n, 3), or None if unknown.
+    tool_mm : tool offset of each row, shape (n, 3), or None for that of the machine file.
     approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
     labels : whole-number labels by column name (run, line, repeat, block, setup, pose), each of shape (n,).
-    covariates : further numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
+    covariates : other numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each row, for messages.
-    poses : by set-up, the pose that was taken out of the coordinates of a part; empty for deviations as they were measured.
+    poses : by set-up, the pose removed from the coordinates of a part; empty for measured deviations.
 
     Examples
     --------
@@ -95,7 +95,7 @@ class Deviations(Displayed):
         return len(self.position_mm)
 
     def overview(self) -> Overview:
-        """Number of the positions, the components that were measured, and the box that holds them."""
+        """Number of positions, the measured components, and the bounding box."""
         found = [
             f"d{letter}"
             for letter, column in zip("xyz", self.deviation_mm.T, strict=True)
@@ -122,7 +122,7 @@ _DEVIATIONS = Schema(
 def read_deviations(files: str | Path | Sequence[str | Path]) -> Deviations:
     r"""Read one or more ``*.deviations.csv`` files into one :class:`Deviations`, um to mm.
 
-    Files may measure different components; labels that only some of the files carry are 0 in the others.
+    Files may measure different components; labels that only some of the files have are 0 in the others.
 
     Examples
     --------
@@ -144,10 +144,10 @@ def read_deviations(files: str | Path | Sequence[str | Path]) -> Deviations:
 
 
 def _check_components(table: CsvTable, measured: Field, u: Field) -> list[str]:
-    """At least one component is measured, and the uncertainty is given of all of them or of none."""
+    """Check that a component is measured, and that uncertainties are given for all components or none."""
     found = [name for name in measured.columns if name in table.columns]
     if not found:
-        raise InputError(f"has none of {', '.join(measured.columns)}; at least one is needed", file=table.path)
+        raise InputError(f"has none of {', '.join(measured.columns)}; at least one is required", file=table.path)
     given = [name for name in u.columns if name in table.columns]
     needed = [u_name for name, u_name in zip(measured.columns, u.columns, strict=True) if name in found]
     if given and given != needed:
@@ -169,12 +169,12 @@ def format_deviations(deviations: Deviations) -> str:
     return _DEVIATIONS.format(deviations, deviations.metadata)
 
 
-# Features of parts that the machine made, measured elsewhere: ``*.part.csv`` (nominal and measured coordinates).
+# Features of parts made on the machine and measured elsewhere: ``*.part.csv`` (nominal and measured coordinates).
 
 
-#: Coordinates further from their nominal ones than this, rms after the best pose, belong to something else.
+#: Coordinates further from their nominal ones than this, rms after the best pose, are not those of the part.
 FAR_MM = 1.0
-#: What :attr:`Deviations.metadata` says under ``measured`` where the positions are features of a part.
+#: Value of ``measured`` in :attr:`Deviations.metadata` if the positions are features of a part.
 PART = "part"
 _PARTS = Schema(
     (
@@ -192,25 +192,25 @@ _PARTS = Schema(
 def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
     """Read one or more ``*.part.csv`` files: measured minus nominal coordinates, each set-up in its own frame.
 
-    A feature lies where the tool was when it was made, so that its deviation is the error of the machine at the
-    nominal position, seen from the unknown pose of the part. The nominal coordinates are those of the machine; a comment
-    ``# origin_mm = X, Y, Z`` says where the part's origin was in them. Without ``z_mm`` all features lie at one height:
-    that of the origin.
+    A feature is where the tool was when it was made, so its deviation is the error of the machine at the nominal
+    position, seen from the unknown pose of the part. The nominal coordinates are machine coordinates; a comment ``#
+    origin_mm = X, Y, Z`` gives the part's origin in them. Without ``z_mm`` all features are at the height of the
+    origin.
 
     Returns
     -------
     Deviations
-        aligned: see :func:`aligned`; nan for what was not measured.
+        aligned: see :func:`aligned`; nan for components that were not measured.
 
     Raises
     ------
     InputError
-        for a file without a measured coordinate, uncertainties for other coordinates than are measured, features that do
-        not lie where they should.
+        for a file without a measured coordinate, uncertainties for other coordinates than the measured ones, features
+        far from their nominal places.
     """
     tables = _PARTS.read_tables(files)
     for table in tables:
-        # both are of one size, however the part was turned: an inch or a metre shows here
+        # both have the same size, whatever the orientation: this detects inches and metres
         measured = _check_components(table, *_PARTS.fields[2:4])
         nominal = [f"{name[1]}_mm" for name in measured if f"{name[1]}_mm" in table.columns]
         spans = [
@@ -227,7 +227,7 @@ def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
 
 
 def _part(table: CsvTable) -> Deviations:
-    """Measured minus nominal coordinates of one file at the nominal positions in the machine."""
+    """Return measured minus nominal coordinates of one file at the nominal positions in the machine."""
     values = _PARTS.values(table)
     nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
     values["metadata"]["measured"] = PART
@@ -235,7 +235,7 @@ def _part(table: CsvTable) -> Deviations:
 
 
 def _origin(table: CsvTable) -> FloatArray:
-    """The part's origin in machine coordinates, mm, from the comment ``origin_mm``; zeros without it."""
+    """Return the part's origin in machine coordinates, mm, from the comment ``origin_mm``; zeros without it."""
     text = table.metadata.get("origin_mm", "0, 0, 0")
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
@@ -252,12 +252,12 @@ def setups_of(deviations: Deviations) -> NDArray[np.int64]:
 
 
 def aligned(deviations: Deviations) -> Deviations:
-    """Take the pose that fits best out of every set-up, so that what is left is small; in the plane for two components.
+    """Remove the best-fit pose from every set-up, so that the rest is small; in the plane for two components.
 
     Raises
     ------
     InputError
-        where what is left cannot be an error of a machine (axes exchanged or mirrored, features in another order).
+        if the rest cannot be an error of a machine (axes exchanged or mirrored, features in another order).
     """
     setups, turned = setups_of(deviations), deviations.deviation_mm.copy()
     poses = {}
@@ -266,7 +266,7 @@ def aligned(deviations: Deviations) -> Deviations:
         nominal = deviations.position_mm[own]
         actual = nominal + deviations.deviation_mm[own]
         rotation = _turn(nominal, actual)
-        # means over what was measured; 0 for a component that was not
+        # means over the measured components; 0 for the others
         seen = np.isfinite(actual)
         count = np.maximum(seen.sum(axis=0), 1)
         middle, there = (np.where(seen, values, 0.0).sum(axis=0) / count for values in (nominal, actual))
@@ -277,7 +277,7 @@ def aligned(deviations: Deviations) -> Deviations:
         if rms_mm > FAR_MM:
             raise InputError(
                 f"set-up {setup}: after the best pose the coordinates are {rms_mm:.3g} mm rms from their nominal ones; are two "
-                "axes exchanged, one mirrored, the unit wrong, or the features numbered otherwise?",
+                "axes exchanged, one mirrored, the unit wrong, or the features numbered differently?",
                 file=deviations.origin[0][0] if deviations.origin else None,
             )
     return replace(deviations, deviation_mm=turned, poses=poses)
@@ -294,7 +294,9 @@ def _turn(nominal_mm: FloatArray, actual_mm: FloatArray) -> FloatArray:
     moment = np.zeros((3, 3))
     moment[np.ix_(components, components)] = (second - second.mean(axis=0)).T @ (first - first.mean(axis=0))
     size = np.linalg.svd(moment, compute_uv=False)
-    if size[len(components) - 2] < 1e-9 * max(size[0], 1e-9):  # all on one line: its rotation about itself is not seen
+    if size[len(components) - 2] < 1e-9 * max(
+        size[0], 1e-9
+    ):  # all on one line: the rotation about it is not observable
         return np.eye(3)
     if len(components) == 2:  # the component that was not measured stays: no turn out of the plane, no mirror image
         left = 3 - components.sum()

@@ -1,7 +1,7 @@
-"""How results show themselves: one line in a session, a table in a notebook, a picture by ``plot()``.
+"""Display of results: one line in a session, a table in a notebook, a picture by ``plot()``.
 
-A class that inherits :class:`Displayed` says what there is to see (``overview``, ``panels``);
-how it looks is decided here, once for all of them. Figures are in the units of reports: um, urad, mm.
+A class that inherits :class:`Displayed` provides the contents (``overview``, ``panels``); this module decides how they
+look. Figures are in the units of reports: um, urad, mm.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: Colours that people with any kind of colour vision tell apart (Okabe and Ito 2008).
+#: Colours that can be distinguished with any kind of colour vision (Okabe and Ito 2008).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 PANELS_ACROSS = 3
 PANEL_SIZE_INCH = (4.2, 3.0)
@@ -28,12 +28,12 @@ Values = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Overview:
-    """What a result says at a glance.
+    """A result at a glance.
 
     Parameters
     ----------
     title : one line without a full stop.
-    header, rows : a table; cells are texts, the first column holds names.
+    header, rows : a table; cells are texts, the first column contains names.
     notes : lines below the table.
     """
 
@@ -75,26 +75,26 @@ class Panel:
 
 
 class Displayed(ABC):
-    """Something that people look at in a session or a notebook."""
+    """A result that is shown in a session or a notebook."""
 
     @abstractmethod
     def overview(self) -> Overview:
-        """Return what there is to say; its title is the line of ``repr``."""
+        """Return the overview; its title is the line of ``repr``."""
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.overview().title}>"
 
     def _repr_html_(self) -> str:
-        """Return the table that a notebook shows."""
+        """Return the table for a notebook."""
         return html_of(self.overview())
 
 
 class Drawable(Displayed):
-    """A result that has a picture as well."""
+    """A result with a picture."""
 
     @abstractmethod
     def panels(self) -> Sequence[Panel]:
-        """Return what there is to draw."""
+        """Return the panels to draw."""
 
     def plot(self, figure: Figure | None = None) -> Figure:
         """Draw this result, into ``figure`` or a new one, and return the figure.
@@ -118,7 +118,7 @@ def html_of(overview: Overview) -> str:
 
 
 def _row(cells: Sequence[str], tag: str) -> str:
-    """One row: names to the left, figures to the right."""
+    """Return one row: names on the left, figures on the right."""
     sides = ("left", *["right"] * (len(cells) - 1))
     return "<tr>{}</tr>".format(
         "".join(

@@ -1,7 +1,7 @@
 """Geometric errors and reversal as curves over the axis position, read and written; bases of such curves.
 
-:class:`ErrorTable` is what identification, fit and export hand on: 18 curves and 3 squareness errors in mm and rad. Files
-hold um and urad (``*.errors.csv``). :class:`ReversalCurves` adds what differs between both directions of travel
+Identification, fit and export pass on :class:`ErrorTable`: 18 curves and 3 squareness errors in mm and rad. Files are
+in um and urad (``*.errors.csv``). :class:`ReversalCurves` adds the difference between both directions of travel
 (``*.reversal.csv``).
 """
 
@@ -27,7 +27,7 @@ from compgen.errors import CompgenWarning, InputError
 
 K = TypeVar("K", bound=Hashable)
 
-# Geometric errors as tables over the axis position: the object that identify, fit and export hand on.
+# Geometric errors as tables over the axis position: the object that identify, fit and export pass on.
 
 
 #: Columns that an ``*.errors.csv`` file must have.
@@ -38,7 +38,7 @@ ERROR_COLUMNS = ("error", "position_mm", "value")
 class Curve(Displayed):
     """One error over its axis: ``position_mm`` ascending, ``value`` and standard uncertainty ``u`` in mm or rad.
 
-    All three have shape (n,); ``u`` is nan where it is not known. Linear between positions, constant outside.
+    All three have shape (n,); ``u`` is nan if unknown. Linear between positions, constant outside.
 
     Examples
     --------
@@ -58,7 +58,7 @@ class Curve(Displayed):
             raise ValueError(f"lengths differ: {len(self.position_mm)}, {len(self.value)}, {len(self.u)}")
         ascending = self.position_mm[1:] > self.position_mm[:-1]
         if not (ascending.all() and np.isfinite(self.position_mm).all()):
-            raise ValueError("positions of a curve must be finite and ascend")
+            raise ValueError("positions of a curve must be finite and ascending")
 
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Value at the given positions, same shape."""
@@ -130,7 +130,7 @@ class ErrorTable(Drawable):
             low, high = curve.position_mm[0], curve.position_mm[-1]
             if len(curve.position_mm) > 1 and (along.min() < low - 1e-6 or along.max() > high + 1e-6):
                 warnings.warn(
-                    f"{name} is known from {low:g} to {high:g} mm, but positions go from {along.min():g} to "
+                    f"{name} is known from {low:g} to {high:g} mm, but positions range from {along.min():g} to "
                     f"{along.max():g} mm; its end values are used outside",
                     CompgenWarning,
                     stacklevel=3,
@@ -152,7 +152,7 @@ class ErrorTable(Drawable):
         )
 
     def uncertainties(self) -> FloatArray:
-        """Standard uncertainties in the order of :meth:`values`, (k,), mm and rad; nan where one is not known."""
+        """Standard uncertainties in the order of :meth:`values`, (k,), mm and rad; nan if unknown."""
         return self._stacked(
             [(self.squareness[n][1],) if n in self.squareness else self.curves[n].u for n in self.names]
         )
@@ -162,7 +162,7 @@ class ErrorTable(Drawable):
         return np.concatenate([np.zeros(0), *(np.asarray(part) for part in parts)])
 
     def rows(self) -> dict[str, slice]:
-        """Where the values of each error are in :meth:`values`."""
+        """Slice of the values of each error in :meth:`values`."""
         found, first = {}, 0
         for name in self.names:
             count = 1 if name in self.squareness else len(self.curves[name].value)
@@ -195,7 +195,7 @@ class ErrorTable(Drawable):
         squareness: Mapping[str, tuple[float, float]] | None = None,
         metadata: Mapping[str, str] | None = None,
     ) -> ErrorTable:
-        """Return a copy with what is given replaced."""
+        """Return a copy with the given parts replaced."""
         return ErrorTable(
             self.curves if curves is None else curves,
             self.squareness if squareness is None else squareness,
@@ -247,7 +247,7 @@ def read_errors(path: str | Path) -> ErrorTable:
 
 
 def parse_errors(text: str, source: Path) -> ErrorTable:
-    """Read the text of an ``*.errors.csv`` file as :func:`read_errors` does; ``source`` is what messages name."""
+    """Read the text of an ``*.errors.csv`` file like :func:`read_errors`; ``source`` is the name in messages."""
     return errors_of_table(csv_table(source, text, required=ERROR_COLUMNS, optional=("u_value",)))
 
 
@@ -280,7 +280,7 @@ def errors_of_table(table: CsvTable) -> ErrorTable:
 
 
 def _grouped(keys: Iterable[K]) -> dict[K, NDArray[np.int64]]:
-    """The rows of each key, in the order of their first rows."""
+    """Return the rows of each key, in the order of their first rows."""
     rows: dict[K, list[int]] = {}
     for row, key in enumerate(keys):
         rows.setdefault(key, []).append(row)
@@ -288,7 +288,7 @@ def _grouped(keys: Iterable[K]) -> dict[K, NDArray[np.int64]]:
 
 
 def _ascending(table: CsvTable, name: str, rows: NDArray[np.int64], positions_mm: FloatArray) -> NDArray[np.int64]:
-    """The rows of a curve in the order of their positions, each of which comes once."""
+    """Return the rows of a curve in order of position; each position occurs once."""
     twice = repeated(positions_mm[rows].tolist())
     if twice is not None:
         first, row = rows[list(twice)]
@@ -298,7 +298,7 @@ def _ascending(table: CsvTable, name: str, rows: NDArray[np.int64], positions_mm
 
 
 def _uncertainties(table: CsvTable, column: str) -> FloatArray:
-    """An optional column of standard uncertainties, nan where it is empty."""
+    """Return an optional column of standard uncertainties, nan for empty cells."""
     if column not in table.columns:
         return np.full(len(table), np.nan)
     values = table.numbers(column, empty=np.nan)
@@ -343,16 +343,17 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
     return format_csv(columns, {**errors.metadata, **(metadata or {})}, digits)
 
 
-# Reversal of each axis over its position: ``*.reversal.csv``, what a control needs beside the two-way mean errors.
+# Reversal of each axis over its position: ``*.reversal.csv``, what a control needs in addition to the mean errors of
+# both directions.
 #
-# The reversal value B is that of ISO 230-2: the position reached moving in positive direction minus the one reached moving
-# in negative direction. The error curves are the means of both, so the tool stands at +B/2 after positive travel and at
-# -B/2 after negative travel, beside what the curves say.
+# The reversal value B is that of ISO 230-2: the position reached moving in positive direction minus the one reached
+# moving in negative direction. The error curves are the means of both, so the tool is at +B/2 after positive travel and
+# at -B/2 after negative travel, relative to the curves.
 
 
-#: A reversal beyond this is taken for a slip of unit, um.
+#: A larger reversal is rejected as a wrong unit, um.
 LARGEST_UM = 1000.0
-#: A reversal whose largest value stays below this is not worth a table, mm.
+#: A smaller reversal is not worth a table, mm.
 WORTH_MM = 0.1 * MM_PER_UM
 
 
@@ -360,7 +361,7 @@ WORTH_MM = 0.1 * MM_PER_UM
 class ReversalCurves(Displayed):
     """Reversal values in mm by (axis that travels, component of the tip's displacement), both 0..2.
 
-    A curve with one position is constant over the travel. What is absent is zero.
+    A curve with one position is constant over the travel. Missing ones are zero.
 
     Examples
     --------
@@ -376,7 +377,7 @@ class ReversalCurves(Displayed):
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def displacement(self, position_mm: FloatArray, approach: FloatArray) -> FloatArray:
-        """Displacement of the tip against the mean of both directions, shape (n, 3), mm.
+        """Return the displacement of the tip from the mean of both directions, shape (n, 3), mm.
 
         Parameters
         ----------
@@ -389,7 +390,7 @@ class ReversalCurves(Displayed):
         return moved
 
     def mean_mm(self, axis: int) -> float:
-        """Mean over its positions of an axis' reversal along itself, 0 if there is none."""
+        """Return the mean of an axis' reversal along itself over its positions, 0 if there is none."""
         curve = self.curves.get((axis, axis))
         return 0.0 if curve is None else float(np.mean(curve.value))
 
@@ -399,7 +400,7 @@ class ReversalCurves(Displayed):
 
     @property
     def largest_mm(self) -> dict[tuple[int, int], float]:
-        """Largest reversal in size of each curve, with its sign."""
+        """Reversal of the largest magnitude of each curve, with its sign."""
         return {key: float(curve.value[np.argmax(np.abs(curve.value))]) for key, curve in self.curves.items()}
 
     def overview(self) -> Overview:
@@ -522,10 +523,10 @@ def hat_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
 def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
     """Matrix (m, n) of the clamped cubic B-splines with n coefficients over the range of ``nodes_mm`` (n,).
 
-    The knots are spread like the nodes (averages of three neighbouring nodes), first and last fourfold, so that the
+    The knots are distributed like the nodes (averages of three neighbouring nodes), first and last fourfold, so the
     first and the last coefficient are the end values. Positions (m,) outside the range get the end value.
     """
-    from scipy.interpolate import BSpline  # imported here: slow to load, and linear curves do without
+    from scipy.interpolate import BSpline  # imported here: slow to load, and not needed for linear curves
 
     nodes = np.asarray(nodes_mm, dtype=np.float64)
     inner = (nodes[1:-3] + nodes[2:-2] + nodes[3:-1]) / 3.0
@@ -537,15 +538,15 @@ def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
 def free_basis(constraints: FloatArray, size: int) -> FloatArray:
     """Basis (size, free) of all x with ``constraints`` (k, size) x = 0, by elimination.
 
-    Each row drops the unknown with its largest factor, expressed by the others, which keep their meaning: a row with
-    a single entry gives an exact zero, and the basis stays sparse.
+    Each row eliminates the unknown with its largest factor; the others keep their meaning: a row with a single entry
+    gives an exact zero, and the basis stays sparse.
     """
     rows = np.atleast_2d(constraints).astype(np.float64) if np.size(constraints) else np.zeros((0, size))
     pivots: list[int] = []
     for k in range(len(rows)):
         pivot = int(np.argmax(np.abs(rows[k])))
         if abs(rows[k, pivot]) < 1e-12:
-            continue  # says nothing beyond the rows before it
+            continue  # dependent on the rows before it
         rows[k] /= rows[k, pivot]
         others = np.arange(len(rows)) != k
         rows[others] -= rows[others, pivot][:, None] * rows[k]

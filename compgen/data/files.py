@@ -1,7 +1,7 @@
 """Output files: written to a temporary name and renamed, all files of a step or none.
 
-Temporary files and folders are locked by the process that made them, so that the next one can tell what a killed process
-left behind and remove it.
+Temporary files and folders are locked by the process that made them, so that the next one can recognise and remove what
+a killed process left behind.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from typing import Any
 from compgen.errors import InputError
 
 TEMPORARY = ".tmp"
-#: How temporary folders of the program begin, and the file by whose lock one sees that its process still runs.
+#: Prefix of temporary folders, and the file whose lock shows that the process still runs.
 FOLDERS, LOCK = "compgen-", ".lock"
-#: What is newer may be about to be locked, s.
+#: Newer files may be about to be locked, s.
 NEW_S = 2.0
 #: Temporary files of this process, each with the open file that keeps its lock.
 _locks: dict[Path, int] = {}
@@ -40,7 +40,7 @@ def sha256_of(content: bytes) -> str:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Where the errors came from: (name, SHA-256) of every input file, for manifest and file headers."""
+    """Return the source of the errors: (name, SHA-256) of every input file, for manifest and file headers."""
 
     inputs: Sequence[tuple[str, str]] = ()
 
@@ -55,7 +55,7 @@ def sha256_of_file(path: str | Path) -> str:
 
 
 def json_values(value: Any) -> Any:
-    """Return ``value`` as JSON knows it: keys are texts, and a number that is not known (nan) or not finite is None."""
+    """Return ``value`` as JSON data: keys are texts, and a number that is unknown (nan) or not finite is None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -64,17 +64,17 @@ def json_values(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Return the text of a JSON file, see :func:`json_values`; objects that JSON does not know are written as text."""
+    """Return the text of a JSON file, see :func:`json_values`; other objects are written as text."""
     return json.dumps(json_values(value), indent=2, default=str, allow_nan=False) + "\n"
 
 
 class OutputFolder:
     """A folder that receives a set of files together.
 
-    ``add`` keeps the contents in memory; ``commit`` writes every one to a temporary name beside its target and
-    only then renames them, so that an error leaves neither half a file nor half a set of new ones. ``set_aside`` names a
-    file of the folder that ``commit`` renames to ``PREVIOUS-...`` before the new ones take their names: a process that is
-    killed in between leaves no old file that looks like one of the new set.
+    ``add`` keeps the contents in memory; ``commit`` writes each to a temporary name next to its target and only then
+    renames them, so that an error leaves neither half a file nor half a set. ``commit`` renames a file passed to
+    ``set_aside`` to ``PREVIOUS-...`` before the new ones get their names: a process killed in between leaves no old
+    file that looks like one of the new set.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -102,11 +102,11 @@ class OutputFolder:
         return self._contents
 
     def add(self, name: str, content: str | bytes) -> None:
-        """Remember ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
+        """Add ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
         self._contents[name] = content.encode("utf-8") if isinstance(content, str) else content
 
     def set_aside(self, name: str) -> Path:
-        """Keep the existing file ``name`` under the name that is returned, one that loses no other file."""
+        """Keep the existing file ``name`` under the returned name, which overwrites no other file."""
         self._aside.append(name)
         return _previous(self.folder / name)
 
@@ -115,11 +115,11 @@ class OutputFolder:
         paths = {name: self.folder / name for name in self._contents}
         aside = [(self.folder / name, _previous(self.folder / name)) for name in dict.fromkeys(self._aside)]
         temporary: dict[str, Path] = {}
-        # folders that have to be made for the targets, the innermost first
+        # folders to create for the targets, the innermost first
         missing = {folder for target in paths.values() for folder in target.parents if not folder.exists()}
         made = sorted(missing, key=lambda folder: len(folder.parts), reverse=True)
         try:
-            names: dict[Path, set[str]] = {}  # what processes that were killed left of these files is removed
+            names: dict[Path, set[str]] = {}  # leftovers of killed processes, to be removed
             for target in paths.values():
                 names.setdefault(target.parent, set()).add(target.name)
             for folder, own in names.items():
@@ -150,7 +150,7 @@ class OutputFolder:
 
 
 def _previous(path: Path) -> Path:
-    """A name with ``PREVIOUS-`` that is free, or that a file with the same contents has."""
+    """Return a name with ``PREVIOUS-`` that is free, or belongs to a file with the same contents."""
     for count in itertools.count(1):
         free = path.with_name(f"PREVIOUS-{'' if count == 1 else f'{count}-'}{path.name}")
         if not free.exists() or (free.is_file() and path.is_file() and filecmp.cmp(free, path, shallow=False)):
@@ -159,7 +159,7 @@ def _previous(path: Path) -> Path:
 
 
 def _remove(files: Iterable[Path], folders: Iterable[Path]) -> None:
-    """Remove temporary files, then the folders made for them as far as they are empty."""
+    """Remove temporary files, then the folders made for them if empty."""
     for path in files:
         with contextlib.suppress(OSError):
             path.unlink(missing_ok=True)
@@ -179,7 +179,7 @@ def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
     except BaseException:
         for source, target, before in reversed(done):
             with contextlib.suppress(OSError):
-                if not source.name.endswith(TEMPORARY):  # a file that was set aside: no byte of it is written again
+                if not source.name.endswith(TEMPORARY):  # a file set aside: its contents are not written again
                     os.replace(target, source)
                 elif before is None:
                     target.unlink()
@@ -212,12 +212,12 @@ def _write_temporary(target: Path, content: bytes) -> Path:
 
 
 def _locked(handle: int) -> bool:
-    """Take the lock of an open file, which the system gives back when this process ends; False if another one has it."""
+    """Lock an open file; the system releases it when this process ends. False if another process has the lock."""
     try:
         import fcntl
 
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # a system without such locks: nothing is ever taken for abandoned
+    except ImportError:  # a system without such locks: nothing counts as abandoned
         return False
     except OSError:
         return False
@@ -231,7 +231,7 @@ def _unlock(path: Path) -> None:
 
 
 def _abandoned(path: Path) -> bool:
-    """Whether the process that made a temporary file, or the lock of a folder, was killed: nobody keeps its lock."""
+    """Whether the process that made a temporary file, or the lock of a folder, was killed: no process has the lock."""
     try:
         if time.time() - path.lstat().st_mtime < NEW_S:
             return False
@@ -280,7 +280,7 @@ def read_bytes(path: str | Path, most: int = -1) -> bytes:
     source = Path(path)
     try:
         if source.is_dir():
-            raise InputError("is a folder; a file is needed", file=source)
+            raise InputError("is a folder; expected a file", file=source)
         with source.open("rb") as stream:
             return stream.read(most)
     except FileNotFoundError as error:
@@ -295,7 +295,7 @@ def read_text(path: str | Path) -> str:
 
 
 def decoded(content: bytes, path: str | Path) -> str:
-    """Return the UTF-8 text of the contents of ``path`` as :func:`read_text` does."""
+    """Return the UTF-8 text of the contents of ``path`` like :func:`read_text`."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

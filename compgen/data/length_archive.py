@@ -1,4 +1,4 @@
-"""Tracer lengths in binary form (``*.lengths.npz``): as many as a tracer reads on the fly, never all in memory."""
+"""Tracer lengths in binary form (``*.lengths.npz``): for measurements on the fly, never all in memory."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from compgen.data.lengths import MOST_WHOLE, Lengths
 from compgen.data.records import COVARIATE_COLUMNS, LABEL_COLUMNS, POSITION_COLUMNS
 from compgen.errors import InputError
 
-#: Readings of which an identification from an archive keeps the residuals, and with which it looks for disturbances.
+#: Readings of which an identification from an archive keeps the residuals, and in which it searches for disturbances.
 SAMPLE = 20_000
-#: Readings that are in memory at a time.
+#: Readings in memory at a time.
 CHUNK = 250_000
 _REQUIRED = ("station", *POSITION_COLUMNS, "length_mm")
 
@@ -58,17 +58,17 @@ class LengthArchive:
         return self.columns["length_mm"].shape[0]
 
     def chunks(self) -> Iterator[slice]:
-        """Rows that are in memory at a time."""
+        """Rows in memory at a time."""
         return (slice(first, min(first + CHUNK, len(self))) for first in range(0, len(self), CHUNK))
 
     def check(self, look: Callable[[int, NDArray[np.float64]], None] = lambda *_: None) -> None:
-        """Raise InputError for numbers that are not finite, and stations that are not in the list.
+        """Raise InputError for numbers that are not finite, and for stations that are not in the list.
 
         ``look`` gets the first row and the positions (3, k) of each chunk.
         """
         for rows in self.chunks():
             found = np.stack([self.columns[name][rows] for name in (*POSITION_COLUMNS, "length_mm")]).astype(np.float64)
-            if not np.isfinite(found.sum()):  # it is not if any number is not
+            if not np.isfinite(found.sum()):  # not finite if any number is not
                 for k, name in enumerate((*POSITION_COLUMNS, "length_mm")):
                     for row in np.flatnonzero(~np.isfinite(found[k]))[:1].tolist():
                         message = f"reading {rows.start + row + 1} is not a finite number"
@@ -100,9 +100,9 @@ class LengthArchive:
 
     @cached_property
     def sample_rows(self) -> NDArray[np.int64]:
-        """Rows of a sample: stops spread over all at random distances, so that no period of the data is met.
+        """Return the rows of a sample: stops spread at random distances, so that no period of the data is aliased.
 
-        The readings of a few rows that follow each other are taken together, since stations often read at the same stop.
+        A few consecutive rows are taken together, because stations often read at the same stop.
         """
         together = min(4 * len(self.stations), 64)
         starts = np.arange(0, len(self) - together, max(together, len(self) * together // SAMPLE))
@@ -122,7 +122,7 @@ def open_archive(path: str | Path) -> LengthArchive:
     Raises
     ------
     InputError
-        for a file that is no such archive, lacks a column, or is compressed.
+        for a file that is not such an archive, lacks a column, or is compressed.
     """
     source = Path(path)
     try:
@@ -131,7 +131,9 @@ def open_archive(path: str | Path) -> LengthArchive:
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error
     except (zipfile.BadZipFile, ValueError, EOFError, struct.error, OSError) as error:
-        raise InputError(f"is not an archive of numpy (.npz), or is cut or damaged ({error})", file=source) from error
+        raise InputError(
+            f"is not an archive of numpy (.npz), or is truncated or damaged ({error})", file=source
+        ) from error
     columns = {name: member for name, member in members.items() if isinstance(member, Column)}
     small = {name: member for name, member in members.items() if not isinstance(member, Column)}
     metadata = {name: str(values[()]) for name, values in small.items() if values.ndim == 0}
@@ -156,7 +158,7 @@ def open_archive(path: str | Path) -> LengthArchive:
 
 
 def _member(source: Path, stream: BinaryIO, item: zipfile.ZipInfo) -> NDArray[Any] | Column:
-    """Find one array of an archive, behind its local header and its own header of numpy; small ones are read."""
+    """Find one array of an archive, after its local header and its numpy header; small ones are read."""
     if item.compress_type != zipfile.ZIP_STORED:
         raise InputError("is compressed; write it with numpy.savez, not numpy.savez_compressed", file=source)
     stream.seek(item.header_offset)
@@ -168,7 +170,7 @@ def _member(source: Path, stream: BinaryIO, item: zipfile.ZipInfo) -> NDArray[An
     read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, fortran, dtype = read_header(stream)
     if dtype.hasobject or (fortran and len(shape) > 1):
-        raise ValueError(f"{item.filename} holds objects, or has its columns first")
+        raise ValueError(f"{item.filename} contains objects, or is stored column by column")
     if not shape or 0 in shape or dtype.kind in "US":  # names and comments are small
         stream.seek(item.header_offset + 30 + name_bytes + extra_bytes)
         return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
@@ -176,7 +178,7 @@ def _member(source: Path, stream: BinaryIO, item: zipfile.ZipInfo) -> NDArray[An
 
 
 def read_archive(path: str | Path) -> Lengths:
-    """Read an archive whole; InputError for one of more than ``MOST_WHOLE`` readings."""
+    """Read a whole archive; InputError for more than ``MOST_WHOLE`` readings."""
     archive = open_archive(path)
     if len(archive) > MOST_WHOLE:
         message = (
@@ -190,9 +192,9 @@ def read_archive(path: str | Path) -> Lengths:
 def write_archive(
     path: str | Path, stations: Iterable[str], parts: Iterable[Mapping[str, NDArray[Any]]], metadata: Mapping[str, Any]
 ) -> int:
-    """Write an archive part by part, so that no more than one part is in memory; return the number of readings.
+    """Write an archive in parts, with only one part in memory; return the number of readings.
 
-    Each of ``parts`` has the same columns, which are gathered in files next to ``path`` and then put together.
+    Each of ``parts`` has the same columns, which are collected in files next to ``path`` and then combined.
     """
     target = Path(path)
     open_files: dict[str, tuple[BinaryIO, np.dtype[Any]]] = {}

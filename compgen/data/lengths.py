@@ -25,7 +25,7 @@ from compgen.data.records import (
     within,
 )
 
-#: Archives of so many readings are read whole, and are then what text files are.
+#: Archives of at most this many readings are read whole, like text files.
 MOST_WHOLE = 200_000
 
 __all__ = [
@@ -50,10 +50,10 @@ class Lengths(Displayed):
     point : label of the target point of each reading.
     position_mm : commanded positions, shape (n, 3).
     length_mm : readings, the true distance minus an unknown constant per station and set-up, shape (n,).
-    tool_mm : tool offset of each reading, shape (n, 3), or None for the machine's own.
+    tool_mm : tool offset of each reading, shape (n, 3), or None for that of the machine file.
     approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
     labels : whole-number labels by column name (run, line, repeat, block, setup, pose), each of shape (n,).
-    covariates : further numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
+    covariates : other numbers by column name (``time_s``, ``temp_...``, ...), each of shape (n,).
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each reading, for messages.
 
@@ -128,7 +128,7 @@ _LENGTHS = Schema(
 def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     """Read one or more ``*.lengths.csv`` (or ``*.lengths.npz``) files into one :class:`Lengths`.
 
-    Labels that only some of the files carry are 0 in the others; the same station in two files is one station.
+    Labels that only some of the files have are 0 in the others; the same station in two files is one station.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     binary = [source for source in sources if str(source).lower().endswith(ARCHIVE)]
     parts = []
     if binary:
-        from compgen.data.length_archive import read_archive  # imported here: it is built on what this file declares
+        from compgen.data.length_archive import read_archive  # imported here: it depends on this module
 
         parts = [read_archive(source) for source in binary]
     text = [source for source in sources if source not in binary]
@@ -179,9 +179,9 @@ class Points(Displayed):
     Parameters
     ----------
     position_mm : shape (n, 3).
-    tool_mm : tool offset at each point, shape (n, 3), or None for the machine's own.
+    tool_mm : tool offset at each point, shape (n, 3), or None for that of the machine file.
     approach : last direction of travel of each axis (+1, -1, 0 unknown), shape (n, 3), or None.
-    covariates : further numbers by column name (time_s, feed_mm_min, load_kg, setup, temp_<name>_c), each (n,).
+    covariates : other numbers by column name (time_s, feed_mm_min, load_kg, setup, temp_<name>_c), each (n,).
 
     Examples
     --------
@@ -202,7 +202,7 @@ class Points(Displayed):
         return len(self.position_mm)
 
     def overview(self) -> Overview:
-        """Number of the points, and the box that holds them."""
+        """Number of points, and their bounding box."""
         return Overview(f"{len(self)} points", ("axis", "from (mm)", "to (mm)"), ranges_of(self.position_mm))
 
 
@@ -211,7 +211,7 @@ _POINTS = Schema(
         POSITION,
         TOOL,
         replace(APPROACH, presence="complete", digits=6),
-        # what effects of a machine may depend on
+        # columns on which effects of a machine may depend
         Field("covariates", ("time_s", "feed_mm_min", "load_kg", "setup"), presence="covariates"),
     )
 )

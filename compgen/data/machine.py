@@ -1,7 +1,7 @@
-"""A machine as its TOML file describes it: chain, axes, error model, work zone and tools.
+"""A machine as described by its TOML file: chain, axes, error model, work zone and tools.
 
-:func:`read_machine` reads one file strictly, :func:`load_machine` finds it by name. A machine keeps the raw sections of its
-controls and effects; each of them reads its own settings when it is used.
+:func:`read_machine` reads one file strictly, :func:`load_machine` finds it by name. A machine keeps the raw
+sections of its controls and effects, which read their settings when they are used.
 """
 
 from __future__ import annotations
@@ -23,36 +23,36 @@ from compgen.data.names import AXES, ERROR_NAMES
 from compgen.errors import CompgenWarning, InputError
 from compgen.resources import data_folder
 
-# Where tables have to be best that cannot be good everywhere: a work zone, and tools of several lengths.
+# Where tables must be most accurate if they cannot be accurate everywhere: a work zone, and tools of several lengths.
 
 
 Interval = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
-#: How much more a coordinate within the work zone counts than one outside, if nothing is said.
+#: Default weight of a coordinate within the work zone, relative to one outside.
 ZONE_WEIGHT = 10.0
-#: The zone all but alone; the rest of the travel still settles what the zone leaves open.
+#: Almost only the zone counts; the rest of the travel still determines what the zone leaves open.
 MOST_ZONE_WEIGHT = 1e3
 
 
 @toml_files.accepts({"type": "number", "minimum": 1.0, "maximum": MOST_ZONE_WEIGHT})
 def _weight(value: Any) -> float:
-    """A weight from 1 to 1000."""
+    """Return a weight from 1 to 1000."""
     result = toml_files.number(value)
     if not 1.0 <= result <= MOST_ZONE_WEIGHT:
-        raise ValueError(f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (the zone all but alone) is expected")
+        raise ValueError(f"expected a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (almost only the zone)")
     return result
 
 
 @dataclass(frozen=True)
 class Emphasis:
-    """What the least squares of the tables weighs.
+    """Weights of the least squares for the tables.
 
     Parameters
     ----------
-    zone_mm : ranges of X, Y and Z within the travel (None: the whole travel); where all are None there is no zone.
-    zone_weight : how much more a coordinate within the zone counts; the factors of the axes multiply.
-    tools_mm : tool offsets over which the residual is averaged; none: the machine's own.
+    zone_mm : ranges of X, Y and Z within the travel (None: the whole travel); if all are None there is no zone.
+    zone_weight : weight of a coordinate within the zone, relative to one outside; the factors of the axes multiply.
+    tools_mm : tool offsets over which the residual is averaged; none: that of the machine file.
     """
 
     zone_mm: tuple[Interval | None, Interval | None, Interval | None] = toml_files.axis_setting(
@@ -63,19 +63,19 @@ class Emphasis:
 
     @property
     def has_zone(self) -> bool:
-        """Whether a part of the travel counts more than the rest."""
+        """Whether a part of the travel has more weight than the rest."""
         return any(part is not None for part in self.zone_mm) and self.zone_weight != 1.0
 
     def ends_mm(self, axis: int) -> list[float]:
-        """Return the ends of the zone along an axis, none where it takes the whole travel."""
+        """Return the ends of the zone along an axis, none if it covers the whole travel."""
         part = self.zone_mm[axis]
         return [] if part is None or not self.has_zone else list(part)
 
     def factor(self, axis: int, along_mm: FloatArray) -> FloatArray:
         """Return the factor of one axis in the weight of positions along it, same shape.
 
-        The weight is a product over the axes, so that what depends on one of them stays orthogonal to what depends on
-        another: a table over X must not take up, as a step at the end of the zone, what Y does on the average there.
+        The weight is a product over the axes, so that what depends on one of them remains orthogonal to what depends on
+        another: a table over X must not absorb the average effect of Y as a step at the end of the zone.
         """
         ends = self.ends_mm(axis)
         if not ends:
@@ -83,7 +83,7 @@ class Emphasis:
         return np.where((along_mm > ends[0]) & (along_mm < ends[1]), self.zone_weight, 1.0)
 
     def summary(self) -> dict[str, Any]:
-        """Return what ``manifest.json`` says."""
+        """Return the entries of ``manifest.json``."""
         zone = {letter: list(part) for letter, part in zip(AXES, self.zone_mm, strict=True) if part is not None}
         return {
             "work_zone_mm": zone if self.has_zone else None,
@@ -93,7 +93,7 @@ class Emphasis:
 
     @property
     def notes(self) -> list[str]:
-        """What the user of the tables should know."""
+        """Return what the user of the tables should know."""
         notes = []
         if self.has_zone:
             parts = [
@@ -103,16 +103,16 @@ class Emphasis:
             ]
             zone = ", ".join(parts)
             notes.append(
-                f"The tables are made for the work zone {zone}; a coordinate in it counts {self.zone_weight:g} times."
+                f"The tables are made for the work zone {zone}; a coordinate in it has {self.zone_weight:g} times the weight."
             )
         if self.tools_mm:
             tools = "; ".join(", ".join(f"{value:g}" for value in tool) for tool in self.tools_mm)
-            notes.append(f"The tables are made for the tool offsets (x, y, z in mm) {tools}, which count alike.")
+            notes.append(f"The tables are made for the tool offsets (x, y, z in mm) {tools}, with equal weight.")
         return notes
 
 
 def take_emphasis(root: toml_files.Section, travel_mm: Sequence[Interval]) -> Emphasis:
-    """Take ``work_zone_mm``, ``zone_weight`` and ``tools_mm`` from a machine file."""
+    """Read ``work_zone_mm``, ``zone_weight`` and ``tools_mm`` from a machine file."""
     emphasis = toml_files.take_settings(Emphasis, root)
     for letter, part, (low, high) in zip(AXES, emphasis.zone_mm, travel_mm, strict=True):
         if part is not None and (part[0] < low or part[1] > high):
@@ -132,7 +132,7 @@ def zone_of(text: str, travel_mm: Sequence[Interval]) -> tuple[Interval | None, 
             low, high = np.nan, np.nan
         if letter not in AXES or letter in found or not -np.inf < low < high < np.inf:
             raise InputError(
-                f"--zone: {part.strip()[:40]!r} is not a range; each axis once, lower end first, in mm is expected, "
+                f"--zone: {part.strip()[:40]!r} is not a range; expected each axis once, lower end first, in mm, "
                 f"e.g. X=-400:0,Y=100:300"
             )
         found[letter] = (low, high)
@@ -144,12 +144,12 @@ def zone_of(text: str, travel_mm: Sequence[Interval]) -> tuple[Interval | None, 
 
 def _outside(letter: str, part: Interval, travel: Interval) -> str:
     return (
-        f"the work zone {letter} = {part[0]:g} ... {part[1]:g} mm leaves the travel {travel[0]:g} ... {travel[1]:g} mm; "
+        f"the work zone {letter} = {part[0]:g} ... {part[1]:g} mm exceeds the travel {travel[0]:g} ... {travel[1]:g} mm; "
         f"give the part of it within the travel"
     )
 
 
-# A machine as its TOML file describes it: chain, axes, what the error model contains, settings per control.
+# A machine as described by its TOML file: chain, axes, contents of the error model, settings of the controls.
 
 
 Reference = Literal["X", "Y"]
@@ -158,7 +158,7 @@ ErrorSelection = Literal["observable", 17, 21] | tuple[str, ...]
 
 ToolRange = tuple[Interval, Interval, Interval]
 
-#: How far the tool may reach beyond the machine's own offset in X, Y and Z where no file says it, mm.
+#: Default range of tool offsets about that of the machine file in X, Y and Z, mm.
 ASSUMED_TOOL_MM: Vector3 = (100.0, 100.0, 200.0)
 #: The 24 valid chains: W, every order of X, Y, Z and F, then T.
 CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
@@ -176,19 +176,19 @@ _WITHIN = {"type": "number", "minimum": -MOST_MM, "maximum": MOST_MM}
 
 @toml_files.accepts({**toml_files.accepted(toml_files.interval), "items": _WITHIN})
 def _travel(value: object) -> tuple[float, float]:
-    """Lower and upper end of the travel, mm."""
+    """Return the lower and upper end of the travel, mm."""
     lower, upper = toml_files.interval(value)
     if max(abs(lower), abs(upper)) > MOST_MM:
-        raise ValueError("a range within a kilometre of zero is expected; is the unit mm?")
+        raise ValueError("expected a range within a kilometre of zero; is the unit mm?")
     return lower, upper
 
 
 @toml_files.accepts({**toml_files.accepted(toml_files.vector3), "items": _WITHIN})
 def _offset(value: object) -> Vector3:
-    """A vector from one point of a machine to another, mm."""
+    """Return a vector from one point of a machine to another, mm."""
     x, y, z = toml_files.vector3(value)
     if max(abs(x), abs(y), abs(z)) > MOST_MM:
-        raise ValueError("components of less than a kilometre are expected; is the unit mm?")
+        raise ValueError("expected components of less than a kilometre; is the unit mm?")
     return x, y, z
 
 
@@ -204,12 +204,12 @@ def _error_selection(value: Any) -> ErrorSelection:
     if value == "observable" or (value in (17, 21) and not isinstance(value, bool)):
         return cast(Literal["observable", 17, 21], value)
     if not isinstance(value, list) or not value:
-        raise ValueError("'observable', 17, 21 or a list of error names is expected")
+        raise ValueError("expected 'observable', 17, 21 or a list of error names")
     for name in value:
         if name not in ERROR_NAMES:
             raise ValueError(f"{name!r} is not one of the 21 errors; {nearest(str(name), ERROR_NAMES)}")
     if len(set(value)) != len(value):
-        raise ValueError("each error may be named once")
+        raise ValueError("each error may be listed only once")
     return tuple(name for name in ERROR_NAMES if name in value)
 
 
@@ -218,7 +218,7 @@ def _name(value: Any) -> str:
     """Return the name of a machine, which may be an argument of a command and a cell of a table."""
     name = toml_files.text(value)
     if "=" in name or name.lstrip()[0] in "+-@":
-        raise ValueError("a name without '=' that does not begin with '+', '-' or '@' is expected")
+        raise ValueError("expected a name without '=' that does not begin with '+', '-' or '@'")
     return name
 
 
@@ -245,7 +245,7 @@ class Chain:
     def __post_init__(self) -> None:
         if self.name not in CHAINS:
             raise ValueError(
-                f"chain {self.name!r} is not valid: W first, T last, and X, Y, Z, F once each in between, e.g. 'WFYXZT'"
+                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. 'WFYXZT'"
             )
         left, _, right = self.name[1:-1].partition("F")
         object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
@@ -300,12 +300,12 @@ class Axis(Displayed):
 
 @dataclass(frozen=True, repr=False)
 class Machine(Displayed):
-    """A three-axis machine; ``axes`` holds X, Y, Z in that order, ``errors`` what its model contains.
+    """A three-axis machine; ``axes`` are X, Y, Z in that order, ``errors`` the contents of its model.
 
     ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.kinematics.modelled_errors`).
     ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
-    tables have to be best that cannot be good everywhere. ``tool_range_mm`` are the tool offsets that the machine may
-    carry, None if its file does not say. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
+    tables must be most accurate. ``tool_range_mm`` are the ranges of tool offsets, None if its file does not state
+    them. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
     :func:`compgen.effects.active_effects` reads.
 
     Examples
@@ -363,12 +363,12 @@ class Machine(Displayed):
 
     @property
     def file(self) -> Path | None:
-        """Where the machine file can be read: ``source``, or the copy of it where that is on another computer."""
+        """Where the machine file can be read: ``source``, or a local copy if that is on another computer."""
         return self.copy or self.source
 
     @property
     def tool_range(self) -> ToolRange:
-        """Ranges of the tool offset in X, Y and Z, mm, from the machine file, or assumed around its own offset."""
+        """Ranges of the tool offset in X, Y and Z, mm, from the machine file, or assumed about its tool offset."""
         if self.tool_range_mm is not None:
             return self.tool_range_mm
         x, y, z = ((own - reach, own + reach) for own, reach in zip(self.tool_offset_mm, ASSUMED_TOOL_MM, strict=True))
@@ -408,14 +408,14 @@ class Machine(Displayed):
         ]
 
     def controller_settings(self, name: str) -> toml_files.Section:
-        """Return a fresh section with the settings of one control (empty if the file has none)."""
+        """Return a new section with the settings of one control (empty if the file has none)."""
         section = self.controllers.get(name)
         if section is None:
             return toml_files.Section({}, path=self.source, name=f"controllers.{name}", place=("controllers", name))
         return section.again()
 
     def with_setting(self, controller: str, key: str, value: Any) -> Machine:
-        """Return the machine with one setting of one control put in place of what the file says."""
+        """Return the machine with one setting of one control replaced."""
         section = self.controller_settings(controller)
         section.data[key] = value
         return replace(self, controllers={**self.controllers, controller: section})
@@ -427,12 +427,12 @@ class Machine(Displayed):
 
 
 def read_machine(path: str | Path) -> Machine:
-    """Read a machine TOML strictly: an unknown key, a wrong unit, a reversed range are errors that say what to do."""
+    """Read a machine TOML strictly: unknown keys, wrong units and reversed ranges are errors that say what to do."""
     return machine_of(toml_files.read_toml(path), Path(path))
 
 
 def parse_machine(text: str, source: Path) -> Machine:
-    """Read the text of a machine TOML as :func:`read_machine` does; ``source`` is what messages name."""
+    """Read the text of a machine TOML like :func:`read_machine`; ``source`` is the name in messages."""
     return replace(machine_of(toml_files.parse_toml(text, source), source), source=None)
 
 
@@ -453,12 +453,12 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
         if not low <= reference_mm <= high:
             raise root.fail(
                 "reference_point_mm",
-                f"{axis_name} = {reference_mm:g} mm lies outside the travel {low:g} ... {high:g} mm; the "
-                f"position-dependent errors are zero there, so it must lie within the travel; set reference_point_mm",
+                f"{axis_name} = {reference_mm:g} mm is outside the travel {low:g} ... {high:g} mm; the "
+                f"position-dependent errors are zero there, so it must be within the travel; set reference_point_mm",
                 instead=[axis.range_mm[0] for axis in axes],
             )
     tool_range_mm: ToolRange | None = None
-    if "tool_range_mm" in root:  # an axis that is not named has the machine's own offset
+    if "tool_range_mm" in root:  # an axis without an entry has the offset of the machine file
         section = root.section("tool_range_mm")
         x, y, z = (
             section.take(axis, toml_files.interval, (at, at))
@@ -487,35 +487,37 @@ def _read_axis(section: toml_files.Section, curves: str) -> Axis:
         if key == "nodes_mm" and "nodes" in section:
             raise section.fail("nodes", "nodes and nodes_mm are both given; keep one")
         if abs(nodes_mm[0] - range_mm[0]) > 1e-9 or abs(nodes_mm[-1] - range_mm[1]) > 1e-9:
-            message = f"goes from {nodes_mm[0]:g} to {nodes_mm[-1]:g} mm; first and last node are the ends of range_mm"
+            message = (
+                f"ranges from {nodes_mm[0]:g} to {nodes_mm[-1]:g} mm; first and last node must be the ends of range_mm"
+            )
             raise section.fail(key, message)
     else:
         nodes_mm = np.linspace(*range_mm, section.take("nodes", _NODES))
     if curves == "cubic" and len(nodes_mm) < 4:
-        raise section.fail("nodes", f"{len(nodes_mm)} is too few for curves = 'cubic'; at least 4 are needed")
+        raise section.fail("nodes", f"{len(nodes_mm)} is too few for curves = 'cubic'; at least 4 are required")
     return toml_files.read_settings(Axis, section, range_mm=range_mm, nodes_mm=nodes_mm)
 
 
 def machine_files(folders: tuple[Path, ...] = ()) -> dict[str, Path]:
     """Return the machine files by the name they declare: the shipped ones, and those in ``folders``.
 
-    Looked for are ``*.toml`` and ``*/machine.toml`` that describe a chain or axes; other files (scenarios, jobs) may lie
-    beside them. A file that is no TOML, and names that several files declare, are left out with a warning: one bad file
-    must not keep the other machines from being used.
+    Machine files are ``*.toml`` and ``*/machine.toml`` that describe a chain or axes; other files (scenarios, jobs) may
+    be in the same folder. A file that is not valid TOML, and names that several files declare, are skipped with a
+    warning: one bad file must not block the other machines.
     """
     found = _declared(folders)
     for name, paths in found.items():
         if len(paths) > 1:
-            warnings.warn(f"left out: {_several(name, paths)}", CompgenWarning, stacklevel=2)
+            warnings.warn(f"skipped: {_several(name, paths)}", CompgenWarning, stacklevel=2)
     return {name: paths[0] for name, paths in found.items() if len(paths) == 1}
 
 
 def _several(name: str, paths: Sequence[Path]) -> str:
-    return f"two machines are named {name!r}: {' and '.join(map(str, paths))}; rename one"
+    return f"two machines have the name {name!r}: {' and '.join(map(str, paths))}; rename one"
 
 
 def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
-    """The files that declare each name; a byte-for-byte copy of a machine from another folder counts once."""
+    """Return the files that declare each name; an identical copy of a machine in another folder counts once."""
     found: dict[str, list[Path]] = {}
     here: dict[str, Path] = {}
     for folder in dict.fromkeys(path.resolve() for path in (data_folder("machines"), *folders)):
@@ -524,7 +526,7 @@ def _declared(folders: tuple[Path, ...]) -> dict[str, list[Path]]:
                 root = toml_files.read_toml(path)
                 name = root.take("name", _name) if {"chain", "axes"} & set(root.data) else None
             except InputError as error:
-                warnings.warn(f"left out of the machines: {error}", CompgenWarning, stacklevel=3)
+                warnings.warn(f"machine file skipped: {error}", CompgenWarning, stacklevel=3)
                 continue
             if name is None:
                 continue
@@ -542,7 +544,7 @@ def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine
     ----------
     machine : a path (ends in ``.toml`` or has a folder in it), or a name in the shipped ``machines/``, in a folder
         ``machines/`` below the working directory, or in ``folders``.
-    folders : further folders to look in.
+    folders : additional folders to search.
 
     Raises
     ------
@@ -564,7 +566,7 @@ def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine
     paths = known.get(str(machine), [])
     if not paths:
         raise InputError(
-            f"no machine is named {str(machine)!r}; {nearest(str(machine), known)}, or give the path of a TOML file"
+            f"there is no machine {str(machine)!r}; {nearest(str(machine), known)}, or give the path of a TOML file"
         )
     if len(paths) > 1:
         raise InputError(f"{_several(str(machine), paths)}, or give the path of one", file=paths[-1], field="name")

@@ -1,4 +1,4 @@
-"""Small helpers for messages and for text that came from a user."""
+"""Helpers for messages and for text from users."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from collections.abc import Hashable, Iterable, Mapping
 from typing import TypeVar
 
 Item = TypeVar("Item", bound=Hashable)
-#: Characters that a terminal obeys instead of showing them, or that turn the direction of a line; not line end and tab.
+#: Characters that a terminal interprets instead of showing, or that change the direction of a line; not line end and
+#: tab.
 _OBEYED = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
@@ -18,8 +19,8 @@ _OBEYED = re.compile(
 def nearest(word: str, known: Iterable[str], described: Mapping[str, str] | None = None, alike: float = 0.5) -> str:
     """Return a hint such as ``did you mean 'range_mm'? Known: ...`` for a misspelt ``word``.
 
-    All known words that contain ``word`` are proposed; without one, those whose ``described`` text has it as a word, and
-    last the one that is spelt most alike (``alike``: how much, 0 to 1).
+    All known words that contain ``word`` are proposed; if there are none, those whose ``described`` text has it as a
+    word, and otherwise the most similar one (``alike``: minimum similarity, 0 to 1).
     """
     choices = sorted(known)
     proposed = [choice for choice in choices if len(word) > 2 and word.lower() in choice.lower()]
@@ -34,7 +35,7 @@ def nearest(word: str, known: Iterable[str], described: Mapping[str, str] | None
 
 
 def repeated(items: Iterable[Hashable]) -> tuple[int, int] | None:
-    """Return where an item came first and where again, None if all differ; one look at each, however many there are."""
+    """Return where an item occurs first and again, None if all differ, in a single pass."""
     seen: dict[Hashable, int] = {}
     for k, item in enumerate(items):
         first = seen.setdefault(item, k)
@@ -44,14 +45,14 @@ def repeated(items: Iterable[Hashable]) -> tuple[int, int] | None:
 
 
 def doubled(items: Iterable[Item]) -> Item | None:
-    """Return the first item that came before, None if all differ."""
+    """Return the first duplicate item, None if all differ."""
     kept = list(items)
     found = repeated(kept)
     return None if found is None else kept[found[1]]
 
 
 def visible(text: str, *, flat: bool = False) -> str:
-    r"""Return ``text`` with escapes such as ``\x1b`` for what a terminal would obey; with ``flat`` for line ends as well.
+    r"""Return ``text`` with escapes such as ``\x1b`` for what a terminal would interpret; with ``flat`` also for line ends.
 
     >>> print(visible("a\x1b[2J"))
     a\x1b[2J
@@ -61,7 +62,7 @@ def visible(text: str, *, flat: bool = False) -> str:
 
 
 def visible_line(text: object) -> str:
-    """Return ``text`` on one line in its own script, with escapes for what a terminal would obey.
+    """Return ``text`` on one line in its own script, with escapes for what a terminal would interpret.
 
     >>> visible_line("20  °C ") == "20 °C"
     True
@@ -76,7 +77,7 @@ def one_line(text: object) -> str:
 
 
 def number_text(value: object, digits: int = 3, missing: str = "–") -> str:
-    """A number with ``digits`` decimals; ``missing`` for None, nan, infinity and what is no number.
+    """A number with ``digits`` decimals; ``missing`` for None, nan, infinity and non-numbers.
 
     >>> number_text(1.5), number_text(None), number_text(float("nan"), missing="not known")
     ('1.500', '–', 'not known')
@@ -87,7 +88,7 @@ def number_text(value: object, digits: int = 3, missing: str = "–") -> str:
 
 
 def um_text(value: float | None, whole_from: float = 1000.0) -> str:
-    """A figure in um: two decimals below 10, none from ``whole_from`` on, a dash where there is none.
+    """A figure in um: two decimals below 10, none from ``whole_from`` on, a dash for None.
 
     >>> um_text(0.157), um_text(42.34), um_text(1714.6), um_text(None)
     ('0.16', '42.3', '1715', '–')

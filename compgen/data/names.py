@@ -1,4 +1,4 @@
-"""The 21 geometric errors of three linear axes, named as ISO 230-1 does (``docs/conventions.md``)."""
+"""The 21 geometric errors of three linear axes, named as in ISO 230-1 (``docs/conventions.md``)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ AXES = ("X", "Y", "Z")
 BODY_DIAGONALS = {"PPP": (1, 1, 1), "NPP": (-1, 1, 1), "PNP": (1, -1, 1), "NNP": (-1, -1, 1)}
 Kind = Literal["linear", "angular", "squareness"]
 
-#: Sizes of numbers that anybody gives, whatever their unit, but for zero: squares and quotients of them are numbers too.
+#: Magnitudes of input numbers other than zero, whatever their unit: their squares and quotients are finite, too.
 SMALLEST, LARGEST = 1e-30, 1e15
 MM_PER_UM = 1e-3
 SECONDS_PER_MIN, SECONDS_PER_HOUR = 60.0, 3600.0
 RAD_PER_URAD = 1e-6
-#: Expanded uncertainties are this many standard ones (about 95 %).
+#: Coverage factor of expanded uncertainties (about 95 %).
 COVERAGE = 2.0
 
 
@@ -38,12 +38,12 @@ class ErrorName:
 
     @property
     def si_per_unit(self) -> float:
-        """Factor from the file's unit to the program's (mm or rad)."""
+        """Factor from the unit of files to that of the program (mm or rad)."""
         return MM_PER_UM if self.kind == "linear" else RAD_PER_URAD
 
     @property
     def is_straightness(self) -> bool:
-        """Whether it is a translation across the axis' own direction."""
+        """Whether it is a translation across the direction of the axis."""
         return self.kind == "linear" and self.direction != self.axis
 
 

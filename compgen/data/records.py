@@ -1,4 +1,4 @@
-"""The columns of measurement files, declared once: a schema reads, joins and writes the records, and tells the formats apart.
+"""The columns of measurement files, declared once: a schema reads, joins and writes records, and distinguishes formats.
 
 A record is a frozen dataclass of arrays with one entry (or row) for each line of a file, ``metadata`` for the comments and
 ``origin`` for the file and line of every entry. Its schema lists the fields in the order in which they are written.
@@ -30,19 +30,19 @@ APPROACH_COLUMNS = ("approach_x", "approach_y", "approach_z")
 LABEL_COLUMNS = ("run", "line", "repeat", "block", "setup", "pose")
 COVARIATE_COLUMNS = ("time_s", "feed_mm_min", "load_kg", "u_length_um")
 DEVIATION_COLUMNS = ("dx_um", "dy_um", "dz_um")
-#: Coordinates of features of parts, as they were measured.
+#: Measured coordinates of features of parts.
 MEASURED_COLUMNS = ("mx_mm", "my_mm", "mz_mm")
 #: Temperatures, of which a file may have any number.
 TEMPERATURES = "temp_*_c"
-#: Ending of lengths in binary form, the one format that is told by its name.
+#: Ending of lengths in binary form, the only format recognised by its name.
 ARCHIVE = ".lengths.npz"
-#: A deviation beyond this is taken for a slip of unit, um.
+#: A larger deviation is rejected as a wrong unit, um.
 LARGEST_DEVIATION_UM = 1e5
 
 
 @dataclass(frozen=True)
 class Field:
-    """One field of a record and the columns that hold it.
+    """One field of a record and its columns.
 
     Parameters
     ----------
@@ -51,11 +51,11 @@ class Field:
     read : how a column is read and checked.
     unit : factor from the column to the field.
     digits : decimals in the file.
-    presence : ``required``; ``filled``: columns that a file lacks are ``fill``; ``optional``: as that, but None where the
-        file has none of them; ``complete``: all or none, alike in all files; ``each``: a dict of the columns that
-        are there; ``covariates``: as that, in the order of the file and with its temperatures.
+    presence : ``required``; ``filled``: columns that a file lacks are ``fill``; ``optional``: likewise, but None if the
+        file has none of them; ``complete``: all or none, alike in all files; ``each``: a dict of the columns in the
+        file; ``covariates``: likewise, in the order of the file and with its temperatures.
     fill : value of a column that a file lacks.
-    encode : turns the values into cells of text, as for the letters of axes; None: numbers, or text unchanged.
+    encode : converts the values to text, e.g. to the letters of axes; None: numbers, or text unchanged.
     """
 
     name: str
@@ -68,13 +68,13 @@ class Field:
     encode: Callable[[Any], Sequence[str]] | None = None
 
     def of_table(self, table: CsvTable) -> Any:
-        """Return the values of the field from one file; InputError for columns that are missing or hold something else."""
+        """Return the values of the field from one file; InputError for missing or invalid columns."""
         present = [name for name in self.columns if name in table.columns]
         if self.presence == "each":
             return {name: self.read(table, name) for name in present}
         if self.presence == "covariates":
             known = [name for name in table.columns if name in self.columns or name.startswith("temp_")]
-            # a direction of travel among the covariates is checked as one
+            # a direction of travel among the covariates is checked as such
             return {name: table.signs(name) if name == "approach" else table.numbers(name) for name in known}
         if not present and self.presence in ("optional", "complete"):
             return None
@@ -89,7 +89,7 @@ class Field:
         return found[0] if self.unit == 1.0 else found[0] * self.unit
 
     def cells(self, values: Any) -> dict[str, Sequence[str] | FloatArray]:
-        """Return the columns of a file that hold ``values``; components that were never measured have none."""
+        """Return the columns of a file for ``values``; components that were never measured have none."""
         if isinstance(values, Mapping):
             return {name: np.asarray(column, dtype=np.float64) for name, column in values.items()}
         if values is None:
@@ -111,7 +111,7 @@ def axes_of(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]
 
 
 def within(most: float, unit: str, doubt: str) -> ReadColumn:
-    """Read numbers of at most ``most`` in size; a larger one is refused with the doubt that it raises."""
+    """Read numbers of at most ``most`` in magnitude; a larger one is refused, with the reason ``doubt``."""
 
     def read(table: CsvTable, column: str) -> FloatArray:
         values = table.numbers(column)
@@ -123,7 +123,7 @@ def within(most: float, unit: str, doubt: str) -> ReadColumn:
 
 
 def uncertainties(table: CsvTable, column: str) -> FloatArray:
-    """Read standard uncertainties, which are above zero."""
+    """Read standard uncertainties, which must be above zero."""
     values = table.numbers(column)
     for row in np.flatnonzero(values <= 0)[:1].tolist():
         raise table.fail(row, column, f"{values[row]:g} um is not a standard uncertainty; it must be above zero")
@@ -131,7 +131,7 @@ def uncertainties(table: CsvTable, column: str) -> FloatArray:
 
 
 def directions(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Read directions of approach: 1 or -1, nothing else."""
+    """Read directions of approach: 1 or -1."""
     values = table.signs(column)
     for row in np.flatnonzero(values == 0)[:1].tolist():
         raise table.fail(row, column, "0 is not a direction of approach; expected 1 or -1")
@@ -139,13 +139,13 @@ def directions(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int6
 
 
 def approach_of(moves: FloatArray) -> FloatArray:
-    """Last direction of travel of each axis after moves (n, 3): +1, -1, or 0 while it has not moved yet; (n, 3)."""
+    """Return the last direction of travel of each axis after moves (n, 3): +1, -1, or 0 before its first move; (n, 3)."""
     moving = moves != 0
     last = np.maximum.accumulate(np.where(moving, np.arange(len(moves))[:, None], 0), axis=0)
     return np.sign(np.take_along_axis(moves, last, axis=0))
 
 
-#: Deviations in um; one beyond 100 mm is taken for a slip of unit.
+#: Deviations in um; beyond 100 mm the unit must be wrong.
 deviations_um = within(LARGEST_DEVIATION_UM, "um", "more than 100 mm; is the unit um?")
 
 # Fields that several kinds of record have.
@@ -165,7 +165,7 @@ RUN_DEVIATION = Field("deviation_mm", ("deviation_um",), deviations_um, MM_PER_U
 class Schema:
     """The fields of one kind of record.
 
-    ``keys`` are the columns in which no two rows of a file agree, ``needed`` what a file must have of optional columns.
+    ``keys`` are the columns that identify a row of a file, ``needed`` the optional columns that a file must have.
     """
 
     fields: tuple[Field, ...]
@@ -177,7 +177,7 @@ class Schema:
         required = [name for field in self.fields if field.presence == "required" for name in field.columns]
         others = [name for field in self.fields if field.presence != "required" for name in field.columns]
         table = read_csv(file, (*required, *self.needed), others, (TEMPERATURES,))
-        # two rows that agree in the keys must differ in a label, a direction, the tool or the time
+        # two rows with the same keys must differ in a label, a direction, the tool or the time
         names = (
             (*self.keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s") if self.keys else ()
         )
@@ -192,7 +192,7 @@ class Schema:
         return table
 
     def read_tables(self, files: str | Path | Sequence[str | Path]) -> list[CsvTable]:
-        """Read the columns of one or more files; the same rows may not come in twice."""
+        """Read the columns of one or more files; the same rows must not occur twice."""
         sources = list(files) if isinstance(files, Sequence) and not isinstance(files, str) else [files]
         if not sources:
             raise InputError("no measurement file was given")
@@ -200,7 +200,7 @@ class Schema:
         for k, table in enumerate(tables):
             for earlier in tables[:k]:
                 if table.columns == earlier.columns:
-                    what = f"holds the same rows as {earlier.path}; give each measurement once"
+                    what = f"contains the same rows as {earlier.path}; give each measurement only once"
                     raise InputError(what, file=table.path)
         return tables
 
@@ -211,12 +211,12 @@ class Schema:
         return {**found, "metadata": metadata, "origin": [(str(table.path), line) for line in table.lines]}
 
     def joined(self, parts: Sequence[R]) -> R:
-        """Return several records as one: labels that some lack are 0, covariates nan, directions unknown.
+        """Return several records as one: missing labels are 0, covariates nan, directions unknown.
 
         Raises
         ------
         InputError
-            if only some of them have the tool or uncertainties.
+            if only some of them have a tool or uncertainties.
         """
         if len(parts) == 1:
             return parts[0]
@@ -231,7 +231,7 @@ class Schema:
         others: Mapping[str, FloatArray] | None = None,
         decimals: Mapping[str, int] | None = None,
     ) -> str:
-        """Return the text of a file with the record's fields and then ``others``; ``decimals`` of single columns count."""
+        """Return the text of a file with the record's fields, then ``others``; ``decimals`` override those of columns."""
         columns: dict[str, Sequence[str] | FloatArray] = {}
         digits: dict[str, int] = {}
         for field in self.fields:
@@ -246,7 +246,7 @@ def _chained(parts: Sequence[object], name: str) -> list[Any]:
 
 
 def _joined(field: Field, parts: Sequence[Any]) -> Any:
-    """One field of several records."""
+    """Join one field of several records."""
     values = [getattr(part, field.name) for part in parts]
     if isinstance(values[0], Mapping):
         kinds = {name: column.dtype for found in values for name, column in found.items()}
@@ -272,17 +272,17 @@ def _joined(field: Field, parts: Sequence[Any]) -> Any:
 
 
 def fail_at(origin: Sequence[tuple[str, int]], row: int, message: str, field: str | None = None) -> InputError:
-    """Return the error that points at one entry of a record."""
+    """Return the error about one entry of a record."""
     file, line = origin[row] if origin else (None, None)
     return InputError(message, file=file, line=line, field=field)
 
 
-# What a file is, by the names in its header.
+# The kind of a file, from the names in its header.
 
 
 @dataclass(frozen=True)
 class _Signature:
-    """Columns of a native format: any of ``marks`` tells it, ``needed`` are what a file in the format has besides them."""
+    """Columns of a native format: any of ``marks`` identifies it, ``needed`` are its other required columns."""
 
     kind: str
     marks: tuple[frozenset[str], ...]
@@ -308,12 +308,12 @@ _SIGNATURES = (
 
 
 def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
-    """Return the native format that a header is meant to be, None for a foreign one.
+    """Return the native format of a header, None for a foreign one.
 
     Parameters
     ----------
     names : columns of the file.
-    complete : only a header that has all columns that tell the format from tables of other programs.
+    complete : require all columns that distinguish the format from tables of other programs.
     """
     for signature in _SIGNATURES:
         if any(marks <= names for marks in signature.marks) and (not complete or signature.needed <= names):
@@ -322,7 +322,7 @@ def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
 
 
 def detect_format(source: str | Path) -> str | None:
-    """Return what a measurement file is meant to be by its columns.
+    """Return the kind of a measurement file from its columns.
 
     ``lengths``, ``deviations``, ``part``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
     """

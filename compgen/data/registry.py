@@ -1,8 +1,8 @@
-"""Plug-ins: things of third parties that enter a registry, checked at that moment.
+"""Plug-ins: extensions of third parties, checked when they are registered.
 
-A plug-in is a Python file, a package folder, or an entry point of an installed distribution. A file or folder holds the
-same dicts as compgen itself, e.g. ``CONTROLLERS = {"my-csv": MyCsv()}``. Whatever is wrong with it is said when it is
-registered, with the place; nothing of it is taken then.
+A plug-in is a Python file, a package folder, or an entry point of an installed distribution. A file or folder contains
+the same dicts as compgen itself, e.g. ``CONTROLLERS = {"my-csv": MyCsv()}``. All problems are reported when it is
+registered, with the place; nothing is registered then.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from compgen.data.messages import one_line
 from compgen.errors import CompgenWarning, InputError
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-#: What a fault in the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
+#: What the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
 _FAULTS = (Exception, SystemExit)
-#: How the origin of a plug-in from a path begins.
+#: Prefix of the origin of a plug-in from a path.
 PATH_ORIGIN = "plug-in "
 
 
 class Registry(dict[str, Any]):
-    """What a program and its plug-ins offer, by name; ``broken`` says why an installed entry point is not available."""
+    """The items of the program and its plug-ins by name; ``broken`` says why an installed entry point is unavailable."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -42,23 +42,23 @@ class Registry(dict[str, Any]):
 
 
 def why_missing(broken: Mapping[str, str], name: str) -> str:
-    """Return the reason, for the end of a message, if ``name`` would come from an entry point that is broken."""
+    """Return the reason, for the end of a message, if the entry point of ``name`` is broken."""
     return f"; {broken[name]}" if name in broken else ""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """One kind of thing that plug-ins may add.
+    """One kind of item that plug-ins may add.
 
     Parameters
     ----------
     word : its name in messages, e.g. ``"control"``.
     attribute : name of the dict in a plug-in's file, e.g. ``"CONTROLLERS"``.
     group : group of entry points, e.g. ``"compgen.controllers"``.
-    registry : what receives it, by name.
-    check : takes name and thing, returns the thing to register and everything that is wrong with it, in words.
-    origins : where each thing of a plug-in came from, by name.
-    broken : why an entry point of an installed distribution is not available, by its name.
+    registry : the registry for it, by name.
+    check : takes name and item, returns the item to register and all its problems, in words.
+    origins : the source of each item of a plug-in, by name.
+    broken : why an entry point of an installed distribution is unavailable, by name.
     """
 
     word: str
@@ -70,16 +70,16 @@ class Kind:
     broken: dict[str, str] = field(default_factory=dict)
 
     def register(self, name: str, thing: Any, origin: str) -> None:
-        """Add a thing of the plug-in ``origin``; InputError with everything that is wrong with it."""
+        """Add an item of the plug-in ``origin``; InputError with all its problems."""
         thing, problems = self.check(name, thing) if isinstance(name, str) else (thing, [])
         if not isinstance(name, str) or not _NAME.fullmatch(name) or len(name) > 40:
-            text = "its name has to be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"
+            text = "its name must be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"
             problems = [text, *problems]
         elif name in self.registry:
             problems = [f"the name is taken by {self.origins.get(name, 'a built-in one')}; choose another", *problems]
         if problems:
             code = thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
-            try:  # where the code of the thing begins, as far as it is known
+            try:  # where the code of the item begins, if known
                 file, line = inspect.getsourcefile(code), inspect.getsourcelines(code)[1]
             except (OSError, TypeError):
                 file, line = None, None
@@ -90,7 +90,7 @@ class Kind:
 
 
 def call_problem(function: Any, arguments: Sequence[str], what: str) -> list[str]:
-    """Say what is wrong if ``function`` cannot be called with these arguments, in their order and by their names."""
+    """Return what is wrong if ``function`` cannot be called with these arguments, in order and by name."""
     expected = f"{what}({', '.join(arguments)})"
     if not callable(function):
         return [f"{expected} is missing" if function is None else f"{what} is not a function; expected {expected}"]
@@ -103,7 +103,7 @@ def call_problem(function: Any, arguments: Sequence[str], what: str) -> list[str
 
 
 def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
-    """Import the plug-in in a ``.py`` file or package folder and register what it holds; a second time does nothing."""
+    """Import the plug-in in a ``.py`` file or package folder and register its contents; a second call does nothing."""
     source = Path(path).resolve()
     file = source / "__init__.py" if source.is_dir() else source
     if not file.is_file():
@@ -119,11 +119,11 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
     for kind in kinds:
         things = getattr(module, kind.attribute, None)
         if things is not None and not isinstance(things, Mapping):
-            raise InputError(f"{origin}: {kind.attribute} has to be a dict from names to {kind.word}s", file=file)
+            raise InputError(f"{origin}: {kind.attribute} must be a dict from names to {kind.word}s", file=file)
         found += [(kind, name, thing) for name, thing in (things or {}).items()]
     if not found:
         dicts = ", ".join(f"{kind.attribute} ({kind.word}s by name)" for kind in kinds)
-        raise InputError(f"{origin} holds nothing to register; expected at least one dict: {dicts}", file=file)
+        raise InputError(f"{origin} contains nothing to register; expected at least one dict: {dicts}", file=file)
     with restored(kinds, only_after_errors=True):
         for kind, name, thing in found:
             kind.register(name, thing, origin)
@@ -136,7 +136,7 @@ def _import(name: str, file: Path, package: bool, origin: str) -> ModuleType:
     assert isinstance(spec, ModuleSpec) and spec.loader is not None  # true for every .py file
     module = importlib.util.module_from_spec(spec)
     _forget(name)
-    sys.modules[name] = module  # dataclasses and relative imports look there
+    sys.modules[name] = module  # needed by dataclasses and relative imports
     try:
         spec.loader.exec_module(module)
     except _FAULTS as error:
@@ -146,13 +146,13 @@ def _import(name: str, file: Path, package: bool, origin: str) -> ModuleType:
 
 
 def _forget(name: str) -> None:
-    """Take a plug-in and its parts out of the loaded modules, so that they are read again."""
+    """Remove a plug-in and its parts from the loaded modules, so that they are read again."""
     for loaded in [key for key in sys.modules if key == name or key.startswith(f"{name}.")]:
         del sys.modules[loaded]
 
 
 def _import_error(error: BaseException, origin: str, file: Path | None) -> InputError:
-    """Name the file and line of a fault: that of the syntax, else the innermost line of the plug-in's own code."""
+    """Return the error with file and line: of the syntax error, otherwise the innermost line of the plug-in's code."""
     message = f"{origin} cannot be imported: {type(error).__name__}: {one_line(error)}"
     if isinstance(error, SyntaxError) and error.filename:
         return InputError(message, file=error.filename, line=error.lineno)
@@ -165,7 +165,7 @@ def _import_error(error: BaseException, origin: str, file: Path | None) -> Input
 
 
 def load_entry_points(kinds: Sequence[Kind]) -> None:
-    """Register the entry points of installed distributions; a broken one is a warning, and its name unavailable."""
+    """Register the entry points of installed distributions; a broken one gives a warning, and its name is unavailable."""
     installed = entry_points()
     for kind in kinds:
         for entry in installed.select(group=kind.group):
@@ -190,7 +190,7 @@ def _origin(entry: EntryPoint) -> str:
 
 @contextmanager
 def restored(kinds: Sequence[Kind], *, only_after_errors: bool = False) -> Iterator[None]:
-    """Take out of the registries what the block added, always or only if an error leaves it."""
+    """Remove what the block added to the registries, always or only after an error."""
     before = [(item, set(item)) for kind in kinds for item in (kind.registry, kind.origins)]
     failed = True
     try:
@@ -198,6 +198,6 @@ def restored(kinds: Sequence[Kind], *, only_after_errors: bool = False) -> Itera
         failed = False
     finally:
         if failed or not only_after_errors:
-            for item, names in before:  # a name that is taken is never replaced
+            for item, names in before:  # existing names are never replaced
                 for added in set(item) - names:
                     del item[added]

@@ -1,4 +1,4 @@
-"""Strict reading of TOML: every key is taken by a reader, the rest is an error that names the nearest known key.
+"""Strict reading of TOML: every key is read by a reader; any other is an error that proposes the nearest known key.
 
 A :class:`Section` is one table of a file. A dataclass whose fields are declared with :func:`setting` is read by
 :func:`read_settings`; a reader with rules of its own takes key by key. :func:`section_schema` makes a JSON schema of what is
@@ -38,15 +38,15 @@ def option(
     factory: Callable[[], Any] | None = None,
     required: bool = False,
 ) -> Any:
-    """Return the field of an options dataclass; the command line makes an option of it.
+    """Return the field of an options dataclass; it becomes an option of the command line.
 
     Parameters
     ----------
-    default, factory : value where nothing is given; ``factory`` makes one that can be changed.
+    default, factory : value if nothing is given; ``factory`` makes a mutable one.
     text : meaning and unit, one or two sentences. A default that is a number or a word is added to it.
-    name : of the option, where it is not that of the field; a flag that is True by default needs one that denies it.
-    metavar : what the help shows for the value.
-    choices : the values that the command line allows, where the type of the field does not list them.
+    name : of the option, if not that of the field; required for a flag that is True by default, to switch it off.
+    metavar : placeholder of the value in the help.
+    choices : the allowed values, if the type of the field does not list them.
     within : the lowest and the highest whole number.
     required : the field has no default, and the option must be given.
     """
@@ -102,7 +102,7 @@ class SettingError(InputError):
 
 @dataclass(frozen=True)
 class DeclaredKey:
-    """A key of a section as it is declared: with the names of sub-sections, its default unless required, its check."""
+    """A key of a section as declared: with the names of sub-sections, its default unless required, its check."""
 
     key: str
     required: bool
@@ -111,7 +111,7 @@ class DeclaredKey:
 
     @property
     def shown(self) -> Any:
-        """The default if a file could have it; a reader may take others, in a form of its own: None."""
+        """The default if it can be written in a file, otherwise None."""
         value = list(self.default) if isinstance(self.default, tuple) else self.default
         try:
             self.check(value)
@@ -121,15 +121,15 @@ class DeclaredKey:
 
     @property
     def allowed(self) -> str:
-        """What the check says that it expects: its message about something that fits nowhere."""
+        """What the check expects: its message about an invalid value."""
         message = _refusal(self.check, object())
         if message == _refusal(number, object()):
             message = _refusal(self.check, -1.0) or message
-        return re.sub(r"\s+(is|are) expected\b", "", message).rstrip(",")
+        return re.sub(r"^expected |\s+(is|are) expected\b", "", message).rstrip(",")
 
 
 class Section:
-    """One table of a TOML file whose keys are taken one by one.
+    """One table of a TOML file whose keys are read one by one.
 
     ``take`` checks and returns a value, ``section`` descends, ``finish`` raises for a key that nobody took. A key that
     the section does not have is taken from that of its ``defaults``, where these are given.
@@ -185,7 +185,7 @@ class Section:
         return error
 
     def __contains__(self, key: str) -> bool:
-        """Whether the file holds ``key``; asking makes the key a known one."""
+        """Whether the file has ``key``; the key counts as known from then on."""
         self._known.add(key)
         usual = self.defaults is not None and key in self.defaults
         return usual or key in self.data
@@ -201,7 +201,7 @@ class Section:
             default = self.defaults.take(key, check)
         if key not in self.data:
             if default is _REQUIRED:
-                # a key of the file that was probably meant: another case, the unit left out, a slip
+                # a key of the file that was probably meant: different case, missing unit, typing error
                 present = [name for name in self.data if name not in self._known]
                 alike = [name for name in present if f"{key}_".lower().startswith(f"{name}_".lower())]
                 alike = alike or difflib.get_close_matches(key, present, n=1, cutoff=0.6)
@@ -254,7 +254,7 @@ class Section:
         return path
 
     def finish(self) -> None:
-        """Raise InputError for the first key that was never asked for."""
+        """Raise InputError for the first key that was not read."""
         for key in self.data:
             if key not in self._known:
                 raise self.fail(key, f"is not a known key; {nearest(key, self._known)}", kind="unknown")
@@ -263,12 +263,12 @@ class Section:
 
 
 def read_toml(path: str | Path) -> Section:
-    """Read a TOML file as the root :class:`Section`; a syntax error, also a doubled key or table, is an InputError."""
+    """Read a TOML file as the root :class:`Section`; a syntax error or a duplicate key or table is an InputError."""
     return parse_toml(read_text(path), Path(path))
 
 
 def parse_toml(text: str, source: Path) -> Section:
-    """Read the text of the TOML file ``source`` as :func:`read_toml` does."""
+    """Read the text of the TOML file ``source`` like :func:`read_toml`."""
     if not text.strip():
         raise InputError("is empty", file=source)
     try:
@@ -280,12 +280,12 @@ def parse_toml(text: str, source: Path) -> Section:
 
 
 def _refusal(check: Callable[[Any], Any], value: Any) -> str:
-    """The message of a check about a value, empty if it takes it or is not prepared for it."""
+    """Return the message of a check about a value, empty if it accepts the value or fails otherwise."""
     try:
         check(value)
     except ValueError as error:
         return str(error)
-    except Exception:  # a check that takes texts for granted
+    except Exception:  # a check that assumes a text
         return ""
     return ""
 
@@ -310,12 +310,12 @@ def setting(
     Parameters
     ----------
     check : returns the clean value of the file or raises ValueError with what is expected.
-    default : value of the field where the file does not have the key; without one the key is required.
-    stated : the default as a file would have it, in place of ``default``.
+    default : value of the field if the file does not have the key; without one the key is required.
+    stated : the default as written in a file, instead of ``default``.
     meaning : for the card of a control, in a few words.
     key : the key of the file if it is not the name of the field.
     unit : factor from the numbers of the file to those of the field.
-    required : the file must have the key though the field has a default for programs.
+    required : the file must have the key although the field has a default for programs.
     name, metavar : as for :func:`option`, where a command takes the setting; the option gives the value as the file
         would have it.
     """
@@ -345,8 +345,8 @@ def axis_setting(
 ) -> Any:
     """Declare a field with a value for each of X, Y and Z, from a sub-section with these keys.
 
-    ``differ`` is the message if two axes have the same value, in which ``{}`` becomes the three of them; by default they
-    may be the same. The other parameters are those of :func:`setting`.
+    ``differ`` is the message if two axes have the same value, with ``{}`` for the three values; by default they may be
+    the same. The other parameters are those of :func:`setting`.
     """
     metadata = {"check": check, "key": key, "unit": unit, "axes": defaults, "differ": differ, "meaning": meaning}
     return field(default=defaults, metadata=metadata)
@@ -355,9 +355,9 @@ def axis_setting(
 def file_setting(
     load: Callable[[Any], Any] | None = None, *, several: bool = False, key: str = "", meaning: str = ""
 ) -> Any:
-    """Declare a field as a setting that names a file (``several``: one or more), relative to the folder of the TOML file.
+    """Declare a field as the path of a file (``several``: one or more), relative to the folder of the TOML file.
 
-    The value is the path (a tuple of paths), or what ``load`` makes of it; without the key it is None (``load`` of no
+    The value is the path (a tuple of paths), or the result of ``load``; without the key it is None (``load`` of no
     path).
     """
     check = texts_of_paths if several else text_of_path
@@ -409,7 +409,7 @@ def take_axes(section: Section, item: Field[Any]) -> tuple[Any, Any, Any]:
 
 
 def declared_settings(kind: type) -> list[tuple[DeclaredKey, str]]:
-    """Return the keys that a dataclass declares, as a file has them, each with its meaning, in the order of the fields."""
+    """Return the keys that a dataclass declares, as in a file, each with its meaning, in the order of the fields."""
     found = []
     for item in fields(kind) if is_dataclass(kind) else ():
         data, key = item.metadata, item.metadata.get("key") or item.name
@@ -457,14 +457,14 @@ def stated_settings(kind: type, section: Section, without: Container[str] = ()) 
 
 
 def read_settings(kind: type[T], section: Section, /, **given: Any) -> T:
-    """Return a ``kind`` as :func:`take_settings` does; a key of the section that it does not know is an error."""
+    """Return a ``kind`` like :func:`take_settings`; an unknown key of the section is an error."""
     result = take_settings(kind, section, **given)
     section.finish()
     return result
 
 
 def unless_stated(settings: T, section: Section, **usual: Any) -> T:
-    """Return settings with the ``usual`` values, by field, wherever the section does not have the key (axis by axis)."""
+    """Return settings with the ``usual`` values, by field, for keys missing in the section (axis by axis)."""
     found = {}
     for item in fields(cast(Any, settings)):
         key = item.metadata.get("key") or item.name
@@ -690,11 +690,11 @@ def _place_naming(data: Any, path: Path | None, file: str | Path | None, at: Pla
 
 @accepts({"type": "number", "minimum": -LARGEST, "maximum": LARGEST})
 def number(value: Any) -> float:
-    """A finite number; zero, or of a size from SMALLEST to LARGEST, so that its square is one as well."""
+    """A finite number: zero, or of magnitude SMALLEST to LARGEST, so that its square is finite, too."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
-        raise ValueError("a finite number is expected")
+        raise ValueError("expected a finite number")
     if not (value == 0 or SMALLEST <= abs(value) <= LARGEST):
-        raise ValueError(f"a finite number is expected: 0, or a size from {SMALLEST:g} to {LARGEST:g}")
+        raise ValueError(f"expected a finite number: 0, or a magnitude from {SMALLEST:g} to {LARGEST:g}")
     return float(value)
 
 
@@ -703,7 +703,7 @@ def positive(value: Any) -> float:
     """A finite number above zero."""
     result = number(value)
     if result <= 0:
-        raise ValueError("a number above zero is expected")
+        raise ValueError("expected a number above zero")
     return result
 
 
@@ -713,7 +713,7 @@ def multiple_of(quantum: Decimal) -> Callable[[Any], float]:
     @accepts(accepted(positive))
     def check(value: Any) -> float:
         if Decimal(repr(positive(value))) % quantum:
-            raise ValueError(f"a multiple of {quantum} mm is expected")
+            raise ValueError(f"expected a multiple of {quantum} mm")
         return float(value)
 
     return check
@@ -724,7 +724,7 @@ def not_negative(value: Any) -> float:
     """A finite number, zero or more."""
     result = number(value)
     if result < 0:
-        raise ValueError("a number that is not negative is expected")
+        raise ValueError("expected a number that is not negative")
     return result
 
 
@@ -737,7 +737,7 @@ def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
         upper = math.inf if maximum is None else maximum
         if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= upper:
             limits = f"from {minimum} to {maximum}" if maximum is not None else f"of at least {minimum}"
-            raise ValueError(f"a whole number {limits} is expected")
+            raise ValueError(f"expected a whole number {limits}")
         return value
 
     return check
@@ -747,7 +747,7 @@ def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
 def flag(value: Any) -> bool:
     """``true`` or ``false``."""
     if not isinstance(value, bool):
-        raise ValueError("true or false is expected")
+        raise ValueError("expected true or false")
     return value
 
 
@@ -755,7 +755,7 @@ def flag(value: Any) -> bool:
 def text(value: Any) -> str:
     """One line of text, at most 200 characters."""
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
-        raise ValueError("one line of text is expected")
+        raise ValueError("expected one line of text")
     return value
 
 
@@ -763,7 +763,7 @@ def text(value: Any) -> str:
 def name(value: Any) -> str:
     """A text without "=", which separates a name from its value in comments and commands."""
     if "=" in text(value):
-        raise ValueError("a name without '=' is expected")
+        raise ValueError("expected a name without '='")
     return str(value)
 
 
@@ -771,7 +771,7 @@ def name(value: Any) -> str:
 def text_of_path(value: Any) -> str:
     """A path as text: not empty, without control characters."""
     if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
-        raise ValueError("the path of a file is expected")
+        raise ValueError("expected the path of a file")
     return value
 
 
@@ -781,7 +781,7 @@ def texts_of_paths(value: Any) -> tuple[str, ...]:
     if isinstance(value, list) and value:
         return tuple(text_of_path(item) for item in value)
     if not isinstance(value, str):
-        raise ValueError("the path of a file, or a list of paths, is expected")
+        raise ValueError("expected the path of a file, or a list of paths")
     return (text_of_path(value),)
 
 
@@ -791,14 +791,14 @@ def choice(*allowed: str) -> Callable[[Any], str]:
     @accepts({"enum": list(allowed)})
     def check(value: Any) -> str:
         if value not in allowed:
-            raise ValueError(f"one of {', '.join(map(repr, allowed))} is expected")
+            raise ValueError(f"expected one of {', '.join(map(repr, allowed))}")
         return str(value)
 
     return check
 
 
 def word_for(values: Mapping[str, T]) -> Callable[[Any], T]:
-    """One of the given words, as the value that it stands for."""
+    """One of the given words, converted to its value."""
     check = choice(*values)
     return accepts(accepted(check))(lambda value: values[check(value)])
 
@@ -810,7 +810,7 @@ def share(most: float, whole: str) -> Callable[[Any], float]:
     def check(value: Any) -> float:
         result = not_negative(value)
         if result > most:
-            raise ValueError(f"a share of {whole} from 0 to {most:g} is expected")
+            raise ValueError(f"expected a share of {whole} from 0 to {most:g}")
         return result
 
     return check
@@ -820,7 +820,7 @@ def share(most: float, whole: str) -> Callable[[Any], float]:
 def numbers(value: Any) -> tuple[float, ...]:
     """A list of finite numbers."""
     if not isinstance(value, list):
-        raise ValueError("a list of numbers is expected")
+        raise ValueError("expected a list of numbers")
     return tuple(number(item) for item in value)
 
 
@@ -828,7 +828,7 @@ def numbers(value: Any) -> tuple[float, ...]:
 def vector3(value: Any) -> tuple[float, float, float]:
     """Three finite numbers, for X, Y and Z."""
     if not isinstance(value, list) or len(value) != 3:
-        raise ValueError("three numbers, for X, Y and Z, are expected")
+        raise ValueError("expected three numbers, for X, Y and Z")
     x, y, z = (number(item) for item in value)
     return x, y, z
 
@@ -837,7 +837,7 @@ def vector3(value: Any) -> tuple[float, float, float]:
 def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
     """A list of tool offsets, each three finite numbers."""
     if not isinstance(value, list) or not value:
-        raise ValueError("a list of tool offsets [[x, y, z], ...] is expected")
+        raise ValueError("expected a list of tool offsets [[x, y, z], ...]")
     return tuple(vector3(item) for item in value)
 
 
@@ -845,10 +845,10 @@ def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
 def interval(value: Any) -> tuple[float, float]:
     """Two finite numbers, the lower one first."""
     if not isinstance(value, list) or len(value) != 2:
-        raise ValueError("two numbers [lower, upper] are expected")
+        raise ValueError("expected two numbers [lower, upper]")
     lower, upper = number(value[0]), number(value[1])
     if lower >= upper:
-        raise ValueError("a range [lower, upper] with the lower number first is expected")
+        raise ValueError("expected a range [lower, upper] with the lower number first")
     return lower, upper
 
 
@@ -857,7 +857,7 @@ def ascending(value: Any) -> tuple[float, ...]:
     """At least two numbers in ascending order."""
     items = numbers(value)
     if len(items) < 2 or any(b <= a for a, b in zip(items, items[1:], strict=False)):
-        raise ValueError("at least two numbers in ascending order are expected")
+        raise ValueError("expected at least two numbers in ascending order")
     return items
 
 
@@ -865,12 +865,12 @@ def ascending(value: Any) -> tuple[float, ...]:
 def table(value: Any) -> dict[str, Any]:
     """A table of keys and values."""
     if not isinstance(value, dict):
-        raise ValueError("a table ([section]) is expected")
+        raise ValueError("expected a table ([section])")
     return value
 
 
 @accepts({"type": "array", "items": {"type": "object"}})
 def _tables(value: Any) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise ValueError("an array of tables ([[section]]) is expected")
+        raise ValueError("expected an array of tables ([[section]])")
     return value

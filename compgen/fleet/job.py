@@ -78,7 +78,7 @@ Schedule = Cron | Every
 def cron(value: object) -> Cron:
     """Return a cron expression as numbers; ValueError says what is wrong with which field."""
     if not isinstance(value, str):
-        raise ValueError("a cron expression, for example '30 6 * * mon', is expected")
+        raise ValueError("expected a cron expression, for example '30 6 * * mon'")
     words = MACROS.get(value.strip().lower(), value).split()
     if len(words) != 5:
         raise ValueError(
@@ -91,7 +91,7 @@ def cron(value: object) -> Cron:
     found = Cron(" ".join(words), minutes, hours, days, months, weekdays, any_day, any_weekday)
     longest = {2: 29, 4: 30, 6: 30, 9: 30, 11: 30}
     if found.any_weekday and not any(day <= longest.get(month, 31) for month in found.months for day in found.days):
-        raise ValueError("a cron expression whose day exists in one of its months is expected")
+        raise ValueError("expected a cron expression whose day exists in one of its months")
     return found
 
 
@@ -101,7 +101,7 @@ def _field(word: str, number: int) -> tuple[int, ...]:
     for part in word.split(","):
         match = re.fullmatch(r"(\*|\w+)(?:-(\w+))?(?:/(\d+))?", part)
         if match is None or (match[1] == "*" and match[2]):
-            raise ValueError(f"{part!r} is not a valid {name}; numbers, a-b, lists and /step are expected")
+            raise ValueError(f"{part!r} is not a valid {name}; expected numbers, a-b, lists and /step")
         first = low if match[1] == "*" else _number(match[1], number)
         last = high if match[1] == "*" or (match[3] and not match[2]) else _number(match[2] or match[1], number)
         step = int(match[3] or 1)
@@ -118,7 +118,7 @@ def _number(word: str, number: int) -> int:
     if word in names:
         return names.index(word) + (low if names is MONTHS else 0)
     if not word.isascii() or not word.isdigit() or not low <= int(word) <= high:
-        raise ValueError(f"{word!r} is not a valid {name}; {low} to {high} is expected")
+        raise ValueError(f"{word!r} is not a valid {name}; expected {low} to {high}")
     return int(word)
 
 
@@ -167,7 +167,7 @@ MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 def _confidence(value: Any) -> float:
     result = toml_files.number(value)
     if not 0.5 <= result < 1.0:
-        raise ValueError("a confidence from 0.5 to below 1, for example 0.95, is expected")
+        raise ValueError("expected a confidence from 0.5 to below 1, for example 0.95")
     return result
 
 
@@ -180,7 +180,7 @@ def _confidence(value: Any) -> float:
 def _controllers(value: Any) -> tuple[str, ...]:
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise ValueError("a list of controls, for example ['siemens-cec'], is expected")
+        raise ValueError("expected a list of controls, for example ['siemens-cec']")
     for name in names:
         if name not in CONTROLLERS:
             raise ValueError(f"{name!r} is not a controller; {nearest(name, CONTROLLERS)}")
@@ -190,9 +190,9 @@ def _controllers(value: Any) -> tuple[str, ...]:
 @accepts(toml_files.array_schema({"type": "string", "pattern": r"^(?!\.\.)[^/]+$"}, 1))
 def _patterns(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or not value or not all(isinstance(item, str) and item for item in value):
-        raise ValueError("a list of file patterns, for example ['*.lengths.csv'], is expected")
+        raise ValueError("expected a list of file patterns, for example ['*.lengths.csv']")
     if any("/" in item or item.startswith("..") for item in value):
-        raise ValueError("patterns of file names, without folders, are expected")
+        raise ValueError("expected patterns of file names, without folders")
     return tuple(value)
 
 
@@ -203,7 +203,7 @@ def command_words(value: Any) -> tuple[str, ...]:
     """Return a command as its words: a list, or one text that is split as a shell does."""
     words = shlex.split(value) if isinstance(value, str) else value
     if not isinstance(words, list) or not words or not all(isinstance(word, str) and word for word in words):
-        raise ValueError("a command, as a list of its words, is expected")
+        raise ValueError("expected a command, as a list of its words")
     return tuple(words)
 
 

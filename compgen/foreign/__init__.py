@@ -1,4 +1,4 @@
-"""Files of instruments and other programs, as objects of the project."""
+"""Files of instruments and other programs, converted to the objects of this program."""
 
 from typing import TYPE_CHECKING
 

@@ -42,7 +42,7 @@ from compgen.foreign.source import LARGEST, MEGABYTE, Text, check_size, parse_nu
 
 _THOUSANDS_COMMA = re.compile(r"[+-]?\d{1,3}(,\d{3})+\.\d+")
 _THOUSANDS_POINT = re.compile(r"[+-]?\d{1,3}(\.\d{3})+,\d+")
-#: Thousands separated by a blank or an apostrophe can be read in one way only.
+#: Thousands separated by a blank or an apostrophe are unambiguous.
 _THOUSANDS_BLANK = re.compile(r"[+-]?\d{1,3}([ \u00a0\u202f'\u2019]\d{3})+([.,]\d+)?")
 _BLANKS = re.compile(r"[ \u00a0\u202f'\u2019]")
 #: A number that may have a decimal comma or thousands.
@@ -52,10 +52,10 @@ _POINT = re.compile(r"[+-]?\d*\.\d+([eE][+-]?\d+)?")
 
 
 def plain_decimals(rows: list[list[str]], lines: Sequence[int], decimal: str | None) -> tuple[list[list[str]], bool]:
-    """Turn decimal commas into points if the rows use them, and take marks between thousands out.
+    """Convert decimal commas to points if the rows use them, and remove thousands separators.
 
-    ``decimal`` is what the user says, "comma" or "point". Raises InputError for rows that mix both, and for numbers that may
-    be either (1,000).
+    ``decimal`` is the choice of the user, "comma" or "point". Raises InputError for rows that mix both, and for numbers
+    that may be either (1,000).
     """
     together = "".join(map("".join, rows))
     if _BLANKS.search(together):
@@ -89,13 +89,11 @@ def plain_decimals(rows: list[list[str]], lines: Sequence[int], decimal: str | N
     if point:  # a number such as 1,000 has a decimal comma then, or is in conflict with the point
         comma, either = comma or either, 0
     if comma and point:
-        message = (
-            f"a decimal comma here, a decimal point in line {point}; write all numbers in one way, or say --decimal"
-        )
+        message = f"a decimal comma here, a decimal point in line {point}; write all numbers alike, or give --decimal"
         raise InputError(f"{message} comma or point (the other separates thousands)", line=comma)
     if either and not comma:
         raise InputError(
-            "numbers such as 1,000 may be 1000 or 1.000; say --decimal point (1000) or comma (1.000)", line=either
+            "numbers such as 1,000 may be 1000 or 1.000; give --decimal point (1000) or comma (1.000)", line=either
         )
     changed = comma or any(_THOUSANDS_COMMA.fullmatch(cell) for row in rows for cell in row)
     return [[_plain(cell) for cell in row] for row in rows] if changed else rows, bool(comma)
@@ -109,18 +107,18 @@ def _plain(cell: str) -> str:
     return cell.replace(",", "") if _THOUSANDS_COMMA.fullmatch(cell) else cell
 
 
-# Cells of a table as text or a sheet gives them, and where among them header and rows are.
+# Cells of a text or a sheet, and the place of header and rows among them.
 
 
-#: The rows of the largest sheet there is.
+#: Rows of the largest possible sheet.
 MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
 #: Cells of a table; each takes some sixty bytes of memory.
 MOST_CELLS = 10_000_000
-#: So many lines are looked at for the separator, and for the header.
+#: Number of lines examined for the separator, and for the header.
 _SAMPLE_LINES, _SAMPLE_CHARACTERS, _HEADER_LINES = 200, 20_000, 200
-#: So many rows of each table are counted to find the longest.
+#: Number of rows of each table counted to find the longest.
 _MEASURED_ROWS = 5_000
-#: A number in any way of writing; which one it is turns out later.
+#: A number in any notation, which is determined later.
 _NUMERAL = re.compile(r"[+\-\u2212]?(\d[\d.,' \u00a0\u202f]*)?[.,]?\d(e[+\-]?\d+)?", re.IGNORECASE)
 _SQUARENESS = re.compile(r"(?i)rechtwinkl|square|perpendic|equerr|ortogonal|\u5782\u76f4|E[ABC]0[YZ]")
 _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
@@ -128,7 +126,7 @@ _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
 _NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
 #: A row above a table may contain a key and at most this many cells, the key included.
 _MOST_PAIR = 6
-#: Letters of words that Python takes for numbers (inf, nan), and a comma: a column without them is converted at once.
+#: Letters of words that Python accepts as numbers (inf, nan), and a comma: a column without them is converted at once.
 _NOT_PLAIN = frozenset("infa,")
 
 
@@ -143,7 +141,7 @@ class CellGrid:
     empty: str = ""
 
     def fail(self, message: str, line: int | None = None, column: str | None = None) -> InputError:
-        """Return the error that points at a row, and a column."""
+        """Return the error about a row and column."""
         return InputError(message, file=self.path, line=line, field=f"column {column}" if column else None)
 
 
@@ -151,7 +149,8 @@ class CellGrid:
 class Table:
     """A header and its rows, all of one width.
 
-    ``metadata`` contains the lines above as ``key: value``, keys in lower case; ``comments`` the ``# key = value`` as they are.
+    ``metadata`` contains the lines above as ``key: value``, keys in lower case; ``comments`` the ``# key = value``
+    unchanged.
     """
 
     grid: CellGrid
@@ -168,7 +167,7 @@ class Table:
         return [row[k] for row in self.rows]
 
     def numbers(self, name: str, *, empty: bool = False) -> list[float]:
-        """Return a column as numbers; with ``empty`` an empty cell is nan, else it is an error as any text is."""
+        """Return a column as numbers; with ``empty`` an empty cell is nan, otherwise an error like any text."""
         cells, found = self.column(name), []
         together = "".join(cells)
         if together.isascii() and "_" not in together and _NOT_PLAIN.isdisjoint(together.lower()):
@@ -207,22 +206,24 @@ def grid_of_text(source: Text) -> CellGrid:
         except csv.Error as error:
             raise source.fail(f"is not readable as a table: {error}") from error
         if len(rows) != len(content):
-            raise source.fail("a quoted cell runs over a line end; write each row on one line")
+            raise source.fail("a quoted cell contains a line end; write each row on one line")
     names = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
     notes = [f"columns are separated by {names[separator]}"]
     if source.encoding not in ("utf-8", "utf-8-sig"):
         notes.append(f"is not UTF-8; it was read as {source.encoding}")
     grid = CellGrid(source.path, rows, numbers, tuple(notes))
     if not source.ended and len(rows) > 2 and len(rows[-1]) < len(rows[-2]):
-        raise source.fail("the last line has no line end and fewer cells than the one before: it was cut", numbers[-1])
+        raise source.fail(
+            "the last line has no line end and fewer cells than the one before: it is truncated", numbers[-1]
+        )
     return grid
 
 
 def _separator(lines: Sequence[str]) -> str | None:
     """Return the mark that separates the most numbers in a block of lines with equally many cells; None for blanks.
 
-    A block counts with its numbers times their share among its filled cells. A later mark must be clearly better: decimal
-    commas separate numbers too.
+    The score of a block is its count of numbers times their share of the filled cells. A later mark must be clearly
+    better: decimal commas separate numbers, too.
     """
     best, score = None, 0.0
     for mark, margin in ((";", 1.0), ("\t", 1.0), ("|", 1.0), (",", 1.2), (None, 1.2)):
@@ -244,8 +245,8 @@ def _separator(lines: Sequence[str]) -> str | None:
 class _Layout:
     """Where a table is in a grid: its rows of names from ``top`` on, rows of numbers from ``first`` to before ``end``.
 
-    ``numbers`` counts its cells with numbers. ``labels`` > 0: each row is a run, and so many cells of it name it; then
-    ``names`` are those of the rows.
+    ``numbers`` counts its cells with numbers. ``labels`` > 0: each row is a run, and this many cells of it name it;
+    then ``names`` are those of the rows.
     """
 
     top: int
@@ -259,8 +260,8 @@ class _Layout:
 def find_table(grid: CellGrid, decimal: str | None = None) -> Table:
     """Find header and rows: the longest block of numbers below a row of names; the lines above are metadata.
 
-    The targets may go down (a row each) or across (a column each); the table that is returned has a row for each.
-    ``decimal`` is the decimal mark, "comma" or "point", if the user says it.
+    The targets may be rows or columns; the table that is returned has a row for each. ``decimal`` is the decimal mark,
+    "comma" or "point", if the user says it.
 
     Raises InputError if there is none, for a row of another width below the header, and for a second block of numbers.
     """
@@ -276,7 +277,7 @@ def find_table(grid: CellGrid, decimal: str | None = None) -> Table:
             break
     if best is None:
         raise grid.fail(
-            "holds no table; expected a header line with the names of the columns and rows of numbers below it"
+            "contains no table; expected a header line with the names of the columns and rows of numbers below it"
             f"{grid.empty}"
         )
     metadata: dict[str, str] = {}
@@ -313,7 +314,7 @@ def _down(grid: CellGrid, k: int) -> _Layout | None:
         return None
     top, joined = _joined_names(grid, k)
     # the row has the width of the header and mostly numbers (names of stations or axes may be among them); one of about
-    # twice the width is let through here and refused later: decimal commas between commas
+    # twice the width is accepted here and refused later: decimal commas between commas
     cells, named = _filled(grid.rows[first]), len(_filled(joined))
     count = sum(parse_number(cell) is not None for cell in cells)
     wide = 2 * named - 1 <= len(cells) <= (len(joined) if units else MOST_COLUMNS)
@@ -344,13 +345,13 @@ def _has_number(row: Sequence[str]) -> bool:
 
 
 def _unit_in_cell(cell: str) -> str | None:
-    """Return the text of a unit that a cell holds and nothing else; brackets and "in" do not count."""
+    """Return the unit if a cell contains only a unit; brackets and "in" are ignored."""
     text = re.sub(r"^in\s+", "", cell.strip("[]() "))
     return text if known_unit(text) or covariate_unit(text) or text in _NO_UNIT else None
 
 
 def _are_units(row: Sequence[str]) -> bool:
-    """Whether every filled cell of a row is a unit; in brackets it may be one that is not known."""
+    """Whether every filled cell of a row is a unit; in brackets it may be an unknown one."""
     cells = _filled(row)
     known = [bool(_unit_in_cell(cell)) for cell in cells]
     bracketed = [cell[0] in "[(" and cell[-1] in "])" and parse_number(cell[1:-1]) is None for cell in cells]
@@ -378,7 +379,7 @@ def _joined_names(grid: CellGrid, k: int) -> tuple[int, list[str]]:
         other = names[1:]
         bare = all(way(name) is not None or name.isdigit() or _unit_in_cell(name) for name in other)
         if all(names) and len(set(other)) == len(other) and not bare:
-            break  # the names say which run a column is
+            break  # the names give the run of a column
         over, last = grid.rows[top - 1], ""
         group = _filled(over[1:])  # runs, directions or deviations, which several columns have in common
         if not group or _has_number(over[:1]) or not all(is_known_name(cell) for cell in group):
@@ -441,13 +442,13 @@ def _across(grid: CellGrid, k: int) -> _Layout | None:
 def _turned(
     grid: CellGrid, layout: _Layout, metadata: dict[str, str], comments: dict[str, str], decimal: str | None
 ) -> Table:
-    """Return a table with a row for each target from one with a column for each."""
+    """Return a table with a row for each target, from one with a column for each."""
     names = _single_names(grid, layout.names, grid.lines[layout.first])
     below = grid.rows[layout.first : layout.end]
     width = max(n for row in below for n, cell in enumerate(row, start=1) if cell) - layout.labels
     cells = [[row[layout.labels + n] if layout.labels + n < len(row) else "" for row in below] for n in range(width)]
     lines = [grid.lines[layout.first]] * width
-    note = "the targets go across: each row of the file is a run"
+    note = "the targets are columns: each row of the file is a run"
     return _finished(
         replace(grid, notes=(*grid.notes, note)), names, cells, lines, lines[0], metadata, comments, decimal
     )
@@ -487,7 +488,7 @@ def _is_summary(grid: CellGrid, first: int) -> bool:
 
 
 def _note(row: Sequence[str], metadata: dict[str, str], comments: dict[str, str]) -> None:
-    """Take a line above a table: ``key = value``, ``key: value``, or a key and its value in the next cells."""
+    """Read a line above a table: ``key = value``, ``key: value``, or a key and its value in the next cells."""
     cells = _filled(row)
     text = cells[0].lstrip("#% ") if cells else ""
     if cells and _is_comment([*cells]) and text.partition("=")[0].strip():
@@ -548,11 +549,11 @@ def _table(
                         message = f"rows of numbers follow again, below line {at} where the table ended: put each table into a"
                         raise grid.fail(f"{message} separate file or sheet", below)
                 _check_beside(grid, k, len(grid.rows))
-                notes.append(f"line {at} and everything below is not part of the table and was left out")
+                notes.append(f"line {at} and everything below is not part of the table and was skipped")
                 break
             label = next(iter(_filled(row)))
             if statistic_in(label) is not None and parse_number(rows[0][row.index(label)]) is not None:
-                notes.append(f"line {at}, {label!r}, is a statistic over the rows and was left out")
+                notes.append(f"line {at}, {label!r}, is a statistic over the rows and was skipped")
                 continue
         rows.append(_fitted(grid, names, row, at))
         lines.append(at)
@@ -574,7 +575,7 @@ def _finished(
         grid = replace(grid, notes=(*grid.notes, "decimal commas were read as decimal points"))
     declared = comments.pop("rows", None)
     if declared is not None and parse_number(declared) != len(rows):
-        raise grid.fail(f"declares {shown(declared)} rows but holds {len(rows)}: is it cut?")
+        raise grid.fail(f"declares {shown(declared)} rows but contains {len(rows)}: is it truncated?")
     return Table(grid, names, header_line, plain, lines, metadata, comments)
 
 
@@ -590,7 +591,7 @@ def _fitted(grid: CellGrid, names: Sequence[str], row: Sequence[str], line: int)
     if _filled(row[len(names) :]):
         hint = ""
         if len(row) >= 2 * len(names) - 1:
-            hint = "; decimal commas and commas between columns cannot be told apart: save with semicolons or points"
+            hint = "; decimal commas and commas between columns cannot be distinguished: save with semicolons or points"
         raise grid.fail(f"has {len(row)} cells, the header has {len(names)}{hint}", line)
     cells = row if len(row) == len(names) else [*row[: len(names)], *[""] * (len(names) - len(row))]
     if max(map(len, cells)) > MOST_CELL:
@@ -601,9 +602,9 @@ def _fitted(grid: CellGrid, names: Sequence[str], row: Sequence[str], line: int)
 # Excel workbooks (.xlsx): checked as archives before they are opened, then read row by row without formulas.
 
 
-#: Limits of the archive: packed, unpacked, and members; a workbook that is a bomb is refused before it is unpacked.
+#: Limits of the archive: packed, unpacked, and members; a zip bomb is refused before it is unpacked.
 MOST_PACKED, MOST_UNPACKED, MOST_MEMBERS = 64 * MEGABYTE, 256 * MEGABYTE, 2_000
-#: One sheet, unpacked: some one and a half million cells, half a minute of reading.
+#: One sheet, unpacked: about one and a half million cells, half a minute of reading.
 MOST_SHEET = 48 * MEGABYTE
 #: Unpacked bytes for each packed one, above which a member of more than a megabyte is a bomb; sheets have up to 60.
 MOST_RATIO = 300
@@ -617,8 +618,8 @@ def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Ce
 
     ``name`` is a sheet to read even if it is hidden. InputError for a file that is not a workbook, or unsafe.
 
-    Cells hold text; numbers have all their digits, whatever the format of the cell shows; formulas count with the value
-    that was stored with them.
+    Cells hold text; numbers have all their digits, whatever the format of the cell shows; formulas have their stored
+    value.
     """
     check_size(path, MOST_PACKED)
     _check_archive(path)
@@ -627,7 +628,7 @@ def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Ce
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # styles and extensions that it does not know do not matter
+            warnings.simplefilter("ignore")  # unknown styles and extensions do not matter
             with closing(load_workbook(path, read_only=True, data_only=True, keep_links=False)) as book:
                 sheets = book.worksheets
                 hidden = [sheet.title for sheet in sheets if sheet.sheet_state != "visible" and sheet.title != name]
@@ -636,7 +637,7 @@ def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Ce
                 found = [(sheet.title, _grid(path, sheet)) for sheet in sheets if sheet.title not in hidden]
     except (InputError, MemoryError):
         raise
-    except Exception as error:  # a damaged workbook shows as any of a dozen exceptions of three packages
+    except Exception as error:  # a damaged workbook raises any of a dozen exceptions of three packages
         raise InputError(f"is a damaged workbook: {type(error).__name__}: {error}"[:300], file=path) from error
     filled = [(name, grid) for name, grid in found if grid.rows]
     if not filled:
@@ -645,7 +646,7 @@ def read_sheets(path: Path, name: str | None = None) -> tuple[list[tuple[str, Ce
 
 
 def chosen_sheet(path: Path, sheets: list[tuple[str, CellGrid]], name: str | None) -> tuple[str, CellGrid] | None:
-    """Return the sheet that the user named, the only one there is, or None if there are several."""
+    """Return the sheet given by the user, the only one, or None if there are several."""
     if name is not None:
         for title, grid in sheets:
             if title == name:
@@ -657,13 +658,13 @@ def chosen_sheet(path: Path, sheets: list[tuple[str, CellGrid]], name: str | Non
 
 
 def _check_archive(path: Path) -> None:
-    """Unpack every part once, in blocks, and count: what is declared may be wrong."""
+    """Unpack every part once, in blocks, and count: the declared sizes may be wrong."""
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
             names = {member.filename for member in members}
             if "[Content_Types].xml" not in names or not any(name.startswith("xl/") for name in names):
-                raise InputError("is a zip archive but no .xlsx workbook", file=path)
+                raise InputError("is a zip archive but not an .xlsx workbook", file=path)
             declared = sum(member.file_size for member in members)
             if len(members) > MOST_MEMBERS or declared > MOST_UNPACKED:
                 text = f"unpacks to {declared / MEGABYTE:.0f} MB in {len(members)} parts; at most "
@@ -693,8 +694,8 @@ def _check_archive(path: Path) -> None:
     except InputError:
         raise
     except (zipfile.BadZipFile, OSError, ValueError, RuntimeError, NotImplementedError, EOFError) as error:
-        raise InputError(f"is a damaged or cut workbook: {error}", file=path) from error
-    except Exception as error:  # zlib.error and its kin
+        raise InputError(f"is a damaged or truncated workbook: {error}", file=path) from error
+    except Exception as error:  # zlib.error and the like
         raise InputError(f"is a damaged workbook: {type(error).__name__}", file=path) from error
 
 

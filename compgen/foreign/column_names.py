@@ -1,4 +1,4 @@
-"""Names of columns, runs, directions and units as laboratories of several countries write them."""
+"""Names of columns, runs, directions and units in the notation of laboratories of several countries."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from compgen.errors import InputError
 
 # Names of runs, directions and statistics as laboratories of several countries write them.
 #
-# A name is cut into words, numbers and marks. It names a run only if every one of them is understood; so a column with a
-# word that is not known is never taken for something else, and never for nothing.
+# A name is split into words, numbers and marks. It names a run only if all of them are understood; so a column with an
+# unknown word is never mistaken for something else, and never ignored.
 
 
 def _words(text: str) -> frozenset[str]:
@@ -78,10 +78,10 @@ _STATISTICS = {
     \u6700\u5927\u503c \u6700\u5c0f\u503c \u6700\u5927 \u6700\u5c0f \u53cd\u5411\u5dee\u503c \u91cd\u590d\u7cbe\u5ea6""",
 }
 _STATISTIC = {word: kind for kind, words in _STATISTICS.items() for word in words.split()}
-#: Single letters of ISO 230-2; they are statistics only as a whole name, with or without a direction.
+#: Single letters of ISO 230-2; they are statistics only as a complete name, with or without a direction.
 _ISO_LETTERS = {"b": "other", "r": "other", "m": "other", "e": "other", "a": "other", "s": "scatter", "x": "mean"}
 _UNITS = frozenset(["um", "mm", "nm", "in", "inch", "mil", "mm/m", "um/m", "urad", "mrad", "arcsec", "m"])
-#: First letters that stand for the two ways, where a table has one of these pairs: forward and back in six languages.
+#: First letters of both directions, if a table has one of these pairs: forward and back in six languages.
 _LETTERS = ("vr", "vz", "hr", "fb", "fr", "ar", "ud", "pn", "iv", "ai")
 _LONG = sorted(
     (w for w in {*_UP, *_DOWN, *_RUN, *_FILLERS, *_STATISTIC} if re.search(r"[\u4e00-\u9fff]", w)),
@@ -104,7 +104,7 @@ class RunColumn:
 
 @dataclass(frozen=True)
 class _Words:
-    """What the words of a name are: numbers, ways, kinds of statistics, and those that are not known."""
+    """The words of a name: numbers, directions, kinds of statistics, and unknown ones."""
 
     numbers: tuple[int, ...]
     ways: frozenset[int]
@@ -114,7 +114,7 @@ class _Words:
 
 
 def unaccented(text: str) -> str:
-    """Return lower case without accents; signs that are written in several ways become one, a bar over x stays."""
+    """Return lower case without accents; signs with several notations become one, a bar over x remains."""
     text = (
         text.replace("\u2212", "-")
         .replace("\u2013", "-")
@@ -131,7 +131,7 @@ def unaccented(text: str) -> str:
 
 
 def _tokens(text: str) -> list[str]:
-    """Return words, numbers and marks; a minus within a name parts words, at its ends it is a direction."""
+    """Return words, numbers and marks; a minus within a name separates words, at its ends it is a direction."""
     found = [token for token in _TOKEN.findall(unaccented(text)) if token not in _SEPARATORS]
     while len(found) > 1 and found[-1] in _UNITS:
         found.pop()
@@ -141,7 +141,7 @@ def _tokens(text: str) -> list[str]:
 
 
 def _read(text: str, letters: str = "") -> _Words:
-    """Say what the words of a name are; ``letters`` are the two that stand for the ways, positive first."""
+    """Classify the words of a name; ``letters`` are those of the two directions, positive first."""
     numbers: list[int] = []
     ways: set[int] = set()
     statistics: list[str] = []
@@ -190,7 +190,7 @@ def way(text: str) -> int | None:
 
 
 def run_in(text: str, letters: str = "") -> RunColumn | None:
-    """Return the run that a name or a label names, None if a word of it is not understood.
+    """Return the run of a name or a label, None if a word of it is not understood.
 
     >>> run_in("Lauf 1 zurück [µm]"), run_in("bwd2"), run_in("Dead path 1")
     (RunColumn(name='Lauf 1 zurück [µm]', number=1, direction=-1), RunColumn(name='bwd2', number=2, direction=-1), None)
@@ -204,7 +204,7 @@ def run_in(text: str, letters: str = "") -> RunColumn | None:
 
 
 def names_run(text: str) -> bool:
-    """Whether a text is about runs or directions and nothing else, such as ``Lauf``, ``Run no.``, ``Richtung``."""
+    """Whether a text is only about runs or directions, such as ``Lauf``, ``Run no.``, ``Richtung``."""
     words = _read(text)
     about = words.names_run or any(
         token in ("direction", "dir", "richtung", "sens", "direzione") for token in _tokens(text)
@@ -213,7 +213,7 @@ def names_run(text: str) -> bool:
 
 
 def is_deviation(text: str) -> bool:
-    """Whether a name speaks of deviations or errors, in one of the languages that are known."""
+    """Whether a name refers to deviations or errors, in one of the supported languages."""
     return any(token in _DEVIATIONS for token in _tokens(text))
 
 
@@ -226,7 +226,7 @@ def is_known_name(text: str) -> bool:
 def statistic_in(text: str) -> tuple[str, int] | None:
     """Return the kind of a statistic ("mean", "scatter", "other") that a name names, and its direction (0: of both).
 
-    A number in the name makes it that of one run, which is none over the runs.
+    A number in the name makes it that of one run, so it is not a statistic over the runs.
 
     >>> statistic_in("Mittelwert vor [µm]"), statistic_in("x\u0304 \u2193"), statistic_in("2s"), statistic_in("mean run 1")
     (('mean', 1), ('mean', -1), ('scatter', 0), None)
@@ -245,13 +245,13 @@ def statistic_in(text: str) -> tuple[str, int] | None:
 def run_columns(header: Sequence[str], taken: Sequence[str]) -> list[RunColumn]:
     """Return the columns that hold one run each, such as ``Run 1 +``, ``fwd2``, ``r3``, ``V1`` next to ``R1``.
 
-    Names without a number are counted for each direction as they come.
+    Names without a number are counted for each direction in their order.
 
     >>> run_columns(["target", "Run 1+", "Run 1-", "bwd 2"], ["target"])[1:]
     [RunColumn(name='Run 1-', number=1, direction=-1), RunColumn(name='bwd 2', number=2, direction=-1)]
     """
     names = [name for name in header if name not in taken]
-    # the two letters of names such as V1, R1, V2, R2, positive first; empty where they are not such a pair
+    # the two letters of names such as V1, R1, V2, R2, positive first; empty if they are not such a pair
     first = [
         tokens[0] for name in names if len(tokens := _tokens(name)) >= 2 and len(tokens[0]) == 1 and tokens[1].isdigit()
     ]
@@ -306,7 +306,7 @@ _WORDS = {
 
 
 def covariate_unit(text: str, quantity: Quantity | None = None) -> str | None:
-    """Return the name of such a unit as it is used here, of one quantity if that is given; None if it is none.
+    """Return the name of such a unit as it is used here, of one quantity if that is given; None for other units.
 
     >>> covariate_unit("°C"), covariate_unit("Kelvin"), covariate_unit("m/min"), covariate_unit("um"), covariate_unit("s", "load")
     ('degC', 'K', 'm/min', None, None)
@@ -317,7 +317,7 @@ def covariate_unit(text: str, quantity: Quantity | None = None) -> str | None:
     return unit if unit in allowed else None
 
 
-# What the columns of a foreign table are: fields by the words of their names, units by what is in brackets.
+# The columns of a foreign table: fields by the words of their names, units by the text in brackets.
 
 
 MM_PER_LENGTH = {"mm": 1.0, "um": 1e-3, "nm": 1e-6, "m": 1e3, "cm": 10.0, "in": 25.4, "mil": 0.0254, "0.1um": 1e-4}
@@ -419,9 +419,9 @@ FIELDS: Mapping[str, tuple[str, ...]] = {
 _INDEX = ("i", "no", "nr", "n", "index", "count", "number", "nummer", "lfdnr", "posnr", "point", "pointno", "punkt", "punktnr",
           "zielnr", "targetno", "targetnumber", "step", "schritt", "sample", "row", "zeile", "numero", "num", "id",
           "\u5e8f\u53f7", "\u7f16\u53f7")  # fmt: skip
-#: A channel of temperature that the user names by --map temp_NAME=COLUMN.
+#: A channel of temperature given by --map temp_NAME=COLUMN.
 CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
-#: A column of one run that the user names by --map run3-=COLUMN: number, and direction if one is given.
+#: A column of one run given by --map run3-=COLUMN: number, and direction if given.
 RUN_FIELD = re.compile(r"run(\d{1,3})([+\-]?)")
 _TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)|\u6e29\u5ea6")
 _BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
@@ -472,7 +472,7 @@ def split_name(name: str) -> NamedColumn:
 
 
 def quantity_of(word: str) -> Quantity | None:
-    """Return what a column other than the readings contains, by the word of its name; None if the word does not say it.
+    """Return what a column other than the readings contains, by the word of its name; None if the word is not clear.
 
     >>> quantity_of("airtemp"), quantity_of("vorschub"), quantity_of("timestamp"), quantity_of("position")
     ('temperature', 'feed', 'time', None)
@@ -490,7 +490,7 @@ def _word(text: str) -> str:
 
 
 def fields_of(header: Sequence[str], given: Mapping[str, str], ignored: Sequence[str] = ()) -> dict[str, NamedColumn]:
-    """Return the column of each field: those that the user gave, then those whose name says so, but none of ``ignored``.
+    """Return the column of each field: those given by the user, then those recognised by name, but none of ``ignored``.
 
     Raises InputError for a field or column that does not exist.
     """
@@ -506,7 +506,7 @@ def fields_of(header: Sequence[str], given: Mapping[str, str], ignored: Sequence
         if key in found:
             continue
         matching = [column for column in columns if column.name not in taken and column.word in words]
-        if key in ("actual", "deviation", "value"):  # one way of several, "Deviation +", is a run
+        if key in ("actual", "deviation", "value"):  # one direction of several, "Deviation +", is a run
             matching = [column for column in matching if (run := run_in(column.name)) is None or not run.direction]
         if matching:
             found[key] = min(matching, key=lambda column: words.index(column.word))
@@ -527,6 +527,6 @@ def check_field(key: str, option: str) -> None:
 
 
 def error_columns(header: Sequence[str]) -> dict[str, NamedColumn]:
-    """Return the columns that are called like the errors of ISO 230-1."""
+    """Return the columns named like the errors of ISO 230-1."""
     columns = [split_name(name) for name in header]
     return {column.word.upper(): column for column in columns if column.word.upper() in ERROR_NAMES}

@@ -1,6 +1,6 @@
-"""Foreign files converted in memory, and what a native file holds.
+"""Foreign files converted in memory, and the contents of a native file.
 
-A file that leaves something open is refused with what ``volcomp import`` needs. :func:`given_errors` makes the errors of
+A file with open questions is refused with what ``volcomp import`` needs. :func:`given_errors` makes the errors of
 another program usable like an identification.
 """
 
@@ -33,7 +33,7 @@ from compgen.identify.identification import metadata_of, without_adjustment
 from compgen.instruments.sixdof_readings import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns
-#: So many labels of a column are shown.
+#: Number of labels of a column that are shown.
 _SHOWN_LABELS = 8
 _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
     "lengths": read_lengths,
@@ -70,7 +70,7 @@ def converted_parts(
 
 
 def describe_native(path: Path, kind: str) -> tuple[dict[str, Any], object]:
-    """Return what a native file holds, in words and numbers, and its object.
+    """Return the contents of a native file, in words and numbers, and its object.
 
     Raises
     ------
@@ -111,26 +111,26 @@ def _settled(path: Path, axis: str | None = None) -> Imported:
     item = import_file(path, ImportOptions(axis=axis))
     item.check_settled()
     facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
-    warnings.warn(f"{path} was taken as: {facts} ('volcomp import' shows all)", CompgenWarning, stacklevel=3)
+    warnings.warn(f"{path} was read as: {facts} ('volcomp import' shows all)", CompgenWarning, stacklevel=3)
     return item
 
 
 def converted_errors(source: Path, kind: str | None) -> ErrorTable:
-    """Return the errors of a foreign file, or of axis runs, also native ones (``kind`` "axis"): their two-way means."""
+    """Return the errors of a foreign file, or of axis runs, also native ones (``kind`` "axis"): their bidirectional means."""
     data = read_axis_runs(source) if kind == "axis" else _settled(source).data
     if isinstance(data, AxisRuns):
         table, reversal, _ = positioning_errors(data, data.metadata)
         if reversal is not None:
-            text = "has a reversal, which the mean of both directions does not hold; identify and run take both"
+            text = "has a reversal, which the mean of both directions does not contain; identify and run use both"
             warnings.warn(f"{source}: {text}", CompgenWarning, stacklevel=3)
         return table
     if not isinstance(data, ErrorTable):
-        raise InputError("holds a measurement, not errors; identify it first", file=source)
+        raise InputError("contains a measurement, not errors; identify it first", file=source)
     return data
 
 
 def _joined(parts: Sequence[Plain]) -> Plain:
-    """Several measurements of one kind as one."""
+    """Join several measurements of one kind."""
     if isinstance(parts[0], AxisRuns):
         return join_axis_runs([part for part in parts if isinstance(part, AxisRuns)])
     if isinstance(parts[0], Lengths):
@@ -138,21 +138,21 @@ def _joined(parts: Sequence[Plain]) -> Plain:
     return join_deviations([part for part in parts if isinstance(part, Deviations)])
 
 
-# Errors that another program identified, in place of an identification here.
+# Errors identified by another program, instead of an identification here.
 
 
 def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> Identification:
-    """Return errors of a foreign file as what an identification hands on.
+    """Return errors of a foreign file as the result of an identification.
 
-    They are brought to the zeros that every identification has (positioning and angles at the reference point, straightness
-    at both ends; squareness takes up the lines), without smoothing; ``details`` says what that moved. Of a table that is not
-    the ``whole`` of what is known and contains no squareness, the lines are left out: how a straightedge lay says nothing
-    about the machine.
+    They are brought to the gauge of every identification (positioning and angles zero at the reference point,
+    straightness at both ends; squareness absorbs the lines), without smoothing; ``details`` says what that changed. Of
+    a table that is not the ``whole`` of what is known and contains no squareness, the lines are left out: how a
+    straightedge lay says nothing about the machine.
 
     Raises
     ------
     InputError
-        for errors that the machine's travel or chain does not fit.
+        for errors that do not match the machine's travel or chain.
     """
     if not whole and not table.squareness:
         curves = dict(table.curves)

@@ -1,7 +1,7 @@
 """The other columns of a foreign table: temperatures, times, tool, feed, load and labels, in the project's units.
 
-:func:`row_data_of` takes one column after the other. A column that cannot be read is left out with the reason, unless the
-user named it; a column of numbers that nobody understands is a doubt, which the user has to settle.
+:func:`row_data_of` reads one column after the other. A column that cannot be read is skipped with the reason, unless the
+user named it; a column of numbers that is not understood is an open question for the user.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ from compgen.foreign.source import (
 # Columns other than the readings of a foreign table, as numbers in the units of the contract.
 
 
-#: Temperatures of a workshop and its machines, degC; a column without a unit is taken in the one that puts it here.
+#: Temperatures of a workshop and its machines, degC; for a column without a unit, the unit with values in this range is
+#: assumed.
 USUAL_C = (5.0, 45.0)
 #: Beyond these a unit is wrong, or a sensor was not connected.
 POSSIBLE_C = (-30.0, 120.0)
@@ -87,7 +88,7 @@ def channel_of(word: str) -> str:
 
 
 def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedColumn) -> FloatArray:
-    """Temperatures in degC: by the user's word, the unit in the name, else by the only unit in which they are usual."""
+    """Return temperatures in degC: by option, by the unit in the name, otherwise by the only unit with usual values."""
     raw = np.array(findings.table.numbers(column.name))
     name = channel.removesuffix("_c")
     unit = findings.options.given_unit(name, key, among=CELSIUS, what="temperature")
@@ -101,23 +102,27 @@ def celsius_of(findings: TableFindings, key: str, channel: str, column: NamedCol
             if USUAL_C[0] <= (f * raw + o).min() and (f * raw + o).max() <= USUAL_C[1]
         ]
         if len(fitting) != 1:
-            raise InputError(f"the file gives no unit; say --map {name}={column.name} --unit {name}=degC (or K, degF)")
+            raise InputError(
+                f"the file states no unit; give --map {name}={column.name} --unit {name}=degC (or K, degF)"
+            )
         declared = fitting[0]
         findings.notes.append(
-            f"{shown(column.name)} is taken as {declared}, in which {raw.min():g} to {raw.max():g} is usual"
+            f"{shown(column.name)} is read as {declared}, in which {raw.min():g} to {raw.max():g} is usual"
         )
     factor, offset = CELSIUS[declared]
     values = factor * raw + offset
     if unit is None and (values.min() < POSSIBLE_C[0] or values.max() > POSSIBLE_C[1]):
         low_high = f"{values.min():.4g} to {values.max():.4g} degC"
-        raise InputError(f"in {declared} it would go from {low_high}: another unit (--unit {name}=...), or no sensor")
+        raise InputError(
+            f"in {declared} it would range from {low_high}: another unit (--unit {name}=...), or no sensor"
+        )
     return values
 
 
 def amount_of(
     findings: TableFindings, key: str, what: str, scales: Mapping[str, float], usual: str | None = None
 ) -> FloatArray:
-    """Numbers in the unit of the contract; the unit is given, or in the file, or that of the positions (``usual``)."""
+    """Return numbers in the native unit; the unit is given, or in the file, or that of the positions (``usual``)."""
     column = findings.fields[key]
     unit = findings.options.given_unit(key, among=scales, what=what) or column.unit or usual
     if unit is None or unit not in scales:
@@ -129,7 +134,7 @@ def amount_of(
 
 
 def labels_of(findings: TableFindings, column: NamedColumn) -> NDArray[np.int64]:
-    """Whole numbers as they are; words are numbered as they come."""
+    """Return whole numbers unchanged; words are numbered in order of occurrence."""
     cells = findings.table.column(column.name)
     numbers = [parse_number(cell) for cell in cells]
     if all(value is not None and value == int(value) and abs(value) < 2**53 for value in numbers):
@@ -190,8 +195,8 @@ def times_of(
             return values * S_PER_TIME[unit], None
         days = [found for value in values if (found := serial_date(float(value))) is not None]
         if len(days) < len(values):
-            what = "say --unit time=s (ms, min, h)" if time is not None else "it is not a date"
-            raise InputError(f"it holds numbers without a unit; {what}")
+            what = "give --unit time=s (ms, min, h)" if time is not None else "it is not a date"
+            raise InputError(f"it contains numbers without a unit; {what}")
         findings.notes.append(
             f"the numbers in {shown(column.name)} are taken as days of a spreadsheet (1 is 1900-01-01)"
         )
@@ -207,22 +212,22 @@ def times_of(
 def _of_dates(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatArray | None, str | None]:
     with_day = [bool(date.days) for date in dates]
     if any(with_day) != all(with_day) or len({bool(date.zone) for date in dates}) > 1:
-        raise InputError("some cells have a date or a zone and some have none")
+        raise InputError("some cells have a date or a time zone and some do not")
     if not all(with_day):
         clock = np.array([date.clock_s for date in dates], dtype=np.float64)
         if np.any(np.diff(clock) < 0):
             raise InputError(
-                "the times of the day do not ascend and have no date: the order of the readings is not known"
+                "the times of day are not ascending and have no date: the order of the readings is unknown"
             )
         return clock - clock[0], None
     order = order_of(dates, findings.options.dates)
-    if order is None:  # times within one day do not depend on the order, others are asked about
+    if order is None:  # times within one day do not depend on the order; others need the user's choice
         days = sorted({tuple(sorted(day.date().isoformat() for day in date.days.values())) for date in dates})
         found = f"{shown(dates[0].text)} may be {' or '.join(dict.fromkeys(days[0]))}"
         if len(days) > 1:
-            findings.doubts.append(f"{found}; say --dates dmy, mdy or ymd")
+            findings.doubts.append(f"{found}; give --dates dmy, mdy or ymd")
             return None, None
-        findings.notes.append(f"the date {found}: it is left out; say --dates dmy, mdy or ymd to keep it")
+        findings.notes.append(f"the date {found}: it is left out; give --dates dmy, mdy or ymd to keep it")
         if any(date.clock_s is None for date in dates):
             return None, None
         clock = np.array([date.clock_s for date in dates], dtype=np.float64)
@@ -258,12 +263,11 @@ def date_in_header(findings: TableFindings) -> str | None:
     return found_iso
 
 
-# What a laser file says about air, material and time: sections ENVIRONMENT and EQUIPMENT, and the date of USER-TEXT.
+# Air, material and time in a laser file: sections ENVIRONMENT and EQUIPMENT, and the date of USER-TEXT.
 #
-# There is no public specification. Programs that read such files take two numbers for each key, at the beginning and at the
-# end of the test, and after some of them a third one whose meaning is not known (of the unit, it seems); older descriptions
-# have one. So everything is shown, and only temperatures that can be nothing but degC, and dates that can be read in one
-# way, are used.
+# There is no public specification. Programs that read such files expect two numbers for each key, at the beginning and
+# at the end of the test, and for some keys a third one of unknown meaning (apparently the unit); older descriptions
+# have one. So everything is shown, and only temperatures that must be degC, and unambiguous dates, are used.
 
 
 #: Channels by key; the air and up to three sensors on the machine or the workpiece.
@@ -311,13 +315,13 @@ def surroundings_of(
     if environment.get("exp coeff"):
         notes.append(
             f"its software has the expansion coefficient {shown(environment['exp coeff'])}: if it compensated the material, "
-            "the readings refer to 20 degC already; nothing is corrected here"
+            "the readings already refer to 20 degC; nothing is corrected here"
         )
     return temperatures, at, notes
 
 
 def _date(stamps: str, user_date: str, chosen: Order | None) -> tuple[str | None, str | None]:
-    """Return the beginning of the test; the date of the user text counts where it is clear, else the stamp of the software."""
+    """Return the beginning of the test; the date of the user text if it is clear, otherwise the stamp of the software."""
     at, against = header_date(user_date, chosen)
     first = next(iter(_QUOTED.findall(stamps)), stamps)
     stamped, _ = header_date(first, chosen)
@@ -325,18 +329,18 @@ def _date(stamps: str, user_date: str, chosen: Order | None) -> tuple[str | None
     if stamped and (at is None or (dated is not None and dated.clock_s is None and stamped[:10] == at[:10])):
         return stamped, None
     if stamped and at and stamped[:10] != at[:10]:
-        return at, f"the user's date is {at}, the software's stamp {stamped}: the user's is taken"
+        return at, f"the user's date is {at}, the software's stamp {stamped}: the user's is used"
     return at, against
 
 
-# What a foreign table contains besides positions and readings: temperatures, times, tool, feed, load, labels.
+# Contents of a foreign table in addition to positions and readings: temperatures, times, tool, feed, load, labels.
 #
-# A column that has a place in the contract file is taken along; every other one is named as not used, with the reason.
+# A column with a place in the native file is kept; every other one is listed as not used, with the reason.
 
 
-#: Why a column is not used that the user left out.
-LEFT_OUT = "left out by --ignore"
-#: Parts of names of columns that contain no readings, in the languages of FIELDS; such columns may be left out.
+#: Reason for a column excluded by the user.
+LEFT_OUT = "excluded by --ignore"
+#: Parts of names of columns that contain no readings, in the languages of FIELDS; such columns may be skipped.
 _HARMLESS = (
     "deadpath", "totstrecke", "totweg", "pressure", "druck", "pression", "presion", "humid", "feuchte", "umidita", "humedad",
     "wavelength", "wellenlange", "refractive", "brechung", "intensity", "intensitat", "signal", "quality", "strength", "beam",
@@ -344,12 +348,12 @@ _HARMLESS = (
     "status", "flag", "uncertainty", "unsicherheit", "remark", "comment", "bemerkung", "kommentar", "note", "nota",
     "remarque", "osservazioni", "operator", "bediener", "serial", "dwell",
 )  # fmt: skip
-#: Fields of readings: one that is left over may be what was meant.
+#: Fields of readings: an unused one may be what was meant.
 _READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za")
 #: Units in brackets that are neither a length nor an angle.
 _OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
 
-#: What is kept of the lines above a table, by the words of the key.
+#: Lines above a table that are kept, by the words of the key.
 _FACTS = {
     "operator": ("operator", "bediener", "prufer", "pruefer", "messtechniker", "gemessenvon", "measuredby", "inspector",
                  "technician", "operateur", "operatore", "operador", "bearbeiter", "\u64cd\u4f5c\u5458", "\u6d4b\u91cf\u5458",
@@ -411,11 +415,11 @@ class RowData:
 
 
 def row_data_of(findings: TableFindings, kind: Kind, *, once: bool = True) -> RowData:
-    """Return what a table contains besides its readings, and say in ``findings`` what was taken and what was not.
+    """Return what a table contains besides its readings, and record in ``findings`` what was used and what was not.
 
     Parameters
     ----------
-    once : each row is one reading; False where the runs have columns of their own, and nothing else has a place.
+    once : each row is one reading; False if the runs have separate columns, and nothing else has a place.
     """
     reader = _Reader(
         findings, kind, {findings.fields[key].name for key in _MAIN[kind] if key in findings.fields} | findings.used
@@ -429,7 +433,7 @@ def row_data_of(findings: TableFindings, kind: Kind, *, once: bool = True) -> Ro
 
 @dataclass
 class _Reader:
-    """Takes one column after the other out of what is left of a table."""
+    """Reads one column after the other from the rest of a table."""
 
     findings: TableFindings
     kind: Kind
@@ -438,7 +442,7 @@ class _Reader:
     reasons: dict[str, str] = field(default_factory=dict)
 
     def _try(self, key: str, column: NamedColumn, take: Callable[[], Any]) -> Any:
-        """Return what ``take`` makes of a column; a column that the user did not name is left out if it cannot be read."""
+        """Return the result of ``take`` for a column; a column not given by the user is skipped if it cannot be read."""
         try:
             taken = take()
         except InputError as error:
@@ -491,8 +495,8 @@ class _Reader:
         if values is not None:
             self.found.covariates[channel] = values
             if self.kind != "axis" and channel in ("temp_x_c", "temp_y_c", "temp_z_c"):
-                text = f"{channel} counts as temperature of the scale of {channel[5].upper()}: identify brings the readings to"
-                self.findings.notes.append(f"{text} 20 degC where the machine file has expansion_um_per_m_k")
+                text = f"{channel} is used as temperature of the scale of {channel[5].upper()}: identify corrects the readings to"
+                self.findings.notes.append(f"{text} 20 degC if the machine file has expansion_um_per_m_k")
             low_high = [float(values.min()), float(values.max())]
             self.findings.understood.setdefault("temperatures_c", {})[channel] = low_high
 
@@ -505,7 +509,7 @@ class _Reader:
                     self.found.covariates[name] = values
 
     def labels(self) -> None:
-        """Take run, repeat, line, block, set-up and pose as whole numbers; words are numbered as they come."""
+        """Take run, repeat, line, block, set-up and pose as whole numbers; words are numbered in order of occurrence."""
         for key in _LABELS:
             column = self._column(key)
             if column is not None:
@@ -527,7 +531,7 @@ class _Reader:
             if all(part is not None for part in parts):
                 self.found.tool_mm = np.column_stack(parts)
         else:
-            lacking = "a tool offset has three columns, x, y and z; --map tool_x=... names them"
+            lacking = "a tool offset has three columns, x, y and z; give them with --map tool_x=..."
             self.reasons |= {column.name: lacking for column in tool}
         rows = len(self.findings.table.rows)
         ways = {a: self._ways(f"approach_{a}") for a in "xyz"}
@@ -545,7 +549,7 @@ class _Reader:
         return None if taken is None else np.asarray(taken, dtype=np.float64)
 
     def report(self, *, once: bool) -> None:
-        """Name the columns that were not used."""
+        """List the columns that were not used."""
         why = "the native format has no column for it" if once else "there is one value for several runs"
         unused = {}
         other_fields = [column for key, column in self.findings.fields.items() if key not in _READINGS]
@@ -554,7 +558,7 @@ class _Reader:
             if name in self.used or (name.startswith("column ") and not any(self.findings.table.column(name))):
                 continue
             letters = re.sub(r"[^a-z]", "", column.word)
-            # a column whose name says what it holds, and that it is no reading, may be left out
+            # a column whose name shows that it contains no readings may be skipped
             understood = (
                 column in other_fields
                 or is_temperature(column)
@@ -567,14 +571,14 @@ class _Reader:
             if name in self.findings.options.ignore:
                 reason = LEFT_OUT
             elif name not in self.reasons and column.word in ("uncertainty", "unsicherheit", "u"):
-                reason = f"{reason}; a standard uncertainty (k = 1) of lengths is named by --map u_value=..."
+                reason = f"{reason}; a standard uncertainty (k = 1) of lengths is given by --map u_value=..."
             elif name not in self.reasons and not understood and self.findings.is_numeric(name):
-                # what looks like data is never left out without a word of the user
+                # what looks like data is never skipped without the user's consent
                 reason = "it is not understood"
                 run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
                 self.findings.doubts.append(
-                    f"column {shown(name)} holds numbers and is not understood; say what it is, --map FIELD={name},{run} or "
-                    f"leave it out: --ignore {shown(name)}"
+                    f"column {shown(name)} contains numbers but is not understood; identify it with --map FIELD={name},{run} or "
+                    f"exclude it: --ignore {shown(name)}"
                 )
             unused[name] = reason
         if unused:
@@ -583,10 +587,10 @@ class _Reader:
 
 
 def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
-    """Return the comments of the contract file: those of the file itself, the lines above its table, source and date.
+    """Return the comments of the native file: those of the file itself, the lines above its table, source and date.
 
-    Comments ``# key = value`` count for other commands (``u_length_um``, ``reference_point_mm``) and are kept as they are.
-    Temperatures, operator, instrument, its serial number and the expansion coefficient are kept where they are clear; a
+    Comments ``# key = value`` are used by other commands (``u_length_um``, ``reference_point_mm``) and kept unchanged.
+    Temperatures, operator, instrument, its serial number and the expansion coefficient are kept if they are clear; a
     temperature above a table corrects nothing.
     """
     comments = dict(findings.table.comments)
@@ -602,7 +606,7 @@ def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
 
 
 def _fact(key: str, text: str) -> dict[str, str]:
-    """Return what a line above a table says, by the name and in the unit of the contract; nothing if it is not clear."""
+    """Return a line above a table with native name and unit; nothing if it is not clear."""
     column = split_name(key)
     name = next((name for name, words in _FACTS.items() if column.word in words), None)
     if name is not None and text:

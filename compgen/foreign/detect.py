@@ -1,7 +1,7 @@
-"""What a file is, by its first bytes, and the import of each foreign format.
+"""Detection of a file's format from its first bytes, and the import of each foreign format.
 
-:func:`form_of` looks at the head of a file; :func:`import_file` calls the reader of its format and
-turns units, sign and axis into those of the project. What the file leaves open becomes a doubt.
+:func:`form_of` reads the beginning of a file; :func:`import_file` calls the reader of its format and converts units, sign
+and axis to native ones. What the file leaves open becomes a doubt.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ from compgen.foreign.table_kinds import check_largest, import_table, merged_shee
 MOST_EXCHANGE_BYTES = 16_000_000
 #: A slope of readings over targets further from 1 than this is not an error of a machine.
 SLOPE_TOLERANCE = 0.01
-_SIGN_NOTE = "deviations are measured minus target (errors), as the maker's software has them"
+_SIGN_NOTE = "deviations are measured minus target (errors), as in the maker's software"
 _USER_TEXT = (
     "machine", "serial no", "date", "by", "axis", "location", "title", "owner", "version no", "filetype", "flags",
 )  # fmt: skip
@@ -71,13 +71,13 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     angular = found.letter == "a"
     doubts: list[str] = []
     notes = list(found.notes)
-    if found.zero_runs and options.zero_runs != "keep":  # some programs fill a test in one direction up with such runs
+    if found.zero_runs and options.zero_runs != "keep":  # some programs pad a unidirectional test with such runs
         named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
         if found.one_way_test or options.zero_runs == "drop":
             found = without_runs(found, found.zero_runs)
-            notes.append(f"{named}: zero at every target, left out as not made")
+            notes.append(f"{named}: zero at every target, excluded as not measured")
         else:
-            doubts.append(f"{named}: zero at every target; say --zero-runs drop if not made, keep if measured")
+            doubts.append(f"{named}: zero at every target; give --zero-runs drop if not measured, keep if measured")
     temperatures, measured_at, about = surroundings_of(
         found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates
     )
@@ -89,7 +89,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         "axis": axis,
         **_facts(runs, angular=angular),
         "unit": f"{unit} (by the type of the file, which does not state it)" if "value" not in options.units else unit,
-        "sign": "measured minus target" if options.sign != "correction" else "target minus measured, turned round",
+        "sign": "measured minus target" if options.sign != "correction" else "target minus measured, sign reversed",
         "directions_from": options.directions or "the order of the targets in each run",
         "instrument": found.keys.get("owner") or "Renishaw laser software",
         "encoding": found.encoding,
@@ -104,7 +104,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         error = _error_named(path, axis, options, doubts, angular=angular)
     elif axis is None:
         named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
-        doubts.append(f"the file does not say X, Y or Z{named}; give --axis")
+        doubts.append(f"the file does not state X, Y or Z{named}; give --axis")
     return _imported(path, "renishaw", runs, axis, error, understood, doubts, notes)
 
 
@@ -138,10 +138,10 @@ def _axis_of_name(path: Path, notes: list[str]) -> str | None:
 
 
 def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
-    """Return the error that the user named; without one a placeholder, with the doubt that keeps it from being used."""
+    """Return the error given by the user; without one a placeholder, with the doubt that prevents its use."""
     if options.error is None:
         about = "EA?, EB? or EC? with the axis in place of ?" if angular else "the straightness error, for example EYX"
-        doubts.append(f"the file does not say which error it is; give --error ({about})")
+        doubts.append(f"the file does not state which error it is; give --error ({about})")
         letter = axis or "X"
         return f"E{'B' if angular else AXES[(AXES.index(letter) + 1) % 3]}{letter}"
     try:
@@ -161,10 +161,10 @@ def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: li
     judged = unit_of_deviations(found.runs.value, weighed, usual)
     if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
         doubts.append(
-            f"such files are in {unit}, but the numbers look like {judged.best}: say --unit value={judged.best} or {unit}"
+            f"such files are in {unit}, but the numbers look like {judged.best}: give --unit value={judged.best} or {unit}"
         )
     elif not given:
-        notes.append(f"by the size of the numbers {judged.text()}")
+        notes.append(f"by the magnitude of the numbers {judged.text()}")
     runs = replace(found.runs, value=found.runs.value * units[unit])
     if options.directions == "alternate":
         _, order = np.unique(found.one_way, return_inverse=True)
@@ -173,14 +173,14 @@ def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: li
     else:
         if found.sorted_rows and options.directions is None:
             doubts.append(
-                "its flags say runs in both directions, but every run lists the targets in the same order; give --directions "
-                "alternate (odd runs up, even runs down) or motion"
+                "its flags indicate runs in both directions, but every run lists the targets in the same order; give "
+                "--directions alternate (odd runs up, even runs down) or motion"
             )
         if not runs.direction.all():
-            doubts.append("a run has a single target: its direction is not known")
+            doubts.append("a run has a single target: its direction is unknown")
     if options.sign == "correction":
         runs = runs.negated()
-        notes.append("the values were said to be corrections: their sign was turned round")
+        notes.append("the values are corrections, as given by --sign: their sign was reversed")
     return runs, unit
 
 
@@ -192,18 +192,20 @@ def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
 
 
 def import_ecmc(path: Path, options: ImportOptions) -> Imported:
-    """Import an ISO 230-2 input file of the ecmc tools; it does not say which axis it is."""
+    """Import an ISO 230-2 input file of the ecmc tools; it does not state its axis."""
     found = read_ecmc(path)
-    doubts, notes = [], ["deviations are reading minus target; nothing is taken out of them here"]
+    doubts, notes = [], ["deviations are reading minus target; nothing is removed from them"]
     if found.fitted:
-        notes.append("a gear ratio was fitted to these readings before: the scale error of the axis is not in them")
+        notes.append(
+            "a gear ratio was already fitted to these readings: they do not contain the scale error of the axis"
+        )
     axis = options.axis or _axis_of_name(path, notes)
     if axis is None and options.error is None:
-        doubts.append("the file does not say X, Y or Z; give --axis")
+        doubts.append("the file does not state X, Y or Z; give --axis")
     if abs(found.slope - 1.0) > SLOPE_TOLERANCE:
         doubts.append(
             f"the readings follow the targets with the slope {found.slope:.5g}, which no machine error explains: a gear ratio or "
-            "a sign is missing; correct the readings first, and say so where the result is used"
+            "a sign is missing; correct the readings first, and state it where the result is used"
         )
     runs = found.runs
     if options.directions == "motion":
@@ -216,7 +218,7 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         **_facts(runs, angular=False),
         "unit": found.keys.get("UNIT", "mm (none stated)"),
         "sign": "reading minus target",
-        "directions_from": "the order of the targets: FWD goes through them as they are numbered",
+        "directions_from": "the order of the targets: FWD follows their numbers",
         "slope_of_readings": found.slope,
         "offset_mm": found.offset_mm,
         "instrument": found.keys.get("REF_PV"),
@@ -247,7 +249,7 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
         f"lengths are {units['linear']} and angles {units['angle']}; squareness in the convention of ISO 230-1 (reference X)"
     ]
     if options.sign == "correction":
-        notes.append("the values were said to be corrections: their sign was turned round")
+        notes.append("the values are corrections, as given by --sign: their sign was reversed")
     understood = {
         "errors": list(table.names),
         "ranges_mm": {name: [float(c.position_mm[0]), float(c.position_mm[-1])] for name, c in curves.items()},
@@ -257,7 +259,7 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
             **{name: abs(value) * 1e6 for name, (value, _) in table.squareness.items()},
         },
         "unit": f"{units['linear']}, {units['angle']}",
-        "sign": "errors" if options.sign != "correction" else "corrections, turned round",
+        "sign": "errors" if options.sign != "correction" else "corrections, sign reversed",
         "instrument": "laser tracer software (Etalon exchange)",
     }
     doubts = tuple(_absurd(table, options))
@@ -265,7 +267,7 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
 
 
 def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
-    """Errors that are hundreds of times larger than usual are in another unit, unless the user has said it."""
+    """Errors that are hundreds of times larger than usual are in another unit, unless given by the user."""
     found = []
     for name, curve in table.curves.items():
         linear = error_named(name).kind == "linear"
@@ -274,12 +276,12 @@ def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
         if kind not in options.units and decades_off(curve.value, 1.0, usual) > ABSURD_DECADES:
             reach = f"{float(np.max(np.abs(curve.value))) * (1e3 if linear else 1e6):.4g} {'um' if linear else 'urad'}"
             found.append(
-                f"{name} reaches {reach}: are the numbers mm and rad? say --unit {kind}={'mm' if linear else 'rad'} or another"
+                f"{name} reaches {reach}: are the numbers mm and rad? give --unit {kind}={'mm' if linear else 'rad'} or another"
             )
     for name, (value, _) in table.squareness.items():
         if "angle" not in options.units and abs(value) > USUAL_URAD * 1e-6 * 10**ABSURD_DECADES:
             found.append(
-                f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad? say --unit angle=rad or another"
+                f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad? give --unit angle=rad or another"
             )
     return found
 
@@ -293,7 +295,7 @@ def import_capture(path: Path, options: ImportOptions) -> Imported:
     understood["measured_at"] = at
     keys = {key: value for key, value in found.keys.items() if key != "date"}
     keys |= {"measured_at": at, "date": at} if at else {}
-    notes = ("a capture over time has no targets: no other command computes from it", *([against] if against else []))
+    notes = ("a capture over time has no targets: no other command uses it", *([against] if against else []))
     return Imported(path, "renishaw-capture", "capture", replace(found, keys=keys), understood, (), notes)
 
 
@@ -314,7 +316,7 @@ _FLAGS = {
     "ignore": "--ignore",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
-#: What each format leaves to the user.
+#: What each format leaves open to the user.
 _TAKES: dict[str, tuple[str, ...]] = {
     "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
     "renishaw-capture": ("dates",),
@@ -345,12 +347,12 @@ def form_of(path: Path) -> str:
 
 
 def import_file(path: str | Path, options: ImportOptions | None = None) -> Imported:
-    """Import any foreign file that is known.
+    """Import any supported foreign file.
 
     Raises
     ------
     InputError
-        with file, line and column for one that is damaged, cut, too large or not known.
+        with file, line and column for one that is damaged, truncated, too large or unknown.
     """
     source, chosen = Path(path), options or ImportOptions()
     form = form_of(source)
@@ -361,9 +363,9 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
             raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=source, field=flag)
     for key in chosen.units:
         if form == "renishaw" and key not in ("value", "deviation"):
-            raise InputError("of this format only the unit of the values is open", file=source, field=f"--unit {key}")
+            raise InputError("in this format only the unit of the values is open", file=source, field=f"--unit {key}")
         if form == "etalon-exchange" and key not in ("linear", "angle"):
-            raise InputError("say linear= or angle= for this format", file=source, field=f"--unit {key}")
+            raise InputError("give linear= or angle= for this format", file=source, field=f"--unit {key}")
         if key not in ("value", "linear", "angle"):
             check_field(key, "--unit")
     item = import_table(grid_of_text(read_source(source)), chosen) if form == "table" else READERS[form](source, chosen)
@@ -375,15 +377,15 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
         if name not in text:
             raise InputError(f"there is no column or sheet {name!r}", file=source, field="--ignore")
     if chosen.kind is not None and item.kind != chosen.kind:
-        raise InputError(f"holds {item.kind}, not {chosen.kind}", file=source, field="--kind")
+        raise InputError(f"contains {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item
 
 
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:
     sheets, hidden = read_sheets(path, options.sheet)
-    aside = tuple(f"sheet {shown(name)} is hidden and was left out; --sheet takes it" for name in hidden)
+    aside = tuple(f"sheet {shown(name)} is hidden and was skipped; --sheet reads it" for name in hidden)
     left_out = [name for name, _ in sheets if name in options.ignore]
-    aside += tuple(f"sheet {shown(name)} was left out by --ignore" for name in left_out)
+    aside += tuple(f"sheet {shown(name)} was excluded by --ignore" for name in left_out)
     sheets = [sheet for sheet in sheets if sheet[0] not in left_out]
     if not sheets:
         raise InputError("no sheet is left to read", file=path, field="--ignore")
@@ -396,18 +398,18 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
         try:
             read.append((name, _of_sheet(import_table(grid, options, "xlsx"), name)))
         except CompgenError as error:
-            reason = f"sheet left out: {shown(name)}: {error}"
+            reason = f"sheet skipped: {shown(name)}: {error}"
             if holds_readings(grid):
                 reason = (
-                    f"sheet {shown(name)} holds numbers that are not understood ({error}); take one sheet with --sheet, or "
-                    f"leave it out: --ignore {shown(name)}"
+                    f"sheet {shown(name)} contains numbers that are not understood ({error}); choose one sheet with --sheet, or "
+                    f"exclude it: --ignore {shown(name)}"
                 )
                 open_sheets.append(reason)
             else:
                 reasons.append(reason)
     if not read:
         raise InputError(
-            f"no sheet holds a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
+            f"no sheet contains a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
         )
     item = merged_sheets(read)
     return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))

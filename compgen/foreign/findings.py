@@ -1,7 +1,7 @@
-"""What is found out about a foreign file: options, result, and the units that its numbers speak for.
+"""Findings about a foreign file: options, result, and the units that its numbers suggest.
 
-:class:`ImportOptions` is what the user says, :class:`Imported` what comes out, :class:`TableFindings` the state of a table
-while it is read. Units that a file does not state are weighed by the data (:func:`judge_lengths`, :func:`slope_of`).
+:class:`ImportOptions` is the input of the user, :class:`Imported` the result, :class:`TableFindings` the state of a table
+while it is read. Units that a file does not state are judged from the data (:func:`judge_lengths`, :func:`slope_of`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from compgen.foreign.column_names import (
 from compgen.foreign.laser_files import Capture, format_capture
 from compgen.foreign.source import Order, parse_number, shown
 
-# What an import hands on: the object of the project, what was understood, and what is in doubt.
+# The result of an import: the object, what was understood, and what is in doubt.
 
 
 Kind = Literal["axis", "lengths", "deviations", "errors", "capture"]
@@ -58,25 +58,25 @@ _WRITERS: dict[type, Callable[[Any], str]] = {
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the user says about a file; None or empty: take it from the file.
+    """Input of the user about a file; None or empty: take it from the file.
 
     Parameters
     ----------
-    kind : what the file holds.
+    kind : contents of the file.
     columns : column of the file by field (position, deviation, direction, ...).
-    units : unit by field; the field "value" stands for deviations, lengths and errors.
-    axis : X, Y or Z, for files that measure along one axis and do not say which.
-    error : name of the error (EYX, ECX, ...) that the values of a file are, for straightness and angles.
-    sign : "error" (measured minus commanded) or "correction" (what is to be added; turned round on import).
+    units : unit by field; the field "value" is for deviations, lengths and errors.
+    axis : X, Y or Z, for files that measure along one axis and do not state it.
+    error : name of the error (EYX, ECX, ...) in the file, for straightness and angles.
+    sign : "error" (measured minus commanded) or "correction" (what is to be added; the sign is reversed on import).
     directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
     sheet : name of the sheet of a workbook.
-    decimal : decimal mark of a table, where its numbers do not show it.
-    zero_runs : what becomes of laser runs that are zero at every target.
-    dates : order of day, month and year where the file writes them as numbers.
-    ignore : columns, or sheets of a workbook, that are left out though they hold numbers.
+    decimal : decimal mark of a table, if its numbers do not show it.
+    zero_runs : treatment of laser runs that are zero at every target.
+    dates : order of day, month and year if they are numbers.
+    ignore : columns, or sheets of a workbook, to exclude although they contain numbers.
     """
 
-    kind: Kind | None = option(None, "What the file holds; default: told by its columns.")
+    kind: Kind | None = option(None, "What the file contains; default: recognised by its columns.")
     columns: Mapping[str, str] = option(
         factory=dict,
         text="FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, "
@@ -95,27 +95,27 @@ class ImportOptions:
     )
     axis: str | None = option(None, "The axis that moved.", choices=AXES)
     error: str | None = option(
-        None, "The error that the values are (EYX, ECX, ...), for straightness and angles.", metavar="NAME"
+        None, "Name of the error in the file (EYX, ECX, ...), for straightness and angles.", metavar="NAME"
     )
     sign: Literal["error", "correction"] | None = option(
         None,
-        "error: measured minus commanded (default where the format says so); correction: to be turned round.",
+        "error: measured minus commanded (default if the format defines it); correction: the sign is to be reversed.",
     )
     directions: Literal["labels", "motion", "alternate"] | None = option(
         None,
-        "labels: as the file names them; motion: from the order of the rows; alternate: odd runs up, even down.",
+        "labels: as in the file; motion: from the order of the rows; alternate: odd runs up, even down.",
     )
     sheet: str | None = option(None, "Sheet of a workbook.", metavar="NAME")
     dates: Order | None = option(None, "Order of dates such as 03/04/2025 (never guessed): day, month, year.")
     decimal: Literal["comma", "point"] | None = option(
-        None, "Decimal mark of a table; the other one separates thousands (needed where 1,000 may be either)."
+        None, "Decimal mark of a table; the other one separates thousands (needed if 1,000 is ambiguous)."
     )
     zero_runs: Literal["drop", "keep"] | None = option(
-        None, "Laser runs that are zero at every target: not made (drop) or measured (keep)."
+        None, "Laser runs that are zero at every target: not measured (drop) or measured (keep)."
     )
     ignore: Sequence[str] = option(
         (),
-        "Column, or sheet of a workbook, that is left out though it holds numbers (may be given several times).",
+        "Column, or sheet of a workbook, to exclude although it contains numbers (may be given several times).",
         metavar="NAME",
     )
 
@@ -135,17 +135,17 @@ class ImportOptions:
 
 @dataclass(frozen=True)
 class Imported:
-    """A foreign file as an object of the project.
+    """A foreign file as a native object.
 
     Parameters
     ----------
     path, format : the file, and the name of its format.
-    kind : which contract file it becomes.
+    kind : kind of native file.
     data : the object, mm and rad.
     understood : what was read from the file or inferred, in words and numbers.
-    doubts : what the file does not settle; until the user has said it, no other command takes the file as it is.
-    notes : remarks that need no decision.
-    reversal : difference of both directions, where ``data`` holds only their mean.
+    doubts : open questions; until the user answers them, no other command accepts the file.
+    notes : remarks that require no decision.
+    reversal : difference of both directions, if ``data`` contains only their mean.
     beside : errors on other sheets of a workbook of axis runs (squareness, straightness).
     """
 
@@ -161,28 +161,28 @@ class Imported:
 
     @property
     def file_name(self) -> str:
-        """Name of the contract file that it becomes."""
+        """Name of the native file."""
         return f"{self.path.stem}{SUFFIXES[self.kind]}"
 
     def check_settled(self) -> None:
         """Raise InputError if something is in doubt, or the file holds two measurements."""
         if self.doubts:
             raise InputError(
-                f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and takes what is "
-                "missing; give its result to this command",
+                f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and accepts what is "
+                "missing; pass its result to this command",
                 file=self.path,
             )
 
         if self.beside is not None:
             names = ", ".join(self.beside.names)
             raise InputError(
-                f"holds runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file of each; or take one "
-                "of them, with --ignore SHEET for the other",
+                f"contains runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file for each; or read "
+                "one of them, with --ignore SHEET for the other",
                 file=self.path,
             )
 
     def files(self) -> dict[str, str]:
-        """Return the texts of the contract files by name."""
+        """Return the texts of the native files by name."""
         found = {self.file_name: _WRITERS[type(self.data)](self.data)}
         if self.reversal is not None:
             found[f"{self.path.stem}.reversal.csv"] = format_reversal(self.reversal)
@@ -202,24 +202,25 @@ class Imported:
         }
 
 
-# Unit and sign as hypotheses that the data speak for or against.
+# Unit and sign as hypotheses tested with the data.
 #
-# Three ways to judge, the strongest first. Where a file holds target AND reading, the slope of the one over the other is
-# the ratio of their units and its sign the sign. Tracer lengths and commanded points obey |P - S|^2 = (k L + c)^2, linear in
-# k^2, S and the rest, so least squares tells the unit k and, by the sign of k L + c, the sign. Bare deviations have their
-# size only: it is compared with what machine tools have.
+# Three methods, the strongest first. If a file contains target AND reading, the slope of the reading over the target is
+# the ratio of their units, and its sign is the sign. Tracer lengths and commanded points obey |P - S|^2 = (k L + c)^2,
+# linear in k^2, S and the rest, so least squares gives the unit k and, by the sign of k L + c, the sign. Deviations
+# alone have only their magnitude: it is compared with that of usual machine tools.
 
 
-#: Usual size of a deviation: so much, and so much for each metre of travel; one standard deviation is a factor of 5.
+#: Usual magnitude of a deviation: a constant, and a part for each metre of travel; one standard deviation is a factor
+#: of 5.
 USUAL_UM, USUAL_UM_PER_M, SPREAD_DECADES = 2.0, 10.0, 0.7
 USUAL_URAD = 10.0
 #: Usual travel, and its spread.
 USUAL_TRAVEL_MM, TRAVEL_DECADES = 800.0, 0.5
-#: A hypothesis with less than this share of all is not taken without being asked.
+#: A hypothesis with a smaller share is not used without confirmation.
 SURE = 0.95
-#: A declared unit that makes the data so much larger or smaller than usual is doubted (decades).
+#: A declared unit that makes the data this much larger or smaller than usual is doubted (decades).
 ABSURD_DECADES = 2.2
-#: Deviation of a slope from a ratio of units that still is that ratio.
+#: Largest deviation of a slope from a ratio of units.
 SLOPE_TOLERANCE = 0.02
 
 
@@ -233,11 +234,11 @@ class UnitVerdict:
 
     @property
     def sure(self) -> bool:
-        """Whether it may be taken without asking."""
+        """Whether it may be used without confirmation."""
         return self.share >= SURE
 
     def text(self) -> str:
-        """Say the best two in words."""
+        """Return the best two in words."""
         ranked = sorted(self.shares.items(), key=lambda item: -item[1])[:2]
         return ", ".join(f"{name} {100 * share:.1f} %" for name, share in ranked)
 
@@ -273,7 +274,7 @@ def unit_of_deviations(values: FloatArray, units: Mapping[str, float], usual_si:
 
 
 def unit_of_positions(span: float) -> UnitVerdict:
-    """Judge mm, m and inch for positions that span so much; mm is ten times as likely before one looks."""
+    """Judge mm, m and inch for positions of this range; mm is ten times as likely a priori."""
     scores = {
         name: prior - 0.5 * (float(np.log10(max(span * scale, 1e-12) / USUAL_TRAVEL_MM)) / TRAVEL_DECADES) ** 2
         for name, scale, prior in (("mm", 1.0, 0.0), ("m", 1e3, -np.log(10.0)), ("in", 25.4, -np.log(50.0)))
@@ -304,7 +305,7 @@ def slope_of(target: FloatArray, reading: FloatArray) -> Slope:
 
 @dataclass(frozen=True)
 class LengthGeometry:
-    """What lengths and points say together: mm per unit of length, and the sign with which lengths grow."""
+    """Joint result of lengths and points: mm per unit of length, and the sign of growing lengths."""
 
     mm_per_unit: float
     sign: int
@@ -313,12 +314,12 @@ class LengthGeometry:
 def judge_lengths(position_mm: FloatArray, length: FloatArray) -> LengthGeometry | None:
     """Judge the unit and the sign of the lengths of ONE station and set-up.
 
-    |P|^2 = k^2 L^2 + 2 k c L + 2 S P + (c^2 - |S|^2) with points P (n, 3) in mm and lengths L (n,) in their unit. Two
-    solutions c differ in sign only with k; of both the one counts with k L + c > 0 everywhere.
+    |P|^2 = k^2 L^2 + 2 k c L + 2 S P + (c^2 - |S|^2) with points P (n, 3) in mm and lengths L (n,) in their unit. Of
+    the two solutions, which differ in the sign of k and c, the one with k L + c > 0 everywhere is used.
 
     Returns
     -------
-    what they say, or None if the points are too few or do not tell (k^2 not above zero, sign mixed).
+    the result, or None if the points are too few or inconclusive (k^2 not above zero, mixed signs).
     """
     if len(length) < 8:
         return None
@@ -340,22 +341,22 @@ def judge_lengths(position_mm: FloatArray, length: FloatArray) -> LengthGeometry
     return LengthGeometry(k * size / scale, 1 if distance[0] > 0 else -1)
 
 
-# What is found out about one table while it is read: the units that count, what was understood, what is in doubt.
+# Findings about one table while it is read: the units in use, what was understood, what is in doubt.
 
 
 #: A unit in brackets, after the word "in" (en, em), or at the end of a line.
 _UNIT_IN_TEXT = re.compile(r"[\[(]([^\])]{1,8})[\])]|\b(?:in|en|em)\s+(\S{1,6})|\s([u\u00b5\u03bc]m|mm)\s*$")
-#: Units that are weighed when a file says none.
+#: Units that are considered if a file states none.
 _LENGTHS = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "nm", "in")}
 _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg")}
 
 
 @dataclass
 class TableFindings:
-    """One table being read; ``fields`` holds its columns by field, ``used`` the names of columns that gave values.
+    """One table being read; ``fields`` holds its columns by field, ``used`` the names of used columns.
 
-    ``letter`` is the axis by the names of the columns.
-    ``checked_sign`` says that a second column has shown the sign of the values; ``runs`` are the columns of a run each.
+    ``letter`` is the axis by the names of the columns. ``checked_sign`` is True if a second column confirmed the sign
+    of the values; ``runs`` are the columns of a run each.
     """
 
     table: Table
@@ -379,21 +380,21 @@ class TableFindings:
         return bool(filled) and 2 * sum(parse_number(cell) is not None for cell in filled) >= len(filled)
 
     def unit(self, key: str, *also: str) -> str | None:
-        """Return the unit that the user gave for a field, or for one of ``also``, else that in the column's name, or None."""
+        """Return the unit that the user gave for a field, or for one of ``also``, otherwise the one in the column's name."""
         return self.options.given_unit(key, *also) or self.fields[key].unit
 
     def positions_mm(self, key: str, values: FloatArray) -> FloatArray:
-        """Return positions in mm: by the user's word, the column's name, else by their size."""
+        """Return positions in mm: by option, by the column's name, otherwise by their magnitude."""
         unit = self.unit(key, "position")
         if unit is None:
             judged = unit_of_positions(float(np.ptp(values)))
-            # positions are probably in inches too where another field is
+            # positions are probably also in inches if another field is
             said = {key: known_unit(unit) for key, unit in self.options.units.items()}
             said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
             inches = next((key for key, unit in said.items() if unit in ("in", "mil")), None)
             if inches and judged.best != "in":
                 self.doubts.append(
-                    f"{inches} is in inches, and the file gives no unit of {key}; give --unit {key}=in or mm"
+                    f"{inches} is in inches, and the file states no unit of {key}; give --unit {key}=in or mm"
                 )
             unit = judged.best if inches else self._weighed(f"unit of {key}", judged)
         if unit not in MM_PER_LENGTH:
@@ -403,15 +404,15 @@ class TableFindings:
         return values * MM_PER_LENGTH[unit]
 
     def values_si(self, key: str, name: str, values: FloatArray, usual_si: float, *, angular: bool) -> FloatArray:
-        """Return deviations in mm or rad: by the user's word, the column's name, else by their size.
+        """Return deviations in mm or rad: by option, by the column's name, otherwise by their magnitude.
 
-        A declared unit is doubted where it makes the data absurdly large or small and another one does not.
+        A declared unit is doubted if it makes the data absurdly large or small and another one does not.
         """
         units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
         column = self.fields.get(key)
         given = self.options.given_unit(key, "value")
         unit = given or (column.unit if column else None)
-        if unit is None:  # above the table: ``Unit: um``, or the only unit in the lines that speak of deviations
+        if unit is None:  # above the table: ``Unit: um``, or the only unit in the lines about deviations
             above = self.table.metadata
             said = next((text for key, text in above.items() if key in ("unit", "units", "einheit")), None)
             lines = [line for key, text in above.items() if is_deviation(line := f"{key} {text}")]
@@ -433,7 +434,7 @@ class TableFindings:
     def _weighed(self, what: str, judged: UnitVerdict) -> str:
         key = what.rpartition(" ")[2]
         if judged.sure:
-            self.notes.append(f"the file gives no {what}; by the size of the numbers {judged.text()}")
+            self.notes.append(f"the file states no {what}; by the magnitude of the numbers {judged.text()}")
         else:
-            self.doubts.append(f"the file gives no {what} ({judged.text()}); give --unit {key}=...")
+            self.doubts.append(f"the file states no {what} ({judged.text()}); give --unit {key}=...")
         return judged.best

@@ -1,6 +1,6 @@
 """Files of laser interferometers: Renishaw runs as text, ecmc input files, and dynamic captures in binary form.
 
-Each reader refuses a file that is cut or does not fit together, with the line; units and axis are left to
+Each reader refuses a truncated or inconsistent file, with the line; units and axis are determined by
 :mod:`compgen.foreign.detect`.
 """
 
@@ -30,12 +30,12 @@ from compgen.foreign.source import (
 
 # Renishaw laser files in text form: .rtl (linear, um), .rta (angular, mrad), .rts (straightness, um).
 #
-# There is no public specification. The layout is what programs that write and read such files agree on: sections
+# There is no public specification. The layout is the common ground of programs that write and read such files: sections
 # ``NAME::``, lines ``key : value``, N targets in free format, rows ``run target deviation``. The parser is tolerant in
-# spacing and in sections that it does not know, and strict in numbers: every run must hold every target.
+# spacing and unknown sections, and strict in numbers: every run must contain every target.
 
 
-#: What the deviations are by the letter of the file type; the file does not state the unit.
+#: Kind of the deviations by the letter of the file type; the file does not state the unit.
 UNITS = {"l": "um", "a": "mrad", "s": "um"}
 SUFFIXES = {".rtl": "l", ".rta": "a", ".rts": "s"}
 REFUSED = {".rtf": "flatness", ".rtp": "squareness", ".rtr": "a rotary axis"}
@@ -46,14 +46,14 @@ _SECTION = re.compile(r"\s{0,20}([A-Za-z][A-Za-z0-9 _\-]{0,40})::\s*")
 _KEY = re.compile(r"\s{0,40}([A-Za-z][^:]{0,60}?)\s{0,40}:(.*)")
 #: Sections about the surroundings and the instrument; their keys are not those of the machine.
 BESIDE = ("ENVIRONMENT", "EQUIPMENT")
-#: Keys after which numbers follow; a line of user text that is called the same begins nothing.
+#: Keys followed by numbers; a line of user text with the same key begins nothing.
 _BLOCKS = ("targets", "run target data")
 _SIGNS = ("run target data", "target-count", "run-count")
 
 
 @dataclass
 class _File:
-    """What was read so far: values by lower-case key, numbers by section, and how the file ended."""
+    """The data read so far: values by lower-case key, numbers by section, and how the file ended."""
 
     keys: dict[str, str] = field(default_factory=dict)
     targets: list[float] = field(default_factory=list)
@@ -70,9 +70,10 @@ class _File:
 class Renishaw:
     """A text file of the laser software: ``letter`` of its type, axis runs in the file's unit, user text by key.
 
-    ``one_way`` holds the run numbers of the file (n,); ``sorted_rows`` says that the flags name two directions, but all
-    runs list their targets in the same order. ``beside`` holds the keys of ENVIRONMENT and EQUIPMENT, ``zero_runs`` the runs
-    that are zero at every target while others are not; ``one_way_test`` says that the flags name one direction only.
+    ``one_way`` holds the run numbers of the file (n,); ``sorted_rows`` is True if the flags indicate two directions,
+    but all runs list their targets in the same order. ``beside`` has the keys of ENVIRONMENT and EQUIPMENT,
+    ``zero_runs`` the runs that are zero at every target while others are not; ``one_way_test`` is True if the flags
+    indicate one direction only.
     """
 
     letter: str
@@ -88,16 +89,16 @@ class Renishaw:
 
 
 def is_renishaw_text(head: str) -> bool:
-    """Tell a text file of the laser software by its first lines."""
+    """Recognise a text file of the laser software by its first lines."""
     low = head.lower()
     return low.lstrip().startswith("header::") or any(f"\n{sign}" in low for sign in _SIGNS)
 
 
 def read_renishaw(path: Path) -> Renishaw:
-    """Read a .rtl, .rta or .rts file; InputError with the line for one that is cut or does not fit together."""
+    """Read a .rtl, .rta or .rts file; InputError with the line for one that is truncated or inconsistent."""
     if path.suffix.lower() in REFUSED:
         what = REFUSED[path.suffix.lower()]
-        raise InputError(f"holds {what}; .rtl, .rta and .rts of linear axes are read", file=path)
+        raise InputError(f"contains {what}; .rtl, .rta and .rts of linear axes are read", file=path)
     source = read_source(path, ENCODINGS_EAST, MOST_RENISHAW_BYTES)
     found = _File()
     for number, line in enumerate(source.text.split("\n"), start=1):
@@ -167,7 +168,7 @@ def _row(source: Text, found: _File, number: int, line: str) -> tuple[int, int, 
     words = line.split()
     values = [parse_number(word) for word in words]
     if len(words) != 3 or None in values:
-        cut = "; was the file cut?" if len(words) < 3 else ""
+        cut = "; is the file truncated?" if len(words) < 3 else ""
         message = f"expected three numbers 'run target deviation', found {shown(line.strip())}{cut}"
         raise source.fail(message, number, "DEVIATIONS")
     run, target, deviation = (float(value) for value in values if value is not None)
@@ -188,22 +189,22 @@ def _count(source: Text, found: _File, key: str, most: int) -> int | None:
 
 
 def _check_end(source: Text, found: _File) -> None:
-    """Refuse a cut file: counts must hold, every run must have every target, and a last number must be whole."""
+    """Refuse a truncated file: counts must match, every run must have every target, and the last number be complete."""
     targets, rows = len(found.targets), len(found.rows)
     declared = _count(source, found, "target-count", MOST_TARGETS)
     runs = _count(source, found, "run-count", MOST_RUNS)
     if not targets:
-        raise source.fail("holds no target positions ('Targets :' in the section TARGET DATA); was it cut?")
+        raise source.fail("contains no target positions ('Targets :' in the section TARGET DATA); is it truncated?")
     if declared is not None and targets != declared:
         raise source.fail(
-            f"declares {declared} targets but holds {targets}; was it cut or edited?", None, "Target-count"
+            f"declares {declared} targets but contains {targets}; is it truncated or edited?", None, "Target-count"
         )
     if not rows:
-        raise source.fail("holds no readings ('Run Target Data:' in the section DEVIATIONS); was it cut?")
+        raise source.fail("contains no readings ('Run Target Data:' in the section DEVIATIONS); is it truncated?")
     runs = runs or max(row[1] for row in found.rows)
     if rows != runs * targets:
-        cut = "" if found.complete else ", and has no end mark EOF::: it was cut"
-        message = f"{runs} runs of {targets} targets are {runs * targets} readings, the file holds {rows}{cut}"
+        cut = "" if found.complete else ", and has no end mark EOF::: it is truncated"
+        message = f"{runs} runs of {targets} targets are {runs * targets} readings, the file contains {rows}{cut}"
         raise source.fail(message, found.rows[-1][0], "DEVIATIONS")
     seen: set[tuple[int, int]] = set()
     for number, run, target, _ in found.rows:
@@ -212,7 +213,7 @@ def _check_end(source: Text, found: _File) -> None:
             raise source.fail(message, number, "DEVIATIONS")
         seen.add((run, target))
     if not found.complete and found.reading and not source.ended:
-        raise source.fail("ends in the middle of a line, without an end mark: it was cut", found.rows[-1][0])
+        raise source.fail("ends in the middle of a line, without an end mark: it is truncated", found.rows[-1][0])
 
 
 def without_runs(found: Renishaw, numbers: tuple[int, ...]) -> Renishaw:
@@ -223,7 +224,7 @@ def without_runs(found: Renishaw, numbers: tuple[int, ...]) -> Renishaw:
 
 
 def _letter(source: Text, found: _File) -> str:
-    """Type by the file's name, else by the value of 'File type'."""
+    """Return the type from the file's name, otherwise from 'File type'."""
     by_name = SUFFIXES.get(source.path.suffix.lower())
     kind = found.keys.get("file type", "").lower()
     by_key = next((SUFFIXES[suffix] for suffix in SUFFIXES if suffix[1:] in re.findall("[a-z]+", kind)), None)
@@ -231,21 +232,21 @@ def _letter(source: Text, found: _File) -> str:
         words = {"linear": "l", "angular": "a", "straightness": "s"}
         by_key = next((letter for word, letter in words.items() if word in kind), None)
     if by_name and by_key and by_name != by_key:
-        raise source.fail(f"is called {source.path.suffix} but says File type {shown(kind)}; rename it to what it is")
+        raise source.fail(f"has the ending {source.path.suffix} but File type {shown(kind)}; rename it accordingly")
     chosen = by_name or by_key
     if chosen is None:
-        raise source.fail("neither its name (.rtl, .rta, .rts) nor 'File type' says whether it is linear or angular")
+        raise source.fail("neither its name (.rtl, .rta, .rts) nor 'File type' shows whether it is linear or angular")
     return chosen
 
 
-# ISO 230-2 input files of the ecmc motion tools (``*.dat``): assignments as a shell reads them.
+# ISO 230-2 input files of the ecmc motion tools (``*.dat``): assignments in shell syntax.
 #
 # ``TGT_DATA[i]=`` targets, ``REF_DATA_FWD[i,j]=`` and ``REF_DATA_BWD[i,j]=`` the reference readings at target i of cycle j,
 # ``UNIT=``, ``CYCLES=``, ``POSITIONS=``. Deviation = reading - target; nothing is removed from it.
 
 
 MOST_ECMC_BYTES = 16_000_000
-#: Correlation below which readings are taken to have been fitted; by chance it is a few percent.
+#: Correlation below which readings count as fitted; by chance it is a few percent.
 FITTED = 1e-4
 MM_PER = {"mm": 1.0, "um": 1e-3, "m": 1e3, "nm": 1e-6}
 _ASSIGNMENT = re.compile(r"\s{0,20}([A-Za-z_][A-Za-z0-9_]{0,40})(?:\[\s*(\d{1,6})\s*(?:,\s*(\d{1,6})\s*)?\])?\s*=(.*)")
@@ -255,7 +256,7 @@ _SIGN = re.compile(r"^\s*(TGT_DATA|REF_DATA_FWD|REF_DATA_BWD)\[", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Ecmc:
-    """Readings in mm, the other assignments by name, and what the readings say about slope and direction."""
+    """Readings in mm, the other assignments by name, and slope and direction of the readings."""
 
     runs: OneAxis
     keys: Mapping[str, str]
@@ -264,7 +265,7 @@ class Ecmc:
 
     @property
     def fitted(self) -> bool:
-        """Whether a line from readings to targets was fitted to these very readings and taken out of them.
+        """Whether a line from readings to targets was fitted to these readings and removed from them.
 
         Then the deviations have no mean and do not follow the readings (the normal equations of that fit).
         """
@@ -285,12 +286,12 @@ class _Reading:
 
 
 def is_ecmc(head: str) -> bool:
-    """Tell such a file by its first lines."""
+    """Recognise such a file by its first lines."""
     return _SIGN.search(head) is not None
 
 
 def read_ecmc(path: Path) -> Ecmc:
-    """Read an ISO 230-2 input file; InputError with the line for one that is cut or does not fit together."""
+    """Read an ISO 230-2 input file; InputError with the line for one that is truncated or inconsistent."""
     source = read_source(path, most=MOST_ECMC_BYTES)
     keys: dict[str, str] = {}
     targets: dict[int, tuple[float, int]] = {}
@@ -301,7 +302,7 @@ def read_ecmc(path: Path) -> Ecmc:
         if content:
             decimals.append(_take(source, number, content, keys, (targets, readings)))
     if not source.ended and len(decimals) > 2 and decimals[-1] < min(decimals[len(keys) : -1], default=0):
-        raise source.fail("the last line has no line end and fewer decimals than all others: it was cut")
+        raise source.fail("the last line has no line end and fewer decimals than all others: it is truncated")
     _check_complete(source, keys, targets, readings)
     unit = keys.get("UNIT", "mm").lower().replace("\u00b5", "u").replace("\u03bc", "u")
     if unit not in MM_PER:
@@ -312,12 +313,12 @@ def read_ecmc(path: Path) -> Ecmc:
     order = [targets[k][0] for k in sorted(targets)]
     steps = np.sign(np.diff(order))
     if not (np.all(steps == steps[0]) and steps[0] != 0):
-        raise source.fail("the targets neither ascend nor descend; the directions cannot be told")
-    # a cycle goes through the targets in their order (FWD) and back (BWD); the file lists all FWD before all BWD
+        raise source.fail("the targets are neither ascending nor descending; the directions cannot be determined")
+    # a cycle visits the targets in their order (FWD) and back (BWD); the file lists all FWD before all BWD
     rows = sorted(readings.values(), key=lambda item: (item.cycle, -item.way, item.way * item.target))
     position = np.array([targets[item.target][0] for item in rows]) * scale
     actual = np.array([item.value for item in rows]) * scale
-    # the direction of FWD is that of the motion, whatever its name says
+    # the direction of FWD is that of the motion, whatever its name
     way, cycle, at = np.array([(item.way, item.cycle, item.line) for item in rows], dtype=np.int64).T
     slope, offset = np.polyfit(position, actual, 1).tolist()
     runs = OneAxis(position, way * int(steps[0]), cycle, actual - position, at, in_time=True)
@@ -331,24 +332,24 @@ def _take(
     keys: dict[str, str],
     data: tuple[dict[int, tuple[float, int]], dict[tuple[str, int, int], _Reading]],
 ) -> int:
-    """Take one assignment and return the number of its decimals."""
+    """Read one assignment and return the number of its decimals."""
     match = _ASSIGNMENT.fullmatch(content)
     if not match:
-        raise source.fail(f"expected an assignment NAME=value, found {shown(content)}; was the file cut?", number)
+        raise source.fail(f"expected an assignment NAME=value, found {shown(content)}; is the file truncated?", number)
     name, first, second, text = match.group(1).upper(), match.group(2), match.group(3), match.group(4).strip(" \t\"';")
     if name not in _ARRAYS:
         keys[name] = text
         return 99
     if (first is None) or (second is not None) != (_ARRAYS[name] == 2):
         due = "[target,cycle]" if _ARRAYS[name] == 2 else "[target]"
-        raise source.fail(f"{name} takes {due}, found {shown(content)}", number)
+        raise source.fail(f"{name} requires {due}, found {shown(content)}", number)
     value = parse_number(text)
     if value is None:
-        raise source.fail(f"{shown(text)} is not a number; was the file cut?", number, name)
+        raise source.fail(f"{shown(text)} is not a number; is the file truncated?", number, name)
     targets, readings = data
     if name == "TGT_DATA":
         if targets.setdefault(int(first), (value, number)) != (value, number) and targets[int(first)][0] != value:
-            raise source.fail(f"target {first} has another value already in line {targets[int(first)][1]}", number)
+            raise source.fail(f"target {first} already has another value in line {targets[int(first)][1]}", number)
         return len(text.partition(".")[2])
     key = (name, int(first), int(second))
     if key in readings:
@@ -369,18 +370,18 @@ def _check_complete(
     ):
         declared = parse_number(keys.get(name, ""))
         if declared is not None and declared != found:
-            raise source.fail(f"declares {keys[name]} {what} but holds {found}: was it cut?", field=name)
+            raise source.fail(f"declares {keys[name]} {what} but contains {found}; is it truncated?", field=name)
     names = {name for name, _, _ in readings}
     cycles = {item.cycle for item in readings.values()}
     for name in sorted(names):
         missing = [(i, j) for j in sorted(cycles) for i in sorted(targets) if (name, i, j) not in readings]
         if missing:
-            raise source.fail(f"{name}[{missing[0][0]},{missing[0][1]}] is missing: was it cut?")
+            raise source.fail(f"{name}[{missing[0][0]},{missing[0][1]}] is missing; is it truncated?")
     strange = next((item for item in readings.values() if item.target not in targets), None)
     if strange:
         raise source.fail(f"a reading of target {strange.target}, which has no TGT_DATA", strange.line)
     if len(targets) < 2 or not readings:
-        raise source.fail("holds fewer than two targets with readings")
+        raise source.fail("contains fewer than two targets with readings")
 
 
 # Dynamic captures of a laser interferometer (.rtx): displacement over time, no targets.
@@ -389,7 +390,7 @@ def _check_complete(
 
 
 _START, _DATA = b"HEADER::\r\n", b"\nData:\r\n"
-#: The end mark is looked for in so many bytes behind the samples.
+#: Number of bytes after the samples in which the end mark is searched.
 _TRAILER_BYTES, _SAMPLE_BYTES = 16, 8
 #: More samples than this are not written as text.
 MOST_ROWS = 2_000_000
@@ -409,7 +410,7 @@ class Capture:
         return len(self.value)
 
     def summary(self) -> dict[str, object]:
-        """Say what was captured; the samples are looked at in blocks."""
+        """Return a summary of the capture; the samples are processed in blocks."""
         low, high, first, last = np.inf, -np.inf, float(self.value[0]), float(self.value[-1])
         for start in range(0, len(self.value), 1_000_000):
             block = self.value[start : start + 1_000_000]
@@ -427,12 +428,12 @@ class Capture:
 
 
 def is_capture(head: bytes) -> bool:
-    """Tell a binary capture by its first bytes."""
+    """Recognise a binary capture by its first bytes."""
     return head.startswith(_START) and _DATA in head
 
 
 def read_capture(path: Path) -> Capture:
-    """Read a .rtx file without loading it whole; InputError for one that is cut."""
+    """Read a .rtx file without loading it whole; InputError for a truncated one."""
     size = check_size(path, MOST_CAPTURE_BYTES)
     head = read_bytes(path, HEAD_BYTES)
     if not is_capture(head):
@@ -447,18 +448,18 @@ def read_capture(path: Path) -> Capture:
     count = _whole(path, keys, "sample no")
     if size < start + _SAMPLE_BYTES * count:
         found = max(0, (size - start) // _SAMPLE_BYTES)
-        raise InputError(f"declares {count} samples but holds {found}: it was cut", file=path, field="Sample no")
+        raise InputError(
+            f"declares {count} samples but contains {found}: it is truncated", file=path, field="Sample no"
+        )
     with path.open("rb") as stream:
         stream.seek(start + _SAMPLE_BYTES * count)
         trailer = stream.read(_TRAILER_BYTES)
-    if (
-        not 0 <= trailer.find(b"EOF") < _SAMPLE_BYTES
-    ):  # further off, there would be a sample before it that is not counted
-        raise InputError("has no end mark EOF:: behind its samples: it was cut, or Sample no is wrong", file=path)
+    if not 0 <= trailer.find(b"EOF") < _SAMPLE_BYTES:  # further off, there would be an uncounted sample before it
+        raise InputError("has no end mark EOF:: after its samples: it is truncated, or Sample no is wrong", file=path)
     value = np.memmap(path, dtype="<f8", mode="r", offset=start, shape=(count,))
     for first in range(0, count, 1_000_000):
         if not np.isfinite(value[first : first + 1_000_000]).all():
-            raise InputError("holds samples that are not finite numbers; is it damaged?", file=path)
+            raise InputError("contains samples that are not finite numbers; is it damaged?", file=path)
     angular = "angular" in keys.get("file type", "").lower()
     return Capture(value, "mrad" if angular else "mm", _step(path, keys), keys)
 
@@ -476,7 +477,7 @@ def _step(path: Path, keys: Mapping[str, str]) -> float:
         value = parse_number(keys.get(key, ""))
         if value is not None and value > 0:
             return 1.0 / value if is_rate else value
-    raise InputError("says neither a sample rate nor an interval", file=path, field="Sample rate")
+    raise InputError("states neither a sample rate nor an interval", file=path, field="Sample rate")
 
 
 def format_capture(capture: Capture) -> str:

@@ -1,4 +1,4 @@
-"""Readings along one axis as every format gives them, and what becomes of them: axis runs, or one error over the axis."""
+"""Readings along one axis from any format, converted to axis runs or to one error over the axis."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from compgen.errors import InputError
 from compgen.identify.axis_tests import SAME_TARGET_MM, two_way_mean, worth_a_table
 
 IntArray = NDArray[np.int64]
-#: A reading is remarked on if it lies so far from the median, mm or rad, and so many times further than nine in ten others.
+#: A reading is reported if it is this far from the median, mm or rad, and this many times further than nine in ten
+#: others.
 _NOTABLE, _FAR = 0.1, 20.0
 _AXIS = re.compile(r"(?<![A-Z])([XYZ])[0-9]?(?![A-Z])")
 
@@ -29,11 +30,11 @@ class OneAxis:
     Parameters
     ----------
     position_mm : targets (n,).
-    direction : +1, -1, or 0 where it is not known, (n,).
-    run : number of the run, from 1, (n,); the two ways of a cycle count as one run.
+    direction : +1, -1, or 0 if unknown, (n,).
+    run : number of the run, from 1, (n,); both directions of a cycle count as one run.
     value : measured minus target (n,), mm or rad.
     line : line of the file, (n,).
-    covariates : further numbers by contract name (time_s, temp_..._c), each (n,).
+    covariates : other numbers by native name (time_s, temp_..._c), each (n,).
     in_time : whether the rows are in the order in which they were measured; tables by target or direction are not.
     """
 
@@ -46,10 +47,10 @@ class OneAxis:
     in_time: bool = False
 
     def ordered(self) -> OneAxis:
-        """Return the rows in the order of time: run by run, up then down, unless the file says more.
+        """Return the rows in order of time: run by run, up then down, unless the file gives another order.
 
-        Rows that are in the order of time already stay; where it is another one (a cycle that begins downwards), the column
-        ``order`` keeps it, since the order of rows by itself is never taken for time.
+        Rows already in order of time remain; another order (a cycle that begins downwards) is kept in the column
+        ``order``, because the order of rows alone never counts as time.
         """
         usual = np.lexsort((self.position_mm * self.direction, -self.direction, self.run))
         if "time_s" in self.covariates and np.isfinite(self.covariates["time_s"]).all():
@@ -73,7 +74,7 @@ class OneAxis:
         )
 
     def negated(self) -> OneAxis:
-        """Return the readings with corrections turned into errors."""
+        """Return the readings with corrections converted to errors."""
         return replace(self, value=-self.value)
 
     @property
@@ -84,7 +85,7 @@ class OneAxis:
         return self.position_mm[first]
 
     def summary(self) -> dict[str, object]:
-        """Say what was measured, in the words of ISO 230-2."""
+        """Return what was measured, in the words of ISO 230-2."""
         targets = self.targets_mm
         ways = [int(way) for way in np.unique(self.direction)]
         return {
@@ -112,7 +113,7 @@ def axis_in(text: str) -> str | None:
 
 
 def motion(position_mm: FloatArray, run: IntArray) -> IntArray:
-    """Direction of travel (n,) from the order of the rows within each run; the first row goes as the second.
+    """Direction of travel (n,) from the order of the rows within each run; the first row has that of the second.
 
     A run of a single target has direction 0, and a repeated target keeps the direction of the row before it.
     """
@@ -140,7 +141,7 @@ def cycles(direction: IntArray, one_way: IntArray) -> IntArray:
 
 
 def earlier_rows(keys: FloatArray) -> tuple[IntArray, IntArray]:
-    """Return for each row the first one with the same key, and how often it came so far (1: the first time), (rows,)."""
+    """Return for each row the first one with the same key, and its number of occurrences so far (from 1), (rows,)."""
     rows = (
         np.ascontiguousarray(keys)
         .view([("", keys.dtype)] * keys.shape[1])
@@ -158,20 +159,20 @@ def earlier_rows(keys: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 def check_error(error: str, axis: str | None, *, angular: bool) -> str:
-    """Return the error that the user named; InputError if it is none of this axis or has another unit."""
+    """Return the error given by the user; InputError if it is not one of this axis or has another unit."""
     if error not in CURVE_NAMES:
         raise InputError(f"{error!r} is not an error over an axis; {nearest(error, CURVE_NAMES)}", field="--error")
     known = error_named(error)
     if (known.kind == "angular") != angular:
         due = "an angle (EAX ... ECZ)" if angular else "a displacement (EXX ... EZZ)"
-        raise InputError(f"{error} does not fit: the file holds {due}", field="--error")
+        raise InputError(f"{error} does not fit: the file contains {due}", field="--error")
     if axis is not None and AXES[known.axis] != axis:
         raise InputError(f"{error} belongs to axis {AXES[known.axis]}, the file to {axis}", field="--error")
     return error
 
 
 def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[ErrorTable, ReversalCurves | None]:
-    """Return the two-way mean over the targets as one error, and the reversal of the axis.
+    """Return the bidirectional mean over the targets as one error, and the reversal of the axis.
 
     See :func:`compgen.identify.axis_tests.two_way_mean`. The reversal is None for angles, for one direction, and below
     0.1 um.
@@ -185,7 +186,7 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
 
 
 def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
-    """Say which readings are missing, and which runs are equal to the last digit; nothing for a regular test."""
+    """Return which readings are missing, and which runs are equal to the last digit; nothing for a regular test."""
     found, name = [], f"axis {axis}" if axis else "the axis"
     keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
     _, target = np.unique(keys, return_inverse=True)
@@ -200,11 +201,11 @@ def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
         found.append(f"{name}: {empty} of {table.size} {what} missing, the first in one-way run {row + 1} at {at:g} mm")
     away = np.abs(runs.value - np.median(runs.value))
     worst = int(np.argmax(away))
-    # a reading that is far beyond what the others spread over
+    # a reading far outside the spread of the others
     if len(away) >= 3 and away[worst] >= max(_NOTABLE, _FAR * float(np.quantile(np.delete(away, worst), 0.9))):
         at, value = runs.position_mm[worst], runs.value[worst]
         size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
-        found.append(f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a slip?")
+        found.append(f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a mistake?")
     first: dict[bytes, int] = {}
     for k, values in enumerate(
         table

@@ -1,4 +1,4 @@
-"""Files as users have them: opened by what they are; limits of size, encodings, numbers, dates and times."""
+"""Reading of any text file: limits of size, encodings, numbers, dates and times; and opening by kind."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from compgen.data.records import ARCHIVE, format_of_columns
 from compgen.errors import InputError
 from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
-# Reading foreign files: limits of size, encodings, and what a file is that cannot be read at all.
+# Reading foreign files: limits of size, encodings, and kinds of files that cannot be read.
 
 
 MEGABYTE = 1_000_000
 #: Larger files are not a measurement in text form: a million tracer lengths have 80 MB.
 MOST_BYTES = 128 * MEGABYTE
-#: The project's own files are read faster, but they too fit into the memory of a workstation.
+#: Native files are read faster, but they must also fit into the memory of a workstation.
 MOST_OWN_BYTES = 256 * MEGABYTE
 
-#: Captures over time are read piece by piece.
+#: Captures over time are read in pieces.
 MOST_CAPTURE_BYTES = 4_000_000_000
-#: Larger numbers are none (a number of 400 digits becomes infinite).
+#: Larger numbers are refused (a number of 400 digits becomes infinite).
 LARGEST = 1e300
-#: So much of a file says what it is.
+#: Length of the beginning of a file that identifies it.
 HEAD_BYTES = 65_536
-#: Encodings that are tried in turn when there is no mark; the last one reads everything.
+#: Encodings tried in turn without a byte-order mark; the last one reads everything.
 ENCODINGS = ("utf-8", "cp1252", "latin-1")
 #: Instruments of one maker write user text in the code page of the computer (see :mod:`compgen.foreign.laser_files`).
 ENCODINGS_EAST = ("utf-8", "gbk", "latin-1")
-#: Position, deviation, error, forward, backward, temperature, positioning; two characters are not met by chance.
+#: Position, deviation, error, forward, backward, temperature, positioning; two characters do not occur by chance.
 _CHINESE = (
     "\u4f4d\u7f6e", "\u504f\u5dee", "\u8bef\u5dee", "\u6b63\u5411", "\u53cd\u5411", "\u6e29\u5ea6",
     "\u5b9a\u4f4d",
@@ -49,22 +49,22 @@ _BINARY = (
     (b"\x1f\x8b", "compressed (gzip); unpack it first"),
     (b"7z\xbc\xaf", "compressed (7z); unpack it first"),
     (b"Rar!", "compressed (rar); unpack it first"),
-    (b"\x89PNG", "a picture; the numbers themselves are needed"),
-    (b"\xff\xd8\xff", "a picture; the numbers themselves are needed"),
+    (b"\x89PNG", "a picture; give the numbers as text or .xlsx"),
+    (b"\xff\xd8\xff", "a picture; give the numbers as text or .xlsx"),
 )
 _MARKUP = ("<?xml", "<!doctype", "<html", "<svg")
 
 
 @dataclass(frozen=True)
 class Text:
-    """A text file as it was read, its line ends made line feeds, and the encoding that it turned out to have."""
+    """A text file as read, with line feeds as line ends, and its encoding."""
 
     path: Path
     text: str
     encoding: str
 
     def fail(self, message: str, line: int | None = None, field: str | None = None) -> InputError:
-        """Return the error that points at a line of this file (counting from 1)."""
+        """Return the error about a line of this file (counted from 1)."""
         return InputError(message, file=self.path, line=line, field=field)
 
     @property
@@ -74,9 +74,9 @@ class Text:
 
 
 def check_size(path: Path, most: int = MOST_BYTES) -> int:
-    """Return the size in bytes; InputError for a file that is missing, no file, empty or too large to be meant."""
+    """Return the size in bytes; InputError for a missing, empty or too large file, or a folder."""
     if path.is_dir():
-        raise InputError("is a folder; a file is needed", file=path)
+        raise InputError("is a folder; expected a file", file=path)
     try:
         size = os.stat(path).st_size
     except FileNotFoundError:
@@ -104,7 +104,7 @@ def read_head(path: Path) -> bytes:
 
 
 def decode_head(head: bytes) -> str:
-    """Return the beginning of a file as text for a look at what it is; nothing is refused here."""
+    """Return the beginning of a file as text, to identify it; nothing is refused here."""
     encoding = next((name for mark, name in _MARKS if head.startswith(mark)), None) or _without_mark(head) or "utf-8"
     return head.decode(encoding, errors="replace").replace("\r\n", "\n").replace("\r", "\n")
 
@@ -112,7 +112,7 @@ def decode_head(head: bytes) -> str:
 def read_source(path: Path, encodings: Sequence[str] = ENCODINGS, most: int = MOST_BYTES) -> Text:
     """Read a text file in whatever encoding it has.
 
-    A byte-order mark counts; zero bytes in every second place mean UTF-16; then ``encodings`` in turn.
+    The order is: a byte-order mark, zero bytes in every second place (UTF-16), then ``encodings`` in turn.
     """
     check_size(path, most)
     content = read_bytes(path)
@@ -138,10 +138,12 @@ def _decode(path: Path, content: bytes, encodings: Sequence[str]) -> tuple[str, 
             return encoding, content.decode(encoding).lstrip("\ufeff")
         except UnicodeDecodeError as error:
             if encoding.startswith("utf-16"):
-                raise InputError(f"is cut or damaged UTF-16 text: {error.reason}", file=path) from error
+                raise InputError(f"is truncated or damaged UTF-16 text: {error.reason}", file=path) from error
             if encoding == chosen[-1]:
                 line = content[: error.start].count(b"\n") + 1
-                raise InputError("is not UTF-8 text though its mark says so", file=path, line=line) from error
+                raise InputError(
+                    "is not UTF-8 text although its byte-order mark says so", file=path, line=line
+                ) from error
     raise InputError("is text in no known encoding; save it as UTF-8", file=path)
 
 
@@ -184,11 +186,11 @@ def shown(word: object, most: int = 40) -> str:
     return repr(" ".join(str(word).split())[:most])
 
 
-# Dates and times as instruments and spreadsheets write them; the order of day and month is never guessed.
+# Dates and times of instruments and spreadsheets; the order of day and month is never guessed.
 #
-# A date whose numbers allow several orders (``03/04/2025``) is settled by the other dates of the same column, where one of
-# them allows one order only, or by the user (``--dates``). Dots mean day.month.year, a year of four digits in front
-# year-month-day, and a month may have its English or German name.
+# A date whose numbers allow several orders (``03/04/2025``) is resolved by another date of the same column that allows
+# only one order, or by the user (``--dates``). Dots mean day.month.year, a year of four digits in front year-month-day,
+# and a month may have its English or German name.
 
 
 Order = Literal["dmy", "mdy", "ymd"]
@@ -217,9 +219,9 @@ _MONTH_NAMES = frozenset([
 
 @dataclass(frozen=True)
 class Written:
-    """One date as written: what each possible order makes of it (at midnight), seconds of the day, and the zone.
+    """One date as written: its value in each possible order (at midnight), seconds of the day, and the time zone.
 
-    ``day_text`` is what is left of the text without the time of the day.
+    ``day_text`` is the text without the time of day.
     """
 
     text: str
@@ -230,12 +232,12 @@ class Written:
 
     @property
     def settled(self) -> bool:
-        """Whether all orders that are possible say the same day."""
+        """Whether all possible orders give the same day."""
         return len(set(self.days.values())) == 1
 
 
 def read_date(text: str) -> Written | None:
-    """Return the date, the time, or both, that a cell or a line holds; None if it is neither.
+    """Return the date, the time, or both, in a cell or a line; None if it is neither.
 
     >>> sorted(read_date("03/04/2025 12:58").days), read_date("13/04/2025").settled, read_date("10:46 Dec 12 2016").clock_s
     (['dmy', 'mdy'], True, 38760.0)
@@ -258,7 +260,7 @@ def read_date(text: str) -> Written | None:
 
 @lru_cache(maxsize=4096)
 def _days(text: str) -> Mapping[Order, datetime]:
-    """Return what each order makes of a date in numbers, or of one whose month is a word (12 Dec 2016, 2016-Dec-12)."""
+    """Return the value in each order of a date in numbers, or of one whose month is a word (12 Dec 2016, 2016-Dec-12)."""
     found = _NUMBERS.search(text)
     if found:
         first, mark, second, third = found.group(1), found.group(2), found.group(3), found.group(4)
@@ -310,12 +312,12 @@ def serial_date(days: float) -> Written | None:
 
 
 def order_of(dates: Sequence[Written], chosen: Order | None = None) -> Order | None:
-    """Return the order of day, month and year in which all dates of a column can be read, None if it stays open.
+    """Return the order of day, month and year in which all dates of a column can be read, None if it remains open.
 
     Raises
     ------
     InputError
-        for dates of which no order, or not the chosen one, is possible.
+        for dates that no order, or not the chosen one, fits.
     """
     dates = list({date.day_text or date.text: date for date in dates}.values())
     open_ones = [date for date in dates if not date.settled]
@@ -334,7 +336,7 @@ def order_of(dates: Sequence[Written], chosen: Order | None = None) -> Order | N
 
 
 def _telling(dates: Sequence[Written]) -> list[Written]:
-    """Return the dates that allow one order only, written with the marks of the open ones (a year in front tells nothing)."""
+    """Return the dates with only one order, with the separators of the open ones (a leading year tells nothing)."""
     marks = {found.group(2) for date in dates if not date.settled and (found := _NUMBERS.search(date.text))}
     return [
         date
@@ -344,13 +346,13 @@ def _telling(dates: Sequence[Written]) -> list[Written]:
 
 
 def moment(date: Written, order: Order) -> datetime:
-    """Return date and time by an order; a date that is settled needs none."""
+    """Return date and time by an order; an unambiguous date needs none."""
     day = date.days.get(order) or next(iter(date.days.values()))
     return day + timedelta(seconds=date.clock_s or 0.0)
 
 
 def iso(date: Written, order: Order) -> str:
-    """Return a date as ISO 8601 has it, without a time if none was written.
+    """Return a date in ISO 8601, without a time if none was written.
 
     >>> iso(read_date("13.4.2025 09:05"), "dmy"), iso(read_date("2025-04-13"), "dmy")
     ('2025-04-13T09:05:00', '2025-04-13')
@@ -370,24 +372,24 @@ def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str
         return None, None
     found = read_date(text)
     if found is None or not found.days:
-        return None, f"the date {shown(text)} is not understood and left out"
+        return None, f"the date {shown(text)} is not understood and was skipped"
     order = order_of([found], chosen)
     if order is None:
         days = " or ".join(sorted({day.date().isoformat() for day in found.days.values()}))
-        return None, f"the date {shown(text)} may be {days}: it is left out; say --dates dmy, mdy or ymd to keep it"
+        return None, f"the date {shown(text)} may be {days}: it is skipped; give --dates dmy, mdy or ymd to keep it"
     return iso(found, order), None
 
 
-# How commands open files: native ones are read as they are, foreign ones are converted in memory.
+# How commands open files: native ones are read directly, foreign ones are converted in memory.
 #
-# :func:`open_measurement` and :func:`open_errors` take any file; a foreign one that leaves something open is refused with
-# what ``volcomp import`` needs. What converts a foreign file is imported when there is one.
+# :func:`open_measurement` and :func:`open_errors` take any file; a foreign one with open questions is refused with what
+# ``volcomp import`` needs. The converters are imported when a foreign file is read.
 
 _NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv", ".circle.csv")
 
 
 def native_format(path: Path) -> str | None:
-    """Return the kind of a native file, None for a foreign one; InputError for what is not data."""
+    """Return the kind of a native file, None for a foreign one; InputError for files without data."""
     if path.name.lower().endswith(ARCHIVE):
         return "lengths"
     check_size(path, MOST_CAPTURE_BYTES)
@@ -412,7 +414,7 @@ def open_measurement(
     ----------
     paths : files; those of one kind are one measurement, several kinds a mixture. A single file of errors gives those.
     instrument : the instrument TOML of six-DOF readings.
-    axis : the axis of foreign files that measure along one and do not say which; native files do.
+    axis : the axis of foreign files that measure along one and do not state it; native files do.
     stated : errors that are known without a file.
 
     Raises
@@ -424,7 +426,7 @@ def open_measurement(
     if axis is not None and any(kinds):
         known = paths[[kind is not None for kind in kinds].index(True)]
         raise InputError(
-            "is in the native format, which names its axis; use --axis for instrument files only",
+            "is in the native format, which states its axis; use --axis for instrument files only",
             file=known,
             field="--axis",
         )
@@ -453,19 +455,19 @@ def open_measurement(
 
 
 def open_errors(path: str | Path) -> ErrorTable:
-    """Read errors: ``*.errors.csv``, or a foreign file with errors, or with axis runs (their two-way means).
+    """Read errors: ``*.errors.csv``, or a foreign file with errors, or with axis runs (their bidirectional means).
 
     Raises
     ------
     InputError
-        for a foreign file that leaves something open, or holds neither.
+        for a foreign file with open questions, or without errors and axis runs.
     """
     source = Path(path)
     kind = native_format(source)
     if kind == "errors" or (kind is None and source.name.lower().endswith(".errors.csv")):
         return read_errors(source)
     if kind not in (None, "axis"):
-        raise InputError(f"holds {kind}, not errors; identify them first", file=source)
+        raise InputError(f"contains {kind}, not errors; identify them first", file=source)
     from compgen.foreign.converted import converted_errors
 
     return converted_errors(source, kind)

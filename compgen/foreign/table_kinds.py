@@ -1,4 +1,4 @@
-"""A foreign table becomes runs, errors, tracer lengths or measured positions.
+"""Conversion of a foreign table to runs, errors, tracer lengths or measured positions.
 
 :func:`import_table` decides which kind a table is and calls the reader of that kind; :func:`merged_sheets` puts the sheets
 of one workbook together.
@@ -68,19 +68,19 @@ from compgen.identify.axis_tests import POSITIONING, SAME_TARGET_MM, two_way_mea
 
 # Tables of readings along axes: a row for each reading, or a row for each target and a column for each run.
 #
-# :func:`axis_readings` finds runs, deviations, axes and directions. Columns that say the same thing twice (deviations next to
-# readings, means next to runs) are compared, and the user is asked where they disagree.
+# :func:`axis_readings` finds runs, deviations, axes and directions. Redundant columns (deviations next to readings, means
+# next to runs) are compared, and the user must decide if they disagree.
 
 #: Units that are tried for deviations without one, mm.
 _LIKELY = {name: MM_PER_LENGTH[name] for name in ("um", "mm", "in", "nm")}
-#: A column without a telling name holds readings, not deviations, if it follows the targets so closely.
+#: A column without a clear name contains readings, not deviations, if it follows the targets this closely.
 FOLLOWS = 1e-2
 _AXIS_KEYS = ("measuredaxis", "machineaxis", "testaxis", "gemesseneachse", "messachse", "maschinenachse", "axemesure",
               "assemisurato", "ejemedido")  # fmt: skip
 _NAMED_AXIS = re.compile(
     r"\b([XYZ])[1-9]?[\s\-_]*(?:ACHSE|AXIS|AXE|ASSE|EJE|\u8f74)|(?:ACHSE|AXIS|AXE|ASSE|EJE|\u8f74)[\s\-_:]*([XYZ])[1-9]?\b"
 )
-#: Parts of words that speak of corrections.
+#: Parts of words for corrections.
 _COUNTER = ("korr", "kompens", "compens", "correc", "correzion", "\u8865\u507f")
 _TELLING = (
     "deviation", "abweichung", "error", "fehler", "230", "ecart", "scarto", "errore", "desviac", "accuracy",
@@ -101,7 +101,7 @@ class _Rows:
 
 
 def axis_readings(findings: TableFindings, *, angular: bool = False) -> tuple[dict[str, OneAxis], RowData]:
-    """Return the readings of each axis, "" where nothing says which it is, and the other columns."""
+    """Return the readings of each axis, "" if the axis is not stated, and the other columns."""
     rows = _rows(findings)
     target = findings.positions_mm("position", findings.numbers("position"))[rows.row]
     value = _deviations(findings, rows, target, angular=angular)
@@ -128,12 +128,12 @@ def _rows(findings: TableFindings) -> _Rows:
     wide = [*said, *run_columns(header, taken)]
     key = next((name for name in ("actual", "deviation", "correction", "value") if name in fields), None)
     if key is not None and said:
-        raise InputError(f"columns of runs are named, and {fields[key].name!r} holds {key}s: leave it out with --ignore",
+        raise InputError(f"columns of runs are given, and {fields[key].name!r} contains {key}s: exclude it with --ignore",
                          file=findings.table.grid.path, field="--map")  # fmt: skip
     if key is None and not wide:
         raise findings.table.grid.fail(
             f"has positions but no deviations or readings; the header has {shown(', '.join(header), 200)}; "
-            "give --map deviation=COLUMN, or --map run1+=COLUMN, run1-=COLUMN ... for a column each run",
+            "give --map deviation=COLUMN, or --map run1+=COLUMN, run1-=COLUMN ... for one column per run",
             findings.table.header_line,
         )
     if key is None:
@@ -153,7 +153,7 @@ def _rows(findings: TableFindings) -> _Rows:
 
 
 def _labels(findings: TableFindings) -> IntArray:
-    """Directions as a column names them (rows,), 0 without such a column; signs of the axis count too (X+, X-)."""
+    """Return directions from a column (rows,), 0 without one; signs of the axis are accepted, too (X+, X-)."""
     rows = len(findings.table.rows)
     signed = "axis" in findings.fields and "direction" not in findings.fields
     if signed:
@@ -167,7 +167,7 @@ def _labels(findings: TableFindings) -> IntArray:
 
 
 def _runs_in_cells(findings: TableFindings) -> tuple[IntArray, IntArray | None]:
-    """Return numbers of runs, and directions where every cell of that column names one as well (1+, 1-, Lauf 2 vor)."""
+    """Return numbers of runs, and directions if every cell of that column also gives one (1+, 1-, Lauf 2 vor)."""
     column = findings.fields["run"]
     cells = findings.table.column(column.name)
     read = {cell: run_in(cell) for cell in dict.fromkeys(cells)}
@@ -176,7 +176,9 @@ def _runs_in_cells(findings: TableFindings) -> tuple[IntArray, IntArray | None]:
         return labels_of(findings, column), None
     unknown = next((k for k, cell in enumerate(cells) if (item := read[cell]) is None or not item.direction), None)
     if unknown is not None:
-        message = f"{shown(cells[unknown])} names no direction, other cells of this column do ({shown(named[0].name)})"
+        message = (
+            f"{shown(cells[unknown])} gives no direction, but other cells of this column do ({shown(named[0].name)})"
+        )
         raise findings.table.grid.fail(message, findings.table.lines[unknown], column.name)
     runs = [item for cell in cells if (item := read[cell]) is not None]
     number = np.array([item.number for item in runs], dtype=np.int64)
@@ -184,9 +186,9 @@ def _runs_in_cells(findings: TableFindings) -> tuple[IntArray, IntArray | None]:
 
 
 def _compared(findings: TableFindings, key: str) -> str:
-    """Compare deviations or corrections that are printed next to the readings with them; return the field that counts.
+    """Compare the readings with deviations or corrections printed next to them; return the field to use.
 
-    The finer one counts where both agree; where they do not, or differ in sign, the user is asked.
+    If both agree, the finer one is used; if they do not, or differ in sign, the user must decide.
     """
     for other, sign in (("deviation", 1.0), ("correction", -1.0)):
         if other not in findings.fields or other == key or key not in ("actual", "deviation"):
@@ -212,19 +214,19 @@ def _compared(findings: TableFindings, key: str) -> str:
             findings.checked_sign |= found == {1.0}
             if key == "actual" and other == "deviation" and declared and own_digit * scales[0] / reference_mm < digit:
                 findings.used.add(counting)
-                findings.notes.append(f"{name!r} has more digits and is taken")
+                findings.notes.append(f"{name!r} has more digits and is used")
                 return other
             continue
         what = "has the opposite sign of" if found else "disagrees with"
         pair = f"{counting!r} minus target" if key == "actual" else repr(counting)
-        findings.doubts.append(f"{name!r} {what} {pair}; leave out the wrong one: --ignore COLUMN")
+        findings.doubts.append(f"{name!r} {what} {pair}; exclude the wrong one: --ignore COLUMN")
     return key
 
 
 def _reference(findings: TableFindings, key: str) -> tuple[FloatArray | None, float, float]:
     """Return the deviations by which others are judged, mm per unit of them, and the value of their last digit.
 
-    None where readings do not follow the targets in a known unit; the user is asked elsewhere.
+    None if readings do not follow the targets in a known unit; the user is asked elsewhere.
     """
     values, digit = findings.numbers(key), _last_digit(findings, findings.fields[key].name)
     unit = findings.unit(key, *(["value"] if key == "deviation" else []))
@@ -239,24 +241,26 @@ def _reference(findings: TableFindings, key: str) -> tuple[FloatArray | None, fl
 
 
 def _last_digit(findings: TableFindings, name: str) -> float:
-    """Return the value of the last digit that a column is written with."""
+    """Return the value of the last digit in a column."""
     decimals = [len(cell.partition(".")[2]) for cell in findings.table.column(name) if "e" not in cell.lower()]
     return float(10.0 ** -max(decimals, default=0))
 
 
 def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
-    """Columns of runs, one after the other; an empty cell is a reading that was not taken."""
+    """Return the columns of runs, one after the other; an empty cell is a missing reading."""
     labels = _labels(findings)
     seen: dict[tuple[int, int], str] = {}
     for column in columns:
         earlier = seen.setdefault((column.number, column.direction), column.name)
         if earlier != column.name:
-            message = f"{shown(earlier)} and {shown(column.name)} are the same run and direction; say which is which: "
+            message = (
+                f"{shown(earlier)} and {shown(column.name)} are the same run and direction; distinguish them with "
+            )
             raise findings.table.grid.fail(message + "--map run1+=COLUMN, run1-=COLUMN ...", findings.table.header_line)
     units = {column.name: split_name(column.name).unit for column in columns}
     if len(set(units.values())) > 1 and findings.options.given_unit("deviation", "value") is None:
         text = ", ".join(f"{shown(name)} {unit or 'none'}" for name, unit in units.items())
-        message = f"the runs have different units ({text}); if all have one, say it with --unit deviation=UNIT"
+        message = f"the runs have different units ({text}); if all have the same, give --unit deviation=UNIT"
         raise findings.table.grid.fail(message, findings.table.header_line)
     numbers = {way: {column.number for column in columns if column.direction == way} for way in (1, -1)}
     if numbers[1] and numbers[-1] and numbers[1] != numbers[-1]:
@@ -281,7 +285,7 @@ def _wide(findings: TableFindings, columns: Sequence[RunColumn]) -> _Rows:
 
 
 def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
-    """Tell means and other statistics from the runs; a mean must be that of the runs."""
+    """Separate means and other statistics from the runs; a mean must be that of the runs."""
     mm = MM_PER_LENGTH.get(split_name(columns[0].name).unit or "")
     taken = {*findings.used, *(column.name for column in findings.fields.values()), *findings.options.ignore}
     for name in findings.table.header:
@@ -290,7 +294,7 @@ def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
             continue
         kind, way_of = found
         findings.used.add(name)
-        findings.notes.append(f"{name!r} is a statistic over the runs, no run")
+        findings.notes.append(f"{name!r} is a statistic over the runs, not a run")
         own = [column for column in columns if way_of in (0, column.direction)]
         if kind != "mean" or not own or not findings.is_numeric(name):
             continue
@@ -325,22 +329,22 @@ def _deviations(findings: TableFindings, rows: _Rows, target: FloatArray, *, ang
     chosen = findings.options.sign
     if chosen is None and key == "correction":
         chosen = "correction"
-        findings.notes.append("the column is called a correction: its sign is turned round")
+        findings.notes.append("the column is named a correction: its sign is reversed")
     if chosen is None:
         above = findings.table.metadata
         words = unaccented(" ".join([*findings.table.header, *above, *above.values()]))
         told = any(word in words for word in (*_TELLING, *FIELDS["deviation"][:1]))
         told = told or any(is_deviation(name) for name in findings.table.header)
         if not told and len(findings.runs) > 1 and not any(word in words for word in _COUNTER):
-            findings.notes.append("runs are measured: their values are taken as measured minus target")
+            findings.notes.append("runs are measured: their values are assumed to be measured minus target")
         elif not told and not findings.checked_sign:
             findings.doubts.append(
-                "nothing says whether the values are errors (measured minus target) or corrections; give --sign error or "
+                "it is not stated whether the values are errors (measured minus target) or corrections; give --sign error or "
                 "correction"
             )
         chosen = "error"
     findings.understood["sign"] = (
-        "measured minus target" if chosen == "error" else "target minus measured, turned round"
+        "measured minus target" if chosen == "error" else "target minus measured, sign reversed"
     )
     return -si if chosen == "correction" else si
 
@@ -359,11 +363,11 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
         findings.doubts.append(f"{rows.name!r} says {declared}, but one mm of travel is {slope.unit_ratio:g} in it")
         scale = 1.0 / slope.unit_ratio
     if slope.sign < 0:
-        findings.doubts.append("the readings fall where the targets rise: the sign of one of them is turned round")
+        findings.doubts.append("the readings decrease where the targets increase: the sign of one of them is reversed")
     sign = -1.0 if slope.sign < 0 and findings.options.sign == "correction" else 1.0
     offset = slope.offset * scale
     if abs(offset) > 1.0:
-        findings.notes.append(f"readings are {offset:.6g} mm off the targets at zero; nothing was taken off")
+        findings.notes.append(f"readings are {offset:.6g} mm off the targets at zero; nothing was subtracted")
     findings.understood["slope_of_readings"] = slope.slope
     findings.understood["sign"] = "measured minus target"
     findings.understood["unit"] = next((u for u, mm in MM_PER_LENGTH.items() if abs(mm / scale - 1) < 1e-9), "mm")
@@ -371,7 +375,7 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
 
 
 def _axes(findings: TableFindings, row: IntArray) -> list[str]:
-    """Axis of each reading: by the user, a column, the metadata, the header, or the name of the sheet or file."""
+    """Return the axis of each reading: from the option, a column, the metadata, the header, or the sheet or file name."""
     if findings.options.axis:
         return [findings.options.axis] * len(row)
     if "axis" in findings.fields:
@@ -399,20 +403,20 @@ def _axes(findings: TableFindings, row: IntArray) -> list[str]:
     if len(said) == 1 and named in (None, *said):
         return [said.pop()] * len(row)
     if said:
-        other = f"the sheet or file is called {named}" if len(said) == 1 else "several axes are named"
-        findings.doubts.append(f"the lines above the table say axis {', '.join(sorted(said))}, {other}; give --axis")
+        other = f"but the sheet or file is named {named}" if len(said) == 1 else "several axes"
+        findings.doubts.append(f"the lines above the table give axis {', '.join(sorted(said))}, {other}; give --axis")
         return [sorted(said)[0]] * len(row)
     if named:
         findings.notes.append(f"axis {named} by the name of the sheet or file")
         return [named] * len(row)
-    findings.doubts.append(f"nothing says which axis it is; give --axis {', '.join(AXES)}")
+    findings.doubts.append(f"the axis is not stated; give --axis {', '.join(AXES)}")
     return [""] * len(row)
 
 
 def _directions(
     findings: TableFindings, target: FloatArray, run: IntArray, label: IntArray, value: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Direction of travel and number of the cycle: labels, against the order of the rows where that tells."""
+    """Return direction of travel and number of the cycle: from labels, checked with the order of the rows if possible."""
     chosen = findings.options.directions
     one_way = run if run.any() else _sweeps(target)
     if chosen == "alternate":
@@ -421,32 +425,32 @@ def _directions(
         return direction, cycles(direction, one_way)
     if not label.any():
         if len(set(zip(one_way.tolist(), target.tolist(), strict=True))) < len(target):
-            one_way = _sweeps(target, one_way)  # a run that goes forth and back
+            one_way = _sweeps(target, one_way)  # a run in both directions
         direction = motion(target, one_way)
         if len(findings.runs) > 1 and chosen is None:
             if _alternate(target, run, value):
                 findings.doubts.append(
-                    "no run names a direction, and odd and even runs differ as two directions do; say --directions alternate "
+                    "no run gives a direction, and odd and even runs differ like two directions; give --directions alternate "
                     "(odd runs up, even runs down) or motion (all in the order of the rows)"
                 )
             else:
-                findings.notes.append("no run names a direction: all are taken as made in the order of the rows")
+                findings.notes.append("no run gives a direction: all are assumed to be in the order of the rows")
         findings.understood.setdefault("directions_from", "the order of the rows")
         if not direction.all():
             header = shown(", ".join(findings.table.header), 200)
             findings.doubts.append(
-                f"there is no column of directions (the header has {header}), and the order of the rows does not tell them "
+                f"there is no column of directions (the header has {header}), and the order of the rows does not show them "
                 "everywhere; give --map direction=COLUMN, or --directions alternate (odd runs up, even runs down)"
             )
         return direction, cycles(direction, one_way)
     if not label.all():
-        findings.doubts.append("some columns name a direction and some do not; give --directions alternate or motion")
+        findings.doubts.append("some columns give a direction and some do not; give --directions alternate or motion")
     turned = _contradicted(target, one_way, label)
     if chosen == "motion" or (turned and chosen is None):
         label = -label if turned else label
     if turned and chosen is None:
         findings.doubts.append(
-            "the rows labelled as positive (forward) go down and the others up; direction follows the motion, so the labels "
+            "the rows labelled as positive (forward) descend and the others ascend; direction follows the motion, so the labels "
             "were swapped: confirm with --directions motion, or keep them with --directions labels"
         )
     findings.understood.setdefault("directions_from", "the labels" if chosen != "motion" else "the order of the rows")
@@ -473,7 +477,7 @@ def _alternate(target: FloatArray, run: IntArray, value: FloatArray) -> bool:
 
 
 def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
-    """Number of the one-way run of each row: a new one begins where a target comes a second time, or with another ``run``."""
+    """Number of the one-way run of each row: a new one begins where a target is repeated, or ``run`` changes."""
     keys = np.round(target / SAME_TARGET_MM).astype(np.int64).tolist()
     runs = [0] * len(keys) if run is None else run.tolist()
     number, seen, result, last = 1, set[int](), [], runs[0] if runs else 0
@@ -487,7 +491,7 @@ def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
 
 
 def _contradicted(target: FloatArray, run: IntArray, label: IntArray) -> bool:
-    """Whether the rows of each label go the other way, in every run; a table sorted by targets says nothing."""
+    """Whether the rows of each label run in the opposite direction, in every run; a table sorted by targets shows nothing."""
     ways: dict[int, set[int]] = {1: set(), -1: set()}
     for number in np.unique(run):
         for sign in (1, -1):
@@ -505,7 +509,7 @@ _MOST_DEG = 0.5
 
 
 def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> ErrorTable:
-    """Return errors that have a column each; those of one axis share the column of positions."""
+    """Return errors with a column each; those of one axis share the column of positions."""
     axes = {error_named(name).axis for name in columns if name not in SQUARENESS_NAMES}
     if len(axes) > 1 and "axis" not in findings.fields:
         findings.doubts.append("errors of several axes share one column of positions; give one table for each axis")
@@ -529,7 +533,7 @@ def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> 
 
 
 def long_errors(findings: TableFindings) -> ErrorTable:
-    """Return errors that have a row for each value: name, position, value."""
+    """Return errors with a row for each value: name, position, value."""
     table = findings.table
     names = [cell.strip().upper() for cell in table.column(findings.fields["error"].name)]
     for name, line in zip(names, table.lines, strict=True):
@@ -548,7 +552,7 @@ def long_errors(findings: TableFindings) -> ErrorTable:
         rows = np.flatnonzero(np.array(names) == name)
         si = _si(findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0)
         u_si = np.full(len(rows), np.nan)
-        if u_column is not None:  # in its own unit, else in that of the values
+        if u_column is not None:  # in its unit, otherwise in that of the values
             u = np.array(table.numbers(u_column.name, empty=True))[rows]
             if np.any(u < 0):
                 line = table.lines[int(rows[np.flatnonzero(u < 0)[0]])]
@@ -571,9 +575,9 @@ def long_errors(findings: TableFindings) -> ErrorTable:
 
 
 def _si(findings: TableFindings, name: str, column: NamedColumn, values: np.ndarray, span_mm: float) -> np.ndarray:
-    """Values of one error in mm or rad; a length may have an angle's unit (um/m) for squareness only."""
+    """Values of one error in mm or rad; an angle unit such as um/m is allowed for squareness only."""
     if not len(values):
-        raise findings.table.grid.fail("holds no value", findings.table.header_line, column.name)
+        raise findings.table.grid.fail("contains no value", findings.table.header_line, column.name)
     angular = error_named(name).kind != "linear"
     key = "value"
     findings.fields = {**findings.fields, key: column}
@@ -593,18 +597,18 @@ def _finished(
     sign = -1.0 if findings.options.sign == "correction" else 1.0
     findings.understood |= {
         "errors": [*curves, *squareness],
-        "sign": "errors" if sign > 0 else "corrections, turned round",
+        "sign": "errors" if sign > 0 else "corrections, sign reversed",
     }
     words = " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]).lower()
     if findings.options.sign is None and any(word in words for word in ("correct", "compensat", "korrektur")):
-        findings.doubts.append("the file speaks of corrections; give --sign error or correction")
+        findings.doubts.append("the file mentions corrections; give --sign error or correction")
     turned = {name: Curve(curve.position_mm, sign * curve.value, curve.u) for name, curve in curves.items()}
     constants = {name: (sign * value, u) for name, (value, u) in squareness.items()}
     return ErrorTable(turned, constants, {"source": findings.table.grid.path.name})
 
 
-#: Names of squareness in sheets of laboratories: the pair of axes, the error of ISO 230-1, and the sign with which an angle
-#: above 90 degrees between the positive axes enters it.
+#: Names of squareness in sheets of laboratories: the pair of axes, the error of ISO 230-1, and its sign for an angle
+#: above 90 degrees between the positive axes.
 _PAIRS = {"XY": ("EC0Y", 1.0), "XZ": ("EB0Z", -1.0), "YZ": ("EA0Z", 1.0)}
 _PAIR = re.compile(
     r"(?<![A-Z])([XYZ])\s*[-/\u2013_:]?\s*(?:ZU|TO|\u00c0|A|VS|AND|UND|ET|E|Y)?\s*[-/\u2013_]?\s*([XYZ])(?![A-Z])"
@@ -613,7 +617,7 @@ _ISO = re.compile(r"(?<![A-Z0-9])E_?([CBA])_?[0O]_?([YZ])(?![A-Z0-9])")
 
 
 def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
-    """Return the squareness errors of a sheet that holds nothing else, rad, and what it leaves open; None for another sheet.
+    """Return the squareness errors of a sheet that contains only these, rad, and what it leaves open; otherwise None.
 
     Each row has a name (EC0Y, or a pair of axes), a number and a unit, which may be above. The sign of a bare pair is
     never guessed; an angle in degrees near 90 shows it.
@@ -641,7 +645,7 @@ def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
         unit = next((name for name in own if name in RAD_PER_ANGLE), above.get(numbers[0], ""))
         if unit not in RAD_PER_ANGLE:
             doubts.append(
-                f"line {line}: the file gives no unit of {shown(called)}; write urad, arcsec, um/m or deg next to it"
+                f"line {line}: the file states no unit of {shown(called)}; write urad, arcsec, um/m or deg next to it"
             )
             continue
         if iso:
@@ -652,7 +656,7 @@ def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
             if unit != "deg" or abs(value - 90.0) > _MOST_DEG:
                 meaning = f"{name} > 0: the angle between the positive axes is {'more' if sign > 0 else 'less'} than 90 degrees"
                 doubts.append(
-                    f"line {line}: the sign of {shown(called)} is not known; write {name} in its place ({meaning})"
+                    f"line {line}: the sign of {shown(called)} is not clear; write {name} instead ({meaning})"
                 )
                 continue
         if name in found:
@@ -664,7 +668,7 @@ def squareness_in(grid: CellGrid) -> tuple[ErrorTable, list[str]] | None:
 # Tables of tracer lengths, and of measured positions, in space.
 
 
-#: The unit of lengths by their geometry must agree with a known one so well (the machine's errors are far smaller).
+#: Required agreement of the unit of lengths from geometry with a known one (the machine's errors are far smaller).
 UNIT_TOLERANCE = 0.03
 
 
@@ -675,7 +679,7 @@ def lengths_of(findings: TableFindings) -> Lengths:
     rows = len(table.rows)
     names = table.column(fields["station"].name) if "station" in fields else ["S1"] * rows
     if "station" not in fields:
-        findings.notes.append("there is no column of stations: all lengths belong to one, S1")
+        findings.notes.append("there is no column of stations: all lengths are assigned to one, S1")
     points = table.column(fields["point"].name) if "point" in fields else [str(k + 1) for k in range(rows)]
     for cells, key in ((names, "station"), (points, "point")):
         empty = next((k for k, cell in enumerate(cells) if not cell), None)
@@ -717,7 +721,9 @@ def _positions(findings: TableFindings, keys: str) -> FloatArray:
     first = findings.positions_mm(keys[longest], raw[longest])
     factor = MM_PER_LENGTH[str(findings.understood["position_unit"])]
     columns = []
-    for k, key in enumerate(keys):  # the other two in their own unit if they have one, else in that of the longest axis
+    for k, key in enumerate(
+        keys
+    ):  # the other two in their unit if they have one, otherwise in that of the longest axis
         unit = findings.unit(key, "position") or ""
         columns.append(first if k == longest else raw[k] * MM_PER_LENGTH.get(unit, factor))
     return np.column_stack(columns)
@@ -726,7 +732,7 @@ def _positions(findings: TableFindings, keys: str) -> FloatArray:
 def _length_scale(
     findings: TableFindings, position: FloatArray, reading: FloatArray, station: NDArray[np.int64]
 ) -> float:
-    """Signed mm per unit of the lengths: declared, and compared with the geometry of each station."""
+    """Return the signed mm per unit of the lengths: as declared, compared with the geometry of each station."""
     found = [judge_lengths(position[station == k], reading[station == k]) for k in np.unique(station)]
     geometry = [item for item in found if item is not None]
     declared = findings.unit("length", "value")
@@ -739,20 +745,22 @@ def _length_scale(
         raise findings.table.grid.fail(f"{declared} is not a unit of length", None, findings.fields["length"].name)
     if declared is None and unit is None:
         findings.doubts.append(
-            "the file gives no unit of the lengths, and the points do not show it; give --unit length=mm"
+            "the file states no unit of the lengths, and the points do not show it; give --unit length=mm"
         )
     elif declared is None:
         findings.notes.append(f"the lengths fit the points in {unit}")
     elif unit is not None and unit != declared:
-        findings.doubts.append(f"the lengths say {declared}, but they fit the points in {unit}; give --unit length=...")
+        findings.doubts.append(
+            f"the declared unit of the lengths is {declared}, but they fit the points in {unit}; give --unit length=..."
+        )
     if sign < 0:
-        findings.notes.append("the lengths shrink where the distance grows: their sign was turned round")
+        findings.notes.append("the lengths decrease with growing distance: their sign was reversed")
     if sign == 0:
         findings.notes.append(
-            "the points do not tell the sign of the lengths; they are taken to grow with the distance"
+            "the points do not show the sign of the lengths; they are assumed to grow with the distance"
         )
     chosen = declared or unit or "mm"
-    findings.understood |= {"unit": chosen, "sign": "grows with the distance" if sign >= 0 else "turned round"}
+    findings.understood |= {"unit": chosen, "sign": "grows with the distance" if sign >= 0 else "reversed"}
     findings.understood["mm_per_unit_by_geometry"] = ratio
     return MM_PER_LENGTH[chosen] * (-1.0 if sign < 0 else 1.0)
 
@@ -760,7 +768,7 @@ def _length_scale(
 def _numbered(
     findings: TableFindings, names: Sequence[Sequence[str]], position: FloatArray, value: FloatArray, row_data: RowData
 ) -> dict[str, NDArray[np.int64]]:
-    """Return the labels; rows that nothing tells apart are numbered as repeats, or refused if they are a copy.
+    """Return the labels; indistinguishable rows are numbered as repeats, or refused if they are a copy.
 
     Raises
     ------
@@ -773,10 +781,12 @@ def _numbered(
         return row_data.labels
     if again.size >= 3 and np.array_equal(value[again], value[first[again]]):
         line, earlier = (findings.table.lines[k] for k in (int(again[0]), int(first[again[0]])))
-        message = f"{again.size} rows repeat earlier ones to the last digit (this one line {earlier}): take out what is a copy"
+        message = (
+            f"{again.size} rows repeat earlier ones to the last digit (this one line {earlier}): remove the copies"
+        )
         raise findings.table.grid.fail(message, line)
     findings.notes.append(
-        f"{again.size} rows repeat a position without a run or repeat: they were numbered as they come"
+        f"{again.size} rows repeat a position without a run or repeat: they were numbered in order of occurrence"
     )
     if "repeat" in row_data.labels:
         count = count + row_data.labels["repeat"] * (1 + int(count.max()))
@@ -784,7 +794,7 @@ def _numbered(
 
 
 def _keys(names: Sequence[Sequence[str]], position: FloatArray, row_data: RowData) -> FloatArray:
-    """Return what tells rows apart, a number for each column (rows, k)."""
+    """Return what distinguishes rows, a number for each column (rows, k)."""
     numbered = [np.unique(np.array(cells), return_inverse=True)[1] for cells in names]
     times = [row_data.covariates[key] for key in ("time_s", "approach") if key in row_data.covariates]
     vectors = [part for part in (position, row_data.tool_mm, row_data.approach) if part is not None]
@@ -805,7 +815,7 @@ def deviations_of(findings: TableFindings) -> Deviations:
             deviation[:, k] = _measured(findings, f"{axis}a", position[:, k])
     if findings.options.sign == "correction":
         deviation = -deviation
-        findings.understood["sign"] = "corrections, turned round"
+        findings.understood["sign"] = "corrections, sign reversed"
     else:
         findings.understood["sign"] = "measured minus commanded"
     findings.understood["readings"] = len(position)
@@ -823,20 +833,20 @@ def deviations_of(findings: TableFindings) -> Deviations:
 
 
 def check_largest(deviation_mm: FloatArray, origin: Sequence[tuple[str, int]]) -> None:
-    """Refuse deviations that no file of the contract may hold; ``deviation_mm`` is (n,) or (n, 3), nan where unknown."""
+    """Refuse deviations that native files do not allow; ``deviation_mm`` is (n,) or (n, 3), nan where unknown."""
     size = np.nan_to_num(np.abs(deviation_mm)).reshape(len(deviation_mm), -1).max(axis=1)
     worst = int(np.argmax(size))
     if size[worst] > LARGEST_DEVIATION_UM * MM_PER_UM:
         file, line = origin[worst]
         raise InputError(
-            f"a deviation of {size[worst]:.4g} mm is not plausible; is it a slip, or another unit?",
+            f"a deviation of {size[worst]:.4g} mm is not plausible; is it a mistake, or another unit?",
             file=file,
             line=line,
         )
 
 
 def _measured(findings: TableFindings, key: str, position: FloatArray) -> FloatArray:
-    """Measured minus commanded coordinate; unit and sign by the slope of the one over the other."""
+    """Return measured minus commanded coordinate; unit and sign by the slope of measured over commanded."""
     values = findings.numbers(key)
     name, declared = findings.fields[key].name, findings.unit(key)
     scale = MM_PER_LENGTH.get(declared, 1.0) if declared else 1.0
@@ -847,15 +857,15 @@ def _measured(findings: TableFindings, key: str, position: FloatArray) -> FloatA
     return values * scale - position
 
 
-# Which kind of measurement a table is, and the sheets of a workbook put together.
+# The kind of measurement of a table, and the combination of the sheets of a workbook.
 
 
-#: So many lines above a table are shown.
+#: Number of lines above a table that are shown.
 _MOST_HEADER = 12
 
 
 def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") -> Imported:
-    """Import one table, or a list of squareness errors; InputError if it is none or lacks what its kind needs."""
+    """Import one table, or a list of squareness errors; InputError if it is neither or lacks what its kind needs."""
     try:
         return _import_table(grid, options, form)
     except InputError:
@@ -907,7 +917,7 @@ def _import_table(grid: CellGrid, options: ImportOptions, form: str) -> Imported
 
 
 def _along_one_axis(findings: TableFindings) -> None:
-    """Take the one coordinate that a table has as position, and its deviation with it: X [mm], dX [um]."""
+    """Use the only coordinate of a table as position, with its deviation: X [mm], dX [um]."""
     letters = [axis for axis in "xyz" if axis in findings.fields]
     own = [axis for axis in "xyz" if f"d{axis}" in findings.fields or f"{axis}a" in findings.fields]
     if "position" in findings.fields:
@@ -938,7 +948,7 @@ def _kind(findings: TableFindings) -> Kind:
         return "axis"
     header = ", ".join(findings.table.header)
     raise findings.table.grid.fail(
-        f"its columns are not known: {shown(header)}; say what they are: --map position=COLUMN --map deviation=COLUMN (axis "
+        f"its columns are not recognised: {shown(header)}; assign them: --map position=COLUMN --map deviation=COLUMN (axis "
         "runs), x y z length (lengths), x y z dx dy dz (deviations), error position value (errors)",
         findings.table.header_line,
     )
@@ -949,7 +959,7 @@ def _need(findings: TableFindings, *keys: str) -> None:
         if key not in findings.fields:
             header = ", ".join(findings.table.header)
             raise findings.table.grid.fail(
-                f"no column is known as {key}; the header has {shown(header)}; give --map {key}=COLUMN",
+                f"no column is recognised as {key}; the header has {shown(header)}; give --map {key}=COLUMN",
                 findings.table.header_line,
             )
 
@@ -962,7 +972,7 @@ def _along_axes(findings: TableFindings) -> tuple[Data, ReversalCurves | None, K
     path = findings.table.grid.path
     if error is not None:
         if len(found) > 1:
-            raise InputError("holds several axes; --error names the error of one", file=path)
+            raise InputError("contains several axes; --error is for the error of one axis", file=path)
         ((letter, runs),) = found.items()
         check_error(error, letter or None, angular=angular)
         findings.understood |= _described(runs, 1e-6 if angular else MM_PER_UM)
@@ -983,7 +993,7 @@ def _described(runs: OneAxis, unit: float) -> dict[str, object]:
 
 
 def runs_of(found: dict[str, OneAxis], file: str, metadata: dict[str, str]) -> AxisRuns:
-    """Return the readings of all axes as one object; an axis that is not known counts as X until the user has said it."""
+    """Return the readings of all axes as one object; an unknown axis counts as X until the user gives it."""
     parts = [(letter, item.ordered()) for letter, item in found.items()]
     runs = AxisRuns(
         axis=np.concatenate([np.full(len(item.value), AXES.index(letter or "X")) for letter, item in parts]),
@@ -1023,8 +1033,8 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
                 mean, _, _ = two_way_mean(runs.position_mm[rows], runs.direction[rows], runs.deviation_mm[rows])
                 away = float(np.abs(mean.value - beside.curves[name].at(mean.position_mm)).max()) / MM_PER_UM
                 doubts.append(
-                    f"a sheet holds {name}, and the runs of {AXES[axis]} give it as well (their means differ by up to "
-                    f"{away:.3g} um); leave out one sheet with --ignore SHEET"
+                    f"a sheet contains {name}, and the runs of {AXES[axis]} give it, too (their means differ by up to "
+                    f"{away:.3g} um); exclude one sheet with --ignore SHEET"
                 )
     elif kinds == {"errors"}:
         data = _joined_errors(first, errors)

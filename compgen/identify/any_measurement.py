@@ -1,6 +1,6 @@
 """Read and identify a measurement of any kind, detected by its columns: lengths, positions, axis runs, six-DOF readings.
 
-What reads and identifies a kind is imported when a file of that kind is there.
+The code for a kind is imported when a file of that kind is read.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from compgen.data.length_archive import LengthArchive
     from compgen.identify.six_dof import SixDofMeasurement
 
-#: Deviations that are all smaller than this are refused: 100 um in the wrong unit, mm for um.
+#: Deviations that are all smaller than this are refused: 100 um written in mm.
 SMALLEST_UM = 0.1
 
 
@@ -83,7 +83,7 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         raise InputError(text, file=kinds["diagonals"][0])
     if "sixdof" in kinds and instrument is None:
         message = (
-            "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+            "contains six-DOF readings, which require the constants of their instrument; give --instrument FILE (TOML)"
         )
         raise InputError(message, file=kinds["sixdof"][0])
     if instrument is not None and "sixdof" not in kinds:
@@ -178,9 +178,7 @@ def identify_measurement(
         if largest_um < SMALLEST_UM:
             message = "all deviations are zero; was nothing measured? Give the measured values"
             if largest_um:
-                message = (
-                    f"the largest deviation is {largest_um:.3g} um, which no machine tool reaches; are the values "
-                )
+                message = f"the largest deviation is {largest_um:.3g} um, too small for a machine tool; are the values "
                 message += "in mm, a thousand times too small for um? Give them in um"
             file = measurement.origin[0][0] if measurement.origin else None
             raise InputError(f"{message}, or add --small-deviations if they are right", file=file)
@@ -191,7 +189,7 @@ def identify_measurement(
         if other:
             raise InputError(
                 "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
-                "deviations, which take --u-deviation-um"
+                "deviations, for which use --u-deviation-um"
             )
         return identify_deviations(machine, measurement, chosen)
     if isinstance(measurement, AxisRuns | Circles):
@@ -199,7 +197,7 @@ def identify_measurement(
             what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
             raise InputError(
                 f"--method, --stations, --u-... apply to other kinds of measurement; the files contain {what}, whose "
-                "uncertainty is that of their scatter"
+                "uncertainty comes from their scatter"
             )
         if isinstance(measurement, AxisRuns):
             return identify_axis_runs(machine, measurement)
@@ -266,7 +264,7 @@ def _applicable(part: OneKind, options: IdentifyOptions) -> IdentifyOptions:
     )
 
 
-# What a later report needs beside the results of an identification: the machine file, and the residuals.
+# What a later report needs in addition to the results of an identification: the machine file, and the residuals.
 
 
 def evidence_files(
@@ -279,14 +277,14 @@ def evidence_files(
     return files
 
 
-#: Comments of a measurement that say with what and by whom it was made; the report shows them.
+#: Comments of a measurement on instrument and operator; the report shows them.
 MEASURED_WITH = ("instrument", "serial_number", "operator")
 
 
 def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, result: Identification) -> str:
     """Return the text of ``residuals.csv``: measurement minus model of every reading, um, in the order of the files.
 
-    ``used`` is 0 for readings that were rejected; lengths have columns for station and commanded position. Comments of the
+    ``used`` is 0 for rejected readings; lengths have columns for station and commanded position. Comments of the
     measurement about instrument and operator are kept.
     """
     columns: dict[str, Sequence[str] | FloatArray] = {}

@@ -1,8 +1,8 @@
 """The joint covariance of identified errors and stations, in memory and as ``identified.covariance.npz``.
 
-It is kept as a factor F with F F^T the covariance, one row for every value of the errors file and for every station
-coordinate and dead length. The uncertainty of E = C P at a point is then the length of a row of (C B) F: the
-covariance of E itself is never formed.
+It is kept as a factor F with F F^T the covariance, one row for every value of the errors file, every station coordinate
+and dead length. The uncertainty of E = C P at a point is then the length of a row of (C B) F: the covariance of E
+itself is never formed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from compgen.kinematics.first_order import c_matrix
 
 FILE_NAME = "identified.covariance.npz"
 FORMAT = "compgen covariance 1"
-#: Points whose rows of C B are made together.
+#: Points whose rows of C B are computed together.
 CHUNK = 1024
 _MEMBERS = ("format", "machine", "errors_sha256", "error", "position_mm", "unit", "station", "setup", "factor")
 
@@ -48,7 +48,7 @@ class Covariance(Displayed):
     station, setup : name and set-up of each dead length (g,); the stations are in the order of first mention.
     factor : shape (k + 3 S + g, r); ``factor @ factor.T`` is the covariance: error values, then x, y, z of every
         station, then dead lengths.
-    machine, errors_sha256 : name of the machine, and SHA-256 of the errors file that it belongs to ("" for none).
+    machine, errors_sha256 : name of the machine, and SHA-256 of its errors file ("" for none).
     """
 
     error: tuple[str, ...]
@@ -125,7 +125,7 @@ def covariance_from_factor(
 
 
 def joint_covariance(result: Identification) -> Covariance:
-    """Return the covariance of everything that was identified, systematic inputs included."""
+    """Return the covariance of all identified values, including systematic inputs."""
     if result.values_factor is not None:
         return covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
     if result.adjustment is None:
@@ -167,7 +167,7 @@ def values_at_nodes(errors: ErrorTable, names: Sequence[str], position_mm: Float
 def covariance_or_independent(
     errors: ErrorTable, covariance: Covariance | None, machine: str = ""
 ) -> Covariance | None:
-    """Return the covariance; without one that of independent values with their own u; None where a u is not known."""
+    """Return the covariance; without one that of independent values from their u; None if a u is unknown."""
     if covariance is not None:
         return covariance
     u = errors.uncertainties()
@@ -227,7 +227,7 @@ def predict_uncertainty(machine: Machine, covariance: Covariance, points: Points
     ----------
     machine : chain, tool offset and squareness reference are taken from it.
     covariance : of the identified errors.
-    points : the points; their tool offsets count, if they have any.
+    points : the points, with their tool offsets if they have any.
     """
     factor = covariance.errors_factor
     u = np.empty((len(points), 3))
@@ -290,12 +290,12 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
     Parameters
     ----------
     path : the file.
-    errors : the errors file that it has to belong to; None takes any.
+    errors : the errors file that it must belong to; None accepts any.
 
     Raises
     ------
     InputError
-        if it is another kind of file, cut, damaged, inconsistent, or belongs to another errors file.
+        if it is another kind of file, truncated, damaged, inconsistent, or belongs to another errors file.
     """
     source = Path(path)
     covariance = parse_covariance(read_bytes(source), source)
@@ -311,7 +311,7 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
 
 
 def parse_covariance(content: bytes, source: Path) -> Covariance:
-    """Read the contents of a ``*.covariance.npz`` file; ``source`` is what messages name."""
+    """Read the contents of a ``*.covariance.npz`` file; ``source`` is the name in messages."""
     if not content.startswith(b"PK"):
         raise InputError("is not a covariance file (*.covariance.npz, written by volcomp identify)", file=source)
     try:
@@ -344,14 +344,14 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
         ) from error
     unknown = [name for name in covariance.error if name not in ERROR_INDEX]
     if unknown:
-        raise InputError(f"names {unknown[0]!r}, which is not one of the 21 errors", file=source)
+        raise InputError(f"contains {unknown[0]!r}, which is not one of the 21 errors", file=source)
     count = len(covariance.error)
     rows = count + 3 * len(covariance.stations) + len(covariance.station)
     shapes = (covariance.position_mm.shape, covariance.setup.shape, covariance.factor.shape[:1], covariance.factor.ndim)
     if shapes != ((count,), (len(covariance.station),), (rows,), 2):
-        raise InputError(f"its parts do not fit together: {count} error values, shapes {shapes}", file=source)
+        raise InputError(f"its parts do not match: {count} error values, shapes {shapes}", file=source)
     if not (np.abs(covariance.factor) <= LARGEST).all():
-        raise InputError(f"the factor holds numbers that are not finite, or above {LARGEST:g}", file=source)
+        raise InputError(f"the factor contains numbers that are not finite, or above {LARGEST:g}", file=source)
     for name in dict.fromkeys(covariance.error):
         position = covariance.position_mm[np.array(covariance.error) == name]
         if name in SQUARENESS_NAMES:

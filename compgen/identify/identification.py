@@ -26,14 +26,14 @@ from compgen.kinematics.first_order import observable_errors
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
 
-# What an identification returns, and the contents of ``identify.json``.
+# The result of an identification, and the contents of ``identify.json``.
 
 
 @dataclass(frozen=True)
 class StationResult:
     """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um.
 
-    ``segment`` counts the dead lengths that beam breaks added to it, 0 being the main one.
+    ``segment`` numbers the dead lengths that beam breaks added to it; 0 is the main one.
     """
 
     station: str
@@ -60,32 +60,33 @@ class Identification(Drawable):
     rms_um, degrees_of_freedom, reduced_chi_square : of the used readings; chi-square with the stated uncertainty.
     u_source : "stated" or "assumed"; with "assumed", and whenever the residuals are larger than stated, the
         uncertainties are scaled by the root of the reduced chi-square (``u_scale``).
-    unobservable : combinations that the model leaves out because nothing can show them, in words.
-    rejected : readings that were not used, with the reason.
-    segments : beam breaks: runs of readings with a dead length of their own, or rejected together.
+    unobservable : combinations that are not in the model because they are not observable, in words.
+    rejected : rejected readings, with the reason.
+    segments : beam breaks: runs of readings with a separate dead length, or rejected together.
     reversal : mean difference between the directions of approach; None if no stop was approached from both sides.
-    residual_tests : makes the tests behind ``whiteness``.
-    corrections : what was taken out of the readings (temperature of the scales, wavelength, effects of the machine file).
+    residual_tests : computes the tests of ``whiteness``.
+    corrections : what was removed from the readings (temperature of the scales, wavelength, effects of the machine
+        file).
     rank, unknowns, condition, iterations : of the least-squares problem.
     worst_u : largest standard uncertainty by unit ("um", "urad") with its error.
     layout : the unknown errors and their bases.
     adjustment : the optimum with its factor, for the joint covariance and for systematic inputs; None if there is none.
-    systematic : what systematic inputs contribute, and is part of the standard uncertainties then; None if none is.
+    systematic : contributions of systematic inputs, included in the standard uncertainties; None if there are none.
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
         the mean of their position), "merged" for those and others, "axis-runs" for
         runs along single axes, "circles" for circular tests, "together" for a mixture of these, "given" for errors of
         another program (no residuals), or "deviations" where measured positions were given instead of lengths; then the
         residuals are those of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
     steps : figures of the single steps of the two-step method.
-    positions : the positions that it measured in the machine frame, against the commanded ones.
-    values_factor : where there is no adjustment: F (k, r) with F F^T the covariance of the error values in the order of
-        the errors file, mm and rad; None if there is none.
-    reversal_curves : reversals over the position of each axis, where the instrument shows them so.
-    details : figures of the method beyond those that all methods have in common.
-    objections : why nothing that is made of these errors may be accepted; empty if there is no such reason.
-    misfit : whether the residuals are larger than their uncertainty allows, and what explains them; None where no
-        uncertainty of the readings is part of the method.
-    counted : number of readings and of those that were used, where ``residual_mm`` and ``accepted`` are those of a sample.
+    positions : the positions measured by it in the machine frame, and the commanded ones.
+    values_factor : without an adjustment: F (k, r) with F F^T the covariance of the error values in the order of the
+        errors file, mm and rad; None if there is none.
+    reversal_curves : reversals over the position of each axis, if the instrument shows them.
+    details : additional figures of the method.
+    objections : why no result from these errors may be accepted; empty if there is no such reason.
+    misfit : whether the residuals exceed their uncertainty, and what explains them; None if the method does not use an
+        uncertainty of the readings.
+    counted : number of readings and of used readings, if ``residual_mm`` and ``accepted`` are those of a sample.
 
     Examples
     --------
@@ -151,9 +152,9 @@ class Identification(Drawable):
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance of the unknown errors in the order of the layout (size, size), mm and rad; made at the first look.
+        """Covariance of the unknown errors in the order of the layout (size, size), mm and rad; computed on first use.
 
-        Systematic inputs are part of it where they were given.
+        Systematic inputs are included if given.
         """
         if self.adjustment is None:
             raise ValueError("this identification keeps no covariance")
@@ -165,7 +166,7 @@ class Identification(Drawable):
 
     @cached_property
     def whiteness(self) -> Whiteness | None:
-        """Tests of the residuals, made at the first look, with a CompgenWarning if one fires; None if there are none."""
+        """Tests of the residuals, computed on first use, with a CompgenWarning if one fails; None if there are none."""
         if self.residual_tests is None:
             return None
         found = self.residual_tests()
@@ -225,7 +226,7 @@ class Identification(Drawable):
         return Overview(title, table.header, table.rows, notes)
 
     def panels(self) -> Sequence[Panel]:
-        """The errors, and the residuals of the readings that were used."""
+        """The errors, and the residuals of the used readings."""
         residual_um = -self.residual_mm[self.accepted] / MM_PER_UM  # kept as model minus reading, shown as in the files
         if not len(residual_um):
             return self.errors.panels()
@@ -237,7 +238,7 @@ class Identification(Drawable):
 
 
 def uncertainty_scale(reduced_chi_square: float, u_source: str) -> float:
-    """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only where they exceed it."""
+    """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only if they exceed it."""
     root = float(np.sqrt(reduced_chi_square))
     return root if u_source == "assumed" else max(1.0, root)
 
@@ -300,7 +301,7 @@ class AdjustedReadings:
 
     @property
     def u_scale(self) -> float:
-        """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only where they exceed it."""
+        """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only if they exceed it."""
         return uncertainty_scale(self.reduced_chi_square, self.u_source)
 
     def used(self, values: FloatArray) -> FloatArray:
@@ -416,7 +417,7 @@ def not_among(errors: ErrorTable, why: str) -> tuple[str, ...]:
     return tuple(f"{name}: {why}" for name in ERROR_NAMES if name not in errors.names)
 
 
-# What every method of identification returns: error curves with uncertainties, and notes about them.
+# Common results of all methods of identification: error curves with uncertainties, and notes about them.
 
 
 def error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArray) -> ErrorTable:
@@ -425,7 +426,7 @@ def error_table(layout: ErrorParameters, unknowns: FloatArray, factor: FloatArra
     ``factor`` (size, r) times its transpose is their covariance.
     """
     positions = [layout.output_positions_mm(axis) for axis in range(3)]
-    plain = layout.machine.curves == "linear"  # written at the nodes, where coefficients are values
+    plain = layout.machine.curves == "linear"  # written at the nodes, so coefficients are values
     bases = [np.zeros((0, 0)) if plain else layout.basis(axis, positions[axis]) for axis in range(3)]
     variance = np.einsum("ij,ij->i", factor, factor)
     curves = {}
@@ -468,14 +469,14 @@ def metadata_of(machine: Machine, metadata: Mapping[str, str]) -> dict[str, str]
 
 
 def unobservable(layout: ErrorParameters) -> tuple[str, ...]:
-    """Say in words which of the 21 errors the model leaves out, and why."""
+    """Return in words which of the 21 errors are not in the model, and why."""
     machine = layout.machine
     identified = {curve.error.name for curve in layout.curves} | set(layout.squareness)
     shown = observable_errors(machine)
     return tuple(
-        f"{name}: left out of the machine file's errors, although it is observable on chain {machine.chain.name}"
+        f"{name}: excluded by errors in the machine file, although it is observable on chain {machine.chain.name}"
         if name in shown
-        else f"{name}: no lever arm but its own axis' travel or one tool offset on chain {machine.chain.name}"
+        else f"{name}: no lever arm other than the travel of its axis or one tool offset on chain {machine.chain.name}"
         for name in ERROR_NAMES
         if name not in identified
     )

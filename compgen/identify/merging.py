@@ -1,10 +1,10 @@
-"""Errors of one machine from two instruments: brought to the same gauge, compared, and averaged where they agree.
+"""Errors of one machine from two instruments: brought to the same gauge, compared, and averaged if they agree.
 
-The six-DOF instrument measures all 21 errors, a tracer (or a set of measured positions) those that its chain and tool
-show, each with the gauge of its own. So the six-DOF errors are projected: least squares finds the errors of the other
-identification's layout, plus a rigid motion, that move the tool in the same way. That folds what this layout cannot
-tell apart (:func:`compgen.kinematics.gauge.align` gives the same where nothing has to be folded), and carries the
-covariance along. Then every value is compared and averaged with the inverse variances as weights.
+The six-DOF instrument measures all 21 errors, a tracer (or a set of measured positions) those observable with its chain
+and tool, each in a different gauge. So the six-DOF errors are projected: least squares finds the errors of the other
+identification's layout, plus a rigid motion, that move the tool in the same way. That combines what this layout cannot
+distinguish (:func:`compgen.kinematics.gauge.align` gives the same if nothing has to be combined), and propagates the
+covariance. Then every value is compared and averaged with the inverse variances as weights.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from compgen.identify.identification import Identification, table_of_values, wor
 from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.many_points import full_grid
 
-#: Probability with which two true measurements are said to disagree somewhere.
+#: Probability of a false report that two measurements disagree.
 FALSE_ALARM = 0.05
-#: Degrees of freedom where the scatter is stated, not estimated.
+#: Degrees of freedom of a stated scatter.
 MANY = 1e6
 #: Levels of the other axes at which the motion of the tool is compared.
 LEVELS = 3
@@ -37,7 +37,7 @@ LEVELS = 3
 
 @dataclass(frozen=True)
 class InstrumentAgreement:
-    """How two identifications compare, by error.
+    """Comparison of two identifications, by error.
 
     Parameters
     ----------
@@ -59,8 +59,8 @@ class InstrumentAgreement:
 def merge(machine: Machine, first: Identification, second: Identification) -> Identification:
     """Merge the identification of lengths or deviations with that of six-DOF readings of the same machine.
 
-    Values that agree are averaged. An error that disagrees keeps the value of ``first``, with half of the difference
-    as additional uncertainty, and is named by a CompgenWarning.
+    Values that agree are averaged. An error that disagrees keeps the value of ``first``, with half of the difference as
+    additional uncertainty, and is listed in a CompgenWarning.
 
     Raises
     ------
@@ -104,10 +104,10 @@ def merge(machine: Machine, first: Identification, second: Identification) -> Id
 def _check(machine: Machine, first: Identification, second: Identification) -> None:
     missing = [axis for axis in AXES if f"E{axis}{axis}" not in second.errors.curves]
     if missing:
-        message = f"the six-DOF readings lack {', '.join(missing)}; merging needs all three axes"
+        message = f"the six-DOF readings lack {', '.join(missing)}; merging requires all three axes"
         raise InputError(message + "; otherwise identify the files separately")
     if not first.has_covariance or not second.has_covariance:
-        raise InputError("one of the measurements has no uncertainties, so that they cannot be compared or averaged")
+        raise InputError("one of the measurements has no uncertainties, so they cannot be compared or averaged")
 
 
 def _points(machine: Machine) -> FloatArray:
@@ -192,7 +192,7 @@ def _table(
 
 
 def _texts(agreement: InstrumentAgreement) -> tuple[str, ...]:
-    """What has to be said; empty if everything agrees."""
+    """Return the warnings; empty if everything agrees."""
     if not agreement.disagree:
         return ()
     listed = ", ".join(f"{name} ({agreement.en[name]:.1f})" for name in agreement.disagree)
@@ -200,5 +200,5 @@ def _texts(agreement: InstrumentAgreement) -> tuple[str, ...]:
     return (
         f"the two instruments disagree beyond their uncertainty in {listed} (En, 1 is the limit): these "
         f"{'angles and lengths' if len(kinds) > 1 else 'errors'} keep the value of the first one with half of the "
-        "difference as uncertainty; look at calibration, set-up and time between the measurements",
+        "difference as uncertainty; check calibration, set-up and time between the measurements",
     )

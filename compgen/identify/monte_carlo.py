@@ -1,7 +1,7 @@
 """Uncertainty by sampling: draws of the errors from their covariance, and re-identification as a self-check.
 
-Linear propagation agrees with nonlinear re-identification to some 1e-5 um, so that drawing from the covariance is
-enough for whatever depends on the errors; the re-identification shows that it is.
+Linear propagation agrees with nonlinear re-identification to about 1e-5 um, so drawing from the covariance is enough
+for everything that depends on the errors; the re-identification confirms it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class SelfCheck:
     """Outcome of :func:`self_check`.
 
     ``ratio_median``, ``ratio_min``, ``ratio_max`` compare the standard deviation over the replicates with the stated
-    standard uncertainty, value by value; ``expected_spread`` is the standard deviation that chance gives such a ratio.
+    standard uncertainty, value by value; ``expected_spread`` is the standard deviation of such a ratio by chance.
     """
 
     replicates: int
@@ -51,7 +51,7 @@ class SelfCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the stated uncertainties are those of the replicates, within chance."""
+        """Whether the stated uncertainties agree with the replicates, within chance."""
         return abs(self.ratio_median - 1.0) < 3.0 * self.expected_spread and (
             1.0 - 5.0 * self.expected_spread < self.ratio_min and self.ratio_max < 1.0 + 5.0 * self.expected_spread
         )
@@ -70,15 +70,15 @@ def self_check(
     progress: Callable[[int], None] = lambda _: None,
     mapper: Map = map,
 ) -> SelfCheck:
-    """Identify again from simulated readings: the model's own with new noise of the stated size.
+    """Identify again from simulated readings: those of the model with new noise of the stated size.
 
     Parameters
     ----------
     machine, lengths, result : what was identified, by the joint method, and the outcome.
     replicates : at least 10.
-    seed : of the noise; each replicate draws from a generator of its own, by this seed and its number.
-    progress : is told the number of finished replicates.
-    mapper : may spread the replicates over processes; the outcome is the same.
+    seed : of the noise; each replicate has a separate generator, from this seed and its number.
+    progress : called with the number of finished replicates.
+    mapper : may distribute the replicates over processes; the outcome is the same.
     """
     adjustment = result.adjustment
     if replicates < 10 or adjustment is None or result.method != "joint":

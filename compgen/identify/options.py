@@ -1,4 +1,4 @@
-"""Options of an identification: uncertainty of the readings, and stations that are known beforehand."""
+"""Options of an identification: uncertainty of the readings, and known stations."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from compgen.kinematics.first_order import tool_of
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
 
-# Stations whose machine coordinates are known beforehand: from a file, or located with the machine taken as perfect.
+# Stations with known machine coordinates: from a file, or located with the machine assumed perfect.
 #
-# A known coordinate is one more observation, s = s0 with standard uncertainty u. It is not more than that: which errors
-# one or two stations determine is for the rank to say (``docs/method.md``, "One or two stations").
+# A known coordinate is one more observation, s = s0 with standard uncertainty u, and no more than that: the rank shows
+# which errors one or two stations determine (``docs/method.md``, "One or two stations").
 
 
-#: A station without a stated uncertainty is fixed to this: a nanometre is nothing for a tracer.
+#: A station without a stated uncertainty is fixed within this: a nanometre is negligible for a tracer.
 FIXED_MM = 1e-6
 
 #: Columns of ``stations.csv`` of an identification.
@@ -47,7 +47,7 @@ class KnownStations:
     u_mm: FloatArray
 
     def indices(self, stations: Sequence[str]) -> IntArray:
-        """Return the indices of the known ones among ``stations``; InputError for a name that is not there."""
+        """Return the indices of the known ones among ``stations``; InputError for an unknown name."""
         for name in self.names:
             if name not in stations:
                 message = f"the stations file contains {name!r}, but the measurement has no such station"
@@ -58,7 +58,7 @@ class KnownStations:
 def read_stations(path: str | Path) -> KnownStations:
     """Read known stations: CSV with ``station, x_mm, y_mm, z_mm`` and, if they are not exact, ``u_mm``.
 
-    ``stations.csv`` of an identification will do, with its uncertainties; more rows of a station are accepted.
+    ``stations.csv`` of an identification is valid, with its uncertainties; several rows of a station are accepted.
     """
     optional = ("u_mm", *OF_IDENTIFY)
     table = read_csv(path, required=("station", *POSITION_COLUMNS), optional=optional)
@@ -82,11 +82,11 @@ def read_stations(path: str | Path) -> KnownStations:
 
 
 def locate_stations(machine: Machine, lengths: Lengths) -> KnownStations:
-    """Locate every station with the machine taken as perfect (single-station method of Zha & Zhang 2024, section 1).
+    """Locate every station with the machine assumed perfect (single-station method of Zha & Zhang 2024, section 1).
 
-    The machine's own errors go into the positions. They are smooth over the volume, so that more readings do not average
-    them out: the uncertainty is what errors of the size of the residual RMS do if all of them act in the worst way,
-    the root of n times that of independent ones.
+    The errors of the machine affect the positions. They are smooth over the volume, so more readings do not average
+    them out: the uncertainty is the effect of errors of the size of the residual RMS if all act in the worst way,
+    sqrt(n) times that of independent ones.
     """
     target = lengths.position_mm + tool_of(machine, lengths.tool_mm)
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
@@ -147,30 +147,31 @@ def known_positions(known: KnownStations, stations: Sequence[str], sigma_mm: flo
 Method = Literal["joint", "two-step"]
 METHODS: tuple[Method, ...] = ("joint", "two-step")
 
-#: Standard uncertainty of a laser tracer's length when neither the file nor the user states one: half of the usual
+#: Standard uncertainty of a laser tracer's length if neither the file nor the user states one: half of the usual
 #: statement 0.2 um + 0.3 um/m at k = 2.
 ASSUMED_U_UM = 0.1
 ASSUMED_U_UM_PER_M = 0.15
-#: Standard uncertainty of a measured deviation when nobody states one.
+#: Standard uncertainty of a measured deviation if none is stated.
 ASSUMED_U_DEVIATION_UM = 1.0
 
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """What the user may say beyond the machine and the readings.
+    """Options of the user in addition to machine and readings.
 
     ``u_length_um`` and ``u_length_um_per_m`` are the standard uncertainty a + b L of a reading; without them the
-    comments of that name in the file count, else the usual statement of a laser tracer. ``reject`` False keeps all
-    readings. ``systematic`` are the uncertainties of inputs that all readings share.
+    comments of that name in the file are used, otherwise the usual statement of a laser tracer. ``reject`` False keeps
+    all readings. ``systematic`` are the uncertainties of inputs common to all readings.
 
-    ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are known beforehand, or located
-    with the machine taken as perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured deviation;
-    it belongs to deviations files only. ``temperature`` False leaves the scales at the temperature that they had.
+    ``method`` is "joint" or "two-step" (:mod:`compgen.identify.two_step`). ``stations`` are the known ones, or located
+    with the machine assumed perfect ("nominal"). ``u_deviation_um`` is the standard uncertainty of a measured
+    deviation; it applies to deviations files only. ``temperature`` False leaves the scales at their measured
+    temperature.
 
-    ``part_scale`` "free" takes one scale out of each set-up of a part (its temperature is not known), and ``travel``
-    "from-data" lets the curves end where the readings do; both belong to positions in frames of unknown pose
-    (:mod:`compgen.identify.positions`).
-    ``small_deviations`` takes deviations that are all zero, or smaller than any machine's, as they are.
+    ``part_scale`` "free" removes one scale from each set-up of a part (of unknown temperature), and ``travel``
+    "from-data" limits the curves to the range of the readings; both apply to positions in frames of unknown pose
+    (:mod:`compgen.identify.positions`). ``small_deviations`` accepts deviations that are all zero, or too small for a
+    machine.
 
     Examples
     --------
@@ -194,35 +195,35 @@ class IdentifyOptions:
     stations: KnownStations | Literal["nominal"] | None = option(
         None,
         "CSV with known stations (station, x_mm, y_mm, z_mm; optional u_mm, exact without), or the word nominal: "
-        "located with the machine taken as perfect.",
+        "located with the machine assumed perfect.",
         metavar="FILE",
     )
     u_deviation_um: float | None = option(
         None,
-        "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: the file's, else 1 um scaled by "
+        "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: from the file, otherwise 1 um scaled by "
         "the residuals.",
     )
     temperature: bool = option(
         True,
-        "Leave the scales at the temperature that they had; by default they are corrected to 20 degC where the file has "
+        "Leave the scales at their measured temperature; by default they are corrected to 20 degC if the file has "
         "temp_x_c, temp_y_c, temp_z_c and the machine file expansion_um_per_m_k.",
         name="--no-temperature",
     )
     part_scale: Literal["known", "free"] = option(
         "known",
         "Scale of a measured part (*.part.csv): known (1, or by the temperatures in the file), or free: one unknown "
-        "scale for each set-up, which takes the mean of the scale errors of the axes with it.",
+        "scale for each set-up, which absorbs the mean of the scale errors of the axes.",
     )
     travel: Literal["machine", "from-data"] = option(
         "machine",
-        "machine: curves over the whole travel, nodes that no reading reaches tied by smoothness; from-data: over the "
+        "machine: curves over the whole travel, with nodes beyond the readings tied by smoothness; from-data: over the "
         "range that the readings cover. For parts, and deviations at one height or without a component.",
         name="--range",
     )
     small_deviations: bool = option(
         False,
-        "Take deviations that are all zero, or all below 0.1 um, as they are; without it they are refused, because "
-        "nothing was measured then, or the values are in mm.",
+        "Accept deviations that are all zero, or all below 0.1 um; without it they are refused, because then "
+        "nothing was measured, or the values are in mm.",
     )
 
 
@@ -230,7 +231,7 @@ class IdentifyOptions:
 class ReadingNoise:
     """Standard uncertainty a + b L of a reading; ``source`` is "stated" or "assumed".
 
-    ``column_um`` (n,) takes its place for readings that state their own; nan for the others.
+    ``column_um`` (n,) replaces it for readings that state their own; nan for the others.
     """
 
     source: str
@@ -240,7 +241,7 @@ class ReadingNoise:
 
     @property
     def uniform_mm(self) -> float | None:
-        """Standard uncertainty in mm where it is the same for all readings, else None."""
+        """Standard uncertainty in mm if it is the same for all readings, otherwise None."""
         if self.proportional_um_per_m or self.column_um is not None:
             return None
         return self.constant_um * MM_PER_UM
@@ -256,7 +257,7 @@ class ReadingNoise:
 def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
     """Return the uncertainty of the readings.
 
-    Options count first, then the column ``u_length_um``, then the file's comments, then the usual statement.
+    The order of precedence is: options, the column ``u_length_um``, the comments of the file, the usual statement.
     """
     column = _column(lengths) if options.u_length_um is None and options.u_length_um_per_m is None else None
     if column is not None and np.isfinite(column).all():
@@ -285,7 +286,7 @@ def _column(lengths: Lengths) -> FloatArray | None:
 
 
 def number_in_comment(readings: Lengths | Deviations, key: str) -> float | None:
-    """Number of the comment ``# key = ...`` of the readings; None without one, InputError for something else."""
+    """Return the number in the comment ``# key = ...`` of the readings; None without one, InputError if not a number."""
     text = readings.metadata.get(key)
     if text is None:
         return None
@@ -299,7 +300,7 @@ def number_in_comment(readings: Lengths | Deviations, key: str) -> float | None:
 def deviation_sigma(deviations: Deviations, options: IdentifyOptions) -> tuple[FloatArray, str]:
     """Standard uncertainty of each component (n, 3) in mm, and "stated" or "assumed".
 
-    The option counts first, then the columns of the file, then its comment, then the usual uncertainty.
+    The order of precedence is: the option, the columns of the file, its comment, the usual uncertainty.
     """
     stated = options.u_deviation_um
     if stated is None:

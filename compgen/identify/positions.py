@@ -43,10 +43,10 @@ from compgen.identify.reference_conditions import without_effects
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
 
-# Errors from positions measured in frames of unknown pose, in any of their components: what they determine, no more.
+# Errors from positions measured in frames of unknown pose, in any of their components: only what they determine.
 #
-# The positions are features of parts (``*.part.csv``) or measured deviations that lack a component, lie at one height, or
-# come from several set-ups. Component i of position j, measured in set-up s, is to first order
+# The positions are features of parts (``*.part.csv``) or measured deviations without one component, at one height, or
+# from several set-ups. Component i of position j, measured in set-up s, is to first order
 #
 #     d_ij = e_i . (shift_s + turn_s x p_j + scale_s p_j + C(p_j) P)
 #
@@ -59,10 +59,10 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class FramePose:
-    """Where the frame of one set-up lies: measured = offset + rotation(scale x (nominal + error)).
+    """Pose of the frame of one set-up: measured = offset + rotation(scale x (nominal + error)).
 
     ``offset_mm`` (3,) is that of the nominal origin, ``turn_rad`` (3,) the rotation vector; nan in components that the
-    readings do not show. ``scale`` is 1 where it was not free.
+    readings do not show. ``scale`` is 1 if it was not free.
     """
 
     setup: int
@@ -110,13 +110,13 @@ def needs_free_pose(deviations: Deviations) -> bool:
 
 
 def identify_with_free_pose(machine: Machine, deviations: Deviations, options: IdentifyOptions) -> Identification:
-    """Identify what positions in frames of unknown pose determine.
+    """Identify the errors that positions in frames of unknown pose determine.
 
     Parameters
     ----------
     machine : chain, nodes, reference point and the errors that its model contains.
-    deviations : measured minus nominal coordinates, any components; the label ``setup`` tells the frames apart.
-    options : ``u_deviation_um``, ``reject``, ``part_scale`` ("free", or "known": 1, or what the temperatures say) and
+    deviations : measured minus nominal coordinates, any components; the label ``setup`` distinguishes the frames.
+    options : ``u_deviation_um``, ``reject``, ``part_scale`` ("free", or "known": 1, or from the temperatures) and
         ``travel`` ("machine", or "from-data": curves over the range that the readings cover).
 
     Raises
@@ -124,7 +124,7 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
     InputError
         for temperatures without the coefficient of expansion of the part.
     UndeterminedError
-        where no error at all is determined.
+        if no error is determined.
     """
     deviations = _at_20_degrees(deviations if deviations.poses else aligned(deviations))
     if options.travel == "from-data":
@@ -137,7 +137,7 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
         lambda accepted, _: least_squares(layout, observations, accepted),
         lambda solution: solution.residual / readings.sigma_mm,
         len(readings.row),
-        "coordinates do not fit the model; check the axis order, signs and units, and which feature is which,",
+        "coordinates do not fit the model; check the axis order, signs and units, and assignment of the features,",
         reject=options.reject,
     )
     result = _free_pose_result(deviations, readings, solution, accepted, source)
@@ -145,7 +145,7 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
     if texts:
         warnings.warn(
             f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
-            "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data keeps to what was measured",
+            "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data uses only what was measured",
             CompgenWarning,
             stacklevel=3,
         )
@@ -153,9 +153,9 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
 
 
 def _at_20_degrees(deviations: Deviations) -> Deviations:
-    """Measured coordinates brought to the size that the part has at 20 degC, and to that it had when it was machined.
+    """Scale measured coordinates to the size of the part at 20 degC and to its size during machining.
 
-    ``temp_part_c`` is the temperature of the part while it was measured, ``temp_machined_c`` while it was machined.
+    ``temp_part_c`` is the temperature of the part during the measurement, ``temp_machined_c`` during machining.
     """
     names = ("temp_part_c", "temp_machined_c")
     if not any(name in deviations.covariates for name in names):
@@ -170,14 +170,14 @@ def _at_20_degrees(deviations: Deviations) -> Deviations:
             file=deviations.origin[0][0] if deviations.origin else None,
         ) from None
     measured, machined = (np.nan_to_num(deviations.covariates.get(n, 20.0) - np.array(20.0)) for n in names)
-    # the part grew by the difference of the two temperatures between the machine and the measurement
+    # the part expanded by the temperature difference between machining and measurement
     growth = (expansion * (measured - machined))[..., None]
     actual = deviations.position_mm + deviations.deviation_mm
     return replace(deviations, deviation_mm=deviations.deviation_mm - growth * actual)
 
 
 def _within(machine: Machine, position_mm: FloatArray) -> Machine:
-    """The machine with the travel that the positions cover; nodes as far apart as before, the reference point inside."""
+    """Return the machine with the travel covered by the positions; same node spacing, reference point inside."""
     axes = []
     for k, axis in enumerate(machine.axes):
         low, high = float(position_mm[:, k].min()), float(position_mm[:, k].max())
@@ -197,7 +197,7 @@ def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) ->
     tools = np.broadcast_to(tool_of(machine, deviations.tool_mm), deviations.position_mm.shape)
     setups = setups_of(deviations)
     centre = np.array([deviations.poses[setup].nominal_mm for setup in setups.tolist()])
-    # a coordinate that was not measured has no centre of its own
+    # an unmeasured coordinate has no centre
     centre = np.where(np.isfinite(deviations.deviation_mm).any(axis=0), centre, deviations.position_mm.mean(axis=0))
     return _Readings(
         row.astype(np.int64),
@@ -267,7 +267,7 @@ def _free_pose_result(
         -solution.residual, readings.sigma_mm, accepted, source, solution.rank, solution.freedom, too_few=too_few
     )
     errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
-    ambiguous = "a part of it is not told apart from the pose, the scale or other errors"
+    ambiguous = "a part of it cannot be separated from the pose, the scale or other errors"
     return replace(
         _result(adjusted, errors, solution.layout, deviations, readings.row, readings.component),
         unobservable=(
@@ -314,8 +314,8 @@ def _poses(
     solution: Determined,
     u_scale: float,
 ) -> list[FramePose]:
-    """The pose of each set-up: the rotation that was taken out first, and the small one that was adjusted."""
-    from scipy.spatial.transform import Rotation  # imported here: slow to load, and few measurements need it
+    """Return the pose of each set-up: the rotation removed first, and the small adjusted one."""
+    from scipy.spatial.transform import Rotation  # imported here: slow to load, and rarely needed
 
     setups, found = setups_of(deviations), []
     poses = solution.others.reshape(len(np.unique(setups)), -1)
@@ -342,10 +342,10 @@ def _poses(
     return found
 
 
-# Errors from positions measured against commanded ones (``*.deviations.csv``): the separation step on its own.
+# Errors from measured and commanded positions (``*.deviations.csv``): the separation step alone.
 #
-# The rigid placement of the measured frame is unknown (six unknowns more), so that a file in the frame of any instrument
-# will do as long as its axes are those of the machine to a few degrees.
+# The rigid placement of the measured frame is unknown (six more unknowns), so the file may be in the frame of any
+# instrument whose axes are those of the machine to a few degrees.
 
 
 def identify_deviations(
@@ -357,14 +357,14 @@ def identify_deviations(
     ----------
     machine : chain, nodes, reference point and which errors its model contains.
     deviations : measured minus commanded position; any of the three components.
-    options : ``u_deviation_um`` and ``reject`` count.
+    options : ``u_deviation_um`` and ``reject`` are used.
 
     Raises
     ------
     InputError
         for positions outside the travel, or an uncertainty that is not above zero.
     UndeterminedError
-        if the positions do not determine the errors; it names the combinations.
+        if the positions do not determine the errors; it lists the combinations.
     ConvergenceError
         if no optimum is reached.
     """

@@ -41,15 +41,15 @@ from compgen.kinematics.first_order import tool_of
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
 
-# Effects that the machine file switches on, taken out of the readings before errors are identified.
+# Effects in the machine file, removed from the readings before errors are identified.
 
 
-#: Where a station is taken to be while only the columns of the file are looked at, mm.
+#: Assumed place of a station while only the columns of the file are checked, mm.
 FAR_MM = (0.0, 0.0, 1e5)
 
 
 def effects_of_lengths(machine: Machine, lengths: Lengths) -> tuple[catalogue.ActiveEffect, ...]:
-    """Return the effects of the machine file that act on these lengths; warns of columns that they lack."""
+    """Return the effects of the machine file that act on these lengths; warn of missing columns."""
     if not machine.effects:
         return ()
     effects = catalogue.active_effects(machine)
@@ -68,18 +68,20 @@ def _usable(
         if active.change_mm(readings) is not None:
             usable.append(_settled(active, readings))
         else:
-            message = f"{active.name} of the machine file stays in the readings: they lack {', '.join(card.covariates)}"
+            message = (
+                f"{active.name} of the machine file is not applied: the readings lack {', '.join(card.covariates)}"
+            )
             warnings.warn(message, CompgenWarning, stacklevel=6)
     return tuple(usable)
 
 
 def _settled(active: catalogue.ActiveEffect, readings: catalogue.Readings) -> catalogue.ActiveEffect:
-    """The effect with what its settings are for these readings, so that a part of them means the same."""
+    """Return the effect with its settings resolved for these readings, so that they mean the same for a part of them."""
     return replace(active, effect=active.effect.with_settings(active.effect.used(readings)))
 
 
 def moved_by(effects: Sequence[catalogue.ActiveEffect], readings: catalogue.Readings) -> tuple[FloatArray, FloatArray]:
-    """Return how effects move the tip (n, 3), and what the others add to the readings (n,), mm."""
+    """Return the displacement of the tip by effects (n, 3), and the change of the readings by the others (n,), mm."""
     moved, _ = catalogue.displacement_of(effects, readings)
     lengthened = np.zeros(len(readings))
     for active in effects:
@@ -95,7 +97,7 @@ def notes_of(effects: Sequence[catalogue.ActiveEffect]) -> dict[str, Any]:
 
 
 def without_effects(machine: Machine, deviations: Deviations) -> tuple[Deviations, dict[str, Any]]:
-    """Return deviations without what the machine file's effects add, and what was taken out."""
+    """Return deviations without the effects of the machine file, and what was removed."""
     if not machine.effects:
         return deviations, {}
     readings = catalogue.readings_of_deviations(machine, deviations)
@@ -106,35 +108,35 @@ def without_effects(machine: Machine, deviations: Deviations) -> tuple[Deviation
     return replace(deviations, deviation_mm=deviations.deviation_mm - moved_mm.T), notes_of(effects)
 
 
-# catalogue.Readings brought to reference conditions: machine scales at 20 degC, the wavelength of the air that was there.
+# Readings at reference conditions: machine scales at 20 degC, the actual wavelength in air.
 #
-# * **Scales.** At the temperature T of an axis its scale has grown about the reference point: at the command q the
-#   carriage stands at q + alpha (T - 20 degC)(q - q_ref), along the (leaning) axis. What this does to a length, with the
-#   exact model, is taken out of the reading. The identified errors then are those of the machine with all scales at
-#   20 degC. Unless the machine file names effects, nothing else is corrected: neither bending, nor a growth of bed,
-#   spindle or workpiece.
-# * **Effects** of the machine file (``[effects.NAME]``): what they add to a length is taken out.
+# * **Scales.** At the temperature T of an axis its scale has expanded about the reference point: at the command q
+#   the carriage is at q + alpha (T - 20 degC)(q - q_ref), along the actual direction of the axis. The effect of this on
+#   a length, by the exact model, is removed from the reading. The identified errors are then those of the machine with
+#   all scales at 20 degC. Unless the machine file lists effects, nothing else is corrected: neither bending, nor
+#   expansion of bed, spindle or workpiece.
+# * **Effects** of the machine file (``[effects.NAME]``): their change of a length is removed.
 # * **Wavelength**, only if the file says ``# wavelength_compensated = false``: the refractive index of the air by the
 #   modified Edlen equation (Birch & Downs, Metrologia 30 (1993) 155 and 31 (1994) 315). A reading N is the true change of
-#   n times the distance D since the tracer was set to zero, over the index that the instrument assumed:
+#   n times the distance D since the tracer was zeroed, over the index that the instrument assumed:
 #
 #       n(t) D(t) - n(0) D(0) = n_assumed N
 #
 #   so D = n_assumed N / n + dead length * (mean n) / n.
 
 
-#: Temperatures that vary by more than this call for an expansion coefficient.
+#: Temperatures that vary by more than this require an expansion coefficient.
 NOTABLE_K = 0.5
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the readings have to be corrected for; n readings.
+    """Corrections of n readings.
 
     Parameters
     ----------
     machine : the machine.
-    growth_mm : what the scales add to the command of each axis, (n, 3).
+    growth_mm : expansion of the scales at the command of each axis, (n, 3).
     dead_share : share of the dead length by which a reading is too short, (n,).
     notes : what was corrected, for ``identify.json``.
     effects : effects of the machine file that the readings show.
@@ -156,7 +158,7 @@ class Conditions:
     ) -> FloatArray:
         """Return what must be added to the readings (n,), mm, for stations, dead lengths and errors ``state``.
 
-        ``further_mm`` (n, 3) is a displacement of the tip that is to be taken out as well.
+        ``further_mm`` (n, 3) is another displacement of the tip to remove.
         """
         machine = layout.machine
         tool = tool_of(machine, lengths.tool_mm)
@@ -178,12 +180,12 @@ class Conditions:
 
 
 def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool = True) -> tuple[Lengths, Conditions]:
-    """Return the readings with the right wavelength, and what else they have to be corrected for.
+    """Return the readings with the right wavelength, and their other corrections.
 
     Raises
     ------
     InputError
-        for temperatures that some readings lack, or air that is not described.
+        for missing temperatures of some readings, or missing air data.
     """
     growth, notes = (_growth(machine, lengths)) if temperature else (np.zeros(lengths.position_mm.shape), {})
     share = np.zeros(len(lengths))
@@ -192,11 +194,11 @@ def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool 
         file = lengths.origin[0][0] if lengths.origin else None
         raise InputError(f"the comment wavelength_compensated = {text!r} is neither true nor false", file=file)
     if text in ("false", "no", "0"):
-        # index of the air at each reading (n,), and the one that the instrument assumed
+        # index of the air at each reading (n,), and the one assumed by the instrument
         temperature_c = lengths.covariates.get("temp_ambient_c")
         if temperature_c is None:
             file = lengths.origin[0][0] if lengths.origin else None
-            message = "is missing; wavelength_compensated = false needs the air temperature of each reading"
+            message = "is missing; wavelength_compensated = false requires the air temperature of each reading"
             raise InputError(message, file=file, field="column temp_ambient_c")
         _check_complete(lengths, "temp_ambient_c", temperature_c)
         pressure = _metadata_number(lengths, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))
@@ -229,7 +231,7 @@ def _growth(machine: Machine, lengths: Lengths) -> tuple[FloatArray, dict[str, A
             if spread > NOTABLE_K:
                 warnings.warn(
                     f"the temperature of {name} varies by {spread:.1f} K, and the machine file has no "
-                    f"[axes.{name}] expansion_um_per_m_k: the readings stay as they are",
+                    f"[axes.{name}] expansion_um_per_m_k: the readings are not corrected",
                     CompgenWarning,
                     stacklevel=5,
                 )
@@ -251,7 +253,7 @@ def _check_complete(lengths: Lengths, column: str, values: FloatArray) -> None:
     if missing.size:
         file, line = lengths.origin[int(missing[0])] if lengths.origin else (None, None)
         raise InputError(
-            "is known for some of the readings only; give it in every file or in none",
+            "is known for only some of the readings; give it in every file or in none",
             file=file,
             line=line,
             field=f"column {column}",
@@ -264,18 +266,18 @@ def _metadata_number(lengths: Lengths, key: str, default: float, allowed: tuple[
         return default
     if not allowed[0] <= value <= allowed[1]:
         file = lengths.origin[0][0] if lengths.origin else None
-        raise InputError(f"the comment {key} = {value:g} must lie within {allowed[0]:g} ... {allowed[1]:g}", file=file)
+        raise InputError(f"the comment {key} = {value:g} must be within {allowed[0]:g} ... {allowed[1]:g}", file=file)
     return value
 
 
 # Identification at reference conditions: scales at 20 degC, the right wavelength, the mean of both directions.
 #
-# What has to be taken out of the readings depends a little on stations and errors; so they are identified, and once or
-# twice again with better corrected readings.
+# The corrections of the readings depend slightly on stations and errors, so these are identified once or twice again
+# with better corrected readings.
 
 
 ROUNDS = 3
-#: Corrections that change by less than this are settled, mm.
+#: Corrections that change by less than this have converged, mm.
 SETTLED_MM = 1e-8
 
 
@@ -287,12 +289,12 @@ def identify_at_reference(
     *,
     temperature: bool = True,
 ) -> Identification:
-    """Identify from readings that are brought to reference conditions, and test the residuals.
+    """Identify from readings at reference conditions, and test the residuals.
 
     Parameters
     ----------
     machine, lengths : as in :func:`compgen.identify.tracer_lengths`.
-    adjust : identifies from readings as they are.
+    adjust : identifies from readings without correction.
     rough : start values for stations and dead lengths.
     temperature : whether the scales are corrected to 20 degC.
     """
@@ -353,7 +355,7 @@ def _tested(machine: Machine, used: Lengths, found: Identification, reversal_mm:
     """
     adjustment = found.adjustment
     assert adjustment is not None
-    if adjustment.known_weight is None:  # known stations bring their own uncertainty in
+    if adjustment.known_weight is None:  # known stations contribute their uncertainty
         typical = adjustment.sigma_mm / float(np.sqrt(max(adjustment.weight.mean(), 1e-12)))
         warn_of_weakness(machine, found.errors, found.worst_u, typical)
     warn_of_misfit(found.reduced_chi_square, found.u_source)

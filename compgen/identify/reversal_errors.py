@@ -1,7 +1,7 @@
-"""Reversal: how the tool position differs when an axis comes from the other side (ISO 230-1, 3.5.6; ISO 230-2).
+"""Reversal: difference of the tool position between both directions of approach (ISO 230-1, 3.5.6; ISO 230-2).
 
 Readings of one station at one stop in both directions differ by the line of sight times the vector of each axis whose
-direction of approach changed. Taken against their mean at that stop, they do not depend on the error curves.
+direction of approach changed. Relative to their mean at that stop, they do not depend on the error curves.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from compgen.identify.adjust.grid_problem import levels_of
 from compgen.identify.adjust.robust import time_order
 from compgen.identify.adjust.unknowns import IntArray
 
-#: A reversal smaller than this many standard uncertainties is not taken out of the readings.
+#: A reversal below this many standard uncertainties is not removed from the readings.
 SIGNIFICANT = 5.0
-#: Cells are counted anew when there could be so many times more of them than readings.
+#: Cells are renumbered if there could be this many times more of them than readings.
 SPARSE = 8
-#: Fewer readings than this, of all stations or of one, say nothing.
+#: Fewer readings than this, of all stations or of one, are not evaluated.
 LEAST_READINGS = 12
 #: Eigenvalue of the normal matrix with unit diagonal below which a direction counts as undetermined.
 ZERO = 1e-8
@@ -49,16 +49,16 @@ class ReversalStops:
     weight: FloatArray
 
     def cost(self, displacement_mm: FloatArray) -> float:
-        """Weighted square sum of the differences within the stops if the tip is displaced by (n, 3)."""
+        """Return the weighted square sum of the differences within the stops if the tip is displaced by (n, 3)."""
         left = self.difference_mm - np.einsum("ij,ij->i", self.sight, displacement_mm)
         return float(self.weight @ _centred(left[:, None], self.cell, self.weight)[:, 0] ** 2)
 
 
 @dataclass(frozen=True)
 class AxisReversal:
-    """Displacement of the tool tip, approached in positive minus approached in negative direction of one axis.
+    """Displacement of the tool tip between positive and negative approach (positive minus negative) of one axis.
 
-    ``vector_mm`` and its standard uncertainty ``u_mm`` have the components X, Y, Z. ``stations`` holds for each station
+    ``vector_mm`` and its standard uncertainty ``u_mm`` have the components X, Y, Z. ``stations`` has for each station
     the mean difference of its readings and the standard uncertainty of that, mm.
     """
 
@@ -76,8 +76,8 @@ class AxisReversal:
 class Reversal:
     """Mean reversal of each axis that was approached from both sides at the same stops.
 
-    ``pairs`` counts the readings that have one from another side at the same station and stop. ``removed`` says whether
-    the readings were brought to the mean of both directions, so that the curves are the two-way means.
+    ``pairs`` counts the readings with another from the other side at the same station and stop. ``removed`` says
+    whether the readings were corrected to the mean of both directions, so that the curves are the bidirectional means.
     """
 
     axes: Mapping[str, AxisReversal]
@@ -92,8 +92,8 @@ class Reversal:
     def resolved(self, approach: FloatArray, station: IntArray, stops: ReversalStops) -> FloatArray:
         """Give unknown directions (0) the sign that fits: an axis that has not moved yet has one direction.
 
-        ``approach`` (n, 3) and ``station`` (n,) belong to the readings of ``stops``; an axis of which nothing is known
-        stays unknown.
+        ``approach`` (n, 3) and ``station`` (n,) belong to the readings of ``stops``; an axis without known directions
+        remains unknown.
         """
         known = approach.copy()
         for axis in np.flatnonzero(np.any(approach != 0, axis=0)).tolist():
@@ -108,7 +108,7 @@ class Reversal:
         return known
 
     def displacement(self, approach: FloatArray) -> FloatArray:
-        """Displacement of the tip against the mean of both directions for approaches (n, 3): shape (n, 3), mm."""
+        """Return the displacement of the tip from the mean of both directions for approaches (n, 3): shape (n, 3), mm."""
         vectors = np.zeros((3, 3))
         for name, axis in self.axes.items():
             vectors[AXES.index(name)] = axis.vector_mm if axis.significant else 0.0
@@ -135,8 +135,8 @@ class Reversal:
 def approach_signs(lengths: Lengths) -> FloatArray | None:
     """Return the last direction of travel of each axis at each reading, (n, 3), +1, -1 or 0; None if unknown.
 
-    Columns ``approach_x`` ... count first; with the column ``approach`` or several runs the directions follow from the
-    order of the stops.
+    Columns ``approach_x`` ... take precedence; with the column ``approach`` or several runs the directions follow from
+    the order of the stops.
     """
     if lengths.approach is not None:
         return lengths.approach if np.any(lengths.approach) else None
@@ -157,13 +157,13 @@ def approach_signs(lengths: Lengths) -> FloatArray | None:
 
 
 def estimate_reversal(lengths: Lengths, approach: FloatArray, stops: ReversalStops) -> Reversal | None:
-    """Estimate the reversal of each axis; None where no stop was approached from both sides.
+    """Estimate the reversal of each axis; None if no stop was approached from both sides.
 
     Parameters
     ----------
     lengths : the readings.
-    approach : direction of each axis, (n, 3); readings for which that of a moving axis is unknown do not count.
-    stops : what is compared.
+    approach : direction of each axis, (n, 3); readings with an unknown direction of a moving axis are not used.
+    stops : the stops to compare.
     """
     unknown = np.any((approach == 0) & np.any(approach != 0, axis=0), axis=1)
     cell, weight = stops.cell, np.where(unknown, 0.0, stops.weight)
@@ -174,7 +174,7 @@ def estimate_reversal(lengths: Lengths, approach: FloatArray, stops: ReversalSto
     if np.count_nonzero(moved) < LEAST_READINGS:
         return None
     value, u, known = _solved(cell[moved], columns[moved], target[moved], weight[moved])
-    # The uncertainty of a mean grows where successive residuals are alike: for an autoregressive process of first order
+    # The uncertainty of a mean grows if successive residuals are correlated: for a first-order autoregressive process
     # with correlation rho by the root of (1 + rho)/(1 - rho).
     order = time_order(lengths)
     order = order[np.argsort(lengths.station[order], kind="stable")]
@@ -218,7 +218,7 @@ def stop_cells(lengths: Lengths, group: IntArray) -> IntArray:
 
 
 def _centred(columns: FloatArray, cell: IntArray, weight: FloatArray) -> FloatArray:
-    """Take the weighted mean of each cell out of columns (n, k)."""
+    """Subtract the weighted mean of each cell from columns (n, k)."""
     total = np.bincount(cell, weight)
     total[total == 0] = 1.0
     centred = np.empty_like(columns)

@@ -40,7 +40,7 @@ from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import WARNING, AxisRun, RelativeRun, drift_of, expected_away, reduce_runs
 from compgen.instruments.sixdof_uncertainty import SixDofBudget, scatter_of, uncertainty_budget
 
-# The object ``sixdof`` of ``identify.json``: what was done to the readings, repeatability and the uncertainty budget.
+# The object ``sixdof`` of ``identify.json``: processing of the readings, repeatability and the uncertainty budget.
 
 
 def details_of(
@@ -51,7 +51,7 @@ def details_of(
     evaluation: Evaluation,
     budget: SixDofBudget | None,
 ) -> dict[str, Any]:
-    """Everything about the six-DOF evaluation that has no place in the errors file."""
+    """Return all results of the six-DOF evaluation that are not in the errors file."""
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     repeated = half_ranges(each_run(machine, instrument, runs))
     freedom = []  # of the scatter of repeated runs, by axis
@@ -88,7 +88,7 @@ def details_of(
 
 
 def _axis(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> dict[str, Any]:
-    """Set-up of one axis, and which systematic parts were taken out by which means."""
+    """Return the set-up of one axis, and how its systematic parts were removed."""
     run = runs[0]
     set_up = instrument.axes[run.axis].set_up
     constant, linear = _classes(instrument, run)
@@ -147,7 +147,7 @@ def _squareness(instrument: SixDofInstrument, evaluation: Evaluation) -> dict[st
 
 @dataclass(frozen=True)
 class SixDofMeasurement:
-    """Readings and the instrument that made them."""
+    """Readings and their instrument."""
 
     readings: SixDof
     instrument: SixDofInstrument
@@ -163,7 +163,7 @@ class SixDofMeasurement:
 
 
 def identify_sixdof(machine: Machine, measurement: SixDofMeasurement) -> Identification:
-    """Identify the errors of every measured axis, and squareness where both axes were measured.
+    """Identify the errors of every measured axis, and squareness if both axes were measured.
 
     Parameters
     ----------
@@ -173,14 +173,14 @@ def identify_sixdof(machine: Machine, measurement: SixDofMeasurement) -> Identif
     Raises
     ------
     InputError
-        for positions outside the travel, an axis that the instrument file does not describe, air that is not described,
-        a displacement that does not follow the command.
+        for positions outside the travel, an axis that the instrument file does not describe, missing air data, a
+        displacement that does not follow the command.
     """
     instrument, raw = measurement.instrument, measurement.readings
     check_axis_travel(machine, raw.axis, raw.position_mm, raw.origin, "column position_mm")
     readings, notes = compensated(measurement.readings, instrument)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CompgenWarning)  # said once below, not once a run
+        warnings.simplefilter("ignore", CompgenWarning)  # reported once below, not for every run
         runs = axis_runs(machine, readings, instrument)
         suspicions = [] if instrument.as_printed else sixdof_health(machine, readings, instrument)
     evaluation = evaluate(machine, instrument, runs)
@@ -229,14 +229,14 @@ def _residuals(runs: Sequence[AxisRun]) -> tuple[FloatArray, int]:
 
 
 def _objections(runs: Sequence[AxisRun], *, as_printed: bool) -> tuple[str, ...]:
-    """Why nothing that is made of these errors may be accepted."""
+    """Return why no result from these errors may be accepted."""
     if as_printed:
         return (WARNING,)
     return tuple(dict.fromkeys(run.contradiction for run in runs if run.contradiction))
 
 
 def _uncalibrated(instrument: SixDofInstrument, evaluation: Evaluation) -> list[str]:
-    """What was not calibrated and cannot be seen in the readings."""
+    """Return what was not calibrated and does not show in the readings."""
     known = {axis: {*instrument.axes[axis].systematics, *instrument.u_systematics} for axis in evaluation.axes}
     found = []
     letters = [AXES[axis] for axis, names in known.items() if "eps_PEy" not in names]
@@ -253,7 +253,7 @@ def _uncalibrated(instrument: SixDofInstrument, evaluation: Evaluation) -> list[
     ]
     if bare and evaluation.squareness_rad:
         found.append(
-            f"squareness contains the deviation of the prism of {', '.join(bare)} from 90 degrees in full (1 arcsec of eps_zir "
+            f"squareness contains the full deviation of the prism of {', '.join(bare)} from 90 degrees (1 arcsec of eps_zir "
             "is 2 arcsec of S_xy), and its uncertainty does not: calibrate the prism and give eps_?ir, eps_?mrs?"
         )
     return found
@@ -262,7 +262,7 @@ def _uncalibrated(instrument: SixDofInstrument, evaluation: Evaluation) -> list[
 def _reversal(
     machine: Machine, readings: SixDof, instrument: SixDofInstrument, evaluation: Evaluation
 ) -> ReversalCurves | None:
-    """Reversals that are far beyond their uncertainty and worth a table: displacement by axis and component, mm."""
+    """Return reversals well above their uncertainty and worth a table: displacement by axis and component, mm."""
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     curves = {}
     for axis, entry in evaluation.axes.items():

@@ -1,12 +1,12 @@
-"""Errors from an archive of tracer lengths, however many: the normal equations are added up chunk by chunk.
+"""Errors from an archive of tracer lengths, of any size: the normal equations are accumulated chunk by chunk.
 
-A sample of the readings is identified first, as a file of its own: with rank, gross errors, tests of the residuals and all
-warnings. From its optimum on all readings count: passes over the archive, chunk by chunk, add up cost, gradient and
-normal matrix until no unknown moves. So the memory that is needed does not depend on the number of readings.
+A sample of the readings is identified first, like a separate file: with rank, gross errors, tests of the residuals and
+all warnings. All readings are used from its optimum on: passes over the archive, chunk by chunk, accumulate cost,
+gradient and normal matrix until no unknown changes. So the required memory does not depend on the number of readings.
 
-What the sample does for all, since nothing of the size of the readings is kept: the residuals that are kept, and the
-tests that look at the order of the readings (whiteness, misfit and its causes, weak errors). A gross error is a reading
-beyond the robust limit at the optimum; beam breaks get no dead length of their own, what lies behind one is rejected.
+The sample alone provides the kept residuals, and the tests on the order of the readings (whiteness, misfit and its
+causes, weak errors). A gross error is a reading beyond the robust limit at the optimum; beam breaks get no separate
+dead length, and the readings after one are rejected.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from compgen.kinematics.kernel_switch import one_thread, use_compiled
 #: The remaining distance to the optimum, estimated from the last two steps, that ends the passes, mm.
 TOLERANCE_MM = 1e-8
 MOST_PASSES = 12
-#: Rejected readings that are named; the others are counted.
+#: Number of rejected readings that are listed; the others are counted.
 MOST_NAMED = 1000
 
 
@@ -54,7 +54,7 @@ MOST_NAMED = 1000
 class _Stream:
     """The archive with its unknowns; ``setups`` (G, 2) are station and set-up of each dead length.
 
-    ``model`` is the compiled form; without it every chunk is a problem of its own.
+    ``model`` is the compiled form; without it every chunk is a separate problem.
     """
 
     archive: LengthArchive
@@ -64,7 +64,7 @@ class _Stream:
     model: PathModel | None
 
     def chunks(self) -> Iterator[Chunk]:
-        """Readings that are in memory at a time."""
+        """Readings in memory at a time."""
         columns = self.archive.columns
         most = int(self.setups[:, 1].max()) + 1
         for rows in self.archive.chunks():
@@ -75,15 +75,13 @@ class _Stream:
                 group = np.minimum(group, len(self.setups) - 1)
                 for row in np.flatnonzero((self.setups[group] != np.stack([station, setup], axis=1)).any(axis=1))[:1]:
                     name = self.archive.stations[int(station[row])]
-                    message = (
-                        f"setup {setup[row]} of station {name!r} has so few readings that a sample has none of them"
-                    )
-                    raise InputError(f"{message}; leave them out", file=self.archive.path, field="setup")
+                    message = f"setup {setup[row]} of station {name!r} has so few readings that the sample contains none of them"
+                    raise InputError(f"{message}; remove them", file=self.archive.path, field="setup")
             x, y, z = (columns[name][rows] for name in POSITION_COLUMNS)
             yield chunk_of((x, y, z), station, group, columns["length_mm"][rows])
 
     def sums(self, state: State, noise: DistanceNoise, rejected: list[tuple[int, float]], *, matrix: bool) -> Sums:
-        """Pass over all readings; ``rejected`` gets row and residual of those that are not used, some of them."""
+        """Pass over all readings; ``rejected`` gets row and residual of some that are not used."""
         rejected.clear()
         first = 0
 
@@ -111,7 +109,7 @@ class _Stream:
     def _add_plain(
         self, total: Sums, chunk: Chunk, state: State, noise: DistanceNoise, look: Callable[[Chunk, FloatArray], None]
     ) -> None:
-        """Add a chunk without compiled code: its normal equations are those of a problem of its own."""
+        """Add a chunk without compiled code: its normal equations are those of a separate problem."""
         count, stations = len(chunk.group), len(self.archive.stations)
         poses = distinct_poses(np.column_stack(chunk.position_mm), self.tool_mm)
         where = self.layout.bases(poses.position_mm), poses.position_mm, poses.tool_mm, poses.of
@@ -143,17 +141,18 @@ def identify_archive(
     Raises
     ------
     InputError
-        for options and corrections that need all readings at once, and whatever :func:`compgen.identify.identify` refuses.
+        for options and corrections that require all readings at once, and for the reasons of
+        :func:`compgen.identify.identify`.
     UndeterminedError
-        if the readings do not determine the unknowns; it names the combinations.
+        if the readings do not determine the unknowns; it lists the combinations.
     ConvergenceError
-        if no optimum is reached, or so many readings do not fit that the model must be wrong.
+        if no optimum is reached, or too many readings do not fit the model.
     """
     chosen = options or IdentifyOptions()
     if chosen.method != "joint" or chosen.stations is not None or chosen.systematic != SystematicInputs():
         raise InputError(
             "--method, --stations and the systematic inputs need all readings in memory; an archive of more than "
-            f"{MOST_WHOLE} readings takes none of them: write some of its readings to another one",
+            f"{MOST_WHOLE} readings cannot be combined with them: write some of its readings to another one",
             file=archive.path,
         )
     low, high = (np.array(ends) for ends in (machine.lower_mm, machine.upper_mm))
@@ -167,14 +166,14 @@ def identify_archive(
     sample = archive.taken(archive.sample_rows)
     if "u_length_um" in sample.covariates:
         message = (
-            f"is a column; an archive of more than {MOST_WHOLE} readings takes one u_length_um and u_length_um_per_m"
+            f"is a column; an archive of more than {MOST_WHOLE} readings has a single u_length_um and u_length_um_per_m"
         )
         raise InputError(message, file=archive.path, field="u_length_um")
     _, conditions = reading_conditions(machine, sample, temperature=chosen.temperature)
     if conditions.needs_geometry or conditions.notes:
         raise InputError(
             "needs a correction for temperature, air or effects of the machine file, which an archive of more than "
-            f"{MOST_WHOLE} readings does not get; correct the readings before, or write some of them to another archive",
+            f"{MOST_WHOLE} readings does not support; correct the readings beforehand, or write some of them to another archive",
             file=archive.path,
         )
     found = identify(machine, sample, chosen)
@@ -184,7 +183,7 @@ def identify_archive(
 
 @dataclass(frozen=True)
 class _Optimum:
-    """Where the passes over all readings end, with the sums there and the rejected readings that are named."""
+    """The end of the passes over all readings, with the sums there and the listed rejected readings."""
 
     state: State
     factor: Factor
@@ -195,7 +194,7 @@ class _Optimum:
 
 
 def _optimum(stream: _Stream, state: State, noise: DistanceNoise) -> _Optimum:
-    """Gauss-Newton with one normal matrix, made in the first pass, until no unknown moves and the same readings count."""
+    """Gauss-Newton with one normal matrix, made in the first pass, until no unknown changes and the set of readings is stable."""
     archive, layout, setups, count = stream.archive, stream.layout, stream.setups, len(stream.archive)
 
     def names() -> list[str]:
@@ -218,7 +217,7 @@ def _optimum(stream: _Stream, state: State, noise: DistanceNoise) -> _Optimum:
         previous, sums = length, stream.sums(state, noise, rejected, matrix=False)
     raise ConvergenceError(
         f"{count - used:.0f} of {count} readings do not fit the model of a sample of them; look for beam breaks (readings "
-        "behind one need a setup of their own), and check station labels and units"
+        "after one need a separate setup), and check station labels and units"
     )
 
 
@@ -231,8 +230,8 @@ def _with_all(
     setups = np.array([(archive.stations.index(item.station), item.setup) for item in found.stations], dtype=np.int64)
     if any(item.segment for item in found.stations):
         raise ConvergenceError(
-            "the sample of the readings shows beam breaks, behind which the dead length of a station is another one; give "
-            "the readings behind each a setup of their own"
+            "the sample of the readings shows beam breaks, after which the dead length of a station differs; give "
+            "the readings after each a separate setup"
         )
     model = path_model(layout, tool_mm, setups[:, 0]) if use_compiled(len(archive), 0) else None
     stream = _Stream(archive, layout, tool_mm, setups, model)

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
     from compgen.identify.adjust.path_problem import PathProblem
     from compgen.identify.adjust.problem import LengthProblem
 
-# The readings of an identification with the problem that they pose, and start values in closed form.
+# The readings of an identification with their problem, and start values in closed form.
 
 
 AnyProblem: TypeAlias = "GridProblem | LengthProblem | PathProblem"
@@ -71,7 +71,7 @@ AnyProblem: TypeAlias = "GridProblem | LengthProblem | PathProblem"
 
 @dataclass(frozen=True)
 class Task:
-    """The readings with everything that the steps of the identification share."""
+    """The readings with everything common to the steps of the identification."""
 
     machine: Machine
     lengths: Lengths
@@ -94,7 +94,7 @@ def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
     if len(lengths.stations) < least:
         raise InputError(
             f"contains readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
-            f"needs at least {least}: with fewer unknown stations a function-valued ambiguity is left. Add the "
+            f"needs at least {least}: with fewer unknown stations a function-valued ambiguity remains. Add the "
             "missing station, measure with the same tracer from more places, or give known stations",
             file=lengths.origin[0][0] if lengths.origin else None,
         )
@@ -110,12 +110,12 @@ def task_of(machine: Machine, lengths: Lengths) -> Task:
     return Task(machine, lengths, problem, lengths.station, group)
 
 
-#: Readings from which the compiled pass over scattered positions pays.
+#: Number of readings from which the compiled pass over scattered positions pays off.
 ENOUGH = 20_000
 
 
 def problem_of(machine: Machine, lengths: Lengths, layout: ErrorParameters, group: IntArray) -> AnyProblem:
-    """Return the least-squares problem of the readings: on a grid of levels where they form one, else point by point."""
+    """Return the least-squares problem of the readings: on a grid of levels if they form one, otherwise point by point."""
     readings = common_tool(machine, lengths.tool_mm), lengths.station, group, lengths.length_mm
     found: AnyProblem | None = grid_problem(layout, lengths.position_mm, *readings)
     if found is None and len(lengths) >= ENOUGH and use_compiled(len(lengths), ENOUGH):
@@ -172,10 +172,10 @@ def with_weights(task: Task, start: State, noise: ReadingNoise) -> tuple[Task, F
     return replace(task, problem=task.problem.weighted(weights)), sigma_mm, weights
 
 
-# What the readings leave open at the start, before anything is adjusted.
+# What the readings leave undetermined at the start, before the adjustment.
 
 
-#: Eigenvalue of the scaled normal matrix below which a combination is named when nothing converges.
+#: Eigenvalue of the scaled normal matrix below which a combination is reported if nothing converges.
 HARDLY_DETERMINED = 1e-6
 
 
@@ -185,9 +185,9 @@ def determined(task: Task, start: State) -> tuple[Factor, Rank | None]:
 
 
 def unmirrored(task: Task, start: State, searched: Sequence[int]) -> State:
-    """Choose the side for stations whose targets all lie in a plane: its mirror image explains the readings as well.
+    """Choose the side for stations whose targets are all in a plane: the mirror image explains the readings equally well.
 
-    Only the machine's errors, seen from the other stations, tell the two apart; so both are tried.
+    Only the machine's errors, seen from the other stations, distinguish the two, so both are tried.
     """
     for k in searched:
         targets = task.target_mm[task.station == k]
@@ -212,17 +212,17 @@ def _cost_from(problem: AnyProblem, start: State) -> float:
 
 
 def weakness(task: Task, factor: Factor) -> str:
-    """Say which combinations are hardly determined, where that may be why nothing converged."""
+    """Return which combinations are weakly determined, if that may be why nothing converged."""
     rank = describe_rank(factor.matrix, task.unknown_names(), HARDLY_DETERMINED)
     if rank.rank == rank.size:
         return ""
     return (
-        f"; hardly determined even at the start: {'; '.join(rank.combinations[:3])}; stations must not lie on a line, "
+        f"; only weakly determined even at the start: {'; '.join(rank.combinations[:3])}; stations must not be on a line, "
         "nor in a plane with an end of the travel"
     )
 
 
-# From the optimum to what the user gets: curves, stations, uncertainties, and what was rejected.
+# From the optimum to the result: curves, stations, uncertainties, and rejected readings.
 
 
 def assemble(
@@ -232,15 +232,15 @@ def assemble(
     noise: ReadingNoise,
     rank: Rank | None,
 ) -> Identification:
-    """Return what the user gets of a finished adjustment.
+    """Return the result of a finished adjustment.
 
     Parameters
     ----------
     task : the readings and their problem.
     fit : the optimum, which readings were used, and the residuals.
     sigma_mm : standard uncertainty of each reading, (n,).
-    noise : where that comes from.
-    rank : the detailed look at the rank, if it was taken.
+    noise : its source.
+    rank : the detailed analysis of the rank, if made.
 
     Raises
     ------
@@ -300,7 +300,7 @@ def _stations(
 
 # Joint identification of error curves, squareness, stations and dead lengths from tracer lengths.
 #
-# Zha & Zhang 2024, section 5 (eq. 22-28), with the exact machine model in place of C P and the constraints of
+# Zha & Zhang 2024, section 5 (eq. 22-28), with the exact machine model instead of C P and the constraints of
 # ``docs/conventions.md`` by elimination.
 
 
@@ -313,15 +313,15 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     Parameters
     ----------
     machine : chain, nodes, reference point and which errors its model contains.
-    lengths : readings of three or more stations (one tracer at three or more places counts as so many).
-    options : uncertainty of the readings and of inputs that they share, rejection.
+    lengths : readings of three or more stations (one tracer at three or more places counts as several).
+    options : uncertainty of the readings and of their common inputs, rejection.
 
     Raises
     ------
     InputError
         for fewer than three stations, or positions outside the travel.
     UndeterminedError
-        if the readings do not determine the unknowns; it names the combinations.
+        if the readings do not determine the unknowns; it lists the combinations.
     ConvergenceError
         if no optimum is reached.
 
@@ -358,7 +358,7 @@ def _at_reference(machine: Machine, lengths: Lengths, options: IdentifyOptions) 
 
 
 def _with_causes(machine: Machine, lengths: Lengths, options: IdentifyOptions, found: Identification) -> Identification:
-    """Add to a misfit what explains most of it: the errors are identified again with dead lengths for each run, ..."""
+    """Add the main cause to a misfit: the errors are identified again with dead lengths for each run, ..."""
     misfit = found.misfit
     if misfit is None or misfit.series is None or misfit.causes:
         return found
@@ -385,16 +385,16 @@ def _with_causes(machine: Machine, lengths: Lengths, options: IdentifyOptions, f
 
 
 def _explained(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> str:
-    """Say what makes readings fit that no optimum was found for; empty if nothing simple does."""
+    """Return what makes readings fit for which no optimum was found; empty if nothing simple does."""
     for name, label in labels_of(lengths.labels, lengths.origin, lengths.position_mm, lengths.station).items():
         if label.min() < label.max() and _split_by(machine, lengths, options, label) is not None:
-            found = f"with dead lengths of its own for each {name} the readings fit: there is a step between {name}s"
+            found = f"with separate dead lengths for each {name} the readings fit: there is a step between {name}s"
             return f"; {found}; `volcomp diagnose` shows it"
-    return "; `volcomp diagnose` looks for what the model lacks"
+    return "; `volcomp diagnose` searches for the missing effect"
 
 
 def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, label: IntArray) -> Identification | None:
-    """Identify with a set-up, and so dead lengths, of its own for each value of a label (n,); None where that fails."""
+    """Identify with a separate set-up, and so dead lengths, for each value of a label (n,); None if that fails."""
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
     _, number = np.unique(np.column_stack([setup, label]), axis=0, return_inverse=True)
     labels = {**lengths.labels, "setup": np.asarray(number, dtype=np.int64).ravel()}
@@ -402,7 +402,7 @@ def _split_by(machine: Machine, lengths: Lengths, options: IdentifyOptions, labe
 
 
 def _quietly(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> Identification | None:
-    """Identify without warnings; None where that fails."""
+    """Identify without warnings; None if that fails."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)
         try:
@@ -427,7 +427,7 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
         if not isinstance(known, KnownStations):
             known = locate_stations(machine, lengths)
             message = (
-                "the stations were located with the machine taken as perfect: its errors are part of their positions"
+                "the stations were located with the machine assumed perfect: its errors are part of their positions"
             )
             warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=4)
         start = with_known_start(start, known, lengths, task.target_mm, task.group)
@@ -447,9 +447,9 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
 
 
 def _undisturbed(task: Task, start: State, options: IdentifyOptions) -> Identification | None:
-    """Identify by plain least squares; None where a reading does not belong, or where it does not converge.
+    """Identify by plain least squares; None if a reading does not fit, or if it does not converge.
 
-    Undisturbed readings are the rule, and need none of the search for gross errors.
+    Undisturbed readings are the usual case and need no search for gross errors.
     """
     if isinstance(task.problem, GridProblem):
         start = affine_start(task.problem, start)
@@ -472,7 +472,9 @@ def _two_step_result(
 ) -> Identification:
     """Identify by self-calibration, transformation and separation (Zha & Zhang 2024, sections 4 and 5)."""
     if options.stations is not None:
-        raise InputError("known stations need the joint method; in the two-step method the tracers locate themselves")
+        raise InputError(
+            "known stations require the joint method; in the two-step method the tracers locate themselves"
+        )
     from compgen.identify.two_step import TracerReadings, solve_in_two_steps
 
     readings = TracerReadings(task.lengths, task.problem.parameters, task.group, sigma_mm, start)
@@ -493,7 +495,7 @@ def _two_step_result(
 def _fit(
     task: Task, start: State, readings: WeightedReadings, factor: Factor, options: IdentifyOptions, *, disturbed: bool
 ) -> RobustFit[AnyProblem]:
-    """Adjust with rejection and beam breaks, or with all readings as they are."""
+    """Adjust with rejection and beam breaks, or with all readings."""
     if not options.reject:
         solution = solve(task.problem, start, factor)
         accepted = np.ones(len(readings.group), dtype=bool)

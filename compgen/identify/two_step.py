@@ -47,7 +47,7 @@ class Frame:
     points_mm: FloatArray
 
     def moved(self, rotation: FloatArray, translation_mm: FloatArray) -> Frame:
-        """Return the same after x -> R x + t."""
+        """Return the frame after x -> R x + t."""
         return Frame(
             self.stations_mm @ rotation.T + translation_mm,
             self.dead_length_mm,
@@ -114,26 +114,26 @@ def solved(information: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(information, right))
     except np.linalg.LinAlgError:
         raise UndeterminedError(
-            "a point lies in line with its stations, or all its stations lie on one line; it cannot be located", []
+            "a point is in line with its stations, or all its stations are on one line; it cannot be located", []
         ) from None
 
 
 # Self-calibration of tracers in their own frame (Zha & Zhang 2024, eq. 12-19): no machine model, no commanded position.
 #
-# Unknown are the stations, the dead lengths and every target point:
+# The unknowns are the stations, the dead lengths and every target point:
 #
 #     | x_j - s_i | - d_i = l_ij
 #
-# The frame is that of eq. 17: the first station in the origin, the second on the x axis, the third in the xy plane. Least
-# squares by Levenberg-Marquardt. A point appears in its own readings only, so its three unknowns are eliminated point by
-# point; what remains is a normal matrix of the stations and dead lengths alone.
+# The frame is that of eq. 17: the first station in the origin, the second on the x axis, the third in the xy plane.
+# Least squares by Levenberg-Marquardt. A point appears only in its own readings, so its three unknowns are eliminated
+# point by point; the remaining normal matrix is that of the stations and dead lengths.
 
 
-#: A point is located by at least this many stations; only from one more on does it help to locate them.
+#: A point is located by at least this many stations; with one more it helps to locate them.
 LOCATING_STATIONS = 3
 TOLERANCE_MM = 1e-8
 MAX_ITERATIONS = 100
-#: Eigenvalues of the scaled normal matrix of the stations below this are zero: the stations are not determined.
+#: Eigenvalues of the scaled normal matrix of the stations below this count as zero: the stations are undetermined.
 ZERO_EIGENVALUE = 1e-12
 #: Sine of the angle at the first station from which the third one may define the xy plane.
 OFF_THE_LINE = 0.02
@@ -141,17 +141,17 @@ OFF_THE_LINE = 0.02
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """Optimum of a self-calibration; q = 3 S + G - 6 unknowns of the stations are left in the frame of eq. 17.
+    """Optimum of a self-calibration; q = 3 S + G - 6 unknowns of the stations remain in the frame of eq. 17.
 
     Parameters
     ----------
     frame : stations, dead lengths and points.
     free : which of the 3 S + G coordinates and dead lengths are unknown, indices (q,).
     information : of each point with the stations fixed, (m, 3, 3), 1/mm^2.
-    lever : movement of each point when an unknown of the stations moves, (m, 3, q).
+    lever : derivative of each point by the unknowns of the stations, (m, 3, q).
     station_information : of the stations and dead lengths, the points eliminated, (q, q), 1/mm^2.
     residual_mm : model minus reading, (n,).
-    chi_square, degrees_of_freedom, iterations : of the adjustment; the machine has no part in it.
+    chi_square, degrees_of_freedom, iterations : of the adjustment, which is independent of the machine.
     """
 
     frame: Frame
@@ -165,7 +165,7 @@ class SelfCalibration:
     iterations: int
 
     def mirrored(self) -> SelfCalibration:
-        """Return the mirror image in the xy plane, which explains the readings as well."""
+        """Return the mirror image in the xy plane, which explains the readings equally well."""
         flip = np.array([1.0, 1.0, -1.0])
         stations = len(self.frame.stations_mm)
         signs = np.concatenate([np.tile(flip, stations), np.ones(len(self.frame.dead_length_mm))])[self.free]
@@ -187,7 +187,7 @@ class SelfCalibration:
         return np.asarray(np.linalg.inv(self.station_information))
 
     def covariance(self) -> FloatArray:
-        """Covariance of each point in the frame of the stations, (m, 3, 3), mm^2; points share the stations' part."""
+        """Covariance of each point in the frame of the stations, (m, 3, 3), mm^2; the stations' part is common to all points."""
         return self.own_covariance() + self.lever @ self.station_covariance() @ self.lever.transpose(0, 2, 1)
 
 
@@ -197,12 +197,13 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
     Parameters
     ----------
     sightings : every point is seen by three stations or more; points with four or more locate the stations.
-    start : rough values in any frame; only the start uses them, and they choose between the two mirror images.
+    start : rough values in any frame, for the start and the choice between the two mirror images.
 
     Raises
     ------
     UndeterminedError
-        if the readings leave more open than the frame: too few points, stations or points in a plane or on a line.
+        if the readings leave more undetermined than the frame: too few points, stations or points in a plane or on a
+        line.
     ConvergenceError
         if no optimum is reached.
     """
@@ -211,12 +212,12 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
     first, second, third = frame_stations(start.stations_mm)
     zeros = [3 * first, 3 * first + 1, 3 * first + 2, 3 * second + 1, 3 * second + 2, 3 * third + 2]
     data = Network(sightings, np.setdiff1d(unknowns, zeros).astype(np.int64))
-    # turned and shifted into that frame
+    # transformed into that frame
     origin, along, across = start.stations_mm[[first, second, third]]
     x = (along - origin) / np.linalg.norm(along - origin)
     y = (across - origin) - x * float(x @ (across - origin))
     if (length := float(np.linalg.norm(y))) < 1e-6:
-        raise UndeterminedError("all stations lie on one line; the tracers cannot locate themselves", [])
+        raise UndeterminedError("all stations are on one line; the tracers cannot locate themselves", [])
     y /= length
     rotation = np.stack([x, y, np.cross(x, y)])
     frame = start.moved(rotation, -rotation @ origin)
@@ -295,13 +296,13 @@ def _moved(frame: Frame, points: FloatArray, stations: FloatArray, free: IntArra
 
 
 def _check_rank(linear: Linear, data: Network) -> None:
-    """UndeterminedError if the points leave more of the stations open than the frame of eq. 17."""
+    """Raise UndeterminedError if the points leave more of the stations undetermined than the frame of eq. 17."""
     coordinates = linear.equations.force.size
     if len(linear.residual_mm) < coordinates + len(data.free):
         raise UndeterminedError(
             f"the self-calibration has {len(linear.residual_mm)} readings for {coordinates} coordinates "
-            f"of points and {len(data.free)} unknowns of the stations; more points seen by four stations are needed, or "
-            "the joint method, which needs no point of its own",
+            f"of points and {len(data.free)} unknowns of the stations; measure more points with four stations, or use "
+            "the joint method, which has no unknown points",
             [],
         )
     scale = 1.0 / np.sqrt(np.diag(linear.equations.own))
@@ -310,7 +311,7 @@ def _check_rank(linear: Linear, data: Network) -> None:
     if open_directions:
         raise UndeterminedError(
             f"the tracers cannot locate themselves: {open_directions} direction(s) of the stations remain undetermined (all "
-            "stations, or all points, in a plane?); use the joint method, which knows how the machine moves",
+            "stations, or all points, in a plane?); use the joint method, which uses the model of the machine",
             [],
         )
 
@@ -318,19 +319,19 @@ def _check_rank(linear: Linear, data: Network) -> None:
 # From the tracers' frame into the machine's (Zha & Zhang 2024, eq. 20), in closed form.
 
 
-#: A mirror image is believed when it fits this much better than the proper placement.
+#: A mirror image is accepted if it fits this much better than the proper placement.
 MIRROR_RATIO = 0.5
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Rigid motion x -> R x + t from one frame into another, with what it leaves.
+    """Rigid motion x -> R x + t from one frame into another, with its residual.
 
     Parameters
     ----------
     rotation, translation_mm : R (3, 3), a rotation, never a reflection, and t (3,).
-    rms_mm : weighted root mean square distance that is left.
-    mirrored : the points fit only as their mirror image: the frame they come from is left-handed.
+    rms_mm : weighted root mean square distance that remains.
+    mirrored : the points fit only as their mirror image: their frame is left-handed.
     """
 
     rotation: FloatArray
@@ -352,13 +353,13 @@ def place(
     ----------
     points_mm, target_mm : corresponding points in the two frames.
     weight : of each point, (n,); default 1.
-    anchor : index of a point that is brought onto its target exactly (the paper's machine origin); default none: the
-        weighted centroids are brought together, which is the minimum.
+    anchor : index of a point that is placed exactly on its target (the paper's machine origin); default None: the
+        weighted centroids coincide, which is the minimum.
 
     Raises
     ------
     UndeterminedError
-        if the points lie on one line.
+        if the points are on one line.
     """
     w = np.ones(len(points_mm)) if weight is None else weight / weight.mean()
     share = w / w.sum() if anchor is None else (np.arange(len(w)) == anchor).astype(np.float64)
@@ -366,7 +367,7 @@ def place(
     moment = (target_mm - there).T @ (w[:, None] * (points_mm - here))
     size = np.linalg.svd(moment, compute_uv=False)
     if size[1] <= 1e-12 * size[0]:
-        raise UndeterminedError("the points lie on one line; nothing tells how the frame is turned about it", [])
+        raise UndeterminedError("the points are on one line; the rotation of the frame about it is undetermined", [])
     # the best rotation, and the best mirror image: a rotation of the points mirrored in their centre
     rotation, image = best_rotation(moment), -best_rotation(-moment)
     rms_mm, rms_of_image = (
@@ -380,12 +381,12 @@ def place(
 def placed_covariance(
     own: FloatArray, lever: FloatArray, shared: FloatArray, points_mm: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Covariance of each point against the best-fit placement of all of them, (n, 3, 3), mm^2.
+    """Return the covariance of each point relative to the best-fit placement of all points, (n, 3, 3), mm^2.
 
     Parameters
     ----------
-    own : covariance of each point by itself, (n, 3, 3).
-    lever, shared : (n, 3, q) and (q, q); the points share the part lever shared lever^T.
+    own : independent covariance of each point, (n, 3, 3).
+    lever, shared : (n, 3, q) and (q, q); the part lever shared lever^T is common to all points.
     points_mm, weight : as for :func:`place`, the points in the final frame.
     """
     motion = small_motion(points_mm, weight)
@@ -399,7 +400,7 @@ def placed_covariance(
     return np.asarray(placed + rest @ shared @ rest.transpose(0, 2, 1))
 
 
-# Points that tracers have located: self-calibration and transformation (Zha & Zhang 2024, eq. 12-20).
+# Points located by tracers: self-calibration and transformation (Zha & Zhang 2024, eq. 12-20).
 
 
 MIN_STATIONS = 4
@@ -407,7 +408,7 @@ MIN_STATIONS = 4
 
 @dataclass(frozen=True)
 class TracerReadings:
-    """Tracer readings as the joint method has prepared them; n readings.
+    """n tracer readings as prepared by the joint method.
 
     Parameters
     ----------
@@ -426,16 +427,16 @@ class TracerReadings:
 
 @dataclass(frozen=True)
 class Located:
-    """Points that the tracers have located.
+    """Points located by the tracers.
 
     Parameters
     ----------
-    rows, point : the readings that were used, and the point of each, (k,).
+    rows, point : the used readings, and the point of each, (k,).
     position_mm, tool_mm : poses of the points, (m, 3).
-    calibration : of the tracers in their own frame, right-handed as the machine.
+    calibration : of the tracers in their own frame, right-handed like that of the machine.
     placement : from that frame into the machine's; ``anchored`` if it was fixed at the reference point.
-    deviations : measured tip minus nominal one in the machine frame; the uncertainty is that against the best-fit
-        placement of all points.
+    deviations : measured minus nominal tip in the machine frame; the uncertainty is relative to the best-fit placement
+        of all points.
     covariance_mm2 : the same as a covariance of each point, (m, 3, 3).
     """
 
@@ -464,7 +465,7 @@ def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[n
     by_pose = seen.sum(axis=1)
     advice = (
         "; self-calibration leaves three unknown coordinates for each point, so at least four stations must see common "
-        "points. Use the joint method (--method joint), which needs three stations and no common point"
+        "points. Use the joint method (--method joint), which needs three stations and no common pointsss"
     )
     file = lengths.origin[0][0] if lengths.origin else None
     if by_pose.max() < MIN_STATIONS:
@@ -496,7 +497,7 @@ def locate_points(readings: TracerReadings, poses: DistinctPoses, rows: IntArray
     calibration = self_calibrate(sightings, start)
     own = calibration.own_covariance()
     weight = 1.0 / np.trace(own, axis1=1, axis2=2)
-    # the pose at the machine's reference point, if it was measured once, is brought onto it
+    # the pose at the machine's reference point, if measured once, is placed exactly on it
     away = np.abs(position_mm - np.array(readings.layout.machine.reference_point_mm)).max(axis=1)
     at = np.flatnonzero(away < 1e-6)
     anchor = int(at[0]) if len(at) == 1 else None
@@ -524,8 +525,8 @@ def locate_points(readings: TracerReadings, poses: DistinctPoses, rows: IntArray
 
 # Identification in the steps of Zha & Zhang 2024, sections 4 and 5: self-calibration, transformation, separation.
 #
-# The tracers locate themselves and every target point without any knowledge of the machine; the points are placed in the
-# machine frame; the errors follow from the placed points. As the correlation of the points is carried along in full, the
+# The tracers locate themselves and every target point independently of the machine; the points are placed in the
+# machine frame; the errors follow from the placed points. As the full correlation of the points is propagated, the
 # result is that of the joint adjustment up to terms of second order; the joint one can use more readings.
 
 
@@ -534,7 +535,7 @@ TOO_MANY = "readings do not fit the model; check the machine file's chain, the s
 
 @dataclass(frozen=True)
 class TwoSteps:
-    """Result: the optimum with the unknowns of the joint method, which readings count, the points, what to report."""
+    """Result: the optimum with the unknowns of the joint method, the used readings, the points, figures for the report."""
 
     solution: LeastSquaresSolution
     accepted: NDArray[np.bool_]
@@ -544,14 +545,14 @@ class TwoSteps:
 
 
 def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
-    """Self-calibrate, place, separate; reject what lies beyond the robust limit, and repeat until the same are kept.
+    """Self-calibrate, place, separate; reject what is beyond the robust limit, and repeat until the set is stable.
 
     Raises
     ------
     InputError
         if fewer than four stations see common points.
     UndeterminedError
-        if tracers, or errors, are not determined.
+        if tracers, or errors, are undetermined.
     ConvergenceError
         if no optimum is reached, or too many readings do not fit.
     """
@@ -575,7 +576,7 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         solution = _solve(problem, located, readings)
         joint = _joint(problem, solution, located, float(readings.sigma_mm.min()))
         state = joint.state
-        # also of the readings that were not used
+        # also of the unused readings
         sight = readings.layout.tips(state.errors, poses.position_mm, poses.tool_mm)[poses.of]
         sight = sight - state.stations_mm[readings.lengths.station]
         distance = np.linalg.norm(sight, axis=1)
@@ -594,7 +595,7 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
                 lengths.stations[lengths.station[row]],
                 str(lengths.point[row]),
                 float(-residual[row]) / MM_PER_UM,
-                "fewer than three stations see its point, so that it cannot be located; the joint method uses the reading",
+                "fewer than three stations see its point, so it cannot be located; the joint method uses the reading",
                 *(lengths.origin[row] if lengths.origin else ("", 0)),
             )
         )
@@ -627,7 +628,7 @@ def _joint(
 
     Stations s and dead lengths d in the machine frame follow from those of the tracers' frame, b their errors, by the
     placement (t, w) of that frame about the centre c: s = R(w) (R_0 (s_0 + b) + t_0 - c) + c + t. The normal matrix is
-    that of the separation, with the derivative of (s, d) by (t, w, b) in place.
+    that of the separation, transformed with the derivative of (s, d) by (t, w, b).
     """
     state, calibration, placement = solution.state, located.calibration, located.placement
     frame = calibration.frame
@@ -658,7 +659,7 @@ def _joint(
 
 
 def _summary(readings: TracerReadings, located: Located, solution: LeastSquaresSolution) -> dict[str, Any]:
-    """Return what each step leaves, for ``identify.json``."""
+    """Return the figures of each step, for ``identify.json``."""
     calibration = located.calibration
     points = len(located.position_mm)
     freedom = 3 * points - readings.layout.size - 6

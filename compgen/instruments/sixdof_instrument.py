@@ -48,7 +48,7 @@ HANDEDNESS = (1, -1, -1)
 def _separation(value: Any) -> float:
     result = toml_files.number(value)
     if result == 0.0:
-        raise ValueError("the separation of the beams, not zero, is expected")
+        raise ValueError("expected the separation of the beams, not zero")
     return result
 
 
@@ -56,7 +56,7 @@ def _separation(value: Any) -> float:
 def _glass(value: Any) -> float:
     result = toml_files.number(value)
     if not 1.0 < result < 4.0:
-        raise ValueError("a refractive index between 1 and 4 is expected")
+        raise ValueError("expected a refractive index between 1 and 4")
     return result
 
 
@@ -119,7 +119,7 @@ TURNED_DRIFT = np.array([-1.0, 1.0])
 @toml_files.accepts({"enum": [1, -1]})
 def _beam_direction(value: Any) -> int:
     if value not in (1, -1) or isinstance(value, bool):
-        raise ValueError("1 (beam along the positive axis at the target) or -1 is expected")
+        raise ValueError("expected 1 (beam along the positive axis at the target) or -1")
     return int(value)
 
 
@@ -336,7 +336,7 @@ def _signs(value: Any) -> tuple[float, float, float]:
     """One sign for all three, or a list of three: +1 keeps the program's own convention, -1 turns it."""
     turns = toml_files.numbers(value) if isinstance(value, list) else (toml_files.number(value),) * 3
     if len(turns) != 3 or any(turn not in (-1.0, 1.0) for turn in turns):
-        raise ValueError("1, -1, or a list of three of them (for XY, XZ, YZ) is expected")
+        raise ValueError("expected 1, -1, or a list of three of them (for XY, XZ, YZ)")
     x, y, z = (sign * turn for sign, turn in zip(SQUARENESS_SIGNS, turns, strict=True))
     return x, y, z
 

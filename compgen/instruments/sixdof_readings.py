@@ -92,7 +92,7 @@ def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
     for table in tables:  # the interferometer's reading is there once, and of one kind in all files
         kinds = [name for name in ("displacement_mm", "phase_rad") if name in table.columns]
         if len(kinds) != 1:
-            message = "holds both of them" if kinds else "holds neither of them"
+            message = "contains both of them" if kinds else "contains neither of them"
             field = "columns displacement_mm, phase_rad"
             raise InputError(f"{message}; give the one that the interferometer read", file=table.path, field=field)
         if kinds[0] not in tables[0].columns:

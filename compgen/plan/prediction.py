@@ -1,4 +1,4 @@
-"""What a planned measurement will determine, how well, and which effects it can never show."""
+"""What a planned measurement will determine, how well, and which effects it cannot show."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import volume_grid
 from compgen.plan.stations import PlannedStations
 
-# The least-squares problem of a measurement that has not been made: its normal matrix, and what follows from it.
+# The least-squares problem of a measurement that has not been made: its normal matrix, and its consequences.
 
 
-#: A target nearer to a station than this can not be measured; the line of sight has no direction there.
+#: A target nearer to a station than this cannot be measured; its line of sight has no direction.
 NEAREST_MM = 1.0
-#: A quantity with more than this share of its size in directions without data is not determined.
+#: A quantity with more than this share of its size in directions without data is undetermined.
 UNDETERMINED_SHARE = 1e-4
 
 
@@ -48,8 +48,8 @@ class Planned:
 
     Parameters
     ----------
-    machine, stations, noise : what measures what, and how well.
-    lengths : the readings that it will have, without errors.
+    machine, stations, noise : the machine, the stations and the noise of the readings.
+    lengths : the future readings, without errors.
     problem : all weights 1; the weights follow the distances, so they change with the stations.
     tool_mm : tool offsets, (3,) or (n, 3).
     """
@@ -62,7 +62,7 @@ class Planned:
     tool_mm: FloatArray
 
     def normal_matrix(self, stations_mm: FloatArray) -> FloatArray:
-        """Normal matrix (size, size) in 1/mm^2 with the stations at the given places (S, 3)."""
+        """Return the normal matrix (size, size) in 1/mm^2 with the stations at the given places (S, 3)."""
         distance = np.linalg.norm(self.lengths.position_mm + self.tool_mm - stations_mm[self.lengths.station], axis=1)
         weight = 1.0 / self.noise.sigma_mm(distance) ** 2
         state = State(np.zeros(self.problem.parameters.size), stations_mm, np.zeros(self.problem.groups))
@@ -82,7 +82,7 @@ class Planned:
         return chosen.design(c_matrix(self.machine, position_mm, tool_mm), bases)
 
     def nodes_without_data(self) -> dict[str, list[float]]:
-        """Nodes in mm by axis whose coefficient no reading touches."""
+        """Nodes in mm by axis that no reading affects."""
         found = {}
         for axis, name in enumerate(AXES):
             basis = self.problem.parameters.basis(axis, np.unique(self.lengths.position_mm[:, axis]))
@@ -136,7 +136,7 @@ class Prediction:
     """What a normal matrix says about the unknowns.
 
     ``scale`` (size,) gives the matrix a unit diagonal, ``eigenvalues`` (size,) and ``vectors`` (size, size) are those
-    of the scaled matrix; directions with an eigenvalue below the limit are not determined.
+    of the scaled matrix; directions with an eigenvalue below the limit are undetermined.
     """
 
     scale: FloatArray
@@ -150,7 +150,7 @@ class Prediction:
 
     @cached_property
     def factor(self) -> FloatArray:
-        """F (size, rank) with F F^T the covariance of what is determined, mm and rad."""
+        """F (size, rank) with F F^T the covariance of the determined part, mm and rad."""
         kept = ~self.null
         return np.asarray(self.scale[:, None] * self.vectors[:, kept] / np.sqrt(self.eigenvalues[kept]))
 
@@ -159,7 +159,7 @@ class Prediction:
         return Prediction(self.scale[unknowns], self.eigenvalues, self.vectors[unknowns])
 
     def u(self, rows: FloatArray) -> FloatArray:
-        """Standard uncertainty of linear functions of the unknowns, rows (..., size): shape (...,), nan if open."""
+        """Standard uncertainty of linear functions of the unknowns, rows (..., size): shape (...,), nan if undetermined."""
         spread = rows @ self.factor
         u = np.sqrt(np.einsum("...k,...k->...", spread, spread))
         if self.null.any():
@@ -188,7 +188,7 @@ def planned_rank(found: Planned, matrix: FloatArray) -> Rank:
 # What a measurement will determine, and how well, before it is made.
 
 
-#: Points of the volume whose rows of C B are made together.
+#: Points of the volume whose rows of C B are computed together.
 CHUNK_POINTS = 1024
 
 
@@ -199,7 +199,7 @@ class VolumeUncertainty:
     Parameters
     ----------
     position_mm : the points, shape (n, 3).
-    u_mm : standard uncertainty of each component, shape (n, 3), nan where it is not determined.
+    u_mm : standard uncertainty of each component, shape (n, 3), nan if undetermined.
     """
 
     position_mm: FloatArray
@@ -212,16 +212,16 @@ class VolumeUncertainty:
 
     @property
     def worst_um(self) -> float:
-        """Largest total in um; infinite if a point is not determined."""
+        """Largest total in um; infinite if a point is undetermined."""
         return float(self.total_mm.max()) / MM_PER_UM if np.isfinite(self.u_mm).all() else np.inf
 
     @property
     def rms_um(self) -> float:
-        """Root mean square of the total in um; infinite if a point is not determined."""
+        """Root mean square of the total in um; infinite if a point is undetermined."""
         return float(np.sqrt(np.mean(self.total_mm**2))) / MM_PER_UM if np.isfinite(self.u_mm).all() else np.inf
 
     def summary(self) -> dict[str, Any]:
-        """Return the object ``volume`` of ``plan.json``; None where a point is not determined."""
+        """Return the object ``volume`` of ``plan.json``; None if a point is undetermined."""
         open_points = ~np.isfinite(self.u_mm).all(axis=1)
         report: dict[str, Any] = {"points": len(self.u_mm), "undetermined_points": int(np.count_nonzero(open_points))}
         whole = not open_points.any()
@@ -242,8 +242,8 @@ class Plan(Drawable):
     ----------
     planned : the measurement.
     rank : numerical rank, condition and the combinations without data in words.
-    nodes_without_data : nodes in mm by axis that no reading touches.
-    errors : zero values with the predicted standard uncertainties, nan where they are not determined.
+    nodes_without_data : nodes in mm by axis that no reading affects.
+    errors : zero values with the predicted standard uncertainties, nan if undetermined.
     volume : uncertainty of E over the working volume.
 
     Examples
@@ -272,10 +272,10 @@ class Plan(Drawable):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why the measurement will not do, in words; empty if everything is determined."""
+        """Why the measurement is insufficient, in words; empty if everything is determined."""
         found = list(self.rank.combinations) if self.rank.rank < self.rank.size else []
         if not found and self.readings <= self.rank.size:
-            found.append(f"{self.readings} readings for {self.rank.size} unknowns leave nothing to check them by")
+            found.append(f"{self.readings} readings for {self.rank.size} unknowns leave no redundancy for a check")
         return tuple(found)
 
     @property
@@ -344,8 +344,8 @@ def plan(machine: Machine, stations: PlannedStations, points: Points, options: I
     Parameters
     ----------
     machine : chain, nodes, and which errors its model contains.
-    stations : any number of them; with one or two the ambiguity that is left is reported.
-    points : commanded points; a point that is listed twice is read twice.
+    stations : any number of them; with one or two the remaining ambiguity is reported.
+    points : commanded points; a point listed twice is read twice.
     options : standard uncertainty of a reading.
 
     Examples
@@ -364,7 +364,7 @@ def plan(machine: Machine, stations: PlannedStations, points: Points, options: I
 
 
 def planned_noise(options: IdentifyOptions | None = None) -> ReadingNoise:
-    """Return the uncertainty of a planned reading: the stated one, else the usual one of a laser tracer."""
+    """Return the uncertainty of a planned reading: the stated one, otherwise the usual one of a laser tracer."""
     nothing = np.zeros(0)
     no_readings = Lengths((), nothing.astype(np.int64), (), nothing.reshape(0, 3), nothing)
     return reading_noise(no_readings, options or IdentifyOptions())
@@ -398,28 +398,28 @@ def plan_of(found: Planned) -> Plan:
     )
 
 
-# What a planned measurement can never see of the catalogue of effects, and what to measure in addition.
+# Effects of the catalogue that a planned measurement cannot show, and what to measure in addition.
 
 
-#: Time between two stops of a plan that says nothing about it, and its feed; only their being constant matters.
+#: Time between two stops and feed of a plan that does not state them; it only matters that they are constant.
 STOP_S = 10.0
 FEED_MM_MIN = 1000.0
 CHUNK_READINGS = 2048
-#: Warming of every channel over a plan without temperatures, K; only that they warm together matters.
+#: Warming of every channel over a plan without temperatures, K; it only matters that they warm together.
 WARMING_K = 1.0
 
 
 @dataclass(frozen=True)
 class PlanVisibility:
-    """Visible fractions, what is hidden and why, effects that look alike.
+    """Visible fractions, hidden effects with the reason, effects that look alike.
 
     Parameters
     ----------
-    parts : visible part of every effect whose columns the plan can tell.
-    hidden : why an effect does not show at all, by its name.
-    pairs : effects that cannot be told apart.
+    parts : visible part of every effect whose columns the plan provides.
+    hidden : why an effect does not show at all, by name.
+    pairs : effects that cannot be distinguished.
     cards : cards of the effects.
-    assumed : what the plan does not say and was assumed, in words.
+    assumed : what the plan does not state and was assumed, in words.
     """
 
     parts: dict[str, VisiblePart]
@@ -430,7 +430,7 @@ class PlanVisibility:
 
     @property
     def never(self) -> dict[str, str]:
-        """Effects that the plan never sees, with the reason."""
+        """Effects that the plan cannot show, with the reason."""
         faint = {
             name: f"visible fraction {part.fraction:.3f}: the errors of the machine, stations and dead lengths imitate it"
             for name, part in self.parts.items()
@@ -461,10 +461,10 @@ class PlanVisibility:
 
 
 def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
-    """Project every effect of the catalogue off what errors, stations and dead lengths can do in this plan.
+    """Project errors, stations and dead lengths of this plan out of every effect of the catalogue.
 
-    The order of the points is that in which they are visited. What the points do not say is assumed: one feed, equal
-    times, temperatures that rise together; the result says so.
+    The points are visited in their order. What they do not state is assumed: one feed, equal times, temperatures that
+    rise together; the result says so.
     """
     readings, assumed = _readings(found, points)
     modelled = modelled_errors(found.machine)
@@ -472,7 +472,7 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
     logged = {*readings.covariates, *readings.labels, "station", "approach_x", "approach_y", "approach_z"}
     for name, effect in catalogue(found.stations.names).items():
         if isinstance(effect, SignError | Squareness):
-            missing = effect.displacement(readings) is not None  # else the sign means nothing on this chain
+            missing = effect.displacement(readings) is not None  # otherwise the sign has no meaning on this chain
         else:
             missing = effect.card.name.removeprefix("lever_") not in modelled
         if "lengths" not in effect.card.kinds or not missing:
@@ -482,7 +482,7 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
         if columns is None:
             of_one = "tool offset" if name.startswith("lever_") else "set-up" if name == "tool_offset_error" else ""
             lacking = [key for key in effect.card.covariates if key not in logged]
-            hidden[name] = f"the plan has no {', '.join(lacking)}" if lacking else "nothing of it varies in this plan"
+            hidden[name] = f"the plan has no {', '.join(lacking)}" if lacking else "it does not vary in this plan"
             hidden[name] = f"one {of_one}" if of_one else hidden[name]
         else:
             chosen[name] = columns
@@ -493,7 +493,7 @@ def plan_visibility(found: Planned, points: Points) -> PlanVisibility:
 
 
 def _columns(effect: Effect, readings: Readings) -> FloatArray | None:
-    """Columns of an effect at the middle of its scan positions."""
+    """Return the columns of an effect at the middle of its scan positions."""
     positions = list(effect.positions(readings))
     fixed = effect.at(positions[len(positions) // 2]) if positions else effect
     columns = fixed.columns(readings)
@@ -538,7 +538,7 @@ def _covariates(points: Points) -> tuple[dict[str, FloatArray], list[str]]:
     assumed: list[str] = []
     if "time_s" not in logged:
         logged["time_s"] = STOP_S * np.arange(len(points), dtype=np.float64)
-        assumed.append("stops follow each other at equal times, and all stations read at once")
+        assumed.append("stops follow at equal intervals, and all stations read simultaneously")
     if "feed_mm_min" not in logged:
         logged["feed_mm_min"] = np.full(len(points), FEED_MM_MIN)
         assumed.append("one feed")
@@ -556,12 +556,12 @@ def _covariates(points: Points) -> tuple[dict[str, FloatArray], list[str]]:
 def _gram(
     found: Planned, readings: Readings, chosen: dict[str, FloatArray]
 ) -> tuple[FloatArray, int, dict[str, slice]]:
-    """Gram matrix of the base Jacobian and the columns of the effects, readings in units of their uncertainty."""
+    """Return the Gram matrix of the base Jacobian and the columns of the effects, readings in units of their uncertainty."""
     where, start = {}, 0
     for name, columns in chosen.items():
         where[name] = slice(start, start + columns.shape[1])
         start += columns.shape[1]
-    names = modelled_errors(found.machine)  # those of one tool: what further tools show is an effect here
+    names = modelled_errors(found.machine)  # those of one tool: what other tools show is an effect here
     layout = error_parameters(found.machine, names)
     keys = np.column_stack([readings.station, readings.labels["setup"], found.lengths.labels["setup"]])
     _, group = np.unique(keys, axis=0, return_inverse=True)

@@ -27,8 +27,8 @@ _OF_IDENTIFY = (
 )
 _BOX_COLUMNS = tuple(f"{axis}_{end}_mm" for axis in "xyz" for end in ("min", "max"))
 
-#: The shell in which stations may be placed where no box is given: this far from the footprint of the working volume, and
-#: this high above its lowest tool tip, the level of the table.
+#: The shell in which stations may be placed without a box: at this distance from the footprint of the working volume,
+#: and at this height above its lowest tool tip, the level of the table.
 SHELL_NEAR_MM, SHELL_FAR_MM, SHELL_HEIGHT_MM = 100.0, 600.0, 300.0
 
 
@@ -41,7 +41,7 @@ class PlannedStations:
     names : one for each station, S of them.
     position_mm : in the workpiece frame, shape (S, 3).
     passes : station index and set-up of each pass, shape (p, 2); in a pass a station reads every point once, and each
-        pass has its own unknown constant.
+    pass has its own dead length.
     """
 
     names: tuple[str, ...]
@@ -73,7 +73,7 @@ def planned_stations(positions: Mapping[str, Sequence[float]]) -> PlannedStation
 
 
 def read_stations(path: str | Path) -> PlannedStations:
-    """Read a stations file: ``station, x_mm, y_mm, z_mm``, optional ``setup``; that of ``volcomp identify`` will do.
+    """Read a stations file: ``station, x_mm, y_mm, z_mm``, optional ``setup``; the file of ``volcomp identify`` is valid, too.
 
     A station with several set-ups has a row for each, at one place.
     """
@@ -85,7 +85,7 @@ def read_stations(path: str | Path) -> PlannedStations:
     position_mm = np.zeros((len(known), 3))
     first: dict[tuple[str, int | None], int] = {}
     main = table.labels("segment") == 0 if "segment" in table.columns else np.ones(len(table), dtype=bool)
-    kept = np.flatnonzero(main).tolist()  # dead lengths that a beam break added are not set-ups to plan
+    kept = np.flatnonzero(main).tolist()  # dead lengths added by a beam break are not planned set-ups
     for row in kept:
         name = names[row]
         earlier = first.setdefault((name, None), row)
@@ -120,13 +120,13 @@ def format_stations(stations: PlannedStations, machine: Machine) -> str:
 
 
 class Region(Protocol):
-    """A set of places, reached from three numbers between 0 and 1."""
+    """A set of places, parametrised by three numbers between 0 and 1."""
 
     def place(self, unit: FloatArray) -> FloatArray:
-        """Place (3,) in mm of numbers (3,)."""
+        """Return the place (3,) in mm of numbers (3,)."""
 
     def unit(self, place_mm: FloatArray) -> FloatArray:
-        """Numbers (3,) of a place (3,) in mm, or of the nearest one that belongs to the region."""
+        """Return the numbers (3,) of a place (3,) in mm, or of the nearest one in the region."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Box:
         return np.asarray(self.lower_mm + unit * (self.upper_mm - self.lower_mm))
 
     def unit(self, place_mm: FloatArray) -> FloatArray:
-        """Return the numbers of a place; one outside counts as the nearest inside."""
+        """Return the numbers of a place; one outside is moved to the nearest inside."""
         size = self.upper_mm - self.lower_mm
         return np.clip((place_mm - self.lower_mm) / np.where(size > 0, size, 1.0), 0.0, 1.0)
 
@@ -163,7 +163,7 @@ class Shell:
     def place(self, unit: FloatArray) -> FloatArray:
         """Return the place for the share of the outline, of the distance, and of the height."""
         outwards = SHELL_NEAR_MM + unit[1] * (SHELL_FAR_MM - SHELL_NEAR_MM)
-        # the outline runs from the lower left corner to the right, (x, y) by the length gone along it
+        # the outline starts at the lower left corner to the right; (x, y) by the length along it
         a, b = (float(half) for half in self.half_mm + outwards)
         along = (float(unit[0]) % 1.0) * 4 * (a + b)
         if along < 2 * a:
@@ -177,11 +177,11 @@ class Shell:
         return np.array([*(self.centre_mm + [x, y]), self.table_mm + unit[2] * SHELL_HEIGHT_MM])
 
     def unit(self, place_mm: FloatArray) -> FloatArray:
-        """Return the shares of a place; one that is too near, far, low or high counts as the nearest."""
+        """Return the shares of a place; one that is too near, far, low or high is moved to the nearest."""
         offset = place_mm[:2] - self.centre_mm
         outwards = float(np.max(np.abs(offset) - self.half_mm))
         half = self.half_mm + max(outwards, 0.0)
-        if outwards < 0:  # inside: straight out of the nearest side
+        if outwards < 0:  # inside: perpendicular to the nearest side
             side = int(np.argmax(np.abs(offset) - self.half_mm))
             offset = offset.copy()
             offset[side] = np.copysign(half[side], offset[side])
@@ -202,12 +202,12 @@ def shell_around(machine: Machine) -> Shell:
 
 
 def regions_of(machine: Machine, stations: PlannedStations, boxes: Mapping[str, Box]) -> list[Region]:
-    """Return the region of each station: its box, else the shell around the table.
+    """Return the region of each station: its box, otherwise the shell around the table.
 
     Raises
     ------
     InputError
-        for a box of a station that is not there.
+        for a box of a station that does not exist.
     """
     for name in boxes:
         if name not in stations.names:
@@ -241,6 +241,6 @@ def read_boxes(path: str | Path) -> dict[str, Box]:
         lower, upper = values[row, 0::2], values[row, 1::2]
         if np.any(lower > upper):
             axis = int(np.argmax(lower > upper))
-            raise table.fail(row, _BOX_COLUMNS[2 * axis], f"{lower[axis]:g} lies above the upper end {upper[axis]:g}")
+            raise table.fail(row, _BOX_COLUMNS[2 * axis], f"{lower[axis]:g} is above the upper end {upper[axis]:g}")
         boxes[name] = Box(lower, upper)
     return boxes

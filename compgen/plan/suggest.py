@@ -26,9 +26,9 @@ from compgen.simulate.trajectory import Line, Trajectory, trajectory_points
 Criterion = Literal["worst", "rms"]
 Progress = Callable[[str], None]
 
-#: Points of the volume that the search looks at; what it finds is judged on the full grid.
+#: Points of the volume for the search; its result is evaluated on the full grid.
 SEARCH_POINTS = 200
-#: Share of the evaluations that goes into places spread over the regions; the rest improves the best of them.
+#: Share of the evaluations for places spread over the regions; the rest improves the best of them.
 SPREAD_SHARE = 0.4
 #: Reciprocal condition below which an arrangement counts as undetermined in the search.
 LEAST_RCOND = 1e-13
@@ -65,7 +65,7 @@ class Suggestion:
 
 
 class _Search:
-    """The criterion as a function of numbers between 0 and 1, with memory of the best and a limit of evaluations."""
+    """The criterion as a function of numbers between 0 and 1; keeps the best and limits the evaluations."""
 
     def __init__(self, found: Planned, regions: Sequence[Region], criterion: Criterion, limit: int) -> None:
         self.found, self.regions, self.criterion, self.limit = found, regions, criterion, limit
@@ -120,16 +120,16 @@ def suggest(
     seed: int = 1,
     progress: Progress = lambda _: None,
 ) -> Suggestion:
-    """Search better places for the stations of a planned measurement: first spread, then Powell's method.
+    """Search for better places of the stations of a planned measurement: first spread, then Powell's method.
 
     Parameters
     ----------
-    start : the measurement with the stations as they are; they count as one candidate wherever they are.
+    start : the measurement with the given stations, which are one candidate wherever they are.
     regions : where each station may be placed.
     criterion : ``"worst"`` or ``"rms"`` of the standard uncertainty of E over the volume.
-    evaluations : how many arrangements are looked at.
+    evaluations : number of arrangements to evaluate.
     seed : of the spread places; the same seed gives the same result.
-    progress : is told how far the search is.
+    progress : called with the progress of the search.
     """
     with one_thread():
         search = _Search(start, regions, criterion, evaluations)
@@ -142,7 +142,7 @@ def suggest(
 
 
 def _spread(search: _Search, seed: int, progress: Progress) -> None:
-    from scipy.stats import qmc  # imported here: it takes a quarter of a second, and few commands need it
+    from scipy.stats import qmc  # imported here: slow to load, and few commands need it
 
     count = max(1, int(SPREAD_SHARE * search.limit))
     samples = qmc.Sobol(3 * len(search.regions), seed=seed).random_base2(int(np.ceil(np.log2(count))))
@@ -154,7 +154,7 @@ def _spread(search: _Search, seed: int, progress: Progress) -> None:
 
 
 def _improve(search: _Search, progress: Progress) -> None:
-    """Powell's method from the best so far, until the limit; what it passes through is remembered."""
+    """Apply Powell's method to the best so far, until the limit; the best is kept."""
     from scipy.optimize import minimize  # imported here: slow to load
 
     start = np.concatenate([r.unit(place) for r, place in zip(search.regions, search.best_mm, strict=True)])
@@ -258,12 +258,12 @@ def judge_trajectories(
     target_um: float,
     progress: Progress = lambda _: None,
 ) -> tuple[list[TrajectoryCandidate], TrajectoryCandidate | None]:
-    """Judge the candidates from the smallest on, and return them with the first that reaches the target, if any does.
+    """Evaluate the candidates from the smallest, and return them with the first that reaches the target, if any.
 
-    ``target_um`` is the largest standard uncertainty of E in the volume that is allowed, um.
+    ``target_um`` is the largest allowed standard uncertainty of E in the volume, um.
     """
     if not (np.isfinite(target_um) and target_um > 0):
-        raise InputError(f"the target is {target_um:g} um; a number above zero is expected")
+        raise InputError(f"the target is {target_um:g} um; expected a number above zero")
     judged: list[TrajectoryCandidate] = []
     with one_thread():
         for name, position_mm in candidate_trajectories(machine).items():

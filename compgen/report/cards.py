@@ -25,8 +25,8 @@ from compgen.tables.render import Format, load_format
 class ControlSetting:
     """One key of ``[controllers.<name>]``.
 
-    ``default`` is as a machine file would have it, None if there is none or the meaning says what it is;
-    ``allowed`` is what its check expects.
+    ``default`` is written as in a machine file, None if there is none or the meaning states it; ``allowed`` is what its
+    check expects.
     """
 
     key: str
@@ -38,7 +38,7 @@ class ControlSetting:
 
 @dataclass(frozen=True)
 class ControlCard:
-    """Everything that ``volcomp controllers NAME`` says."""
+    """Everything that ``volcomp controllers NAME`` shows."""
 
     format: Format
     settings: tuple[ControlSetting, ...]
@@ -67,7 +67,7 @@ class ControlCard:
 def control_card(name: str, templates: Path | None = None) -> ControlCard:
     """Return the card of control ``name``; its settings are those that its ``settings_class`` declares.
 
-    A plug-in that reads its section key by key says in ``[settings]`` of its ``format.toml`` what its keys mean.
+    A plug-in that reads its section key by key describes its keys in ``[settings]`` of its ``format.toml``.
     """
     control, card = controller_named(name), load_format(name, templates)
     declared = toml_files.declared_settings(getattr(control, "settings_class", object))
@@ -90,7 +90,7 @@ def card_text(card: ControlCard, origin: str | None) -> RenderableType:
         *([Text(f"from {origin}")] if origin else []),
         *_paragraph(None, about.summary),
         *_paragraph("What it can express", about.expresses),
-        *_list("Properties", [f"constant offset: {offset}", f"tables of one direction of travel: {direction}"]),
+        *_list("Properties", [f"constant offset: {offset}", f"direction-dependent tables: {direction}"]),
         *_list("Files", [spec.name for spec in about.files]),
         *_settings(about.name, card.settings),
         *_list("Limits", about.limits),
@@ -126,7 +126,7 @@ def _settings(name: str, settings: Sequence[ControlSetting]) -> list[RenderableT
 
 
 def _toml(value: Any) -> str:
-    """A default as a machine file would have it."""
+    """Return a default as it is written in a machine file."""
     if value is None:
         return "none"
     if isinstance(value, bool):
@@ -141,7 +141,7 @@ def _toml(value: Any) -> str:
 # The catalogue of effects as text: one card, and the page ``docs/effects.md``.
 
 
-UNITS = "Parameters carry their unit in the name (um, urad, ppm, K, h, kg, ms)."
+UNITS = "The names of the parameters end with their unit (um, urad, ppm, K, h, kg, ms)."
 
 
 def card_summary(card: Card) -> dict[str, Any]:
@@ -177,7 +177,7 @@ def effect_card_text(card: Card, origin: str | None = None) -> str:
 def catalogue_markdown(effects: Mapping[str, Effect]) -> str:
     """Return the table of ``docs/effects.md``: one row for each family of effects of equal text."""
     rows = ["| effect | equation | columns | parameters | resembles | what separates |", "|---|---|---|---|---|---|"]
-    # effects whose names differ in the last part only are one row, with the card of the first
+    # effects whose names differ only in the last part share a row, with the card of the first
     families: dict[str, tuple[list[str], Card]] = {}
     for name, effect in effects.items():
         family, _, member = name.rpartition("_")

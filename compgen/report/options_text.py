@@ -1,4 +1,4 @@
-"""What the options of a control would buy: tables for the terminal, `options.md` and `explain.md`."""
+"""What the options of a control would gain: tables for the terminal, `options.md` and `explain.md`."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from compgen.data.comparison import Residuals
 from compgen.data.messages import um_text
 from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 
-# What the options of a control would buy: tables for the terminal, and ``options.md``.
+# What the options of a control would gain: tables for the terminal, and ``options.md``.
 
 
 #: Errors that leave less than this at every tool and level are not listed, um.
 LISTED_FROM_UM = 0.1
-#: A level that shrinks the rms by less than this share, or by less than this much, buys nothing.
+#: A level that reduces the rms by less than this share, or by less than this much, gains nothing.
 LEAST_GAIN, LEAST_GAIN_UM = 0.005, 0.05
 LEGEND = (
     "left: what the best table of that level leaves, largest / rms / 95 % in um; left*: the best-fit rigid motion of the "
-    "workpiece removed; buys: by how much the rms* shrinks against the level above, with the machine's own tool: full "
-    "volumetric compensation shows its worth with others. A level may contain a constant shift of "
-    "an axis, which a workpiece offset does as well; controls whose tables are zero at the reference point do not."
+    "workpiece removed; gain: reduction of rms* compared with the level above, with the tool of the machine file: full "
+    "volumetric compensation pays off with other tools. A level may contain a constant shift of "
+    "an axis, which a workpiece offset can do as well; controls whose tables are zero at the reference point do not."
 )
 
 
@@ -39,7 +39,7 @@ def tool_name(tool_mm: Sequence[float]) -> str:
 
 
 def level_rows(result: Capability) -> list[list[str]]:
-    """Rows level, left, left*, buys."""
+    """Return rows of level, left, left*, gain."""
     rows, before = [], None
     for item in result.levels:
         rms = item.left.rigid_removed.rms_um
@@ -49,7 +49,7 @@ def level_rows(result: Capability) -> list[list[str]]:
 
 
 def _gain(before_um: float | None, after_um: float) -> str:
-    """By how much a level shrinks the rms, um and per cent; nothing where it does not."""
+    """Return by how much a level reduces the rms, um and per cent, or "nothing"."""
     if before_um is None:
         return ""
     gain = before_um - after_um
@@ -58,13 +58,13 @@ def _gain(before_um: float | None, after_um: float) -> str:
 
 
 def control_rows(result: Capability) -> list[list[str]]:
-    """Rows control, level, left, left*, remark."""
+    """Return rows of control, level, left, left*, remark."""
     rows = []
     for item in result.controls:
         directional = f", {LABELS['directional'].lstrip('+ ')}" if item.directional else ""
         level = "-" if item.level is None else LABELS[item.level] + directional
         left = ["-", "-"] if item.left is None else [_three(item.left.after), _three(item.left.rigid_removed)]
-        broken = [f"{len(item.broken)} limits broken, first: {item.broken[0]}"] if item.broken else []
+        broken = [f"{len(item.broken)} limits exceeded, first: {item.broken[0]}"] if item.broken else []
         other = [] if item.own else ["not as in the machine file"]
         remark = f"cannot be exported: {item.problem}" if item.problem else "; ".join([*broken, *other, *item.notes])
         rows.append([item.label, level, *left, remark])
@@ -76,7 +76,7 @@ def _shown_levels(result: Capability) -> list[str]:
 
 
 def error_rows(result: Capability, tool: int) -> list[list[str]]:
-    """Rows error and, by level, the largest displacement in um that it leaves with tool number ``tool``."""
+    """Return rows of error and, by level, the largest displacement in um that remains with tool number ``tool``."""
     rows = []
     for name in result.levels[0].by_tool[tool][1]:
         values = [result.level(key).by_tool[tool][1][name] for key in _shown_levels(result)]
@@ -86,7 +86,7 @@ def error_rows(result: Capability, tool: int) -> list[list[str]]:
 
 
 def tool_rows(result: Capability) -> list[list[str]]:
-    """Rows tool offset and, by level, largest / rms of all errors together, with the reference point fixed."""
+    """Return rows of tool offset and, by level, largest / rms of all errors together, with the reference point fixed."""
     return [
         [tool_name(tool), *(um_text(result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result))]
         for k, tool in enumerate(result.tools_mm)
@@ -107,7 +107,7 @@ def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -
 
 
 def options_tables(result: Capability) -> Group:
-    """Return what the terminal shows: levels, controls, errors that remain with the machine's own tool, tools."""
+    """Return the tables for the terminal: levels, controls, errors that remain with the machine's tool, other tools."""
     own = tool_name(result.tools_mm[0])
     levels = ["tables contain", "left", "left*", "buys"]
     controls = ["control", "level", "left", "left*", "remark"]
@@ -115,12 +115,12 @@ def options_tables(result: Capability) -> Group:
         _table(f"{result.machine}: what each level of option leaves (max / rms / p95, um)", levels, level_rows(result)),
         _table("what the file of each control leaves, read back (max / rms / p95, um)", controls, control_rows(result)),
         _table(
-            f"largest displacement that each error leaves by itself, um, tool offset {own}",
+            f"largest displacement left by each single error, um, tool offset {own}",
             ["error", *_level_headings(result)],
             error_rows(result, 0),
         ),
         _table(
-            "largest error left with tools of other offset (mm), um, all errors together",
+            "largest error left with other tool offsets (mm), um, all errors together",
             ["tool offset", *_level_headings(result)],
             tool_rows(result),
         ),
@@ -130,7 +130,7 @@ def options_tables(result: Capability) -> Group:
 
 
 def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown, with a line end."""
+    """Return a table in Markdown, with a line end."""
     lines = [headings, ["---"] * len(headings), *rows]
     return "".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |\n" for line in lines)
 
@@ -140,17 +140,17 @@ def options_markdown(result: Capability) -> str:
     ends = zip("XYZ", result.zone_mm or (), strict=False)
     zone = ", ".join(f"{axis} {part[0]:g} ... {part[1]:g} mm" for axis, part in ends if part is not None)
     parts = [
-        f"# Options for {result.machine}\n\nJudged at {result.points} points over {zone or 'the whole travel'}.\n",
+        f"# Options for {result.machine}\n\nEvaluated at {result.points} points over {zone or 'the whole travel'}.\n",
         "## What each level of option leaves\n\n"
-        + markdown_table(["tables contain", "left, um (max / rms / p95)", "left*, um", "buys"], level_rows(result)),
+        + markdown_table(["tables contain", "left, um (max / rms / p95)", "left*, um", "gain"], level_rows(result)),
         LEGEND + "\n",
         "## What the file of each control leaves\n\n"
         + markdown_table(
             ["control", "level", "left, um (max / rms / p95)", "left*, um", "remark"], control_rows(result)
         ),
-        "## Largest error with tools of other offset, um\n\n"
+        "## Largest error with other tool offsets, um\n\n"
         + markdown_table(["tool offset, mm", *_level_headings(result)], tool_rows(result)),
-        "## Which errors remain\n\nLargest displacement in um that each error leaves by itself, to first order.\n",
+        "## Which errors remain\n\nLargest displacement in um left by each single error, to first order.\n",
     ]
     for k, tool in enumerate(result.tools_mm):
         heading = f"### Tool offset {tool_name(tool)}{' mm' if any(tool) else ''}{' (of the machine file)' if not k else ''}\n\n"
@@ -160,29 +160,29 @@ def options_markdown(result: Capability) -> str:
     return "\n".join(parts)
 
 
-# ``explain.md``: what a control's table corrects, what remains and why, what the next option buys, what it uses.
+# ``explain.md``: what a control's table corrects, what remains and why, what the next option gains, limits used.
 
 
-#: An error counts as corrected, in part at least, if less than this share of it remains.
+#: An error counts as corrected, at least in part, if less than this share of it remains.
 LEAST_HELP = 0.9
-#: What a control of each level holds, in words.
+#: What a control of each level corrects, in words.
 HOLDS = {
     "pitch": "positioning along each axis",
     "squareness": "positioning, straightness and squareness",
     "products": "positioning, straightness, squareness, and angles as products of tables",
-    "volumetric": "all errors of its volumetric model, at the tool in use",
+    "volumetric": "all errors of its volumetric model, for the active tool",
 }
 
 
 def explanation_markdown(item: Explanation) -> str:
     """Return ``explain.md``."""
-    text = f"# {item.controller} on {item.machine}\n\nThis control holds {HOLDS[item.level]}."
+    text = f"# {item.controller} on {item.machine}\n\nThis control corrects {HOLDS[item.level]}."
     if item.own is not None and item.own.left is not None:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
         text += (
-            f" The error over the volume goes from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) and from "
-            f"{um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion removed, "
-            "by the file as it is written."
+            f" Its file changes the error over the volume from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) "
+            f"and from {um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion removed, "
+            "as read back from the file."
         )
     parts = [text + "\n"]
     helped = [fate for fate in item.fates if fate.after_um < LEAST_HELP * fate.before_um]
@@ -201,7 +201,7 @@ def explanation_markdown(item: Explanation) -> str:
             for tool, (left, _) in results
         ]
         other = (
-            "\nThe tables were made for the tool offset of the machine file. With others an angular error acts at another "
+            "\nThe tables were made for the tool offset of the machine file. With other tools an angular error acts at another "
             f"lever; the largest error that the best table of this level leaves is {', '.join(tools)}.\n"
         )
     parts.append("## What remains, and why\n\n" + table + other + notes)
@@ -216,12 +216,12 @@ def _next(item: Explanation) -> str:
             following.append(result)
         result = item.options.after(result.key)
     if not following:
-        return "## What the next option would buy\n\nNothing more: this is the highest level for these errors.\n"
+        return "## What the next option would gain\n\nNothing: this is the highest level for these errors.\n"
     rows = [
         [level.label, um_text(level.left.rigid_removed.max_um), um_text(level.left.rigid_removed.rms_um)]
         for level in (current, *following)
     ]
-    return "## What the next option would buy\n\n" + markdown_table(
+    return "## What the next option would gain\n\n" + markdown_table(
         ["tables contain", "largest left, um", "rms left, um"], rows
     )
 
@@ -264,5 +264,5 @@ def _limits(item: Explanation) -> str:
         headings = ["limit", "used", "allowed", "used, %", "margin"]
         text += "Smallest margin first.\n\n" + markdown_table(headings, rows)
     else:
-        text += "The control states no limits of its own.\n"
+        text += "The control states no limits.\n"
     return text + "".join(f"\nBroken: {violation}.\n" for violation in item.violations)

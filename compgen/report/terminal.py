@@ -157,10 +157,10 @@ VERDICTS = {
 
 
 def _uncertainty(results: Sequence[Verification]) -> str:
-    """What the uncertainty of the measurement adds to the figures after compensation."""
-    known = results[0].uncertainty  # of the errors and points, so much the same for all controls
+    """Return what the uncertainty of the measurement adds to the figures after compensation."""
+    known = results[0].uncertainty  # depends on errors and points: practically the same for all controls
     if known is None:
-        return "the uncertainty of the measurement is not known, so neither is that of the figures after"
+        return "the uncertainty of the measurement is unknown, and so is that of the figures after"
     return (
         f"the uncertainty of the measurement (U, k = 2) comes on top of the figures by the files: +-{um_text(known.max_um)} / "
         f"{um_text(known.rms_um)} um on after, +-{um_text(known.max_rigid_removed_um)} / "
@@ -169,10 +169,10 @@ def _uncertainty(results: Sequence[Verification]) -> str:
 
 
 def verification_table(results: Sequence[Verification]) -> Group:
-    """Return before and after for every control, read from the files, and why tables were not accepted."""
+    """Return before and after for every control, read from its files, and why tables were not accepted."""
     volumetric = all(item.volumetric for item in results)
     what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
-    title = f"{what}, max / rms in um, by the files read back"
+    title = f"{what}, max / rms in um, as read back from the files"
     table = Table(
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
@@ -211,8 +211,8 @@ def verification_table(results: Sequence[Verification]) -> Group:
             notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
     notes += [Text(_uncertainty(results))] if results else []
     legend = (
-        "before, after: as it stands, the reference point fixed; before*, after*: the best-fit rigid motion of the "
-        "workpiece taken out; not held: the largest error that no table of this control can express"
+        "before, after: with the reference point fixed; before*, after*: with the best-fit rigid motion of the "
+        "workpiece removed; not held: the largest error that no table of this control can express"
     )
     judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
     return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
@@ -288,7 +288,7 @@ def comparison_table(found: Comparison) -> Group:
 
 
 def verdict_text(found: Comparison) -> str:
-    """Say in one line how it came out, and by which figures."""
+    """Return the verdict in one line, and the figures that decided it."""
     if found.kind == "prediction" and found.prediction is not None:
         return f"prediction and measurement: {found.prediction.verdict}"
     by = ", ".join(f"{group} {key}" for group, key in found.decisive)
@@ -320,7 +320,7 @@ def _tables(groups: Mapping[str, Mapping[str, ComparedFigure]], kind: str) -> li
 # Readable summaries of the sign crash test, of differences between tables, and of a merge.
 
 
-#: Kinds of wrong ones in the order of the table, with what they are called there.
+#: Kinds of wrong tables in the order of the summary, with their names in it.
 KINDS = {
     "output": "signed axes of the correction",
     "frame": "signed axes of the frame",
@@ -333,7 +333,7 @@ MOST_COMPONENTS = 12
 
 
 def crash_table(results: Sequence[CrashTest]) -> Group:
-    """Return how many wrong tables of every kind were rejected, by control, and every one that was not."""
+    """Return how many wrong tables of every kind were rejected, by control, and each that was not."""
     from compgen.tables.signs import ACCEPTED, REJECTED, SAME
 
     table = Table(
@@ -363,8 +363,8 @@ def crash_table(results: Sequence[CrashTest]) -> Group:
             elif trial.outcome == SAME:
                 notes.append(Text(f"{name}: {what} changes {size_um:.3f} um at most", "yellow"))
     legend = (
-        "same: the wrong table differs from the right one by no more than the verification is meant to see (resolution of "
-        "the format and 0.2 um), so that it does not count"
+        "same: the wrong table differs from the right one by no more than the verification resolves (resolution of "
+        "the format and 0.2 um), so it does not count"
     )
     return Group(table, *notes, Text(legend))
 
@@ -388,10 +388,10 @@ def difference_table(result: TableDifference) -> Group:
 
 
 def merge_text(report: MergeReport) -> Text:
-    """Return how close the merged table comes to old and new together."""
+    """Return how closely the merged table reproduces old and new together."""
     text = (
         f"old and new together reach {report.total_max_um:.1f} um; the merged tables miss it by "
-        f"{report.difference_max_um:.2f} um max, {report.difference_rms_um:.2f} um rms, with all that this control cannot hold"
+        f"{report.difference_max_um:.2f} um max, {report.difference_rms_um:.2f} um rms, including what it cannot express"
     )
     if report.lost_um > 0.1:
         text += f"; {report.lost_um:.2f} um of the old tables belong to no error of the machine's model"
@@ -441,7 +441,7 @@ def volume_line(title: str, plan: Plan) -> str:
     """Return a line or two with the uncertainty of E over the volume."""
     report = plan.volume.summary()
     if report["undetermined_points"]:
-        return f"{title}: E is not determined at {report['undetermined_points']} of {report['points']} points"
+        return f"{title}: E is undetermined at {report['undetermined_points']} of {report['points']} points"
     axes = ", ".join(f"{axis} {report[f'u_{axis}_max_um']:.3f} / {report[f'u_{axis}_rms_um']:.3f}" for axis in "xyz")
     together = f"{report['u_max_um']:.3f} / {report['u_rms_um']:.3f} um"
     return f"{title}: u of E, max / rms: {together}\n  by axis: {axes} um"
@@ -478,10 +478,10 @@ def trajectory_table(
 
 
 def visibility_table(visible: PlanVisibility) -> Group:
-    """Return what the plan can never see of the effects other than geometric errors, and which look alike."""
+    """Return which effects other than geometric errors the plan cannot show, and which look alike."""
     from compgen.effects.catalogue import separating
 
-    never = Table("what this plan can never see", "why", "measure in addition", box=box.SIMPLE)
+    never = Table("what this plan cannot show", "why", "measure in addition", box=box.SIMPLE)
     for (reason, breaker), names in _grouped(visible).items():
         never.add_row(", ".join(names), reason, breaker)
     alike = Table("look alike", "correlation", "measure in addition", box=box.SIMPLE)
@@ -496,7 +496,7 @@ def visibility_table(visible: PlanVisibility) -> Group:
 
 
 def _grouped(visible: PlanVisibility) -> dict[tuple[str, str], list[str]]:
-    """Effects that are not seen, by reason and by what would show them."""
+    """Return the effects that are not shown, by reason and by what would show them."""
     found: dict[tuple[str, str], list[str]] = {}
     for name, reason in visible.never.items():
         found.setdefault((reason.partition(":")[0], visible.cards[name].breaker), []).append(name)

@@ -1,6 +1,6 @@
 """Simulated interferometers: laser tracer, laser along axes (ISO 230-2), laser along diagonals (ISO 230-6).
 
-Each knows its settings in a scenario and turns true tool tips into readings with noise.
+Each has its settings in a scenario and turns true tool tips into readings with noise.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from compgen.simulate.trajectory import (
     with_temperatures,
 )
 
-# A simulated laser tracer: what its interferometer reads at each stop of the machine (Zha & Zhang 2024, eq. 12).
+# A simulated laser tracer: what its interferometer measures at each stop of the machine (Zha & Zhang 2024, eq. 12).
 
 
 MM_PER_M = 1e3
@@ -51,7 +51,7 @@ class LaserTracer:
     Parameters
     ----------
     stations : the stations; their names differ.
-    noise_um, noise_um_per_m : a and b of the standard deviation a + b L of a reading, L the distance in m.
+    noise_um, noise_um_per_m : a and b of the standard deviation a + b L of a reading at distance L in m.
     in_turn : False: all stations read at every stop; True: one tracer goes from station to station, and the machine
         repeats its whole trajectory for each.
     rate_hz : readings a second of each station while the machine moves, without stops; None reads at stops.
@@ -110,7 +110,7 @@ class LaserTracer:
 
 
 def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
-    """Read the ``[instrument]`` section of a scenario, its ``type`` taken already, strictly."""
+    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
     stations = tuple(toml_files.read_settings(Station, entry) for entry in section.sections("stations"))
     if not stations:
         one = toml_files.example_of(toml_files.section_schema(Station))
@@ -122,10 +122,10 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
     return toml_files.read_settings(LaserTracer, section, stations=stations)
 
 
-# A simulated laser along single axes: bidirectional runs as ISO 230-2 has them, ``*.axis.csv``.
+# A simulated laser along single axes: bidirectional runs as in ISO 230-2, ``*.axis.csv``.
 
 
-#: Targets lie this share of the travel inside its ends, so that both directions can approach them.
+#: Targets are this share of the travel inside its ends, so that both directions can approach them.
 OVERRUN = 0.02
 
 
@@ -137,7 +137,7 @@ def _axes(value: Any) -> tuple[int, ...]:
         or any(item not in AXES for item in value)
         or len(set(value)) < len(value)
     ):
-        raise ValueError("a list of different axes, e.g. ['X', 'Y'], is expected")
+        raise ValueError("expected a list of different axes, e.g. ['X', 'Y']")
     return tuple(AXES.index(letter) for letter in value)
 
 
@@ -155,17 +155,17 @@ def _dwells(value: Any) -> float | tuple[float, ...]:
 
 @dataclass(frozen=True)
 class AxisLaser:
-    """Runs to and fro along axes, one after another.
+    """Runs in both directions along axes, one after another.
 
     Parameters
     ----------
     axes : axes that are measured, 0, 1, 2.
     targets : targets of each axis, equally spaced over 96 % of its travel.
-    cycles : runs there and back of each axis.
+    cycles : forward and return runs of each axis.
     noise_um : standard deviation of a reading.
-    feed_mm_min, dwell_s : speed between targets and time at each; several dwells are those of the runs in turn, and are
-        logged.
-    at_mm : where the other axes are; None: the machine's reference point.
+    feed_mm_min, dwell_s : speed between targets and time at each; several dwells apply to the runs in turn, and are
+    logged.
+    at_mm : position of the other axes; None: the machine's reference point.
     """
 
     axes: tuple[int, ...] = setting(_axes, (0, 1, 2))
@@ -214,7 +214,7 @@ class AxisLaser:
         temperatures: Mapping[str, Temperature],
         rng: np.random.Generator,
     ) -> AxisRuns:
-        """Return the readings; ``tips`` tells where the tip really is at stops, ``effects`` act on readings alone."""
+        """Return the readings; ``tips`` returns the true tip at stops, ``effects`` act only on readings."""
         stops, mark = self.stops(machine)
         stops, axis = with_temperatures(stops, temperatures), mark[:, 0]
         deviation = along_beam(machine, tips, np.eye(3)[axis], stops, effects, "axis runs")
@@ -230,7 +230,7 @@ class AxisLaser:
 
 
 def stop_times_s(position_mm: FloatArray, feed_mm_min: float, dwell_s: float | FloatArray) -> FloatArray:
-    """Return the times (n,) at the stops (n, 3): travel at the feed from one to the next, and the dwell at each."""
+    """Return the times (n,) at the stops (n, 3): travel at the feed rate between them, and the dwell at each."""
     travel_mm = np.linalg.norm(np.diff(position_mm, axis=0, prepend=position_mm[:1]), axis=1)
     return np.asarray(np.cumsum(travel_mm / feed_mm_min * SECONDS_PER_MIN + dwell_s))
 
@@ -243,7 +243,7 @@ def along_beam(
     effects: Sequence[SimulatedEffect],
     what: str,
 ) -> FloatArray:
-    """Return how far the tip is along beams (n, 3) from where it was sent, with effects on the readings alone, (n,), mm."""
+    """Return the deviation of the tip along beams (n, 3), with effects on the readings, (n,), mm."""
     moved_mm = tips(stops) - stops.position_mm - np.array(machine.tool_offset_mm)
     deviation = np.einsum("ij,ij->i", moved_mm, unit)
     for effect in effects:
@@ -255,7 +255,7 @@ def along_beam(
 
 
 def logged_beside(stops: Stops) -> dict[str, FloatArray]:
-    """Return the columns that are written next to the readings: the time, the temperatures, and dwells that differ."""
+    """Return the columns written next to the readings: the time, the temperatures, and dwells that differ."""
     logged = {
         name: values for name, values in stops.covariates.items() if name.startswith("temp_") or name == "dwell_s"
     }
@@ -263,7 +263,7 @@ def logged_beside(stops: Stops) -> dict[str, FloatArray]:
 
 
 def read_axis_laser(section: toml_files.Section) -> AxisLaser:
-    """Read the ``[instrument]`` section of a scenario, its ``type`` taken already, strictly."""
+    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
     laser = toml_files.take_settings(AxisLaser, section)
     if isinstance(laser.dwell_s, tuple) and len(laser.dwell_s) != laser.cycles:
         raise section.fail(
@@ -284,23 +284,23 @@ def _names(value: Any) -> tuple[str, ...]:
         or any(item not in [*DIAGONALS] for item in value)
         or len(set(value)) < len(value)
     ):
-        raise ValueError(f"a list of different diagonals is expected, of {', '.join(DIAGONALS)}")
+        raise ValueError(f"expected a list of different diagonals, of {', '.join(DIAGONALS)}")
     return tuple(value)
 
 
 @dataclass(frozen=True)
 class DiagonalLaser:
-    """Runs to and fro along diagonals, one after another; the beam lies along the diagonal.
+    """Runs in both directions along diagonals, one after another; the beam is along the diagonal.
 
     Parameters
     ----------
-    diagonals : names of those that are measured; axes that do not move are at the machine's reference point.
+    diagonals : names of the measured diagonals; axes that do not move are at the machine's reference point.
     targets : targets of each diagonal, equally spaced.
-    cycles : runs there and back of each diagonal.
+    cycles : forward and return runs of each diagonal.
     noise_um : standard deviation of a reading.
     feed_mm_min, dwell_s : speed between targets and time at each.
-    inside : how far the first and last target lie inside the travel of each axis, as a share of it, so that both
-        directions can approach them.
+    inside : distance of the first and last target from the ends of the travel of each axis, as a share of it, so that
+        both directions can approach them.
     """
 
     diagonals: tuple[str, ...] = setting(_names, tuple(BODY_DIAGONALS))
@@ -360,7 +360,7 @@ class DiagonalLaser:
         temperatures: Mapping[str, Temperature],
         rng: np.random.Generator,
     ) -> Diagonals:
-        """Return the readings; ``tips`` tells where the tip really is at stops, ``effects`` act on readings alone."""
+        """Return the readings; ``tips`` returns the true tip at stops, ``effects`` act only on readings."""
         stops, names, mark = self.stops(machine)
         stops = with_temperatures(stops, temperatures)
         units = {name: self.unit(machine, name) for name in self.diagonals}
@@ -378,5 +378,5 @@ class DiagonalLaser:
 
 
 def read_diagonal_laser(section: toml_files.Section) -> DiagonalLaser:
-    """Read the ``[instrument]`` section of a scenario, its ``type`` taken already, strictly."""
+    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
     return toml_files.read_settings(DiagonalLaser, section)

@@ -76,7 +76,7 @@ from compgen.simulate.truth import (
     truth_schema,
 )
 
-# What an effect or an instrument of a plug-in must be; said when it is registered.
+# Requirements on an effect or an instrument of a plug-in; checked when it is registered.
 
 
 #: How the methods of an instrument are called.
@@ -91,7 +91,7 @@ def check_effect(name: str, thing: Any) -> tuple[Any, list[str]]:
 def check_instrument(name: str, thing: Any) -> tuple[Any, list[str]]:
     """A reader: takes the section ``[instrument]`` of a scenario and returns an object with passes and observe.
 
-    A class that the reader names as what it returns is looked at here, the object itself when a scenario is read.
+    A class in the return annotation of the reader is checked here, the object itself when a scenario is read.
     """
     problems = call_problem(thing, ["section"], f"its reader {_name_of(thing)}")
     if not problems:
@@ -105,7 +105,7 @@ def check_instrument(name: str, thing: Any) -> tuple[Any, list[str]]:
 
 
 def instrument_problems(thing: Any) -> list[str]:
-    """Say what an instrument, or its class, lacks."""
+    """Return what an instrument, or its class, lacks."""
     is_class = inspect.isclass(thing)
     name = thing.__name__ if is_class else type(thing).__name__
     known = {*dir(thing), *(getattr(thing, "__annotations__", {}) if is_class else ())}
@@ -124,7 +124,7 @@ def _name_of(thing: Any) -> str:
 
 
 class Instrument(Protocol):
-    """What every simulated instrument has; one with ``stations`` says where they truly are."""
+    """What every simulated instrument has; ``stations``, if any, have their true positions."""
 
     @property
     def passes(self) -> int:
@@ -148,7 +148,7 @@ INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
 @toml_files.accepts({"type": "string", "pattern": r"^[A-Za-z0-9][A-Za-z0-9._-]{0,80}$"})
 def _file_name(value: Any) -> str:
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,80}", value):
-        raise ValueError("a file name of letters, digits, '.', '_' and '-' without an ending is expected")
+        raise ValueError("expected a file name of letters, digits, '.', '_' and '-' without an ending")
     return value
 
 
@@ -201,7 +201,7 @@ class Scenario(Displayed):
 
 
 def read_scenario(path: str | Path) -> Scenario:
-    """Read a scenario TOML strictly, and the error file that it may name.
+    """Read a scenario TOML strictly, and its error file if it has one.
 
     Raises
     ------
@@ -243,10 +243,10 @@ def scenario_of(root: toml_files.Section, source: Path) -> Scenario:
     if isinstance(scenario.instrument, SimulatedSixDof):
         others, text = ("trajectory", "effects", "session", "temperatures"), "a six-DOF instrument runs along the axes"
     elif isinstance(scenario.instrument, LineLaser):
-        others, text = ("trajectory", "session"), "a laser along axes or diagonals runs to and fro along each"
+        others, text = ("trajectory", "session"), "a laser along axes or diagonals runs in both directions along each"
     for key in others:
         if key in root.data:
-            raise root.fail(key, f"belongs to other instruments; {text}")
+            raise root.fail(key, f"applies to other instruments; {text}")
     return scenario
 
 
@@ -259,13 +259,13 @@ ERROR_STREAM, NOISE_STREAM, ORDER_STREAM = 0, 1, 2
 
 @dataclass(frozen=True, repr=False)
 class Simulation(Displayed):
-    """The measurement of a virtual machine, and what is really true of it.
+    """The measurement of a virtual machine, and its truth.
 
     Parameters
     ----------
     name : beginning of the file names.
-    lengths : the readings, as a measurement file holds them.
-    truth : the true errors in mm and rad; its metadata name machine and seed.
+    lengths : the readings, as in a measurement file.
+    truth : the true errors in mm and rad; its metadata give machine and seed.
     stations : the true stations (none for an instrument without).
     """
 
@@ -293,18 +293,18 @@ class SimulatedReadings:
 
 
 def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Effect] = ()) -> FloatArray:
-    """Where the tool tip really is in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
+    """Return the true tool tip in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
     tip_mm = tip_position(machine, truth.at(stops.position_mm), stops.position_mm, stops.tool_mm)
     for effect in effects:
         moved_mm = np.asarray(effect(machine, stops))
-        if (  # the code of others may return anything
+        if (  # code of a plug-in may return anything
             moved_mm.shape != stops.position_mm.shape
             or moved_mm.dtype.kind not in "fi"
             or not np.all(np.isfinite(moved_mm))
         ):
             name = getattr(effect, "__qualname__", type(effect).__qualname__)
             wanted = f"an array {stops.position_mm.shape} of finite numbers in mm"
-            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; {wanted} is expected")
+            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; expected {wanted}")
         tip_mm = tip_mm + moved_mm.astype(np.float64)
     return tip_mm
 
@@ -316,11 +316,11 @@ def simulate(
 
     Parameters
     ----------
-    machine : chain, travel, nodes and modelled errors count.
+    machine : provides chain, travel, nodes and modelled errors.
     scenario : true errors, instrument and trajectory.
-    seed : takes the place of the scenario's. Errors and noise have separate random streams, so that changing
-        the one leaves the other.
-    effects : what acts besides the geometric errors and the effects of the scenario.
+    seed : replaces that of the scenario. Errors and noise have separate random streams, so that changing one leaves the
+    other unchanged.
+    effects : what acts in addition to the geometric errors and the effects of the scenario.
 
     Raises
     ------
@@ -384,10 +384,10 @@ def _stops(machine: Machine, scenario: Scenario, seeds: np.random.SeedSequence, 
 def _changed(
     lengths: Lengths, instrument: object, stops: Stops, tip_mm: FloatArray, effects: Sequence[LengthEffect]
 ) -> Lengths:
-    """Add what effects of tracers and air do to the lengths."""
+    """Add the effects of tracers and air to the lengths."""
     if not isinstance(instrument, LaserTracer):
         raise InputError(
-            f"{effects[0].name} acts on the lengths of a laser-tracer; this instrument has none of its kind"
+            f"{effects[0].name} acts on the lengths of a laser-tracer, which this instrument does not measure"
         )
     stop, station = instrument.rows(len(stops))
     places = np.array([item.position_mm for item in instrument.stations])
@@ -399,7 +399,7 @@ def _changed(
 
 @dataclass(frozen=True)
 class MovingSimulation:
-    """Readings of tracers while a virtual machine moves, made part by part as they are written, and its true errors.
+    """Readings of tracers while a virtual machine moves, generated in parts as they are written, and its true errors.
 
     ``name`` begins the file names, ``readings`` is their number, ``parts`` makes their columns.
     """
@@ -412,7 +412,7 @@ class MovingSimulation:
     parts: Callable[[], Iterator[dict[str, Any]]]
 
 
-#: Positions whose readings are made at a time.
+#: Positions per part.
 _PART = 50_000
 
 
@@ -422,16 +422,16 @@ def simulate_moving(machine: Machine, scenario: Scenario, seed: int | None = Non
     Raises
     ------
     InputError
-        if the trajectory leaves the travel, or for what belongs to stops: effects, temperatures, sessions, other tools.
+        if the trajectory leaves the travel, or for features of stops: effects, temperatures, sessions, other tools.
     """
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
     tracer, path = scenario.instrument, scenario.trajectory
     if not isinstance(tracer, LaserTracer) or tracer.rate_hz is None or tracer.in_turn:
-        message = "needs a laser-tracer with rate_hz whose stations read at once"
+        message = "needs a laser-tracer with rate_hz whose stations read simultaneously"
         raise InputError(message, file=scenario.source, field="[instrument]")
     if scenario.effects or scenario.temperatures or scenario.session or path.tools_mm:
-        message = "readings on the fly (rate_hz) have no effects, temperatures, sessions or tools of their own"
+        message = "readings on the fly (rate_hz) cannot be combined with effects, temperatures, sessions or other tools"
         raise InputError(message, file=scenario.source)
     truth = draw_truth(scenario.errors, machine, child_seeds(seeds, ERROR_STREAM), None)
     corners = np.concatenate(passes_of(path, machine))

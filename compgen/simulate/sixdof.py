@@ -34,12 +34,12 @@ from compgen.kinematics.exact_chain import tip_position
 
 # Exact vector ray tracer of the six-DOF instrument: refraction and reflection at planes, cube corner, prism, plate.
 #
-# Written from the geometry alone, not from the linear model; it takes the place of the ray tracing program of Jia et al. 2022.
+# Written from the geometry alone, not from the linear model; it replaces the ray tracing program of Jia et al. 2022.
 #
-# Frame of the unit: beam 1 leaves along +x on y = z = 0, beam 2 at y = -h; the detectors lie in the exit plane.
-# X: the beam goes straight on, the front face of the target is at x = L. Y: prism 1 with entrance face x = -b/2,
-# reflector y = x, exit face y = b/2. Z: prism 2 reflects on its outside at z = x. Front faces at b/2 + L behind a prism.
-# A beam along the negative axis is the same picture after half a turn about the vertical direction.
+# Frame of the unit: beam 1 leaves along +x on y = z = 0, beam 2 at y = -h; the detectors are in the exit plane. X: the
+# beam goes straight on, the front face of the target is at x = L. Y: prism 1 with entrance face x = -b/2, reflector y =
+# x, exit face y = b/2. Z: prism 2 reflects on its outside at z = x. Front faces at b/2 + L behind a prism. A beam along
+# the negative axis is the same layout after half a turn about the vertical direction.
 
 
 X, Y, Z = np.eye(3)
@@ -53,7 +53,7 @@ class RigidPose:
     shift_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def __matmul__(self, inner: RigidPose) -> RigidPose:
-        """First ``inner``, then this one."""
+        """Apply ``inner`` first, then this one."""
         return RigidPose(self.turn @ inner.turn, self.turn @ inner.shift_mm + self.shift_mm)
 
     def inverse(self) -> RigidPose:
@@ -61,7 +61,7 @@ class RigidPose:
         return RigidPose(self.turn.T, -self.turn.T @ self.shift_mm)
 
     def about(self, pivot_mm: FloatArray) -> RigidPose:
-        """The same turn about ``pivot_mm``."""
+        """Return the same rotation about ``pivot_mm``."""
         return RigidPose(self.turn, self.shift_mm + pivot_mm - self.turn @ pivot_mm)
 
 
@@ -96,29 +96,29 @@ class OpticalPlane:
     normal: FloatArray
 
     def placed(self, pose: RigidPose) -> OpticalPlane:
-        """The plane moved by ``pose``."""
+        """Return the plane moved by ``pose``."""
         return OpticalPlane(pose.turn @ self.point_mm + pose.shift_mm, pose.turn @ self.normal)
 
     def turned(self, vector_rad: FloatArray) -> OpticalPlane:
-        """The plane turned about its own point."""
+        """Return the plane rotated about its point."""
         return OpticalPlane(self.point_mm, rotation(vector_rad) @ self.normal)
 
 
 def _advance(ray: Ray, plane: OpticalPlane, index: float) -> Ray:
-    """Go along the ray to the plane, through a medium of refractive ``index``."""
+    """Propagate to the plane, through a medium of refractive ``index``."""
     distance = float((plane.point_mm - ray.point_mm) @ plane.normal / (ray.direction @ plane.normal))
     return Ray(ray.point_mm + distance * ray.direction, ray.direction, ray.path_mm + index * distance)
 
 
 def reflect(ray: Ray, plane: OpticalPlane, index: float = 1.0) -> Ray:
-    """Go to the plane in a medium of ``index`` and reflect."""
+    """Propagate to the plane in a medium of ``index`` and reflect."""
     there = _advance(ray, plane, index)
     direction = there.direction - 2.0 * (there.direction @ plane.normal) * plane.normal
     return Ray(there.point_mm, direction, there.path_mm)
 
 
 def refract(ray: Ray, plane: OpticalPlane, before: float, after: float) -> Ray:
-    """Go to the plane in a medium of index ``before`` and refract into one of index ``after`` (Snell, as vectors)."""
+    """Propagate to the plane in a medium of index ``before`` and refract into one of index ``after`` (Snell, as vectors)."""
     there = _advance(ray, plane, before)
     cosine = float(there.direction @ plane.normal)
     normal = plane.normal if cosine > 0 else -plane.normal
@@ -129,7 +129,7 @@ def refract(ray: Ray, plane: OpticalPlane, before: float, after: float) -> Ray:
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where things are for one axis, before any error.
+    """Nominal layout for one axis.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ class Tracer:
         self.half_turn = np.eye(3)
         if beam_direction < 0:
             self.half_turn = 2.0 * np.outer(np.eye(3)[DIRECTIONS[axis][2]], np.eye(3)[DIRECTIONS[axis][2]]) - np.eye(3)
-        self.values = {}  # in the frame of the picture: machine axes after the half turn; beam tilts by their channel
+        self.values = {}  # in the frame of the layout: machine axes after the half turn; beam tilts by their channel
         for name, value in (systematics or {}).items():
             rest = name.partition("_")[2]
             if rest.startswith("PE"):
@@ -189,7 +189,7 @@ class Tracer:
         self._out, self._back = self._prism(self.values)
 
     def _prism(self, values: Mapping[str, float]) -> tuple[BeamPath, BeamPath]:
-        """The way from unit to target and back through the prism of the axis."""
+        """The path from unit to target and back through the prism of the axis."""
         axis, n = self.geometry.axis, self.optics.glass_index
         half = 0.5 * self.optics.prism_leg_mm
         pose = _pose(values, "ir").about(np.array([-half, 0.0, 0.0]))
@@ -239,8 +239,8 @@ class Tracer:
         delta_mm, eps_rad : motion errors of the moving body in machine axes, each (3,): of the target about the front
             centre of its first cube corner (mode 1), of unit and prism about the point where beam 1 meets the
             reflector (X: the exit point) (mode 2).
-        drift_rad : tilt of both beams toward unit +y and +z, as the channels are read.
-        travel_mm : travel of the moving body from where L holds, along the beam.
+        drift_rad : tilt of both beams toward unit +y and +z, as in the channels.
+        travel_mm : travel of the moving body from the position of L, along the beam.
         """
         optics, geometry = self.optics, self.geometry
         pose = self._target(travel_mm, distance_mm, np.asarray(delta_mm), np.asarray(eps_rad))
@@ -271,7 +271,7 @@ class Tracer:
         return Ray(point, direction / np.linalg.norm(direction))
 
     def _spot(self, ray: Ray, pose: RigidPose, number: int, offset: float = 0.0) -> tuple[FloatArray, float]:
-        """Spot (y, z) of the beam that cube corner ``number`` returns, and the whole optical path."""
+        """Spot (y, z) of the beam that cube corner ``number`` returns, and the total optical path."""
         n = self.optics.glass_index
         # front plane of the plate, and the three mirrors that meet at the apex behind it, ``offset`` from beam 1
         across = np.eye(3)[DIRECTIONS[self.geometry.axis][1]]
@@ -288,7 +288,7 @@ class Tracer:
         return end.point_mm[1:] - np.array([offset, 0.0]), end.path_mm
 
 
-#: Three perpendicular unit normals, one a row, all inclined alike to +x.
+#: Three perpendicular unit normals, one a row, all at the same angle to +x.
 _DIAGONAL, _ACROSS = np.ones(3) / np.sqrt(3.0), np.array([1.0, -1.0, 0.0]) / np.sqrt(2.0)
 _TRIAD = np.column_stack([_DIAGONAL, _ACROSS, np.cross(_DIAGONAL, _ACROSS)])
 
@@ -305,7 +305,7 @@ def tool_pose(machine: Machine, truth: ErrorTable, position_mm: FloatArray) -> t
 
 
 def run_positions(machine: Machine, instrument: SixDofInstrument, axis: int, along_mm: FloatArray) -> FloatArray:
-    """Positions of all axes while ``axis`` goes to ``along_mm`` (n,), shape (n, 3)."""
+    """Return the positions of all axes while ``axis`` moves to ``along_mm`` (n,), shape (n, 3)."""
     position = np.tile(np.array(instrument.axes[axis].position_mm or (0.0, 0.0, 0.0)), (len(along_mm), 1))
     position[:, axis] = along_mm
     return position
@@ -323,15 +323,15 @@ def run_signals(
 ) -> FloatArray:
     """Signals (n, 7) of one run, in mm and in the order of SIGNALS; the interferometer's with its travel.
 
-    Chain and mode say where unit and target are. The one on the workpiece does not move in the workpiece frame; the one
-    at the tool has the offset ``target_offset_mm`` (the target's front centre, or the unit's reference point).
+    Chain and mode determine where unit and target are. The one on the workpiece does not move in the workpiece frame;
+    the one at the tool has the offset ``target_offset_mm`` (the target's front centre, or the unit's reference point).
 
     Parameters
     ----------
     along_mm : commanded positions of the axis, (n,).
     drift_rad : tilt of the beams toward unit +y, +z, (n, 2); None for no drift.
-    first_mm : where ``distance_first_mm`` holds, default the first position.
-    scatter : what moves the body at the tool further, translations in mm and rotations in rad, (n, 6).
+    first_mm : position of ``distance_first_mm``; default: the first position.
+    scatter : additional motion of the body at the tool, translations in mm and rotations in rad, (n, 6).
     """
     from scipy.spatial.transform import Rotation  # imported here: slow to load, and few commands simulate
 
@@ -361,10 +361,10 @@ def run_signals(
     )
 
 
-# A simulated measurement with the six-DOF instrument: runs along every axis, noise, drift, and what is not calibrated.
+# A simulated measurement with the six-DOF instrument: runs along every axis, noise, drift, and uncalibrated parameters.
 
 
-#: The largest over 17 positions of the half ranges of 3 runs is on average so many standard deviations of a reading.
+#: Mean of the largest half range of 3 runs over 17 positions, in standard deviations of a reading.
 HALF_RANGE = 1.75
 #: Half ranges of X, Y, Z in Table 3 of Jia et al. 2022 in the order of ROLES: um, um, um, arcsec, arcsec, arcsec.
 TABLE_3 = (
@@ -394,10 +394,10 @@ def _positions(value: Any) -> tuple[float, ...]:
     if not isinstance(value, dict):
         return toml_files.ascending(value)
     if set(value) != set(_SPAN):
-        raise ValueError("a list of positions, or { from = .., to = .., step = .. }, is expected")
+        raise ValueError("expected a list of positions, or { from = .., to = .., step = .. }")
     low, high, step = (toml_files.number(value[key]) for key in _SPAN)
     if not (high > low and step > 0 and (high - low) / step < 10000):
-        raise ValueError("from below to, and a step above zero, are expected")
+        raise ValueError("expected from below to, and a step above zero")
     return tuple((low + step * np.arange(int(np.floor((high - low) / step + 1e-9)) + 1)).tolist())
 
 
@@ -407,14 +407,14 @@ class SimulatedSixDof:
 
     Parameters
     ----------
-    instrument : constants, set-up and calibrated parameters, as the instrument file has them.
-    uncalibrated : parameters that the instrument has as well, but the instrument file does not contain, mm and rad.
-    runs, there_and_back : how often each axis is run, and whether each run comes back.
+    instrument : constants, set-up and calibrated parameters, as in the instrument file.
+    uncalibrated : further parameters of the instrument that the instrument file does not contain, mm and rad.
+    runs, there_and_back : number of runs of each axis, and whether each run returns.
     positions_mm : target positions by axis; None takes the machine's nodes.
-    scatter : standard deviation of each reading by axis in the order of ROLES, (3, 6), mm and rad: the machine does not
-        come to the same place.
+    scatter : standard deviation of each reading by axis in the order of ROLES, (3, 6), mm and rad: repeatability of the
+        machine.
     noise_mm : standard deviation of the signals in the order of SIGNALS, then of the two of the drift monitor, (9,).
-    drift_rad : standard deviation of the step that the tilt of the beam takes from reading to reading, rad.
+    drift_rad : standard deviation of the change of beam tilt from reading to reading, rad.
     reversal_mm : reversal value of each axis.
     seconds : time between readings.
     """
@@ -439,7 +439,7 @@ class SimulatedSixDof:
 
     @property
     def true_instrument(self) -> SixDofInstrument:
-        """The instrument as it really is."""
+        """The true instrument."""
         axes = {}
         for k, entry in self.instrument.axes.items():
             names = dict.fromkeys([*entry.systematics, *(n for n in self.uncalibrated if n in known_systematics(k))])
@@ -448,7 +448,7 @@ class SimulatedSixDof:
         return replace(self.instrument, axes=axes)
 
     def measure(self, machine: Machine, truth: ErrorTable, rng: np.random.Generator) -> SixDof:
-        """Return what the instrument reads on the exactly moved machine, all axes and runs one after another."""
+        """Return the readings on the exactly moved machine, all axes and runs one after another."""
         blocks: list[tuple[NDArray[Any], ...]] = []
         tilt = np.zeros(2)
         for axis in sorted(self.instrument.axes):
@@ -475,7 +475,7 @@ class SimulatedSixDof:
         low, high = machine.axes[axis].range_mm
         if there.min() < low - 1e-9 or there.max() > high + 1e-9:
             raise InputError(
-                f"positions from {there.min():g} to {there.max():g} mm leave the travel of {AXES[axis]}, {low:g} to {high:g} mm",
+                f"positions from {there.min():g} to {there.max():g} mm exceed the travel of {AXES[axis]}, {low:g} to {high:g} mm",
                 field=f"[instrument.positions_mm] {AXES[axis]}",
             )
         if not self.there_and_back:
@@ -498,7 +498,7 @@ class SimulatedSixDof:
 
 
 def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
-    """Read the ``[instrument]`` section of a scenario of type ``sixdof``, its type taken already, strictly."""
+    """Read the ``[instrument]`` section of a scenario of type ``sixdof``, without its type, strictly."""
     path = section.file("file")
     if path is None:
         raise section.fail("file", "is missing; give the instrument TOML, relative to the scenario")
@@ -537,7 +537,7 @@ def _sizes_schema(keys: Iterable[str]) -> dict[str, Any]:
 
 
 def _noise(section: toml_files.Section, instrument: SixDofInstrument) -> FloatArray:
-    """Standard deviations (9,) of the signals: given ones, else those of the instrument file."""
+    """Return standard deviations (9,) of the signals: the given ones, otherwise those of the instrument file."""
     result = np.zeros(9)
     for key, places in _NOISE.items():
         stated = instrument.noise.get(key.removesuffix("_um"), 0.0) / MM_PER_UM

@@ -1,6 +1,6 @@
-"""Which points the machine visits, in which order and when: passes over a grid, or sessions of many runs.
+"""The points that the machine visits, with order and time: passes over a grid, or sessions of many runs.
 
-A :class:`Trajectory` gives the points, a :class:`Session` repeats its lines under several loads and feeds; both end as
+A :class:`Trajectory` gives the points, a :class:`Session` repeats its lines under several loads and feeds; both yield
 :class:`Stops` in order of time, with the temperatures there.
 """
 
@@ -23,10 +23,10 @@ from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.simulate.truth import counts
 
-# The trajectory of a simulated measurement: which points the machine visits, in which order and when.
+# The trajectory of a simulated measurement: the points that the machine visits, with order and time.
 
 
-#: Decimals of commanded positions in mm: 0.1 um, no finer than a lengths file keeps, so that writing loses nothing.
+#: Decimals of commanded positions in mm: 0.1 um, no finer than in a lengths file, so that writing loses nothing.
 POSITION_DECIMALS = 4
 
 Levels = tuple[FloatArray, FloatArray, FloatArray]
@@ -45,7 +45,7 @@ class Line:
 def _tools(value: Any) -> tuple[Vector3, ...]:
     tools = toml_files.vectors3(value)
     if len(set(tools)) != len(tools):
-        raise ValueError("each tool offset may be given once")
+        raise ValueError("each tool offset may be given only once")
     return tools
 
 
@@ -57,12 +57,12 @@ class Trajectory:
     ----------
     kind : ``grid``, ``frame`` (the 12 edges of the grid's box), ``faces`` (its 6 faces) or ``lines``.
     counts : number of equally spaced levels of X, Y, Z over the travel, or None.
-    levels_mm : explicit levels of X, Y, Z in mm; None for an axis takes ``counts``, else the machine's nodes.
+    levels_mm : explicit levels of X, Y, Z in mm; None for an axis means ``counts``, otherwise the machine's nodes.
     lines : the lines of kind ``lines``.
     there_and_back : whether each pass is repeated in reverse order.
-    tools_mm : tool offsets, each of which makes a separate pass; empty: the machine's own tool.
-    feed_mm_min, dwell_s : path speed between points and time of standing at each.
-    start_mm : where the machine comes from; default the machine's reference point.
+    tools_mm : tool offsets, each with a separate pass; empty: the tool of the machine file.
+    feed_mm_min, dwell_s : path speed between points and dwell at each.
+    start_mm : where the machine starts; default: the machine's reference point.
     """
 
     kind: str = part_setting(lambda: {"enum": [*BLOCKS, "lines"], "default": "grid"}, "grid", key="type")
@@ -90,10 +90,10 @@ class Stops:
     run : 1 there, 2 back, shape (n,).
     time_s : time of reading since the first stop began, shape (n,).
     approach : last direction of travel of each axis, +1, -1 or 0 while it has not moved, shape (n, 3).
-    tool_mm : tool offset at each stop, shape (n, 3), or None for the machine's own.
-    covariates : further numbers by column name (feed_mm_min, load_kg, temp_<name>_c), each (n,).
-    labels : further whole numbers by column name (line, repeat, block, setup), each (n,).
-    way_mm : motion from the stop before, shape (n, 3); of the first from where the machine came.
+    tool_mm : tool offset at each stop, shape (n, 3), or None for that of the machine file.
+    covariates : other numbers by column name (feed_mm_min, load_kg, temp_<name>_c), each (n,).
+    labels : other whole numbers by column name (line, repeat, block, setup), each (n,).
+    way_mm : motion from the previous stop, shape (n, 3); for the first from the start.
     """
 
     position_mm: FloatArray
@@ -142,7 +142,7 @@ def read_trajectory(section: toml_files.Section) -> Trajectory:
 
 
 def serpentine(levels: Sequence[FloatArray]) -> FloatArray:
-    """All points of a grid, X fastest, every line against the one before: shape (n, 3); no move but to a neighbour."""
+    """All points of a grid, X fastest, every line opposite to the one before: shape (n, 3); all moves are to neighbours."""
     x, y, z = levels
     rows = []
     for plane, height in enumerate(z):
@@ -177,12 +177,12 @@ def _faces(levels: Levels) -> list[FloatArray]:
     return faces
 
 
-#: Trajectory types made from the levels of the three axes: blocks of points that are visited one after another.
+#: Trajectory types made from the levels of the three axes: blocks of points visited one after another.
 BLOCKS: dict[str, Callable[[Levels], list[FloatArray]]] = {"grid": _grid, "frame": _frame, "faces": _faces}
 
 
 def trajectory_points(trajectory: Trajectory, machine: Machine) -> FloatArray:
-    """Points of one pass in order, shape (n, 3), mm, to 0.1 um; a point is not visited twice in succession."""
+    """Points of one pass in order, shape (n, 3), mm, to 0.1 um; no point occurs twice in succession."""
     if trajectory.kind == "lines":
         blocks = [np.linspace(line.from_mm, line.to_mm, line.points) for line in trajectory.lines]
     else:
@@ -207,7 +207,7 @@ def plan_stops(trajectory: Trajectory, machine: Machine, repeats: int = 1) -> St
     Raises
     ------
     InputError
-        if a point lies outside the machine's travel.
+        if a point is outside the machine's travel.
     """
     passes = passes_of(trajectory, machine)
     there = passes[0]
@@ -242,14 +242,14 @@ def check_stops(points: FloatArray, machine: Machine) -> None:
         row, axis = np.argwhere(outside)[0]
         low, high = machine.axes[axis].range_mm
         raise InputError(
-            f"{AXES[axis]} = {points[row, axis]:g} mm lies outside the travel {low:g} ... {high:g} mm of "
+            f"{AXES[axis]} = {points[row, axis]:g} mm is outside the travel {low:g} ... {high:g} mm of "
             f"{machine.name}; choose levels within it",
             field="[trajectory]",
         )
 
 
 def label_points(position_mm: FloatArray) -> tuple[str, ...]:
-    """Number the points in the order in which they first come; equal positions have equal labels."""
+    """Number the points in order of first occurrence; equal positions have equal labels."""
     numbers: dict[tuple[float, ...], int] = {}
     order = [numbers.setdefault(tuple(row), len(numbers) + 1) for row in position_mm.tolist()]
     width = max(4, len(str(len(numbers))))
@@ -264,11 +264,10 @@ def _times(moves: FloatArray, trajectory: Trajectory) -> FloatArray:
 
 # A measurement session of runs: every line at several loads and feeds, repeated, in random order, with temperatures.
 #
-# A session labels its readings (line, repeat, run, block, setup) and logs feed, load and temperatures, as a diagnosis
-# needs them.
+# A session labels its readings (line, repeat, run, block, setup) and logs feed, load and temperatures for a diagnosis.
 
 
-#: Lead-in before the first stop of a run, as a share of the way to the second.
+#: Lead-in before the first stop of a run, as a share of the distance to the second.
 LEAD_IN = 0.05
 
 
@@ -277,7 +276,7 @@ def _different(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ..
     def conditions(value: Any) -> tuple[float, ...]:
         items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
         if not items or len(set(items)) != len(items):
-            raise ValueError("a list of different numbers that are not negative is expected")
+            raise ValueError("expected a list of different numbers that are not negative")
         return tuple(check(item) for item in items)
 
     return conditions
@@ -285,12 +284,13 @@ def _different(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ..
 
 @dataclass(frozen=True)
 class Session:
-    """How often and under which conditions the lines are run.
+    """Number and conditions of the runs of each line.
 
     Parameters
     ----------
     repeats : runs of every line under equal conditions.
-    loads_kg, feeds_mm_min : conditions, each of which every line is run at; empty: no load logged, the trajectory's feed.
+    loads_kg, feeds_mm_min : conditions under each of which every line is run; empty: no load logged, feed of the
+        trajectory.
     shuffled : random order of the runs within each set-up.
     jitter : largest shift of each point along its line, as a share of the line's length; the same in repeats.
     """
@@ -338,7 +338,7 @@ def plan_session(
     Raises
     ------
     InputError
-        if a point lies outside the machine's travel.
+        if a point is outside the machine's travel.
     """
     lines = []
     for line in _lines(trajectory, machine):
@@ -363,7 +363,7 @@ def plan_session(
 
 
 def _lines(trajectory: Trajectory, machine: Machine) -> list[FloatArray]:
-    """Lines one after another, each also backwards where the trajectory goes there and back; other kinds are one line."""
+    """Return the lines in sequence, each also backwards if the trajectory returns; other kinds are one line."""
     if trajectory.kind != "lines":
         return passes_of(trajectory, machine)
     there = [np.linspace(line.from_mm, line.to_mm, line.points) for line in trajectory.lines]
@@ -404,7 +404,7 @@ def _ways(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Last motion to each stop (n, 3), last directions (n, 3) and distance travelled since the stop before (n,).
 
-    Every run is begun from a lead-in before its first stop, so that this is approached like the others.
+    Every run starts from a lead-in before its first stop, so that this is approached like the others.
     """
     first = np.cumsum(counts) - counts
     follow = np.minimum(first + 1, first + counts - 1)

@@ -1,4 +1,4 @@
-"""The truth of a simulation: error curves that are given, read from a file, or drawn at random and smooth."""
+"""The truth of a simulation: error curves given, read from a file, or drawn at random and smooth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from compgen.data.names import (
 )
 from compgen.kinematics import modelled_errors
 
-#: Number of harmonics in a drawn curve; harmonic k bends k half-waves into the travel.
+#: Number of harmonics in a drawn curve; harmonic k has k half-waves over the travel.
 HARMONICS = 3
 
 PeakRange = tuple[float, float]
@@ -34,7 +34,7 @@ PeakRange = tuple[float, float]
 def _peak_range(value: Any) -> PeakRange:
     items = toml_files.numbers(value)
     if len(items) != 2 or not 0 <= items[0] <= items[1]:
-        raise ValueError("two numbers [smallest, largest], not negative and in this order, are expected")
+        raise ValueError("expected two numbers [smallest, largest], not negative and in this order")
     return items[0], items[1]
 
 
@@ -53,7 +53,7 @@ def counts(value: Any) -> tuple[int, int, int]:
     """One whole number for all three axes, or three for X, Y and Z, each at least 2 (a check for TOML values)."""
     items = value if isinstance(value, list) else [value] * 3
     if len(items) != 3:
-        raise ValueError("a whole number, or three for X, Y and Z, is expected")
+        raise ValueError("expected a whole number, or three for X, Y and Z")
     x, y, z = (_COUNT(item) for item in items)
     return x, y, z
 
@@ -66,7 +66,7 @@ def _peak(key: str, unit: float, meaning: str) -> Any:
 class RandomErrors:
     """How errors are drawn: the peak of each one is uniform within its range, in mm or rad.
 
-    ``nodes`` gives the number of nodes of the curves on X, Y, Z; None takes the machine's nodes.
+    ``nodes`` gives the number of nodes of the curves on X, Y, Z; None means the machine's nodes.
     """
 
     linear_peak_mm: PeakRange = _peak(
@@ -83,12 +83,12 @@ class RandomErrors:
 
 @dataclass(frozen=True)
 class TruthPlan:
-    """Where the true errors come from; what is ``given`` wins over what is drawn or in the file.
+    """Source of the true errors; ``given`` ones take precedence over drawn ones and over the file.
 
     Parameters
     ----------
     given : curves and squareness errors of the scenario, or of the file it names.
-    random : how the errors of the machine's model that are not given are drawn; None leaves them zero.
+    random : how the other errors of the machine's model are drawn; None leaves them zero.
     """
 
     given: ErrorTable = field(default_factory=ErrorTable)
@@ -122,17 +122,17 @@ def truth_schema() -> dict[str, Any]:
 
 
 def read_truth_plan(section: toml_files.Section, folder: Path) -> TruthPlan:
-    """Read the ``[errors]`` section of a scenario; a relative ``file`` counts from ``folder``.
+    """Read the ``[errors]`` section of a scenario; a relative ``file`` is relative to ``folder``.
 
     Raises
     ------
     InputError
-        for unknown keys or errors, a unit that does not fit the error, a file together with random errors.
+        for unknown keys or errors, a unit that does not match the error, a file together with random errors.
     """
     file = section.take("file", toml_files.text, None)
     drawn = section.take("random", toml_files.flag, file is None)
     if file is not None and drawn:
-        raise section.fail("random", "errors come from a file already; give either file or random = true")
+        raise section.fail("random", "the errors already come from a file; give either file or random = true")
     table = read_errors(folder / file) if file is not None else ErrorTable()
     random = toml_files.take_settings(RandomErrors, section) if drawn else None
     curves: dict[str, Curve] = {}
@@ -164,14 +164,14 @@ def _read_curve(entry: toml_files.Section, error: ErrorName) -> Curve:
 @toml_files.accepts({"enum": list(CURVE_NAMES)})
 def _curve_name(value: Any) -> str:
     if value in SQUARENESS_NAMES:
-        raise ValueError("a squareness error is a constant; it belongs in [errors.squareness_urad]")
+        raise ValueError("a squareness error is a constant; give it in [errors.squareness_urad]")
     if value not in CURVE_NAMES:
-        raise ValueError(f"the name of one of the 18 error curves is expected; {nearest(str(value), CURVE_NAMES)}")
+        raise ValueError(f"expected the name of one of the 18 error curves; {nearest(str(value), CURVE_NAMES)}")
     return str(value)
 
 
 def child_seeds(seeds: np.random.SeedSequence, index: int) -> np.random.SeedSequence:
-    """Return child ``index`` of ``seeds``, always the same one (``spawn`` would go on counting)."""
+    """Return child ``index`` of ``seeds``, always the same one (``spawn`` would continue counting)."""
     return np.random.SeedSequence(seeds.entropy, spawn_key=(*seeds.spawn_key, index))
 
 
@@ -185,14 +185,14 @@ def draw_truth(
 ) -> ErrorTable:
     """Return the true errors of ``machine`` in mm and rad.
 
-    Every error has its own random stream, so giving one of them leaves the others as they were.
+    Every error has its own random stream, so giving one of them leaves the others unchanged.
 
     Parameters
     ----------
-    plan : what is given and how the rest is drawn.
-    machine : its nodes, reference point and modelled errors count.
+    plan : the given errors and how the rest is drawn.
+    machine : provides nodes, reference point and modelled errors.
     seeds : parent of the 21 random streams, one for each error by its place among the 21.
-    tools_mm : the tool offsets that will be used, shape (k, 3); they decide which errors the model contains.
+    tools_mm : the tool offsets in use, shape (k, 3); they determine which errors the model contains.
     """
     curves, squareness = dict(plan.given.curves), dict(plan.given.squareness)
     if plan.random is None:
@@ -210,8 +210,8 @@ def draw_truth(
 def draw_curve(error: ErrorName, machine: Machine, random: RandomErrors, rng: np.random.Generator) -> Curve:
     """Draw one smooth curve whose largest absolute node value is uniform in the peak range of its kind.
 
-    It keeps the gauge of the model: a straightness is zero at both ends of its nodes (a sum of sines), positioning
-    and angles are zero at the machine's reference point (a slope and cosines, less their value there).
+    It keeps the gauge of the model: a straightness is zero at both ends of its nodes (a sum of sines), positioning and
+    angles are zero at the machine's reference point (a slope and cosines, minus their value there).
     """
     axis = machine.axes[error.axis]
     nodes_mm = axis.nodes_mm if random.nodes is None else np.linspace(*axis.range_mm, random.nodes[error.axis])

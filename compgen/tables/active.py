@@ -1,4 +1,4 @@
-"""A table was active during the measurement: its effect is removed, or the old and the new table become one."""
+"""A table was active during the measurement: its effect is removed, or the old and the new table are merged into one."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from compgen.tables.judge import node_positions
 from compgen.tables.synthesis import Projector, projector
 from compgen.tables.verification import ReadTables, read_tables, table_files
 
-# Double compensation: a table was active while the machine was measured, and its effect is taken out.
+# Double compensation: a table was active during the measurement, and its effect is removed.
 #
-# With the correction c of the active table the machine that was commanded to p was where the bare one is at the
-# command q = p + c(p). So readings are identified at q. Errors M that were identified without regard to the table, and
-# those of the bare machine P, belong together by
+# With the correction c of the active table, a machine commanded to p was where the bare machine is at the command q = p
+# + c(p), so readings are identified at q. Errors M that were identified without regard to the table, and the errors P
+# of the bare machine, are related by
 #
 #     e(q; P) + c(p) = e(p; M)
 #
-# with the exact error e; this is solved for P by least squares over the volume, repeated until nothing changes.
+# with the exact error e; this is solved for P by least squares over the volume, repeated until it converges.
 
 
 Measurement = Lengths | Deviations
 
-#: A larger correction is not a compensation but a wrong table or a wrong unit, mm.
+#: A larger correction means a wrong table or a wrong unit, mm.
 LARGEST_CORRECTION_MM = 20.0
-#: The fixed point is reached when the errors move the tool by less than this, mm.
+#: The iteration has converged when the errors change the tip by less than this, mm.
 CONVERGED_MM = 1e-9
 MOST_PASSES = 30
 
@@ -57,7 +57,7 @@ class ActiveTables:
 
     @property
     def names(self) -> str:
-        """Names of the files, for the comments of a file."""
+        """Return the names of the files, for comments."""
         return ", ".join(name for name, _ in self.tables.files)
 
     @property
@@ -66,7 +66,7 @@ class ActiveTables:
         return self.tables.controller.name
 
     def correction(self, machine: Machine, points: Points) -> FloatArray:
-        """Return what they added to the commands, shape (n, 3), mm; InputError for what cannot be a compensation."""
+        """Return what they added to the commands, shape (n, 3), mm; InputError if too large for a compensation."""
         added = self.tables.correction(machine, points)
         largest = float(np.max(np.abs(added), initial=0.0))
         if largest > LARGEST_CORRECTION_MM:
@@ -87,9 +87,9 @@ class ActiveTables:
 
 
 def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) -> ActiveTables:
-    """Parse tables that were active while the machine was measured; InputError as :func:`read_tables` has it.
+    """Parse tables that were active while the machine was measured; raises InputError like :func:`read_tables`.
 
-    What reading assumed or kept apart is a CompgenWarning: the file of a control holds more than these tables.
+    What reading assumed or kept apart is a CompgenWarning: the file of a control contains more than these tables.
     """
     files = table_files(paths, controller)
     tables = read_tables(machine, files, controller, foreign=True)
@@ -99,9 +99,9 @@ def read_active(machine: Machine, paths: Sequence[str | Path], controller: str) 
 
 
 def keeping_others(machine: Machine, targets: Sequence[str], active: ActiveTables) -> Machine:
-    """Return the machine with settings that keep what the active files hold of other axes, for the controls ``targets``.
+    """Return the machine with settings that keep what the active files contain of other axes, for controls ``targets``.
 
-    What is kept is a CompgenWarning; a machine file that sees to it already is returned as it is.
+    A CompgenWarning says what is kept; a machine whose file already does so is returned unchanged.
     """
     read = active.tables
     found = read.controller.keeping_others(read.tables, active.paths)
@@ -110,7 +110,7 @@ def keeping_others(machine: Machine, targets: Sequence[str], active: ActiveTable
             machine = machine.with_setting(name, key, value)
             shown = [Path(part).name for part in value] if key == "style_from" and isinstance(value, list) else value
             shown = Path(shown).name if isinstance(shown, str) else shown
-            text = f"{name}: what --active shows of other axes is kept, as {key} = {shown} in the machine file would do"
+            text = f"{name}: the entries of other axes in the --active file are kept, as with {key} = {shown} in the machine file"
             warnings.warn(text, CompgenWarning, stacklevel=2)
     return machine
 
@@ -120,9 +120,9 @@ def without_active(
 ) -> tuple[Machine, Measurement, dict[str, object]]:
     """Return machine, measurement and report as if the bare machine had been measured; exact, nothing is fitted.
 
-    The commanded positions become p + c(p), what the axes were really told; deviations then count from there. The
-    travel of the returned machine is wider where a corrected position lies outside; its nodes and thereby the curves
-    stay.
+    The commanded positions become p + c(p), the actual commands of the axes; deviations refer to these. The travel of
+    the returned machine is wider if a corrected position is outside; its nodes, and therefore the curves, are
+    unchanged.
     """
     # Commanded positions outside the travel are refused before the tables widen it.
     check_travel(machine, measurement.position_mm, measurement.origin)
@@ -155,14 +155,15 @@ def bare_errors(
     machine : the machine.
     errors : of the machine with its active tables, mm and rad.
     active : these tables.
-    keep_nodes : True to give the curves the nodes of the active tables as well, so that nothing of a finer table is
-        lost; the default keeps to where the machine was measured.
+    keep_nodes : True to add the nodes of the active tables to the curves, so that a finer table loses nothing; by
+        default only the nodes of the measured errors.
 
     Returns
     -------
     The errors, with the uncertainties of ``errors`` (a table's numbers are exact), and the largest displacement in um
-    that the returned errors do not express: a correction that belongs to no error of the chain, or what a finer table
-    does between the nodes. The frame stays: what the table moved at the reference point is a constant in the curves.
+    that the returned errors do not express: a correction that corresponds to no error of the chain, or what a finer
+    table does between the nodes. The frame is kept: a correction at the reference point becomes a constant in the
+    curves.
     """
     measured = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
     control = active.tables.controller
@@ -184,11 +185,11 @@ def bare_errors(
             added = active.correction(machine, _upwards(position_mm))
             rest = exact_error(machine, errors, position_mm) - added - exact_error(machine, found, position_mm + added)
             return found, float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM
-    raise ConvergenceError("the effect of the active tables cannot be taken out: the iteration does not settle")
+    raise ConvergenceError("the effect of the active tables cannot be removed: the iteration does not converge")
 
 
 def _upwards(position_mm: FloatArray) -> Points:
-    """Points approached upwards on every axis, for tables of one direction."""
+    """Return points approached upwards on every axis, for direction-dependent tables."""
     return Points(position_mm, approach=np.ones_like(position_mm))
 
 
@@ -198,7 +199,7 @@ def _within(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:
 
 
 def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
-    """One term per error of the machine's model; values are the errors, carriers minus the columns of C."""
+    """Return one term per error of the machine's model; values are the errors, carriers minus the columns of C."""
     carriers: dict[str, list[Monomial]] = {}
     for part in coefficients(machine.chain, machine.squareness_reference):
         carriers.setdefault(part.error, []).append(Monomial(part.output, -part.sign, part.lever))
@@ -231,9 +232,9 @@ def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: Floa
     return ErrorTable(curves, squareness, errors.metadata)
 
 
-# One table in place of two: an old table that was active, and the errors that were measured with it.
+# One table instead of two: an old table that was active, and the errors measured with it.
 #
-# The machine with its old table c_old still errs; the correction of what is left is c_new. Commanded to p it must go to
+# The machine with its old table c_old still has errors; c_new corrects what is left. Commanded to p it must go to
 #
 #     c_total(p) = c_new(p) + c_old(p + c_new(p))
 #
@@ -242,11 +243,11 @@ def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: Floa
 
 @dataclass(frozen=True)
 class MergeReport:
-    """How close the merged table comes to old and new together, over the volume, um.
+    """How closely the merged table reproduces old and new together, over the volume, um.
 
     ``total_max_um`` is the largest total correction, ``difference_max_um`` and ``difference_rms_um`` what the merged
-    table misses of it, all that the control cannot hold included; ``lost_um`` is the largest part of the old table that
-    no error of the model expresses.
+    table misses of it, including all that the control cannot express; ``lost_um`` is the largest part of the old table
+    that no error of the model expresses.
     """
 
     total_max_um: float
@@ -260,7 +261,7 @@ class MergeReport:
 
 
 def total_correction(machine: Machine, errors: ErrorTable, active: ActiveTables, position_mm: FloatArray) -> FloatArray:
-    """Return c_total at commanded positions (n, 3): the old correction and that of the errors measured with it, mm."""
+    """Return c_total at commanded positions (n, 3): the old correction plus that of the errors measured with it, mm."""
     new = wanted_correction(machine, errors, position_mm)
     moved = position_mm + new
     return np.asarray(new + active.correction(machine, Points(moved, approach=np.ones_like(moved))))
@@ -274,14 +275,14 @@ def merged_errors(machine: Machine, errors: ErrorTable, active: ActiveTables) ->
 def merge_report(
     machine: Machine, errors: ErrorTable, active: ActiveTables, merged: ReadTables, lost_um: float
 ) -> MergeReport:
-    """Hold merged tables against the total correction at the nodes of old and merged tables and between them.
+    """Compare merged tables with the total correction at the nodes of old and merged tables and between them.
 
     Parameters
     ----------
-    machine, errors : the errors that were measured with the old tables active.
+    machine, errors : the errors measured with the old tables active.
     active : the old tables.
-    merged : the new ones, as they were parsed.
-    lost_um : as :func:`merged_errors` gives it.
+    merged : the new ones, as parsed.
+    lost_um : from :func:`merged_errors`.
     """
     nodes = []
     for axis in range(3):

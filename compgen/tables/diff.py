@@ -1,4 +1,4 @@
-"""What two sets of tables do differently: the difference of their corrections at the tool, over the volume."""
+"""The difference of two sets of tables: of their corrections at the tool, over the volume."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from compgen.kinematics.many_points import volume_grid
 from compgen.tables.judge import components, node_positions
 from compgen.tables.verification import ReadTables
 
-#: Components below this, um rms, are left out of the list.
+#: Smaller components, um rms, are not listed.
 NAMED_FROM_UM = 0.001
-#: Tuples longer than this are numbers of a table, which the correction shows.
+#: Longer tuples are numbers of a table, whose difference is in the correction.
 MOST_LISTED = 3
 
 
@@ -32,7 +32,7 @@ class TableDifference:
     ----------
     position_mm, first_mm, second_mm : points and the corrections of A and B there, shapes (n, 3).
     component_um : rms of every component of the difference over the volume, largest first, um.
-    geometry : what else differs, as (what, in A, in B) in words: nodes of the tables, settings.
+    geometry : other differences, as (what, in A, in B) in words: nodes of the tables, settings.
     """
 
     controllers: tuple[str, str]
@@ -123,7 +123,7 @@ def _nodes(machine: Machine, tables: ReadTables) -> list[FloatArray]:
 
 
 def _geometry(machine: Machine, first: ReadTables, second: ReadTables) -> list[tuple[str, str, str]]:
-    """Nodes that differ, axis by axis."""
+    """Return the nodes that differ, axis by axis."""
     found = []
     for axis, pair in enumerate(zip(_own_nodes(machine, first), _own_nodes(machine, second), strict=True)):
         if len(pair[0]) != len(pair[1]) or np.max(np.abs(pair[0] - pair[1]), initial=0.0) > 1e-6:
@@ -138,7 +138,7 @@ def _spread(nodes_mm: FloatArray) -> str:
 
 
 def _settings(first: ReadTables, second: ReadTables) -> list[tuple[str, str, str]]:
-    """Settings of the machine file, and facts of the files themselves other than their numbers, that differ."""
+    """Return the settings of the machine file, and other data of the files than their numbers, that differ."""
     if first.controller.name != second.controller.name:
         return [("control", first.controller.name, second.controller.name)]
     found = []
@@ -154,7 +154,7 @@ def _settings(first: ReadTables, second: ReadTables) -> list[tuple[str, str, str
 
 
 def _facts(value: Any, name: str = "") -> dict[str, str]:
-    """Flatten settings or tables to texts by name; arrays and the values of tables are left out."""
+    """Flatten settings or tables to texts by name; arrays and the values of tables are excluded."""
     if is_dataclass(value) and not isinstance(value, type):
         compared = (item.name for item in fields(value) if item.compare)
         items: list[tuple[str, Any]] = [(key, getattr(value, key)) for key in compared]

@@ -1,13 +1,14 @@
-"""Entry by entry: parsed tables hold nothing that the errors do not ask for, at no node and with no tool.
+"""Entry by entry: parsed tables contain nothing that the errors do not require, at any node, with any tool.
 
-Means over the volume do not show one wrong number among thousands, and one tool does not show angles without a lever.
-So the tables are made anew from the errors, with the same settings, and numbers and corrections of both are compared:
+Means over the volume do not show one wrong number among thousands, and a single tool does not show angles without a
+lever. So the tables are made again from the errors, with the same settings, and numbers and corrections of both are
+compared:
 
-- Where most numbers are the same, the given tables are these with some numbers changed: no correction may then differ
+- If most numbers are the same, the given tables are these with some numbers changed: no correction may then differ
   by more than ``Judge.goal_mm`` allows one entry, beyond what the format's rounding explains.
-- Tables made in another way (other nodes, other smoothing, another program) differ everywhere by a little. There a
-  place is suspect that differs far more than all the others: a single number, or a step.
-- With other tools than the machine's own no table may turn the tool further than the errors do.
+- Tables made in another way (other nodes, other smoothing, another program) differ everywhere by a little. A
+  place that differs far more than all others is then suspect: a single number, or a step.
+- With tools other than the machine's no table may rotate the tool further than the errors do.
 """
 
 from __future__ import annotations
@@ -39,29 +40,29 @@ if TYPE_CHECKING:
 
 BoolArray = NDArray[np.bool_]
 
-#: Tables that differ from those made anew in no more numbers than these were edited by hand ...
+#: Tables that differ from the remade ones in at most this many numbers were edited by hand ...
 FEW_CHANGED = 2
-#: If this many numbers of a list differ, a run of them may have moved; two may just be rounded differently.
+#: If this many numbers of a list differ, a run of them may have moved; two may only be rounded differently.
 LEAST_RUN = 3
-#: ... and in no more than this share of those that depend on the errors, they were edited or made of nearly the same
-#: errors and rounded.
+#: ... and in at most this share of those that depend on the errors, they were edited, or made from nearly
+#: the same errors and rounded.
 CHANGED_SHARE = 0.2
-#: Where so few numbers differ, a component of the correction may differ by this part of the goal: three make the goal.
+#: If so few numbers differ, a component of the correction may differ by this share of the goal; three reach the goal.
 #: One step of the format may differ beyond that, up to the goal.
 FEW_SHARE = 0.55
-#: Where more numbers differ than by hand, differences beyond rounding and this part of the goal are refused.
+#: If more numbers differ than by hand, differences beyond rounding plus this share of the goal are rejected.
 GOAL_SHARE = 0.5
-#: Part of the goal by which a value may lie beyond what rounding does anywhere else in the tables.
+#: Share of the goal by which a value may exceed what rounding does anywhere else in the tables.
 ROUNDED_SHARE = 0.05
 #: A format that rounds by more than the goal hides differences: this share of the range without the linear part.
 COARSE_SHARE = 0.1
-#: Standard uncertainties of the errors that explain a difference where more than a few numbers differ; no more than
-#: another rounding, unless in every list that differs at least this share of those that depend on the errors does:
-#: another measurement moves whole curves.
+#: Standard uncertainties of the errors that explain a difference if more than a few numbers differ; otherwise only
+#: another rounding does, unless in every list that differs at least this share of the numbers that depend on the errors
+#: differs: another measurement moves whole curves.
 CHANGED_UNCERTAINTIES = 3.0
 WHOLE_SHARE = 0.5
-#: In tables made in another way a step of the difference is suspect that is this many times as large as all others,
-#: where there are enough of these, and exceeds this part of the goal, the format's rounding and this many standard
+#: In tables made in another way a step of the difference is suspect if it is this many times as large as all others (if
+#: there are enough), and exceeds this share of the goal plus the format's rounding and this many standard
 #: uncertainties.
 SPIKE_RATIO, LEAST_OTHERS = 5.0, 4
 SPIKE_SHARE, SPIKE_UNCERTAINTIES = 0.6, 4.0
@@ -70,7 +71,7 @@ MOST_NODES = 20_000
 
 
 def numbers_of(tables: object) -> dict[str, FloatArray]:
-    """Return all numbers that parsed tables hold, by the place where they hold them."""
+    """Return all numbers in parsed tables, by their place."""
     return {place: values for place, values in _numbers(tables, "") if values.size}
 
 
@@ -93,7 +94,7 @@ def _numbers(item: object, place: str) -> Iterator[tuple[str, FloatArray]]:
 
 
 def numbers_changed(one: object, other: object) -> dict[str, BoolArray]:
-    """Return which numbers of two sets of tables differ, by place; zeros in one of them only do not count."""
+    """Return which numbers of two sets of tables differ, by place; zeros that only one of them has are ignored."""
     first, second = numbers_of(one), numbers_of(other)
     changed = {}
     for place in [*first, *(place for place in second if place not in first)]:
@@ -114,7 +115,7 @@ def count_changed(one: object, other: object) -> int:
 
 
 def _changed_by_list(one: object, other: object) -> dict[str, int]:
-    """How many numbers differ in each array, and in each list of single numbers."""
+    """Return how many numbers differ in each array, and in each list of single numbers."""
     first, second, changed = numbers_of(one), numbers_of(other), numbers_changed(one, other)
     lists: dict[str, list[str]] = {}
     for place in changed:
@@ -128,8 +129,8 @@ def _changed_by_list(one: object, other: object) -> dict[str, int]:
                 for part in (first, second)
             )
             if values.shape == others.shape:
-                # One wrong position moves a run of numbers by one place, up or down, with any number at its end, in tables
-                # that are read in the order of their positions.
+                # One wrong position moves a run of numbers by one place, up or down, with any number at its end, in
+                # tables that are read in order of position.
                 differ = np.flatnonzero(~_same(values, others))
                 run, right = (part[differ[0] : differ[-1] + 1] for part in (values, others))
                 if _same(run[1:], right[:-1]).all() or _same(run[:-1], right[1:]).all():
@@ -139,19 +140,19 @@ def _changed_by_list(one: object, other: object) -> dict[str, int]:
 
 
 def _list_of(place: str) -> str:
-    """The list that holds the number at a place such as ``.tables[0].values[7]``, without its number in the list."""
+    """Return the list of a place such as ``.tables[0].values[7]``, without the index."""
     return re.sub(r"\[\d+\]$", "", place)
 
 
 def _same(values: FloatArray, others: FloatArray) -> BoolArray:
     same = values == others
-    if same.all():  # as nearly always, and much faster to find out
+    if same.all():  # the usual case, and much faster to check
         return np.asarray(same)
     return np.isclose(values, others, rtol=1e-9, atol=1e-15, equal_nan=True)
 
 
 def with_number(tables: Any, place: str, index: int, step: float) -> Any:
-    """Return tables in which one number is changed by ``step``, by whole counts at least where numbers are whole.
+    """Return tables in which one number is changed by ``step``, by whole counts at least if numbers are whole.
 
     ``place`` and ``index`` are those of :func:`numbers_of`.
     """
@@ -193,9 +194,9 @@ def _at_least_one(step: float) -> int:
 
 @dataclass(frozen=True)
 class _Sample:
-    """Corrections on a grid of points (nx, ny, nz, 3): of the given tables, the best before rounding, of those made anew.
+    """Corrections on a grid of points (nx, ny, nz, 3): of the given tables, the best before rounding, of the remade ones.
 
-    ``tool_mm`` (3,) is None for the machine's own. ``slack_mm`` is what rounding explains of a difference, same shape.
+    ``tool_mm`` (3,) is None for the machine's own. ``slack_mm`` is the difference that rounding explains, same shape.
     """
 
     position_mm: FloatArray
@@ -207,12 +208,12 @@ class _Sample:
 
     @property
     def miss_mm(self) -> FloatArray:
-        """Difference beyond what rounding explains, with its sign."""
+        """Return the difference beyond what rounding explains, with its sign."""
         miss = self.own_mm - self.best_mm
         return np.asarray(np.sign(miss) * np.maximum(np.abs(miss) - self.slack_mm, 0.0))
 
     def worst(self, surplus_mm: FloatArray) -> list[str]:
-        """Name for each axis the point whose surplus (nx, ny, nz, 3) is largest, where it is positive."""
+        """Describe for each axis the point with the largest surplus (nx, ny, nz, 3), if positive."""
         found = []
         for output in range(3):
             place = np.unravel_index(int(np.argmax(surplus_mm[..., output])), surplus_mm.shape[:-1])
@@ -221,21 +222,21 @@ class _Sample:
         return found
 
     def place(self, index: tuple[Any, ...], output: int) -> str:
-        """Say what the tables hold at a point, and what the errors need."""
+        """Say what the tables contain at a point, and what the errors require."""
         x, y, z = self.position_mm[index]
         tool = "" if self.tool_mm is None else f" with the tool offset {', '.join(f'{k:g}' for k in self.tool_mm)} mm"
         own, best = (part[(*index, output)] / MM_PER_UM for part in (self.own_mm, self.best_mm))
         return (
             f"correction {AXES[output]} at X {x:g} Y {y:g} Z {z:g} mm{tool}: {round(own, 2) + 0.0:+.2f} um in the table, "
-            f"the errors ask for {round(best, 2) + 0.0:+.2f} um"
+            f"the errors require {round(best, 2) + 0.0:+.2f} um"
         )
 
 
 @dataclass(frozen=True)
 class EntryCheck:
-    """Given tables next to those that the errors of a judge give with the same settings.
+    """Given tables, and the tables made from a judge's errors with the same settings.
 
-    ``made`` is None where the control cannot make tables of these errors. ``changed`` is how many numbers differ in each
+    ``made`` is None if the control cannot make tables of these errors. ``changed`` is how many numbers differ in each
     list, ``depends`` which numbers depend on the errors at all (positions do not), by place. ``reversal_known`` says
     whether the reversal is part of ``made``.
     """
@@ -254,7 +255,7 @@ class EntryCheck:
         return replace(self, given=tables, changed_in=changed)
 
     def reasons(self) -> list[str]:
-        """Name for each axis the place where the tables hold most that the errors do not ask for; empty if nowhere."""
+        """Describe for each axis the place with the largest excess over what the errors require; empty if there is none."""
         within = zip(self._all_nodes(), self.machine.lower_mm, self.machine.upper_mm, strict=True)
         nodes = [nodes[(nodes >= low) & (nodes <= high)] for nodes, low, high in within]
         for sample in self._at_nodes(nodes):
@@ -269,7 +270,7 @@ class EntryCheck:
         found = self._wrong_beyond_travel()
         if found:
             return found
-        # what the tables add because of the tool: as much as the errors ask for or less, but never more
+        # what the tables add because of the tool: at most as much as the errors require
         ends = _ends(self.machine)
         for axis in range(3):
             levels = [nodes[k] if k == axis else ends[k] for k in range(3)]
@@ -278,7 +279,7 @@ class EntryCheck:
             for tool in self.machine.tool_corners_mm:
                 sample = self._sample(position_mm, np.array(tool), None)
                 if np.array_equal(sample.own_mm, own_tool.own_mm):
-                    break  # these tables do not know the tool
+                    break  # these tables do not depend on the tool
                 found = self._wrong_numbers(sample) or self._spikes(sample) or self._turned(sample, own_tool)
                 if found:
                     return found
@@ -286,7 +287,7 @@ class EntryCheck:
 
     @property
     def _numbers_differ(self) -> bool:
-        """Whether the given tables are those made anew, with some numbers changed."""
+        """Whether the given tables are the remade ones with some numbers changed."""
         depend = sum(int(part.sum()) for part in self.depends.values())
         return self._few_differ or (self.made is not None and 0 < self.changed <= CHANGED_SHARE * depend)
 
@@ -301,11 +302,11 @@ class EntryCheck:
 
     @property
     def _sides(self) -> tuple[float | None, ...]:
-        """Directions of travel that are looked at; None: the mean of both."""
+        """Directions of travel to compare; None: the mean of both."""
         both = self.reversal_known or (self._few_differ and self.given.controller.bidirectional)
         return (1.0, -1.0) if both else (None,)
 
-    # --- where the tables are looked at ---------------------------------------------------------------------------
+    # --- where the tables are compared ---------------------------------------------------------------------------
 
     def _all_nodes(self) -> list[FloatArray]:
         """Nodes of both sets of tables and the travel ends, by axis."""
@@ -326,13 +327,13 @@ class EntryCheck:
         own, made = self._added(self.given, flat, tool_mm, side), best
         slack: FloatArray = np.full(flat.shape, self.judge.resolution_mm)
         if self.made is not None:
-            # What the control itself makes of the best values: rounded, and looked up where the axes stand.
+            # What the control makes of the best values: rounded, and looked up at the axis positions.
             made = mean = self._added(self.made, flat, tool_mm, None)
             slack = np.maximum(slack, np.abs(mean - best))
             if side is not None:
                 made = self._added(self.made, flat, tool_mm, side)
                 best = best + made - mean
-                if not self.reversal_known:  # a constant backlash in the tables is none of the errors' business
+                if not self.reversal_known:  # a constant backlash in the tables does not come from the errors
                     own = own - np.median(own - self._added(self.given, flat, tool_mm, None), axis=0)
         parts = (np.asarray(part).reshape(shape) for part in (own, best, made, slack))
         return _Sample(position_mm, tool_mm, *parts)
@@ -340,7 +341,7 @@ class EntryCheck:
     def _added(
         self, tables: ReadTables, position_mm: FloatArray, tool_mm: FloatArray | None, side: float | None
     ) -> FloatArray:
-        """Correction at points (n, 3) after travel in one direction, the mean of both without one, shape (n, 3)."""
+        """Return the correction at points (n, 3) after travel in one direction, or the mean of both, shape (n, 3)."""
         tools = None if tool_mm is None else np.array(np.broadcast_to(tool_mm, position_mm.shape))
         if side is None:
             return tables.mean_correction(self.machine, position_mm, tools)
@@ -350,10 +351,10 @@ class EntryCheck:
     # --- what is wrong with them ----------------------------------------------------------------------------------
 
     def _wrong_numbers(self, sample: _Sample) -> list[str]:
-        """Places of tables with some numbers changed where the correction differs by more than the goal.
+        """Return the places of edited tables where the correction differs by more than the goal.
 
-        Where the steps of the format exceed the goal one number may be rounded to its other neighbour: then it misses
-        the best by no more than others do.
+        If the steps of the format exceed the goal, one number may be rounded to its other neighbour: then it misses the
+        best by no more than others do.
         """
         goal = self.judge.goal_mm
         if self._few_differ:
@@ -371,8 +372,8 @@ class EntryCheck:
         for place, part in self.depends.items():
             depend[_list_of(place)] = depend.get(_list_of(place), 0) + int(part.sum())
         whole = all(count >= WHOLE_SHARE * depend.get(name, 0) for name, count in self.changed_in.items() if count)
-        # Where whole lists differ the tables may be of another measurement; where single numbers in a list do, errors that
-        # hardly show in these steps explain one rounding more.
+        # If whole lists differ, the tables may be of another measurement; if single numbers in a list do, errors that
+        # hardly show in these steps explain one more rounding.
         if not whole:
             explained = np.minimum(explained, self.judge.resolution_mm)
         return sample.worst(np.abs(sample.miss_mm) - max(GOAL_SHARE * goal, coarse) - explained)
@@ -382,8 +383,8 @@ class EntryCheck:
         return displacement_uncertainty(self.machine, self.judge.errors, flat, sample.tool_mm)
 
     def _spikes(self, sample: _Sample) -> list[str]:
-        """Name for each axis a single place where the difference changes far more than anywhere else along an axis."""
-        # Where another rounding shows, it shows at single places, by as much as the errors of both tables differ.
+        """Describe for each axis a single place where the difference changes far more than anywhere else along an axis."""
+        # Another rounding shows at single places, by as much as the errors of both tables differ.
         limit = SPIKE_SHARE * self.judge.goal_mm + self.judge.resolution_mm
         miss = sample.miss_mm
         if np.max(np.abs(miss)) <= 0.5 * limit:
@@ -412,7 +413,7 @@ class EntryCheck:
         return [found[output] for output in sorted(found)]
 
     def _wrong_beyond_travel(self) -> list[str]:
-        """Compare the tables at their nodes outside the travel as well, where only single numbers were changed."""
+        """Compare the tables at their nodes outside the travel, too, if only single numbers were changed."""
         if self.made is None or not self._few_differ:
             return []
         ends = _ends(self.machine)
@@ -443,14 +444,14 @@ class EntryCheck:
 
 
 def _ends(machine: Machine) -> list[FloatArray]:
-    """Both ends and the middle of the travel, by axis."""
+    """Return both ends and the middle of the travel, by axis."""
     return [np.array([low, 0.5 * (low + high), high]) for low, high in (axis.range_mm for axis in machine.axes)]
 
 
 def _grids(machine: Machine, nodes: Sequence[FloatArray], numbers: int) -> Iterator[list[FloatArray]]:
     """Levels of the grids on which every number shows: of all three axes, of pairs, or of one at a time.
 
-    As many as tables of that many ``numbers`` may need: a table over two axes has one for each pair of nodes.
+    They suffice for tables of that many ``numbers``: a table over two axes has one for each pair of nodes.
     """
     ends, counts = _ends(machine), [len(part) for part in nodes]
     if math.prod(counts) <= max(MOST_NODES, numbers):
@@ -467,7 +468,7 @@ def _grids(machine: Machine, nodes: Sequence[FloatArray], numbers: int) -> Itera
 def entry_check(
     machine: Machine, judge: Judge, given: ReadTables, reversal: ReversalCurves | None = None
 ) -> EntryCheck:
-    """Make the tables anew from the errors of the judge, and compare their numbers with those of the given ones."""
+    """Make the tables again from the errors of the judge, and compare their numbers with the given ones."""
     control = given.controller
     basis, in_tables = judge.solver.basis, None
     try:

@@ -1,4 +1,4 @@
-"""The judgement on a correction: what it leaves, compared with the best possible, and what it would make the axes do."""
+"""The judgement on a correction: what it leaves, compared with the best possible, and how it would move the axes."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.many_points import VolumeGrid, full_grid, volume_grid
 from compgen.tables.synthesis import Projector, best_values, projector
 
-# A field on a full grid split into what belongs to one axis, to a pair of axes, and to all three.
+# A field on a full grid, split into parts that depend on one axis, on a pair of axes, and on all three.
 #
-# Every component is a place where a wrong sign, a swapped axis or a slip of unit shows, however small it is next to a
-# squareness of millimetres.
+# Each component shows a wrong sign, a swapped axis or a wrong unit, however small it is compared with a squareness of
+# millimetres.
 
 
 def components(grid: VolumeGrid, field_mm: FloatArray) -> dict[str, FloatArray]:
     """Split a field (n, 3) on the grid's points; returns arrays of shape (nx, ny, nz) that broadcast, by name.
 
     Names: ``X constant``, ``X linear in y`` (slope), ``X(y)`` (the rest of the main effect), ``X(x,z)`` (interaction of
-    a pair), ``X(x,y,z)``. The parts are orthogonal on the grid, so that none hides another.
+    a pair), ``X(x,y,z)``. The parts are orthogonal on the grid, so none hides another.
     """
     parts: dict[str, FloatArray] = {}
     for output, letter in enumerate(AXES):
@@ -62,10 +62,10 @@ def components(grid: VolumeGrid, field_mm: FloatArray) -> dict[str, FloatArray]:
     return parts
 
 
-# Lines along the axes, sampled densely: a single wrong node of a fine table shows here and not in any mean.
+# Lines along the axes, sampled densely: a single wrong node of a fine table shows here but in no mean.
 
 
-#: Positions along a line in addition to the nodes of the tables: evenly spread over the travel.
+#: Positions along a line in addition to the nodes of the tables: evenly spaced over the travel.
 SCAN_POSITIONS = 1001
 #: At a point the correction may miss the best possible one by this share of its range, and of the largest range of all
 #: axes without the linear parts (a squareness of millimetres must hide nothing) ...
@@ -77,7 +77,7 @@ POINT_UNCERTAINTIES = 5.0
 
 
 def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray:
-    """Return the points (n, 3) of nine lines along each axis: the other two at both ends and in the middle."""
+    """Return the points (n, 3) of nine lines along each axis, with the other two at both ends and in the middle."""
     low, high = machine.lower_mm, machine.upper_mm
     lines = []
     for axis in range(3):
@@ -93,7 +93,7 @@ def displacement_uncertainty(
 ) -> FloatArray:
     """Standard uncertainty of E = C P at positions (n, 3) from those of the errors, shape (3,): the largest, mm.
 
-    Correlations are left out; an uncertainty that is not known counts as zero.
+    Correlations are ignored; an unknown uncertainty counts as zero.
     """
     curves = {name: replace(curve, value=np.nan_to_num(curve.u)) for name, curve in errors.curves.items()}
     squareness = {name: (float(np.nan_to_num(u)), 0.0) for name, (_, u) in errors.squareness.items()}
@@ -109,7 +109,7 @@ def point_reasons(
     u_mm: FloatArray,
     resolution_mm: float,
 ) -> list[str]:
-    """Name for each axis the point (of n) where the correction (n, 3) misses the best one most, if it is too far.
+    """Describe for each axis the point (of n) where the correction (n, 3) misses the best one most, if too far.
 
     ``bent_mm`` is the largest range of the best one without its linear part, ``u_mm`` (3,) the standard uncertainty
     that the errors give the correction, ``resolution_mm`` the format's.
@@ -136,7 +136,7 @@ def _um(value_mm: float) -> str:
 
 # The judgement on a correction: the best that a control could do is prepared once, any correction is compared with it.
 #
-# It knows nothing of files: ``verify`` gives it what parsed tables do, the sign crash test what wrong ones would do.
+# It does not depend on files: ``verify`` passes what parsed tables do, the sign crash test what wrong ones would do.
 
 
 #: One entry of a table may move the tip by this share of the largest correction without its linear part, or this much.
@@ -159,7 +159,7 @@ class Judge:
     grid, best_mm : points (n, 3) over the volume, nodes and middles, and the best correction there (n, 3).
     line_mm, line_best_mm : points (m, 3) on lines along the axes, and the best correction there (m, 3).
     bent_mm : largest range of the best correction of an axis without its linear part.
-    goal_mm : what one entry of a table may move the tip by and still pass.
+    goal_mm : how far one entry of a table may move the tip and still pass.
     slack_mm, u_mm : what quantum and uncertainty explain of a component, and the uncertainty of E, shapes (3,).
     resolution_mm : largest error of the format's rounding.
     """
@@ -208,7 +208,7 @@ class Judge:
         return residuals_twice(nominal, error)[1].rms_um * MM_PER_UM
 
     def component_reasons(self, correction_mm: FloatArray) -> list[str]:
-        """Name every component of the correction (n, 3) that misses the best possible one by more than its share."""
+        """Describe every component of the correction (n, 3) that misses the best possible one by more than its share."""
         miss = components(self.grid, correction_mm - self.best_mm)
         too_far = [name for name, (_, limit) in self.best_components.items() if rms(miss[name]) > limit]
         own = components(self.grid, correction_mm) if too_far else {}
@@ -225,20 +225,20 @@ class Judge:
         return reasons
 
     def shrink_reasons(self, correction_mm: FloatArray) -> list[str]:
-        """Say so if the exact residual grows with the correction (n, 3), rigid motion taken out."""
+        """Return a reason if the exact residual grows with the correction (n, 3), rigid motion removed."""
         rms_before, rms_after = self.rms_before_mm, self._rms_left_mm(correction_mm)
         if rms_after <= rms_before + 1e-9 or rms_after <= self.resolution_mm:
             return []
         return [
             f"the residual does not shrink: {rms_before / MM_PER_UM:.2f} um rms before, {rms_after / MM_PER_UM:.2f} um "
-            "rms after (rigid motion taken out)"
+            "rms after (rigid motion removed)"
         ]
 
 
 def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, tables: Any = None) -> Judge:
     """Prepare the judgement for the tables of one control on a machine with these errors.
 
-    ``tables`` are the parsed ones: where a control has room for some tables only, there is more than one good choice.
+    ``tables`` are the parsed ones: if a control has room for only some tables, there is more than one good choice.
     """
     basis = control.basis(errors) if tables is None else control.basis_of(errors, tables)
     solver = projector(machine, basis, anchored=control.anchored)
@@ -247,7 +247,7 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
     grid = volume_grid(machine, nodes)
     line_mm = scan_lines(machine, nodes)
     best_mm = solver.field(values, grid.position_mm)
-    # what is bent: the field without its best-fit constant and slopes (squareness, pitch)
+    # the bent part: the field without its best-fit constant and slopes (squareness, pitch)
     columns = np.column_stack([np.ones(len(best_mm)), grid.position_mm - grid.position_mm.mean(axis=0)])
     bent_mm = best_mm - columns @ np.linalg.lstsq(columns, best_mm, rcond=None)[0]
     resolution_mm = control.resolution_mm()
@@ -281,12 +281,12 @@ def _nodes(machine: Machine, errors: ErrorTable, solver: Projector) -> tuple[Flo
     )
 
 
-# Both directions of travel: the mean of what tables do in each, and whether their difference takes the reversal out.
+# Both directions of travel: the mean of what tables do in each, and whether their difference corrects the reversal.
 
 
 Correction = Callable[[Points], FloatArray]
 
-#: Positions along the travel at which the difference of the directions is looked at.
+#: Positions along the travel at which the difference of the directions is checked.
 REVERSAL_POSITIONS = 201
 #: The difference may miss the reversal by this share of its largest value, or by this much, whichever is larger.
 REVERSAL_SHARE = 0.3
@@ -311,7 +311,7 @@ def mean_correction(correction: Correction, position_mm: FloatArray, tool_mm: Fl
 def reversal_reasons(
     machine: Machine, correction: Correction, reversal: ReversalCurves, resolution_mm: float
 ) -> list[str]:
-    """Name each reversal that the tables do not take out, or that they add, axis by axis along the travel.
+    """Describe each reversal that the tables do not correct, or that they add, axis by axis along the travel.
 
     The correction after positive travel minus the one after negative travel must be minus the reversal value.
     """
@@ -337,31 +337,31 @@ def reversal_reasons(
 
 
 def left_by_reversal(reversal: ReversalCurves | None, *, corrected: bool) -> dict[str, float]:
-    """Return in um what a reversal leaves that no table takes out: half of its largest value, by name."""
+    """Return in um the part of a reversal that no table corrects: half of its largest value, by name."""
     if reversal is None or corrected:
         return {}
     largest = {reversal_name(*key): 0.5 * abs(value) for key, value in reversal.largest_mm.items()}
     return {name: round(value / MM_PER_UM, 3) for name, value in largest.items() if value >= 0.5 * WORTH_MM}
 
 
-# What parsed tables would make the axes do, whatever the errors are: steps, the reference point, the table's ends.
+# How parsed tables would move the axes, whatever the errors are: steps, the reference point, the ends of the tables.
 #
-# The tables are looked at on lines along the axes at all of their nodes, also those outside the travel, which no
+# The tables are checked on lines along the axes at all of their nodes, including those outside the travel, which no
 # residual over the working volume shows.
 
-#: A step between neighbouring nodes that the slope of the best table does not explain is absurd from here on, um.
+#: A larger step between neighbouring nodes that the slope of the best table does not explain is rejected, um.
 UNEXPLAINED_STEP_UM = 500.0
-#: A step is absurd if it is this many times as steep as the steepest one that does not touch the same nodes ...
+#: A step is rejected if it is this many times as steep as the steepest one that does not touch the same nodes ...
 SPIKE_RATIO = 10.0
 #: ... and larger than this, um.
 SPIKE_FLOOR_UM = 10.0
 #: Slope up to this many times the steepest one of the best table counts as explained.
 SLOPE_SHARE = 2.0
-#: A correction at the reference point beyond this is worth a warning, um: the axes move when the table is switched on.
+#: A larger correction at the reference point gets a warning, um: the axes move when the table is switched on.
 REFERENCE_UM = 20.0
 #: How far outside the last node the emulator is tried, mm.
 OUTSIDE_MM = 1.0
-#: Positions along the travel where a control does not say where its tables have their nodes.
+#: Positions along the travel if a control does not state the nodes of its tables.
 WITHOUT_NODES = 201
 
 CorrectionAt = Callable[[FloatArray], FloatArray]
@@ -369,11 +369,11 @@ CorrectionAt = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """Limits of :func:`safety_of`; ``max_step_um``: no step between neighbouring nodes may be larger, None: see there."""
+    """Limits of :func:`safety_of`; ``max_step_um``: no step between neighbouring nodes may be larger; None: the default there."""
 
     max_step_um: float | None = option(
         None,
-        "No step of the correction between neighbouring table nodes may be larger than this, um; default: 500 um beyond "
+        "Largest allowed step of the correction between neighbouring table nodes, um; default: 500 um beyond "
         "what the slope of the errors explains.",
     )
 
@@ -386,7 +386,7 @@ class SafetyLimits:
 class LargestStep:
     """The largest step of the correction of one axis (``output``) along one axis, between neighbouring nodes.
 
-    ``step_um`` over ``from_mm`` ... ``to_mm``; ``slope_um_per_mm`` is the steepest one, which may lie elsewhere.
+    ``step_um`` over ``from_mm`` ... ``to_mm``; ``slope_um_per_mm`` is the steepest one, which may be elsewhere.
     """
 
     output: str
@@ -401,9 +401,9 @@ class LargestStep:
 class TableEnd:
     """One end of the tables over one axis.
 
-    ``jump_um`` is the largest correction that belongs to this end on any of the lines: by this the axes jump if the
-    control drops the compensation beyond it. ``outside`` is what the emulated control does: ``"held"`` (the value
-    stays), ``"continued"`` (it goes on smoothly, as levers do) or ``"dropped"``.
+    ``jump_um`` is the largest correction at this end on any of the lines: the axes jump by it if the control drops the
+    compensation beyond. ``outside`` is what the emulated control does: ``"held"`` (the value stays constant),
+    ``"continued"`` (it continues smoothly, as levers do) or ``"dropped"``.
     """
 
     along: str
@@ -440,7 +440,7 @@ class Safety:
 
 
 def node_positions(machine: Machine, nodes_mm: FloatArray, axis: int) -> FloatArray:
-    """Return where the tables over an axis are looked at: their nodes and the travel ends, ascending, mm."""
+    """Return the positions at which tables over an axis are checked: their nodes and the travel ends, ascending, mm."""
     ends = np.array(machine.axes[axis].range_mm)
     inner = nodes_mm if len(nodes_mm) else np.linspace(float(ends[0]), float(ends[1]), WITHOUT_NODES)
     return np.unique(np.concatenate([ends, inner]).round(6))
@@ -468,14 +468,14 @@ def safety_of(
     best: CorrectionAt,
     limits: SafetyLimits | None = None,
 ) -> Safety:
-    """Look at parsed tables as they would move the axes.
+    """Check how parsed tables would move the axes.
 
     Parameters
     ----------
     machine, control, tables : the tables as the control parsed them.
     best : the best correction of this control as a function of positions (n, 3); its slope explains steps.
-    limits : by default a step is absurd that is 0.5 mm larger, or ten times steeper than all others and 10 um larger,
-        than twice the slope of ``best`` explains; with ``max_step_um`` no step may exceed that either.
+    limits : by default a step is rejected if it exceeds what twice the slope of ``best`` explains by 0.5 mm, or by 10
+        um and it is ten times steeper than all others; with ``max_step_um`` no step may exceed that either.
     """
     limits = limits or SafetyLimits()
     nodes = control.table_nodes_mm(tables)
@@ -504,7 +504,7 @@ def safety_of(
         for axis, value in zip(AXES, (x, y, z), strict=True)
         if abs(value) > REFERENCE_UM + slack_um
     ]
-    jolt = f"at the reference point the correction is {', '.join(moved)}: the axes move when it is switched on there"
+    jolt = f"the correction at the reference point is {', '.join(moved)}: the axes move when it is switched on there"
     warnings = [jolt] if moved else []
     warnings += [
         f"the tables over {end.along} end at {end.end_mm:g} mm and the control drops them there: a jump of "
@@ -524,7 +524,7 @@ def safety_of(
 
 @dataclass(frozen=True)
 class _Profile:
-    """CorrectionAt of one axis along another on nine lines in both directions, own and best, (18, n), mm, at (n,)."""
+    """Correction of one axis along another on nine lines in both directions, given and best, (18, n), mm, at (n,)."""
 
     axis: int
     output: int
@@ -539,11 +539,11 @@ class _Profile:
 
     @property
     def step_um(self) -> FloatArray:
-        """Largest step over each interval, shape (n - 1,)."""
+        """Return the largest step over each interval, shape (n - 1,)."""
         return np.asarray(np.max(np.abs(np.diff(self.own_mm, axis=1)), axis=0) / MM_PER_UM)
 
     def explained(self, range_mm: tuple[float, float]) -> float:
-        """Slope that the best table explains, um/mm: twice its steepest one within the travel."""
+        """Return the slope that the best table explains, um/mm: twice its steepest one within the travel."""
         inside = (self.along_mm[:-1] >= range_mm[0] - 1e-9) & (self.along_mm[1:] <= range_mm[1] + 1e-9)
         slopes = np.max(np.abs(np.diff(self.best_mm, axis=1)), axis=0) / MM_PER_UM / self.width_mm
         return SLOPE_SHARE * float(np.max(slopes[inside], initial=0.0))
@@ -583,7 +583,7 @@ class _Profile:
 
 
 def _ends(machine: Machine, nodes_mm: tuple[FloatArray, ...], correction: CorrectionAt) -> tuple[TableEnd, ...]:
-    """Both ends of the tables over every axis that has some."""
+    """Return both ends of the tables over every axis that has tables."""
     found = []
     for axis, nodes in enumerate(nodes_mm):
         if len(nodes) < 2:
@@ -598,7 +598,7 @@ def _ends(machine: Machine, nodes_mm: tuple[FloatArray, ...], correction: Correc
 
 
 def _outside(values_mm: FloatArray) -> str:
-    """Say what happens beyond a table's end from corrections (9, 4, 3): inside, at the end, just and well outside."""
+    """Return what happens beyond a table's end, from corrections (9, 4, 3): inside, at the end, just and well outside."""
     jump, travelled = (float(np.max(np.abs(values_mm[:, k] - values_mm[:, 1]))) for k in (2, 3))
     inside = float(np.max(np.abs(values_mm[:, 0] - values_mm[:, 1])))
     if jump > max(0.5 * MM_PER_UM, 10.0 * inside):

@@ -1,4 +1,4 @@
-"""What each option of a control would buy, from the levels that are sold to the explanation of one control's table."""
+"""What each option of a control would gain: from the levels on the market to the explanation of one control's table."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from compgen.tables import Export, export
 from compgen.tables.judge import LargestStep, in_both_directions, left_by_reversal, safety_of
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
 
-# Levels of compensation that controls sell, as bases of terms, and the best that each could do for given errors.
+# Levels of compensation that controls offer, as bases of terms, and the best that each could do for given errors.
 #
-# A level knows neither quantum nor limits: it is what any control of that kind can reach at most. Each level holds the one
-# before it.
+# A level has neither quantum nor limits: it is the best that any control of that kind can reach. Each level includes
+# the one before it.
 
 
 Zone = tuple[Interval | None, Interval | None, Interval | None]
 
-#: Levels in their order: key and what the tables of that level hold.
+#: Levels in their order: key and contents of the tables of that level.
 LABELS = {
     "nothing": "no table",
     "pitch": "positioning",
@@ -46,8 +46,9 @@ LABELS = {
     "volumetric": "full volumetric",
     "directional": "+ direction-dependent",
 }
-#: Between the nodes of the curves the bases get further nodes, as long as an axis has no more than this many: curves
-#: that act at their own axis' travel are bent there.
+#: The bases get additional nodes between the nodes of the curves, as long as an axis has no more than this many:
+#:
+#: an angular error times the position of its own axis is not linear between its nodes.
 MOST_NODES = 81
 MOST_PARTS = 4
 
@@ -56,7 +57,7 @@ MOST_PARTS = 4
 class Level:
     """The best tables of one level: ``values`` of the terms in ``solver``; no solver: no tables.
 
-    ``pitch`` is there for tables without squareness only: it fits the positioning again after the lines are out.
+    Only tables without squareness have ``pitch``: it fits the positioning again after the lines are removed.
     """
 
     key: str
@@ -67,13 +68,14 @@ class Level:
 
     @property
     def label(self) -> str:
-        """What the tables hold, in words."""
+        """Contents of the tables in words."""
         return LABELS[self.key]
 
     def correction(self, position_mm: FloatArray, approach: FloatArray, tool_mm: FloatArray) -> FloatArray:
         """Return what such a control would add at points (n, 3), reached in directions (n, 3), with a tool (3,): mm.
 
-        Only the volumetric levels know the tool that is in use; the others were made for the machine's own.
+        Only the volumetric levels take account of the tool in use; the others are made for the tool of the machine
+        file.
         """
         added = np.zeros_like(position_mm)
         if self.solver is not None and self.values is not None:
@@ -85,9 +87,9 @@ class Level:
     def left_alone_um(
         self, machine: Machine, errors: ErrorTable, tools_mm: Sequence[FloatArray], *, anchored: bool = False
     ) -> list[dict[str, float]]:
-        """Return the largest displacement (um, first order) that each error by itself leaves, for each tool (3,).
+        """Return the largest displacement (um, first order) left by each single error, for each tool (3,).
 
-        With ``anchored`` the mean over the volume does not count: such tables cannot hold a constant.
+        With ``anchored`` the mean over the volume is ignored: such tables cannot express a constant.
         """
         if self.key in ("volumetric", "directional"):  # the control evaluates E = C P with the tool in use
             return [dict.fromkeys(errors.names, 0.0) for _ in tools_mm]
@@ -119,7 +121,7 @@ def in_zone(machine: Machine, zone_mm: Zone | None) -> Machine:
         low, high = axis.range_mm if part is None else part
         if not axis.range_mm[0] <= low < high <= axis.range_mm[1]:
             raise InputError(
-                f"the zone goes from {low:g} to {high:g} mm in {letter}; it must lie within the travel "
+                f"the zone ranges from {low:g} to {high:g} mm in {letter}; it must be within the travel "
                 f"{axis.range_mm[0]:g} ... {axis.range_mm[1]:g} mm, the lower end first"
             )
         inside = axis.nodes_mm[(axis.nodes_mm > low) & (axis.nodes_mm < high)]
@@ -141,9 +143,9 @@ def _refined(nodes_mm: FloatArray) -> FloatArray:
 
 
 def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> FloatArray:
-    """Table values (parameters,) closest to a wanted field (n, 3); with ``pitch`` those without squareness.
+    """Return the table values (parameters,) closest to a target field (n, 3); with ``pitch`` those without squareness.
 
-    Without squareness every straightness table is zero at both ends, since its line is squareness; positioning is then
+    Without squareness every straightness table is zero at both ends, since its slope is squareness; positioning is then
     fitted again to what is left.
     """
     values = solver.project(wanted_mm)
@@ -160,9 +162,9 @@ def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> 
 
 
 def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | None = None) -> list[Level]:
-    """Return the best tables of every level over the machine's travel; the last only where a reversal is known.
+    """Return the best tables of every level over the machine's travel; the last only if a reversal is known.
 
-    Straightness without squareness has the straightness of the level that follows, zero at both ends of the travel.
+    The level without squareness has the straightness of the next level, zero at both ends of the travel.
     """
     nodes_mm = level_nodes_mm(machine, errors)
     origin_mm = (0.5 * (machine.lower_mm + machine.upper_mm)).tolist()
@@ -201,31 +203,31 @@ def level_key(basis: Sequence[Term]) -> str:
     return "pitch"
 
 
-# What each option of a control would buy: the residual that every level leaves, and every control's own exported table.
+# What each option of a control would gain: the residual of every level, and of every control's exported tables.
 #
 # Levels are judged by the best tables in their basis, controls by the text of their files, read back and emulated.
 
 
-#: Tool lengths that are looked at in addition to the machine's own, along Z, mm.
+#: Tool lengths that are evaluated in addition to the tool of the machine file, along Z, mm.
 TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
-#: Options of a control that are looked at in addition to what the machine file says: words for them, and the settings.
+#: Options of a control that are evaluated in addition to the machine file: their description and settings.
 VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
     "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True}))
 }
-#: Settings that the machine file must state for an export, and what a comparison may take instead: in every mode the
-#: products leave the same residual; of two systems of values the one that leaves less.
+#: Settings that the machine file must state for an export, and what a comparison may assume: in every mode the products
+#: leave the same residual; of two systems of values the one that leaves less.
 ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}, "mitsubishi": {"mode": "incremental"}}
 
 
 @dataclass(frozen=True)
 class Left:
-    """Residuals over the volume: as it stands with the reference point fixed, and without the best-fit rigid motion."""
+    """Residuals over the volume: with the reference point fixed, and with the best-fit rigid motion removed."""
 
     after: Residuals
     rigid_removed: Residuals
 
     def as_dict(self) -> dict[str, Any]:
-        """Return both under their names."""
+        """Return both by name."""
         return {"after": self.after.as_dict(), "after_rigid_motion_removed": self.rigid_removed.as_dict()}
 
 
@@ -233,8 +235,8 @@ class Left:
 class LevelResult:
     """What the best tables of one level leave.
 
-    ``by_tool`` has one entry per tool: residuals of all errors together, and the largest displacement in um that each
-    error by itself leaves.
+    ``by_tool`` has one entry per tool: residuals of all errors together, and the largest displacement in um left by
+    each single error.
     """
 
     key: str
@@ -243,16 +245,17 @@ class LevelResult:
 
     @property
     def label(self) -> str:
-        """What the tables hold, in words."""
+        """Contents of the tables in words."""
         return LABELS[self.key]
 
 
 @dataclass(frozen=True)
 class ControlResult:
-    """What the exported file of one control leaves; ``problem`` says why there is none.
+    """What the exported file of one control leaves; ``problem`` says why there is no file.
 
-    ``level`` is the key of the level it belongs to, ``directional`` whether its tables know the direction of travel,
-    ``own`` whether the settings are those of the machine file, ``broken`` how many limits of the control the tables break.
+    ``level`` is the key of the level it belongs to, ``directional`` whether its tables depend on the direction of
+    travel, ``own`` whether the settings are those of the machine file, ``broken`` how many limits of the control the
+    tables exceed.
     """
 
     name: str
@@ -273,7 +276,7 @@ class ControlResult:
 
 @dataclass(frozen=True)
 class Capability:
-    """Result of :func:`capability`; ``tools_mm`` are the tool offsets looked at, the machine's own first."""
+    """Result of :func:`capability`; ``tools_mm`` are the evaluated tool offsets, that of the machine file first."""
 
     machine: str
     errors: tuple[str, ...]
@@ -333,7 +336,7 @@ class Capability:
 
 
 def default_tools_mm(machine: Machine) -> tuple[tuple[float, float, float], ...]:
-    """Return the machine's own tool offset, then 0, -100 and -200 mm along Z, each once."""
+    """Return the tool offset of the machine file, then 0, -100 and -200 mm along Z, each once."""
     lengths = [(0.0, 0.0, length) for length in TOOL_LENGTHS_MM]
     return tuple(dict.fromkeys([machine.tool_offset_mm, *lengths]))
 
@@ -348,16 +351,16 @@ def capability(
     templates: Path | None = None,
     controllers: Sequence[str] | None = None,
 ) -> Capability:
-    """Say what every level of option and every control leaves of the errors.
+    """Return what every level of option and every control leaves of the errors.
 
     Parameters
     ----------
-    machine, errors : what moves, and how wrong; the exact model judges.
-    tools_mm : tool offsets to look at in addition to the machine's own; default 0, -100, -200 mm along Z.
+    machine, errors : the machine and its errors; evaluated with the exact model.
+    tools_mm : tool offsets in addition to that of the machine file; default 0, -100, -200 mm along Z.
     zone_mm : ranges of X, Y, Z that matter (None: all); levels are fitted to it, and controls' files with this work zone.
-    reversal : difference between the directions of travel; then all points are looked at from both sides.
-    templates : the user's own templates, searched first.
-    controllers : names of the controls to look at, default all.
+    reversal : difference between the directions of travel; all points are then evaluated from both sides.
+    templates : the user's templates, searched first.
+    controllers : names of the controls, default all.
     """
     zone = in_zone(machine, zone_mm)
     if zone_mm is not None:
@@ -412,7 +415,7 @@ def _left(
 
 
 def _settings(machine: Machine, name: str) -> Any:
-    """Settings of a control, or None if the machine file does not say all that an export must know."""
+    """Return the settings of a control, or None if the machine file does not state all that an export needs."""
     try:
         control = controller_named(name)(machine)
     except CompgenError:
@@ -421,7 +424,7 @@ def _settings(machine: Machine, name: str) -> Any:
 
 
 def _variants(machine: Machine, name: str) -> list[tuple[ControlResult, Machine]]:
-    """The variants of a control, yet without a result, each with the machine that has its settings."""
+    """Return the variants of a control, still without a result, each with the machine that has its settings."""
     given = _settings(machine, name)
     found = []
     for words, changes in VARIANTS.get(name, (("", {}),)):
@@ -430,7 +433,9 @@ def _variants(machine: Machine, name: str) -> list[tuple[ControlResult, Machine]
             stated = machine.controller_settings(name).data
             assumed = {key: value for key, value in ASSUMED.get(name, {}).items() if key not in stated}
             other = _with_settings(machine, name, {**assumed, **changes})
-            notes = tuple(f"{key} is not stated in the machine file; {assumed[key]!r} is taken here" for key in assumed)
+            notes = tuple(
+                f"{key} is not stated in the machine file; {assumed[key]!r} is assumed here" for key in assumed
+            )
         own = given is not None and all(getattr(given, key) == value for key, value in changes.items())
         found.append((ControlResult(name, words, own or not changes, notes=notes), other))
     return found
@@ -450,7 +455,7 @@ def _control_result(
     reversal: ReversalCurves | None,
     templates: Path | None,
 ) -> ControlResult:
-    """Export, read the text back, emulate it at the points; a control that cannot be exported says why."""
+    """Export, read the text back, emulate it at the points; if a control cannot be exported, say why."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CompgenWarning)
@@ -468,36 +473,36 @@ def _control_result(
 
 
 def missing_notes(errors: ErrorTable) -> list[str]:
-    """Say which of the 21 errors are not known, and when that matters."""
+    """Return which of the 21 errors are unknown, and when that matters."""
     missing = [name for name in ERROR_NAMES if name not in errors.names]
     if not missing:
         return []
     return [
-        f"not in the errors file, so taken as zero: {', '.join(missing)}; with a tool of another offset than the one "
-        "measured with, some of them act too"
+        f"not in the errors file, so assumed zero: {', '.join(missing)}; with a tool offset other than the one "
+        "used in the measurement, some of them act, too"
     ]
 
 
 def _notes(errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
     if reversal is None:
-        return [*missing_notes(errors), "no reversal was given: both directions of travel are taken as equal"]
+        return [*missing_notes(errors), "no reversal was given: both directions of travel are assumed equal"]
     return [
         *missing_notes(errors),
-        "controls without tables of one direction are shown with the whole reversal left; their backlash parameter "
-        "takes out what lies along the axis",
+        "controls without direction-dependent tables are shown with the full reversal; their backlash parameter "
+        "corrects the part along the axis",
     ]
 
 
-# Why a control's table is as it is: what it corrects, what stays, what the next option would buy, and what it uses.
+# Explanation of a control's table: what it corrects, what remains, what the next option would gain, limits used.
 
 
-#: Errors that stay by less than this are taken as corrected, um.
+#: Errors of which less than this remains count as corrected, um.
 CORRECTED_UM = 0.1
 
 
 @dataclass(frozen=True)
 class Fate:
-    """What becomes of one error: displacement in um that it causes by itself, and that it leaves; why it stays."""
+    """One error: the displacement in um that it causes by itself, how much of it remains, and why."""
 
     name: str
     before_um: float
@@ -509,8 +514,9 @@ class Fate:
 class Explanation:
     """Result of :func:`explain`.
 
-    ``nodes`` holds number, first and last node and smallest and largest step (mm) of the tables over each axis,
-    ``rounding_um`` the most that rounding changes a correction, ``steps`` the largest steps between neighbouring nodes.
+    ``nodes`` has number, first and last node and smallest and largest step (mm) of the tables over each axis,
+    ``rounding_um`` is the largest change of a correction by rounding, ``steps`` the largest steps between neighbouring
+    nodes.
     """
 
     controller: str
@@ -549,14 +555,14 @@ def explain(
     reversal: ReversalCurves | None = None,
     templates: Path | None = None,
 ) -> Explanation:
-    """Explain exported files from their text; ``errors``, ``reversal`` and ``templates`` as they were exported with."""
+    """Explain exported files from their text; ``errors``, ``reversal`` and ``templates`` are those of the export."""
     control = controller_named(exported.controller)(machine)
     tables = control.parse([SourceFile(Path(name), text) for name, text in exported.files.items()])
     solver = projector(machine, control.basis(errors), anchored=control.anchored)
     values = np.concatenate([term.start for term in solver.basis])
     level = level_key(solver.basis)
     safety = safety_of(machine, control, tables, lambda part: solver.field(values, part))
-    rest = None  # what tables of one direction do not take out
+    rest = None  # what direction-dependent tables do not correct
     if reversal is not None:
         rest = reversal.without(control.reversal_in_tables(reversal))
     known = rest if rest is not None and rest.curves else None
@@ -571,7 +577,7 @@ def explain(
         for name in sorted(before, key=lambda name: -after[name])
     ]
     turned_um, kept_um = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
-    why = "the tables act in both directions alike: the control's backlash parameter takes the part along the axis"
+    why = "the tables act alike in both directions: the control's backlash parameter corrects the part along the axis"
     fates += [
         Fate(name, value, kept_um.get(name, 0.0), why if name in kept_um else "") for name, value in turned_um.items()
     ]
@@ -592,17 +598,15 @@ def explain(
 
 
 def _why(name: str, level: str) -> str:
-    """Say in words why a control of this level leaves an error."""
+    """Return why a control of this level leaves an error."""
     error = error_named(name)
     if level in ("products", "volumetric"):
         return "the nodes of the tables do not follow it closely"
     if error.kind == "angular":
-        return (
-            "it acts with a lever that changes with another axis: products of tables or a volumetric function hold it"
-        )
+        return "its lever changes with another axis: products of tables or a volumetric function can correct it"
     if level == "pitch":
         across = "squareness" if error.kind == "squareness" else "straightness"
-        return f"{across} moves the tool across the axis: tables of one axis over another hold it"
+        return f"{across} moves the tool across the axis: tables of one axis over another can correct it"
     return "the nodes of the tables do not follow it closely"
 
 

@@ -1,4 +1,4 @@
-"""Texts of tables through Jinja2: the format of a control, a user's own templates, checks of plug-ins."""
+"""Texts of tables through Jinja2: the format of a control, templates of the user, checks of plug-ins."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from compgen.data.names import AXES, ERRORS
 from compgen.errors import InputError
 from compgen.resources import data_folder
 
-# Controller files through Jinja2: strict about missing values, sandboxed, nothing of a user's text is executed.
+# Controller files through Jinja2: strict about missing values, sandboxed; text of a user is never executed.
 
 
 #: Files that are written together with those of the control.
 OWN_FILES = ("manifest.json", "preflight.md", "result.json", "explain.md")
-#: Longest time that one template may take, s, and most characters that it may write or hold in one text.
+#: Longest time that one template may take, s, and most characters that it may write or keep in one text.
 LONGEST_S, MOST_CHARACTERS = 60.0, 400_000_000
 #: Largest whole number that a template may calculate, bits.
 MOST_BITS = 10_000
 
 
 class EndlessTemplateError(Exception):
-    """A template takes too long or becomes too large; those of users may hold any loop."""
+    """A template takes too long or becomes too large; templates of users may contain any loop."""
 
     def __init__(self, message: str = "it takes too long: does a loop end?") -> None:
         super().__init__(message)
 
 
-#: What a wrong template may raise: Jinja's own errors, and those of the expressions in it.
+#: What a wrong template may raise: Jinja's errors, and those of its expressions.
 _TEMPLATE_FAULTS = (
     TemplateError,
     TypeError,
@@ -62,7 +62,7 @@ _TEMPLATE_FAULTS = (
 class FileSpec:
     """One file of a format: its template, its name, and its line end.
 
-    A file with a ``variant`` is written only where the control's context says ``container = <variant>``.
+    A file with a ``variant`` is written only if the control's context has ``container = <variant>``.
     """
 
     template: str
@@ -73,10 +73,10 @@ class FileSpec:
 
 @dataclass(frozen=True)
 class Format:
-    """The card of a control's format as ``templates/<name>/format.toml`` has it.
+    """The card of a control's format, from ``templates/<name>/format.toml``.
 
     ``evidence`` is ``"documented"`` or ``"unverified"``; ``unverified`` lists what no public document settles.
-    ``settings`` says what the keys of ``[controllers.<name>]`` mean that the control does not declare.
+    ``settings`` describes the keys of ``[controllers.<name>]`` that the control does not declare.
     """
 
     name: str
@@ -93,24 +93,24 @@ class Format:
 
 def _texts(value: Any) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise ValueError("a list of texts is expected")
+        raise ValueError("expected a list of texts")
     return tuple(" ".join(item.split()) for item in value)
 
 
 def _prose(value: Any) -> str:
     if not isinstance(value, str):
-        raise ValueError("a text is expected")
+        raise ValueError("expected a text")
     return " ".join(value.split())
 
 
 def template_folders(name: str, folder: Path | None = None) -> list[Path]:
-    """Return where the templates of control ``name`` are looked for: the user's, a plug-in's own, the shipped ones."""
+    """Return where templates of control ``name`` are searched: the user's, those of its plug-in, the shipped ones."""
     own = CONTROLLERS.templates(name)
     return [*([folder] if folder else []), *([own] if own else []), data_folder("templates")]
 
 
 def check_templates(name: str, folder: Path) -> None:
-    """Check what a plug-in's control brings below ``folder``: the card, every template that it names, their syntax."""
+    """Check what a plug-in's control brings below ``folder``: the card, every template it lists, their syntax."""
     card = _read_format(folder / name / "format.toml", name)
     environment = _environment((folder, data_folder("templates")))
     for template in (*(spec.template for spec in card.files), "preflight.md.j2"):
@@ -124,7 +124,7 @@ def check_templates(name: str, folder: Path) -> None:
 
 
 def load_format(name: str, folder: Path | None = None) -> Format:
-    """Load the card of format ``name`` from ``folder`` (the user's templates), else from the shipped ones."""
+    """Load the card of format ``name`` from ``folder`` (the user's templates), otherwise from the shipped ones."""
     if folder is not None and not folder.is_dir():
         raise InputError("no such folder; --templates needs a folder with a sub-folder per control", file=folder)
     for base in template_folders(name, folder):
@@ -138,23 +138,23 @@ def load_format(name: str, folder: Path | None = None) -> Format:
 def _named(expected: str) -> Callable[[Any], str]:
     def check(value: Any) -> str:
         if value != expected:
-            raise ValueError(f"the name of the control, {expected!r}, is expected")
+            raise ValueError(f"expected the name of the control, {expected!r}")
         return expected
 
     return check
 
 
 def _file_name(value: Any) -> str:
-    """A plain name of an output file: no folder, none of the names that compgen writes itself."""
+    """Return a plain name of an output file: no folder, none of the names that compgen writes itself."""
     name = toml_files.text(value)
     if PurePath(name).name != name or "\\" in name or name.startswith(".") or name.lower() in OWN_FILES:
-        raise ValueError(f"a plain file name without folder, other than {', '.join(OWN_FILES)}, is expected")
+        raise ValueError(f"expected a plain file name without folder, other than {', '.join(OWN_FILES)}")
     return name
 
 
 @lru_cache(maxsize=64)
 def _known_format(path: Path, name: str, _state: tuple[int, int]) -> Format:
-    """Read a card once for as long as time and size of its file stay: every run looks at the cards of all controls."""
+    """Read a card once, until time or size of its file change: every run needs the cards of all controls."""
     return _read_format(path, name)
 
 
@@ -190,12 +190,12 @@ def _read_format(path: Path, name: str) -> Format:
 
 
 class _Bounded(ImmutableSandboxedEnvironment):
-    """A sandbox in which no product or power is larger than a text or a number can sensibly be."""
+    """A sandbox that limits the size of products and powers, of texts and of numbers."""
 
     intercepted_binops = frozenset({"*", "**"})
 
     def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:
-        """Calculate, unless the result would not end or fit into the memory."""
+        """Calculate, unless the result would take too long or not fit into memory."""
         sizes = [len(item) for item in (left, right) if isinstance(item, str | bytes | list | tuple)]
         factors = [item for item in (left, right) if isinstance(item, int)]
         if operator == "*" and sizes and factors and sizes[0] * abs(factors[0]) > MOST_CHARACTERS:
@@ -209,7 +209,7 @@ class _Bounded(ImmutableSandboxedEnvironment):
 
 @lru_cache(maxsize=32)
 def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
-    """Return the environment of some folders; it is kept with its compiled templates, and reads those that changed again."""
+    """Return the environment of some folders; it is cached with its compiled templates, and changed ones are read again."""
     environment = _Bounded(
         loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
         undefined=StrictUndefined,
@@ -224,7 +224,7 @@ def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
 
 
 def _inert(value: Any) -> Any:
-    """Text of a user becomes one line of printable ASCII; containers are passed through item by item."""
+    """Make text of a user one line of printable ASCII; containers are converted item by item."""
     if isinstance(value, str):
         return one_line(value)
     if isinstance(value, Mapping):
@@ -248,7 +248,7 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     try:
         page = _environment(tuple(folders)).get_template(f"{card.name}/{template}")
         with _ended_after(LONGEST_S):
-            # An endless template is stopped as soon as the page is too long.
+            # An endless template is stopped as soon as its output is too long.
             parts = page.generate({**{key: _inert(value) for key, value in context.items()}, "format": card})
             kept, size = [], 0
             for part in parts:
@@ -265,9 +265,9 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
 
 @contextmanager
 def _ended_after(seconds: float) -> Iterator[None]:
-    """Raise EndlessTemplateError in this thread, wherever it is, if the block takes longer.
+    """Raise EndlessTemplateError in this thread if the block takes longer.
 
-    A loop that writes nothing cannot be asked to stop; the interpreter can be, from another thread.
+    A loop that writes nothing cannot be stopped from within; another thread can interrupt the interpreter.
     """
     thread, lock, over, struck = ctypes.c_ulong(threading.get_ident()), threading.Lock(), False, False
 
@@ -289,15 +289,15 @@ def _ended_after(seconds: float) -> Iterator[None]:
     finally:
         with lock:
             over = True
-            if struck:  # it may still be on its way: take it back
-                # Never without need: in CPython 3.11 a thread without a pending exception then looks for one at every
-                # call, and stops for good where its calls are traced (coverage, debuggers).
+            if struck:  # it may still be pending: withdraw it
+                # Only if needed: in CPython 3.11 a thread without a pending exception then checks for one at every
+                # call, and hangs if its calls are traced (coverage, debuggers).
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
         timer.cancel()
 
 
 def _place(error: Exception, folders: Sequence[Path]) -> tuple[str | None, int | None]:
-    """Template file and line of an error: Jinja gives both in syntax errors, and rewrites tracebacks for the rest."""
+    """Return template file and line of an error: Jinja gives both in syntax errors, and rewrites tracebacks for the rest."""
     if isinstance(error, TemplateSyntaxError):
         return error.filename, error.lineno
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
@@ -317,12 +317,12 @@ def render_files(card: Format, context: Mapping[str, Any], folder: Path | None =
     return texts
 
 
-# Files that a user's own templates add to those of a control: for controls whose format is not public.
+# Files that templates of the user add to those of a control: for controls whose format is not public.
 #
-# Some volumetric compensations (SINUMERIK VCS) have no public file format. Whoever knows the format of the own control puts
-# a template ``<templates>/<control>/companion/<file name>.j2`` into a folder of templates; it gets the 21 errors as
-# ``errors21`` in addition to everything that the control's own templates get. Such a file is written and named with its SHA-256,
-# but nothing can be read back from it: what is verified are the files of the control alone.
+# Some volumetric compensations (SINUMERIK VCS) have no public file format. A user who knows the format puts a template
+# ``<templates>/<control>/companion/<file name>.j2`` into a folder of templates; it gets the 21 errors as ``errors21``
+# in addition to everything that the templates of the control get. Such a file is written and listed with its SHA-256,
+# but it cannot be read back: only the files of the control are verified.
 
 
 FOLDER, SUFFIX, CRLF_SUFFIX = "companion", ".j2", ".crlf.j2"
@@ -331,9 +331,9 @@ FOLDER, SUFFIX, CRLF_SUFFIX = "companion", ".j2", ".crlf.j2"
 def errors_context(machine: Machine, errors: ErrorTable) -> list[dict[str, Any]]:
     """Return all 21 errors in the order of ISO 230-1's names, in the conventions of the program.
 
-    Each has ``name``, ``kind`` (linear, angular, squareness), ``axis`` (X, Y, Z, or "" for a squareness), ``unit``
-    (mm or rad), ``position_mm`` and ``value`` (lists of one length; a squareness has no position and one value) and
-    ``known``: an error that the input does not hold is zero.
+    Each has ``name``, ``kind`` (linear, angular, squareness), ``axis`` (X, Y, Z, or "" for a squareness), ``unit`` (mm
+    or rad), ``position_mm`` and ``value`` (lists of one length; a squareness has no position and one value) and
+    ``known``: an error that the input does not contain is zero.
     """
     return [_error(machine, errors, item.name, item.kind, item.axis) for item in ERRORS]
 
@@ -359,9 +359,9 @@ def companion_files(
     Parameters
     ----------
     card : format of the control.
-    context : what the templates get.
-    taken : files of the control, whose names are not free.
-    folder : the user's templates, None: there are none.
+    context : the variables of the templates.
+    taken : files of the control, whose names are reserved.
+    folder : the user's templates, or None.
 
     Raises
     ------
@@ -375,7 +375,7 @@ def companion_files(
         crlf = path.name.endswith(CRLF_SUFFIX)
         name = path.name.removesuffix(CRLF_SUFFIX if crlf else SUFFIX)
         if not name or name.startswith(".") or name.lower() in {*OWN_FILES, *map(str.lower, (*taken, *found))}:
-            raise InputError(f"{name!r} is not free as a file name; name the template <file name>{SUFFIX}", file=path)
+            raise InputError(f"{name!r} is a reserved file name; name the template <file name>{SUFFIX}", file=path)
         text = render(card, f"{FOLDER}/{path.name}", context, folder)
         found[name] = text.replace("\n", "\r\n") if crlf else text
     return found

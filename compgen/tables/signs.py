@@ -1,4 +1,4 @@
-"""Signs, axes and units: the crash test of every wrong convention, and five positions at the machine that show one."""
+"""Signs, axes and units: the crash test of every wrong convention, and five positions at the machine that reveal one."""
 
 from __future__ import annotations
 
@@ -27,29 +27,28 @@ from compgen.tables.judge import COMPONENT_FLOOR_MM, Judge, judge_of
 from compgen.tables.render import load_format, render, template_folders
 from compgen.tables.verification import ReadTables, reasons_against
 
-# The sign crash test: every way to get signs, axes and units wrong, and whether the verification would notice.
+# The sign crash test: every way to get signs, axes and units wrong, and whether the verification detects it. Variants
+# at the level of the **emulated correction** c(p), after the text of the tables was parsed:
 #
-# Wrong ones at the level of the **emulated correction** c(p), that is after the text of the tables was parsed:
+# - ``output``: S c(p) for the 47 wrong signed permutations S of the three axes (the values get a wrong axis or sign);
+# - ``frame``: S c(S^T p), correction and positions both in a wrong frame, as of a machine with other axis directions;
+# - the reversed sign (-c, one of the 47) and wrong units (a thousand times too large or too small).
 #
-# - ``output``: S c(p) for the 47 wrong signed permutations S of the three axes (the values go to a wrong axis or sign);
-# - ``frame``: S c(S^T p), correction and positions both in a wrong frame, as from a machine with other axis directions;
-# - the flipped sign (-c, one of the 47) and slips of unit (a thousand times too large or too small).
+# Variants at the level of the **errors** that tables are made from, exported and parsed again: degrees for radians and
+# vice versa, and the errors instead of the correction.
 #
-# Wrong ones at the level of the **errors** that tables are made of, exported and parsed anew: degrees for radians in both
-# directions, and the errors in place of the correction.
-#
-# Wrong ones at the level of the **numbers** of the parsed tables: one number that depends on the errors is changed so that
-# the tip moves by a little more than the goal of one entry (``Judge.goal_mm``), with the machine's own tool or any other.
+# Variants at the level of the **numbers** of the parsed tables: one number that depends on the errors is changed until
+# the tip moves by a little more than the goal of one entry (``Judge.goal_mm``), with the machine's tool or any other.
 
 
 Correction = Callable[[FloatArray], FloatArray]
 #: Outcomes of one trial.
 REJECTED, SAME, ACCEPTED = "rejected", "same", "ACCEPTED"
-#: Numbers of the tables that are changed one at a time, unless told otherwise.
+#: Default count of numbers of the tables that are changed one at a time.
 ENTRIES = 24
-#: Part of the goal that a changed number exceeds it by.
+#: Share of the goal by which a changed number exceeds it.
 BEYOND_GOAL = 0.05
-#: Changes by which it is found out what a number does, in its own unit (mm, rad, um, counts), and the least that says it.
+#: Trial changes that show what a number does, in its unit (mm, rad, um, counts), and the smallest response that counts.
 TRIALS, LEAST_MOVED_MM = (1e-6, 1e-3, 1.0), 1e-7
 
 
@@ -58,8 +57,8 @@ class Trial:
     """One wrong correction and what the verification said.
 
     ``outcome`` is ``"rejected"``; ``"same"`` if the correction differs from the right one by no more than the
-    verification is meant to see (``difference_um``, the largest over the volume), so that it does not count; or
-    ``"ACCEPTED"``, which must not be. ``reason`` is the first reason of the verification.
+    verification resolves (``difference_um``, the largest over the volume), so it does not count; or ``"ACCEPTED"``, a
+    failure. ``reason`` is the first reason of the verification.
     """
 
     kind: str
@@ -84,7 +83,7 @@ class CrashTest:
         return not self.baseline and not self.count(ACCEPTED)
 
     def count(self, outcome: str) -> int:
-        """Return how many trials ended so."""
+        """Return how many trials had this outcome."""
         return sum(trial.outcome == outcome for trial in self.trials)
 
     def summary(self) -> dict[str, object]:
@@ -113,7 +112,7 @@ def signed_permutations() -> list[FloatArray]:
 
 
 def permutation_name(matrix: FloatArray) -> str:
-    """Say which value each axis gets, e.g. ``X<-Y Y<--X Z<-Z`` as ``(Y, -X, Z)``."""
+    """Return in words which value each axis gets, e.g. ``X<-Y Y<--X Z<-Z`` as ``(Y, -X, Z)``."""
     parts = []
     for row in matrix:
         source = int(np.argmax(np.abs(row)))
@@ -122,7 +121,7 @@ def permutation_name(matrix: FloatArray) -> str:
 
 
 def exported_tables(machine: Machine, errors: ErrorTable, controller: str) -> ReadTables:
-    """Export errors and parse the text again, without any file."""
+    """Export errors and parse the text, without any file."""
     made = export(machine, errors, controller, allow_unverified=True)
     control = controller_named(controller)(machine)
     sources = [SourceFile(Path(name), text) for name, text in made.files.items()]
@@ -130,11 +129,11 @@ def exported_tables(machine: Machine, errors: ErrorTable, controller: str) -> Re
 
 
 def crash_test(machine: Machine, errors: ErrorTable, controller: str, entries: int = ENTRIES) -> CrashTest:
-    """Hold every wrong variant of a control's tables against the errors.
+    """Verify every wrong variant of a control's tables against the errors.
 
     Parameters
     ----------
-    machine, errors : the errors (mm, rad) that the tables are made of and judged against.
+    machine, errors : the errors (mm, rad) from which the tables are made and against which they are judged.
     controller : name of the control.
     entries : how many numbers of the tables are changed, spread evenly over all that depend on the errors.
     """
@@ -166,7 +165,7 @@ def crash_test(machine: Machine, errors: ErrorTable, controller: str, entries: i
         for name, linear, angular in (
             ("deg for rad (angles 57 times too large)", 1.0, math.degrees(1.0)),
             ("rad for deg (angles 57 times too small)", 1.0, math.radians(1.0)),
-            ("correction taken for the error", -1.0, -1.0),
+            ("correction mistaken for the error", -1.0, -1.0),
             ("um for mm in the lengths only", 1000.0, 1.0),
             ("urad for mrad in the angles only", 1.0, 1000.0),
         )
@@ -189,7 +188,7 @@ class _Court:
     visible_mm: float
 
     def trial(self, kind: str, name: str, wrong: Correction, violations: Sequence[str] = ()) -> Trial:
-        """Judge one wrong correction; the lines are looked at only if the grid shows nothing."""
+        """Judge one wrong correction; the lines are checked only if the grid shows nothing."""
         on_grid = wrong(self.judge.grid.position_mm)
         difference = float(np.max(np.abs(on_grid - self.right_mm)))
         reasons = [*violations, *self.judge.component_reasons(on_grid)]
@@ -199,7 +198,7 @@ class _Court:
         return Trial(kind, name, outcome, difference / MM_PER_UM, reasons[0] if reasons else "")
 
     def exported(self, name: str, errors: ErrorTable, controller: str) -> Trial:
-        """Judge tables that were made of wrong errors; tables that cannot be made are rejected as well."""
+        """Judge tables made from wrong errors; tables that cannot be made count as rejected."""
         try:
             tables = exported_tables(self.machine, errors, controller)
             found = tables.controller.violations(tables.tables)
@@ -209,7 +208,7 @@ class _Court:
 
 
 def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) -> Iterator[Trial]:
-    """Change one number at a time, by a little more than the goal; what cannot move the tip by so much is left out."""
+    """Change one number at a time, by a little more than the goal; numbers that cannot move the tip that far are skipped."""
     check = entry_check(machine, judge, right)
     places = [(place, int(k)) for place, part in check.depends.items() for k in np.flatnonzero(part)]
     picked = np.unique(np.linspace(0, len(places) - 1, min(most, len(places))).round().astype(int))
@@ -252,21 +251,21 @@ def _scaled(errors: ErrorTable, length: float, angle: float) -> ErrorTable:
     return ErrorTable(curves, squareness, errors.metadata)
 
 
-# Five positions at the machine that show which sign, axis or unit is wrong, with what must be read there.
+# Five positions at the machine that show which sign, axis or unit is wrong, with the readings expected there.
 #
 # The readings come from the parsed tables (the emulated control) and the exact machine with the given errors; every
-# reading counts from the one at the first position, so that any displacement instrument will do.
+# reading is relative to the one at the first position, so any displacement instrument will do.
 
 
 #: Candidates per axis for the positions.
 LEVELS = 5
-#: Way of the last approach, at most, and as a share of the travel, mm.
+#: Length of the last approach: at most, mm, and as a share of the travel.
 APPROACH_MM, APPROACH_SHARE = 10.0, 0.02
-#: Positions stay this many times that way inside the travel, so that no move ends at a software limit.
+#: Positions keep this many approach lengths away from the ends of the travel, so that no move ends at a software limit.
 MARGIN = 1.5
 #: Feed between the positions and over the last approach, mm/min.
 FEED_MM_MIN, APPROACH_FEED_MM_MIN = 1000, 200
-#: In a folder of their own, so that nobody takes the program for a table.
+#: In a separate folder, so that the program is not mistaken for a table.
 PROGRAM_NAME, PAGE_NAME = "check/check-program.nc", "check/check-program.md"
 
 
@@ -277,12 +276,13 @@ class CheckProgram:
     Parameters
     ----------
     position_mm : the five positions in machine coordinates, shape (5, 3); the first is the zero of all readings.
-    before_mm : from where each is approached: X and Y from below, Z from above, shape (5, 3).
-    safe_z_mm : Z on the way between two positions.
+    before_mm : where each approach starts: X and Y from below, Z from above, shape (5, 3).
+    safe_z_mm : Z between two positions.
     added_mm : what the control adds to the command there, shape (5, 3).
     off_mm, on_mm : readings (actual tip minus commanded) without and with compensation, less the first, shape (5, 3).
     separation_mm : every wrong signed permutation of the axes changes some reading by at least this.
-    slips : common mistakes, as (what, position number, axis, right reading, wrong reading) in mm, with compensation on.
+    slips : common mistakes, as (description, position number, axis, right reading, wrong reading) in mm, with
+        compensation on.
     """
 
     position_mm: FloatArray
@@ -302,15 +302,16 @@ def check_program(
 
     Parameters
     ----------
-    machine : the machine; all positions and approaches lie within its travel.
-    tables : the tables as they were parsed.
-    errors : how the machine errs, usually the identified errors (mm, rad).
-    reversal : what it does differently in its two directions; every position is approached from one side.
+    machine : the machine; all positions and approaches are within its travel.
+    tables : the tables as parsed.
+    errors : errors of the machine, usually the identified errors (mm, rad).
+    reversal : its reversal; every position is approached from one side.
     """
     way_mm = np.minimum(APPROACH_MM, APPROACH_SHARE * (machine.upper_mm - machine.lower_mm))
     candidates = _candidates(machine, way_mm)
     added = tables.correction(machine, _approached(candidates))
-    # What the same tables add at positions (n, 3) if the control reads them otherwise, by words, each (n, 3), mm.
+    # What the same tables add at positions (n, 3) if the control interprets them otherwise, by description, each (n,
+    # 3), mm.
     others = {
         words: np.asarray(other.emulate(tables.tables, _approached(candidates)))
         for words, other in tables.controller.other_readings(tables.tables).items()
@@ -338,14 +339,14 @@ def check_program(
 
 
 def _apart(moved: Sequence[FloatArray]) -> FloatArray:
-    """Smallest difference between any two readings of the tables, each (n, 3): shape (n, 3), mm."""
+    """Return the smallest difference between any two interpretations of the tables, each (n, 3): shape (n, 3), mm."""
     return np.asarray(np.min([np.abs(a - b) for a, b in combinations(moved, 2)], axis=0))
 
 
 def _readings(
     moved_mm: FloatArray, others_mm: Mapping[str, FloatArray], on_mm: FloatArray
 ) -> list[tuple[str, int, str, float, float]]:
-    """Slips of the other readings, all at the position and axis that tell every two of them apart best."""
+    """Return the slips of the other interpretations, all at the position and axis that best distinguish every two."""
     if not others_mm:
         return []
     place, axis = divmod(int(np.argmax(_apart([moved_mm, *others_mm.values()]))), 3)
@@ -357,7 +358,7 @@ def _readings(
 
 
 def _approached(position_mm: FloatArray) -> Points:
-    """Points with the direction of the last travel of every axis: X and Y upwards, Z downwards."""
+    """Return points with the direction of the last travel of every axis: X and Y upwards, Z downwards."""
     return Points(position_mm, approach=_directions(position_mm))
 
 
@@ -366,7 +367,7 @@ def _directions(position_mm: FloatArray) -> FloatArray:
 
 
 def _candidates(machine: Machine, way_mm: FloatArray) -> FloatArray:
-    """The reference point (moved into reach) and a grid within the travel less the approach, shape (n, 3), mm."""
+    """Return the reference point (moved into reach) and a grid within the travel less the approach, shape (n, 3), mm."""
     low, high = machine.lower_mm + MARGIN * way_mm, machine.upper_mm - MARGIN * way_mm
     lines = [np.linspace(low[k], high[k], LEVELS) for k in range(3)]
     first = np.clip(machine.reference_point_mm, low, high)
@@ -375,10 +376,10 @@ def _candidates(machine: Machine, way_mm: FloatArray) -> FloatArray:
 
 
 def _choose(added_mm: FloatArray, others_mm: Sequence[FloatArray]) -> list[int]:
-    """Indices of five candidates: the first, the largest change of X, Y and Z, and the one that tells most apart.
+    """Return the indices of five candidates: the first, the largest change of X, Y and Z, and the most distinctive one.
 
-    The last one tells wrong permutations of the axes apart, and the other readings of the tables (n, 3) from each other,
-    as far as the first four do not.
+    The last one distinguishes wrong permutations of the axes, and the other interpretations of the tables (n, 3), as
+    far as the first four do not.
     """
     moved = added_mm - added_mm[0]
     chosen = [0]
@@ -399,7 +400,7 @@ def _choose(added_mm: FloatArray, others_mm: Sequence[FloatArray]) -> list[int]:
 
 
 def _wrong(moved_mm: FloatArray) -> list[tuple[str, FloatArray]]:
-    """Mistakes as (what, what the control then adds at each position, less the first), shape (5, 3), mm."""
+    """Return mistakes as (description, what the control then adds at each position less the first, shape (5, 3), mm)."""
     found: list[tuple[str, FloatArray]] = [("all signs reversed", -moved_mm)]
     for axis, letter in enumerate(AXES):
         signs = np.ones(3)
@@ -414,7 +415,7 @@ def _wrong(moved_mm: FloatArray) -> list[tuple[str, FloatArray]]:
 
 
 def _slip(name: str, change_mm: FloatArray, on_mm: FloatArray) -> tuple[str, int, str, float, float]:
-    """Where a mistake shows most: position number, axis, right and wrong reading with compensation on."""
+    """Return where a mistake shows most: position number, axis, right and wrong reading with compensation on."""
     place, axis = divmod(int(np.argmax(np.abs(change_mm))), 3)
     right = float(on_mm[place, axis])
     return name, place + 1, AXES[axis], right, right + float(change_mm[place, axis])
@@ -427,11 +428,11 @@ def check_files(
     templates: Path | None = None,
     reversal: ReversalCurves | None = None,
 ) -> dict[str, str]:
-    """Return ``check/check-program.md`` and, for controls whose motion in machine coordinates is documented, the program.
+    """Return ``check/check-program.md`` and, for controls with a documented motion in machine coordinates, the program.
 
     Parameters
     ----------
-    machine, errors : what moves, and how it errs.
+    machine, errors : the machine and its errors.
     exported : the files; the readings are those of their text.
     templates : a user's templates folder, searched first.
     reversal : as in :func:`check_program`.
@@ -441,7 +442,7 @@ def check_files(
     tables = ReadTables(control, control.parse(sources), ())
     card = load_format(exported.controller, templates)
     program = check_program(machine, tables, errors, reversal)
-    # Whether the control's folder has a program; without one only the page is written.
+    # If the control's folder has no program, only the page is written.
     folders = template_folders(card.name, templates)
     has_program = any((folder / card.name / "check-program.nc.j2").is_file() for folder in folders)
     context = {**_context(machine, exported, program), "has_program": has_program}

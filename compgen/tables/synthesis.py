@@ -1,6 +1,6 @@
-"""The best tables that a control can hold: least squares of its basis against the wanted correction field.
+"""The best tables that a control can express: least squares of its basis against the required correction field.
 
-The wanted correction c*(p) brings the exact machine to where it was told to go: tip(p + c*(p)) = p + tool offset. It
+The required correction c*(p) brings the exact machine to the commanded position: tip(p + c*(p)) = p + tool offset. It
 contains what a first-order model leaves out, e.g. the 4 um over a metre that come with a squareness of 2.9 mrad.
 """
 
@@ -26,12 +26,12 @@ from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import volume_sample
 
 #: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
-#: leaves one, everywhere. Both weights lie far below that of any data (the normal matrix has unit diagonal).
+#: leaves one, everywhere. Both weights are far below that of any data (the normal matrix has unit diagonal).
 KEEP = 1e-7
 RIDGE = 1e-11
-#: A table's end interval of which less than this lies within the travel says too little about the node outside.
+#: An end interval of a table with less than this share within the travel says too little about the node outside.
 LEAST_SHARE = 0.5
-#: Steps towards what a control applies that is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
+#: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
 
 #: What a control adds to the commands: values by term, points -> (n, 3), mm.
@@ -41,7 +41,7 @@ Applied = Callable[[Mapping[str, FloatArray], Points], FloatArray]
 def wanted_correction(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
-    """Return what must be added to commands (n, 3) so that the exact machine goes where it was told to, mm."""
+    """Return what must be added to commands (n, 3) so that the exact machine reaches the commanded position, mm."""
     correction = np.zeros_like(position_mm)
     for _ in range(50):
         previous = correction
@@ -57,7 +57,7 @@ class Projector:
     """Least squares of a basis over sample points, with the normal matrix factorised once.
 
     ``position_mm`` (n, 3) with ``weight`` (n,) and ``sample_tool_mm`` (3,) or (n, 3) are the sample; elsewhere the tool
-    is ``tool_mm``. ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 when a
+    is ``tool_mm``. ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 if a
     constant per axis is fitted together with the tables because the control cannot express it. ``design`` (3 n, free +
     offsets) is sparse.
     """
@@ -80,7 +80,7 @@ class Projector:
         return np.asarray(start + self.project_all((wanted_mm - self.field(start))[None])[0])
 
     def project_all(self, wanted_mm: FloatArray) -> FloatArray:
-        """Return table values (k, parameters) for k wanted fields (k, n, 3) at once."""
+        """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
         return np.asarray((self.transform @ self._solved(wanted_mm)[: self.transform.shape[1]]).T)
 
     def left_of(self, wanted_mm: FloatArray) -> FloatArray:
@@ -158,8 +158,8 @@ def projector(
     ----------
     machine : its travel is sampled at the tables' nodes and between them, its work zone by its weight.
     basis : the control's terms.
-    anchored : True if a constant offset per axis is no part of what the control can do.
-    tools_mm : every point is sampled with each of these tool offsets; by default with the machine's own.
+    anchored : True if the control cannot apply a constant offset per axis.
+    tools_mm : every point is sampled with each of these tool offsets; by default with that of the machine file.
     """
     volume = (machine.axes[0].range_mm, machine.axes[1].range_mm, machine.axes[2].range_mm, machine.emphasis)
     about_terms = [(term.name, term.axis, term.carrier, term.zero_at_mm, term.keep_mm, term.zeros_mm) for term in basis]
@@ -171,7 +171,7 @@ def projector(
 
 @dataclass(frozen=True)
 class _Problem:
-    """A least-squares problem; two are the same if the volume and the tables are, whatever values the tables hold."""
+    """A least-squares problem; two are equal if the volume and the tables are, whatever the values of the tables."""
 
     key: tuple[bytes, ...]
     machine: Machine = field(compare=False)
@@ -180,7 +180,7 @@ class _Problem:
     tools_mm: tuple[Vector3, ...] = field(compare=False)
 
 
-@lru_cache(maxsize=16)  # a few MB each: a run for all controls and its report find theirs again
+@lru_cache(maxsize=16)  # a few MB each: a run for all controls and its report reuse them
 def _factorised(problem: _Problem) -> Projector:
     """Factorise once what an export, its verification and the next measurement of the machine have in common."""
     machine, basis, tools_mm = problem.machine, problem.basis, problem.tools_mm
@@ -230,7 +230,7 @@ def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
             if term.zero_at_mm is not None:
                 rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
             rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
-            # nodes beyond the travel continue the line of the two inside, where few points determine them
+            # nodes outside the travel that few points determine continue the line of the two inside
             nodes_mm, (low_mm, high_mm) = term.nodes_mm, machine.axes[term.axis].range_mm
             ends = ((0, 1, 2, low_mm), (-1, -2, -3, high_mm)) if len(nodes_mm) >= 3 else ()
             for node, next_node, third, end_mm in ends:
@@ -254,9 +254,9 @@ def synthesize(
     at_axes: bool = False,
     applied: Applied | None = None,
 ) -> dict[str, FloatArray]:
-    """Return the table values by term that come closest to the wanted correction over the volume.
+    """Return the table values by term that come closest to the required correction over the volume.
 
-    The machine's work zone and tools (``machine.emphasis``) say what counts more. ``applied`` says what a control adds
+    The machine's work zone and tools (``machine.emphasis``) set the weights. ``applied`` is the correction of a control
     that does not simply sum its tables, see :func:`best_values`.
     """
     solver = projector(machine, basis, anchored=anchored)
@@ -266,11 +266,11 @@ def synthesize(
 def best_values(
     machine: Machine, errors: ErrorTable, solver: Projector, *, at_axes: bool = False, applied: Applied | None = None
 ) -> FloatArray:
-    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has some.
+    """Return all values (parameters,) of the best tables, over the tools of ``machine.emphasis`` if it has any.
 
-    With ``at_axes`` the tables are looked up where the axes stand: they hold minus the error there, not c*. A control
-    whose correction ``applied(values by term, points)`` (n, 3) is not the sum of the basis, but close to it, gets
-    values for which that correction is the wanted one (Gauss-Newton).
+    With ``at_axes`` the tables are looked up at the actual axis positions: they contain minus the error there, not c*.
+    A control whose correction ``applied(values by term, points)`` (n, 3) is not the sum of the basis, but close to it,
+    gets values for which that correction is the required one (Gauss-Newton).
     """
     if machine.emphasis.tools_mm:
         solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)

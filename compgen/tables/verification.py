@@ -42,14 +42,14 @@ from compgen.tables.judge import (
 )
 from compgen.tables.synthesis import Projector, wanted_correction
 
-# The verdict on tables and on the measurement behind them: one state, one headline, and what speaks against it.
+# The verdict on tables and on the measurement behind them: one state, one headline, and the objections.
 #
 # ``reasons`` are about the tables, objections about the measurement: how well the model describes its readings, and how
-# much of the machine it shows.
+# much of the machine it covers.
 
 
 State = Literal["accepted", "partial", "accepted_with_reservations", "better_after_new_setup", "not_accepted"]
-#: From the best to the worst; where several apply the last one is the verdict.
+#: From best to worst; if several apply, the last one is the verdict.
 STATES: tuple[State, ...] = (
     "accepted",
     "partial",
@@ -57,11 +57,11 @@ STATES: tuple[State, ...] = (
     "better_after_new_setup",
     "not_accepted",
 )
-#: Residuals of the readings above this share of what the tables take away (rms) leave nothing to be sure of.
+#: With residuals of the readings above this share of what the tables correct (rms), nothing is certain.
 RESIDUAL_SHARE = 1.0 / 3.0
-#: The error as it stands counts as worse if its rms grows by this much.
+#: The error with the reference point fixed counts as worse if its rms grows by this much.
 WORSE_FROM_UM = 0.01
-#: Points at which the uncertainty over the volume is looked at, and numbers kept in memory for it.
+#: Points at which the uncertainty over the volume is evaluated, and numbers kept in memory for it.
 UNCERTAINTY_POINTS, MOST_NUMBERS = 1500, 20_000_000
 #: Codes of the objections that `--allow-misfit` overrides.
 MISFIT_CODES = ("residual_too_large", "step_between_runs", "step_between_blocks", "step_between_files", "step", "drift")
@@ -69,9 +69,9 @@ MISFIT_CODES = ("residual_too_large", "step_between_runs", "step_between_blocks"
 
 @dataclass(frozen=True)
 class Objection:
-    """What speaks against the measurement: ``code`` for programs, ``text`` for people.
+    """An objection to the measurement: ``code`` for programs, ``text`` for people.
 
-    ``blocking`` ones leave the tables not accepted, the others lead to reservations.
+    With a ``blocking`` one the tables are not accepted; the others are reservations.
     """
 
     code: str
@@ -89,9 +89,9 @@ class Coverage:
 
     Parameters
     ----------
-    observable : names of the errors that can be told apart on this machine with one tool.
-    determined : those of them that the errors file holds.
-    left_out : those that the machine file's ``errors`` leaves out of the model.
+    observable : names of the errors that can be distinguished on this machine with one tool.
+    determined : those of them in the errors file.
+    left_out : those that ``errors`` in the machine file excludes from the model.
     """
 
     observable: tuple[str, ...]
@@ -100,12 +100,12 @@ class Coverage:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names of the observable errors that are not known."""
+        """Names of the observable errors that are unknown."""
         return tuple(name for name in self.observable if name not in self.determined)
 
     @property
     def text(self) -> str:
-        """Say what was measured, and what was not."""
+        """Return in words what was measured."""
         kinds = list(dict.fromkeys(_kind(name) for name in self.determined))
         only = f"{' and '.join(kinds)} only, " if 0 < len(kinds) <= 2 else ""
         return f"{only}{len(self.determined)} of {len(self.observable)} errors measured"
@@ -130,7 +130,7 @@ def _kind(name: str) -> str:
 
 
 def coverage_of(machine: Machine, errors: ErrorTable) -> Coverage:
-    """Return how many of the machine's observable errors a table of errors holds."""
+    """Return how many of the machine's observable errors an error table contains."""
     observable = observable_errors(machine)
     known = tuple(name for name in observable if name in errors.names)
     listed = machine.errors if isinstance(machine.errors, tuple) else ERROR_NAMES
@@ -144,7 +144,7 @@ def coverage_of(machine: Machine, errors: ErrorTable) -> Coverage:
 class FigureUncertainty:
     """What the uncertainty of the measurement adds to the figures after compensation: expanded, k = 2, um.
 
-    The files hold what was identified; the machine differs from that by the uncertainty of the errors, which no
+    The files contain what was identified; the machine differs from that by the uncertainty of the errors, which no
     verification of the files can show.
     """
 
@@ -167,9 +167,9 @@ class FigureUncertainty:
 def figure_uncertainty(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
 ) -> FigureUncertainty | None:
-    """Return the uncertainty that the errors give the figures over points (n, 3); None where it is not known.
+    """Return the uncertainty of the figures over points (n, 3) due to the errors; None if it is unknown.
 
-    Without a joint covariance the standard uncertainties of the values count, taken as independent.
+    Without a joint covariance the standard uncertainties of the values are used, as if independent.
     """
     known = covariance_or_independent(errors, covariance, machine.name)
     if known is None:
@@ -192,13 +192,13 @@ def figure_uncertainty(
 def measurement_objections(
     result: Identification, taken_away_um: float | None, *, allow_misfit: bool = False
 ) -> tuple[Objection, ...]:
-    """Say what speaks against a measurement.
+    """Return the objections to a measurement.
 
     Parameters
     ----------
     result : what was identified.
-    taken_away_um : rms of what the tables take out of the error over the volume; None for tables that are wrong.
-    allow_misfit : whether a misfit that would leave the tables not accepted is a reservation only.
+    taken_away_um : rms of what the tables correct of the error over the volume; None for wrong tables.
+    allow_misfit : whether a misfit that would block the tables is only a reservation.
     """
     return tuple(
         replace(item, blocking=False) if allow_misfit and item.code in MISFIT_CODES else item
@@ -217,7 +217,7 @@ def _objections(result: Identification, taken_away_um: float | None) -> Iterator
     if taken_away_um is not None and result.degrees_of_freedom > 0 and result.rms_um > RESIDUAL_SHARE * taken_away_um:
         text = (
             f"the residuals of the readings, {um_text(result.rms_um)} um rms, are more than a third of the "
-            f"{um_text(taken_away_um)} um rms that the tables take away"
+            f"{um_text(taken_away_um)} um rms that the tables correct"
         )
         yield Objection("residual_too_large", text, blocking=True)
     if misfit is not None and misfit.beyond:
@@ -225,15 +225,15 @@ def _objections(result: Identification, taken_away_um: float | None) -> Iterator
 
 
 def blocking_reasons(objections: Sequence[Objection]) -> list[str]:
-    """Return why objections leave the tables not accepted, with what to do."""
-    hint = "; `volcomp diagnose` looks for what the model lacks, --allow-misfit accepts the tables nevertheless"
+    """Return why objections block the tables, and what to do."""
+    hint = "; `volcomp diagnose` searches for the missing effect, --allow-misfit accepts the tables nevertheless"
     return [item.text + (hint if item.code in MISFIT_CODES else "") for item in objections if item.blocking]
 
 
 def taken_away_um(before_rms_um: float, after_rms_um: float) -> float:
-    """Return the rms of what tables take out of a field of errors, from the rms before and after, um.
+    """Return the rms of what tables correct in a field of errors, from the rms before and after, um.
 
-    What stays is what the tables do not reach, so both parts add up by their squares.
+    What remains is independent of the tables, so the squares of both parts add up.
     """
     return float(np.sqrt(max(before_rms_um**2 - after_rms_um**2, 0.0)))
 
@@ -246,16 +246,16 @@ def worst(states: Sequence[State]) -> State:
     return max(states, key=STATES.index, default="accepted")
 
 
-# The round trip: parse the written text, emulate the control, and look at what the exact machine then does.
+# The round trip: parse the written text, emulate the control, and move the exact machine with it.
 
 
-#: Errors that stay uncorrected by less than this are not named.
+#: Errors of which less than this remains uncorrected are not listed.
 NAMED_FROM_MM = 0.1 * MM_PER_UM
 
-#: Largest controller file that is read; the largest tables that the controls take have some 200 000 rows.
+#: Largest controller file that is read; the largest tables of the controls have about 200 000 rows.
 MOST_BYTES, MOST_LINES = 20_000_000, 250_000
 
-#: A correction below this is none; 1e-9 mm is far below what any control resolves.
+#: A smaller correction counts as none; 1e-9 mm is far below what any control resolves.
 ZERO_MM = 1e-9
 #: A control that cannot express more than this share of the largest error gives a partial compensation.
 PARTIAL_SHARE = 0.1
@@ -263,10 +263,10 @@ PARTIAL_SHARE = 0.1
 
 @dataclass(frozen=True, repr=False)
 class ReadTables(Displayed):
-    """Controller tables as they were parsed from text, with the control that understands them.
+    """Controller tables as parsed from text, with their control.
 
-    ``files`` are names and SHA-256; ``contradictions`` say where a plan next to the tables has other numbers;
-    ``remarks`` say what reading assumed, passed over and kept apart.
+    ``files`` are names and SHA-256; ``contradictions`` list where a plan next to the tables has other numbers;
+    ``remarks`` list what reading assumed, ignored and kept apart.
 
     Examples
     --------
@@ -298,7 +298,7 @@ class ReadTables(Displayed):
     ) -> FloatArray:
         """Return what the control adds at positions (n, 3), the mean of both directions of travel, shape (n, 3), mm.
 
-        ``tool_mm`` are the tool offsets (n, 3), None for the machine's own.
+        ``tool_mm`` are the tool offsets (n, 3), None for that of the machine file.
         """
         if not self.controller.bidirectional:
             return self.correction(machine, Points(position_mm, tool_mm))
@@ -309,9 +309,9 @@ class ReadTables(Displayed):
         return mean_correction(added, position_mm, tool_mm) - self.anchor_offset_mm(machine)
 
     def anchor_offset_mm(self, machine: Machine) -> FloatArray:
-        """Return the mean of both directions where an anchored control's tables are zero, shape (3,), mm.
+        """Return the mean of both directions at the zero point of an anchored control's tables, shape (3,), mm.
 
-        They are zero there in one direction only, by a constant, which does no harm.
+        They are zero there in one direction only; the difference is a constant, which is harmless.
         """
         if not (self.controller.bidirectional and self.controller.anchored):
             return np.zeros(3)
@@ -331,11 +331,11 @@ def read_tables(
 
     Parameters
     ----------
-    machine : its ``[controllers.<name>]`` settings say how the control reads them.
-    paths : the files, or the folder of an export, whose manifest names them.
+    machine : its ``[controllers.<name>]`` settings define how the control reads them.
+    paths : the files, or the folder of an export, whose manifest lists them.
     controller : name of the control.
-    foreign : read archives and files of other programs as well, with remarks on what was passed over. Files that this
-        program wrote are read strictly all the same.
+    foreign : read archives and files of other programs, too, with remarks on what was ignored. Files that this program
+        wrote are still read strictly.
 
     Raises
     ------
@@ -362,11 +362,11 @@ def read_tables(
     for path in files:
         content = read_bytes(path, MOST_BYTES + 1)
         lines = content.count(b"\n")
-        if len(content) > MOST_BYTES or lines > MOST_LINES:  # nobody looks for numbers in it
+        if len(content) > MOST_BYTES or lines > MOST_LINES:  # too large for a table
             if not foreign:
                 _decode(path, content)
             what = f"{MOST_LINES} lines" if lines > MOST_LINES else f"{MOST_BYTES // 1_000_000} MB"
-            message = f"is longer than {what}; no controller table is"
+            message = f"is longer than {what}, too long for a controller table"
             raise InputError(message, file=path, line=min(lines, MOST_LINES) + 1)
         contents.append((path, content))
     return _parsed(control, contents, foreign=foreign)
@@ -384,7 +384,7 @@ def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, f
         sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
         tables = control.parse(sources)
     except InputError:
-        # Files of our own stay strict. In others the comments may hold any character, in whatever encoding.
+        # Files of this program are read strictly. In others, comments may contain any character in any encoding.
         if not foreign or any(_OWN_FILE.search(content[:4000]) for _, content in contents):
             raise
         sources = []
@@ -398,9 +398,9 @@ def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, f
         other = control.parse_foreign(sources)
         if other is None and all(source.text.isascii() for source in sources):
             raise
-        if other is None:  # a control without a reader of other files: all but the comments stays strict
+        if other is None:  # a control without a reader of other files: everything but the comments is read strictly
             plain = [SourceFile(source.path, source.text.encode("ascii", "replace").decode()) for source in sources]
-            other = control.parse(plain), ["comments hold characters that are not ASCII: passed over"]
+            other = control.parse(plain), ["comments contain characters that are not ASCII: ignored"]
         return ReadTables(control, other[0], hashes, (), tuple(other[1]))
     others = tuple(control.contradictions(tables, sources))
     remarks = tuple(control.remarks(tables, sources))
@@ -408,7 +408,7 @@ def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, f
 
 
 def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
-    """Return the files, and in place of a folder those that its manifest names; InputError where it does not fit."""
+    """Return the files, for a folder those that its manifest lists; InputError if it does not match."""
     found: list[Path] = []
     for given in map(Path, paths):
         if not given.is_dir():
@@ -429,7 +429,7 @@ def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise InputError("is not the manifest of an export", file=path) from error
         if made_for != controller:
-            message = f"names tables of {one_line(made_for)[:40]}, but {controller} was requested"
+            message = f"lists tables of {one_line(made_for)[:40]}, but {controller} was requested"
             raise InputError(message, file=path, field="controller")
         for name, digest in names:
             table = place / f"{prefix}{name}"
@@ -440,7 +440,7 @@ def table_files(paths: Sequence[str | Path], controller: str) -> list[Path]:
     return found
 
 
-#: Every file that this program writes says so in one of its first lines.
+#: Every file of this program says so in one of its first lines.
 _OWN_FILE = re.compile(rb"\b(?:compgen|volcomp) (?:\d+\.\d|unknown)")
 
 
@@ -457,7 +457,7 @@ def _decode(path: Path, content: bytes) -> str:
     raise InputError(f"contains {what}; controller tables are ASCII text", file=path, line=line)
 
 
-#: Smaller errors of the tool tip are drawn as this one: the reference point has none, and the picture is logarithmic.
+#: Smaller errors of the tool tip are drawn with this value: the reference point has none, and the axis is logarithmic.
 LEAST_DRAWN_UM = 1e-3
 
 
@@ -466,9 +466,9 @@ class Verification(Drawable):
     """Result of :func:`verify`; residuals of the exact model over the same points before and after.
 
     ``reasons`` says why the tables are not accepted (empty: accepted). ``unrepresentable_um`` is the largest residual
-    that the best table of this control leaves (a constant offset is left out if the control cannot hold one), and
-    ``uncorrected_um`` names the errors behind it with the largest displacement that stays. ``reservations`` are what the
-    control says of tables that break no limit: what is inferred, has no room, or is not known.
+    that the best table of this control leaves (without a constant offset if the control cannot apply one), and
+    ``uncorrected_um`` gives the errors behind it with the largest displacement that remains. ``reservations`` are
+    remarks of the control on tables that exceed no limit: what is inferred, has no room, or is unknown.
 
     Examples
     --------
@@ -515,12 +515,12 @@ class Verification(Drawable):
 
     @property
     def volumetric(self) -> bool:
-        """Whether figures over the volume can be claimed: every error that the machine's chain shows is known."""
+        """Whether figures over the volume can be stated: every observable error of the machine's chain is known."""
         return not self.measured.missing
 
     @property
     def worse_as_it_stands(self) -> bool:
-        """Whether the tables make the rms error larger for a workpiece that is left where it is."""
+        """Whether the tables increase the rms error for a workpiece whose set-up is not changed."""
         return self.after.rms_um > self.before.rms_um + WORSE_FROM_UM
 
     @property
@@ -539,7 +539,7 @@ class Verification(Drawable):
 
     @property
     def headline(self) -> str:
-        """The verdict in one sentence, with the one figure that it rests on."""
+        """The verdict in one sentence, with its decisive figure."""
         if not self.accepted:
             more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
             return f"not accepted: {self.reasons[0]}{more}"
@@ -547,9 +547,9 @@ class Verification(Drawable):
         if self.worse_as_it_stands:
             before, after = self.before_rigid_removed, self.after_rigid_removed
             said.append(
-                f"better only after the workpiece is set up anew: as it stands the error grows from "
+                f"better only after the workpiece is set up again: without that the error grows from "
                 f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the "
-                f"workpiece taken out it goes from {um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
+                f"workpiece removed it goes from {um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
             )
         parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
         if parts:
@@ -563,36 +563,36 @@ class Verification(Drawable):
 
     @property
     def figure(self) -> str:
-        """What the tables do, in one figure: rms over the volume as it stands, with the uncertainty of the measurement."""
+        """What the tables do, in one figure: rms over the volume, with the uncertainty of the measurement."""
         change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
         known = "not known" if self.uncertainty is None else f"{um_text(self.uncertainty.rms_um)} um"
         bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")
         if self.volumetric:
-            return f"the error over the volume goes from {change} as it stands ({bounds})"
-        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is not known"
+            return f"the error over the volume goes from {change} ({bounds})"
+        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is unknown"
 
     @property
     def _beyond_text(self) -> str:
         share = 100.0 * self.after_rigid_removed.rms_um / max(self.before_rigid_removed.rms_um, 1e-12)
         return (
-            f"this control cannot express {um_text(self.unrepresentable_um)} um of the error; {share:.0f} % of the rms stays "
-            "with the best-fit rigid motion taken out"
+            f"this control cannot express {um_text(self.unrepresentable_um)} um of the error; {share:.0f} % of the rms remains "
+            "with the best-fit rigid motion removed"
         )
 
     @property
     def partial(self) -> bool:
-        """Whether the control cannot express a good part of the error: the table is right, but much stays."""
+        """Whether the control cannot express a large part of the error: the table is right, but much remains."""
         return self.unrepresentable_um > PARTIAL_SHARE * self.before.max_um
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What else the user should know of accepted tables."""
+        """What else the user should know about accepted tables."""
         notes = [*self.reservations, *self.safety.warnings]
         if self.partial:
             notes.append(self._beyond_text)
         if self.after.max_um > self.before.max_um + 0.05 and not self.worse_as_it_stands:
             notes.append(
-                f"as it stands the largest error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um, "
+                f"with the present set-up the largest error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um, "
                 "by a rigid motion of the workpiece"
             )
         return tuple(notes)
@@ -639,7 +639,7 @@ class Verification(Drawable):
         return Overview(title, ("tool-tip error (um)", "max", "rms", "95 %"), rows, (self.headline, *self.notes))
 
     def panels(self) -> Sequence[Panel]:
-        """How many of the points have an error of the tool tip below which size."""
+        """Share of the points with an error of the tool tip below each size."""
         lines = []
         for name, error_mm in (("before", self.error_before_mm), ("after", self.error_after_mm)):
             size_um = np.maximum(np.sort(np.linalg.norm(error_mm, axis=1)) / MM_PER_UM, LEAST_DRAWN_UM)
@@ -664,13 +664,13 @@ def verify(
     machine : the machine.
     tables : from :func:`read_tables`.
     errors : usually the identified errors; the exact model moves with them.
-    points : where the residuals are reported; default the grid of the nodes of curves and tables and the middles
+    points : where the residuals are reported; default: the grid of the nodes of curves and tables and the middles
         between them. The judgement itself is always made on that grid and on lines along the axes.
     limits : for the steps of the tables, see :func:`compgen.tables.judge.safety_of`.
-    reversal : what each axis does differently in its two directions, in addition to the errors (their mean); points that do
-        not say from where they were approached are then looked at from both sides.
-    covariance : joint covariance of the errors, for the uncertainty of the figures; without it that of the single values
-        counts.
+    reversal : the reversal of each axis, in addition to the errors (the mean of both directions); points without a
+        direction of approach are then evaluated from both sides.
+    covariance : joint covariance of the errors, for the uncertainty of the figures; by default from the uncertainties
+        of the single values.
 
     Examples
     --------
@@ -697,7 +697,7 @@ def verify(
     after = exact_error(machine, errors, where.position_mm + correction, where.tool_mm) + correction
     not_in_tables = None
     if reversal is not None:
-        # it comes on top of both, by the direction in which each point was approached
+        # it is added to both, by the direction of approach of each point
         moved = 0.0 if where.approach is None else reversal.displacement(where.position_mm, where.approach)
         before, after = before + moved, after + moved
         not_in_tables = reversal.without(control.reversal_in_tables(reversal))
@@ -781,9 +781,9 @@ def _useless_reasons(
     figures: Sequence[Residuals],
     removed: Sequence[Residuals],
 ) -> list[str]:
-    """Say so of tables that hold zeros only, or with which the machine is worse whatever is done with the workpiece.
+    """Return a reason against tables that contain only zeros, or make the machine worse whatever the set-up.
 
-    ``figures`` are before and after as it stands, ``removed`` those without the best-fit rigid motion.
+    ``figures`` are before and after with the reference point fixed, ``removed`` with the best-fit rigid motion removed.
     """
     largest = 0.0
     for position_mm in points_mm:
@@ -793,20 +793,20 @@ def _useless_reasons(
     step_um = tables.controller.resolution_mm() / MM_PER_UM
     if largest < ZERO_MM:
         return [
-            f"the tables hold zeros only and change nothing, while the errors reach {um_text(figures[0].max_um)} um: either this "
+            f"the tables contain only zeros, while the errors reach {um_text(figures[0].max_um)} um: either this "
             f"control has no table for them, or its smallest step is too coarse (rounding of an entry: up to {step_um:.3g} um)"
         ]
     if figures[1].rms_um > figures[0].rms_um + WORSE_FROM_UM and removed[1].rms_um > removed[0].rms_um:
         return [
             f"the tables make the machine worse: {um_text(figures[0].rms_um)} um rms before, {um_text(figures[1].rms_um)} "
-            f"after; with the best-fit rigid motion taken out {um_text(removed[0].rms_um)} before, "
+            f"after; with the best-fit rigid motion removed {um_text(removed[0].rms_um)} before, "
             f"{um_text(removed[1].rms_um)} after"
         ]
     return []
 
 
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
-    """Largest displacement in um that the best table leaves of each error alone (first order), where it matters."""
+    """Return the largest displacement in um that the best table leaves of each single error (first order), if relevant."""
     names = errors.names
     wanted = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
     found = {}
@@ -819,7 +819,7 @@ def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dic
     return dict(sorted(found.items(), key=lambda item: -item[1]))
 
 
-# The files that hold the outcome of a verification: its figures, and the points behind them.
+# The files of a verification: its figures, and the points behind them.
 
 
 def verification_files(result: Verification) -> dict[str, str]:
@@ -830,7 +830,7 @@ def verification_files(result: Verification) -> dict[str, str]:
 def format_volume(result: Verification) -> str:
     """Return the text of ``volume.csv``: error of the tool tip before and after at every point of the figures, um.
 
-    Where a reversal is known every point is listed twice, reached in positive and in negative direction.
+    If a reversal is known, every point is listed twice, reached in positive and in negative direction.
     """
     columns: dict[str, FloatArray] = {f"{axis}_mm": result.position_mm[:, k] for k, axis in enumerate("xyz")}
     digits = dict.fromkeys(columns, 6)

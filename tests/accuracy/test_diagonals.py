@@ -225,7 +225,7 @@ def test_one_direction_gives_no_ed_and_says_whose(machine, tmp_path):
     found = accuracy_of(machine, written(tmp_path / "b.diagonals.csv", rows))
     assert found.groups["diagonals"] == {}
     assert set(found.groups["NPP"]) == {"E_up", "D"}
-    assert any("Ed, Bd: not given; NPP measured in one direction only" in text for text in found.statements)
+    assert any("Ed, Bd: not given; NPP measured in only one direction" in text for text in found.statements)
     assert found.groups["squareness indication"]["EC0Y"].value == pytest.approx(10.0, abs=1e-8)
 
 
@@ -235,7 +235,7 @@ def test_diagonals_of_another_box_are_no_set(machine, tmp_path):
     rows = [["NNP", *point, way, 1, 0.0] for way in (1, -1) for point in points]
     other = written(tmp_path / "c.diagonals.csv", rows)
     found = accuracy_of(machine, [path, other])
-    assert any("NNP belong to another box than PPP" in text for text in found.statements)
+    assert any("NNP belong to a different box than PPP" in text for text in found.statements)
     assert "diagonals" not in found.groups
 
 
@@ -266,10 +266,10 @@ END = {"x": 300.0, "y": 400.0, "z": 1200.0}
         ),
         ([good_row(), good_row(**END, direction=0)], "0 is not a direction"),
         ([good_row(), good_row(**END, value=2e5)], "is the unit um"),
-        ([good_row(diagonal="NPP"), good_row(**END, diagonal="NPP")], "NPP goes from .* its letters say"),
+        ([good_row(diagonal="NPP"), good_row(**END, diagonal="NPP")], "NPP runs from .* its letters are"),
         ([good_row(), good_row(x=150.0, y=201.0, z=600.0), good_row(**END)], "off the line between the ends of PPP"),
         ([good_row(), good_row(**END), good_row(**END)], ":5: .*PPP at \\(300, 400, 1200\\) mm.* already appears in"),
-        ([good_row(diagonal="PP0"), good_row(**END, diagonal="PP0")], "PP0 goes from"),
+        ([good_row(diagonal="PP0"), good_row(**END, diagonal="PP0")], "PP0 runs from"),
     ],
 )
 def test_what_is_no_diagonal_is_refused_with_its_place(tmp_path, rows, message):
@@ -279,7 +279,7 @@ def test_what_is_no_diagonal_is_refused_with_its_place(tmp_path, rows, message):
 
 def test_positions_outside_the_travel_and_half_measured_directions_are_refused(machine, tmp_path):
     outside = [good_row(), good_row(x=330.0, y=440.0, z=1320.0)]
-    with pytest.raises(InputError, match=r"b\.diagonals\.csv:4: column x_mm: X = 330 mm lies outside the travel"):
+    with pytest.raises(InputError, match=r"b\.diagonals\.csv:4: column x_mm: X = 330 mm is outside the travel"):
         diagonal_runs(machine, read_diagonals(written(tmp_path / "b.diagonals.csv", outside)))
     half = [good_row(), good_row(**END), good_row(**END, direction=-1)]
     with pytest.raises(InputError, match="PPP, distance along it: no reading at 0 mm in direction -1"):
@@ -367,7 +367,7 @@ def test_diagonals_compare_with_diagonals_only(machine, tmp_path):
     path = box_file(tmp_path / "b.diagonals.csv")
     errors = tmp_path / "e.errors.csv"
     errors.write_text(format_errors(ErrorTable({}, {"EC0Y": (1e-5, 1e-7)})))
-    with pytest.raises(InputError, match="measured diagonals can be compared with measured diagonals only"):
+    with pytest.raises(InputError, match="measured diagonals can only be compared with measured diagonals"):
         compared(machine, path, errors)
 
 
@@ -489,7 +489,7 @@ def test_the_command_says_where_the_reversal_comes_from_or_that_it_is_not_known(
     assert run_command(cli, words) == 0
     data = json.loads((out / "accuracy.json").read_text())
     assert "reversal" not in data["figures"]
-    assert any("reversal: not known" in text and "m.reversal.csv is not there" in text for text in data["statements"])
+    assert any("reversal: unknown" in text and "m.reversal.csv does not exist" in text for text in data["statements"])
     (tmp_path / "m.reversal.csv").write_text(format_reversal(constant_reversal()))
     assert run_command(cli, words) == 0
     data = json.loads((out / "accuracy.json").read_text())
@@ -524,7 +524,7 @@ def test_the_reversal_before_and_after_is_compared_where_both_know_it(machine, t
     (tmp_path / "after.reversal.csv").unlink()
     found = compared(machine, *paths)
     assert "reversal" not in found.groups
-    assert any(text.startswith("after.errors.csv: reversal: not known") for text in found.statements)
+    assert any(text.startswith("after.errors.csv: reversal: unknown") for text in found.statements)
 
 
 def test_no_other_command_identifies_from_diagonals(machine, tmp_path, capsys):

@@ -170,4 +170,4 @@ def test_a_gear_ratio_that_was_fitted_before_is_noticed_in_the_readings_alone(tm
         "\n".join([*(line for line in data_text().splitlines() if "REF_DATA" not in line), *lines]) + "\n"
     )
     notes = [" ".join(import_file(path, ImportOptions(axis="X")).notes) for path in (plain, fitted)]
-    assert ["gear ratio was fitted" in text for text in notes] == [False, True]
+    assert ["gear ratio was already fitted" in text for text in notes] == [False, True]

@@ -415,7 +415,7 @@ def bad_machine(folder, small_machine_file, old, new):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[-50.0, 100.0, -40.0]", "[-50.0, 100.0, 40.0]", "Z = 40 mm lies outside the travel -240 ... 0 mm"),
+        ("[-50.0, 100.0, -40.0]", "[-50.0, 100.0, 40.0]", "Z = 40 mm is outside the travel -240 ... 0 mm"),
         (
             "range_mm = [-300.0, 200.0]",
             "range_m = [-300.0, 200.0]",
@@ -427,7 +427,7 @@ def bad_machine(folder, small_machine_file, old, new):
         ('mult_mode = "S1"', "products = true", "[controllers.siemens-cec] mult_mode: is missing"),
         ('sign = "error"', 'sign = "err"', "sign"),
         ("[controllers.siemens-cec]", "[controllers.simens-cec]", "did you mean 'siemens-cec'"),
-        ('name = "small-gantry"', "name = 7", "name: one line of text is expected"),
+        ('name = "small-gantry"', "name = 7", "name: expected one line of text"),
     ],
 )
 def test_a_bad_machine_exits_with_2_and_writes_nothing(
@@ -459,10 +459,10 @@ def test_two_machines_with_one_name_are_refused_where_that_name_is_used(call, sm
         (tmp_path / "two" / name).mkdir(parents=True)
         shutil.copy(small_machine_file, tmp_path / "two" / name / "machine.toml")
     words = ("run", "small-gantry", "x.csv", "--controller", "isg-csv", "--out", "o")
-    check_refused(*call(*words, "--machines", tmp_path / "two"), "two machines are named 'small-gantry'")
+    check_refused(*call(*words, "--machines", tmp_path / "two"), "two machines have the name 'small-gantry'")
     code, stdout, stderr = call("machines", "--machines", tmp_path / "two")
     assert (code, "zha-gantry" in stdout) == (0, True)
-    assert "left out: two machines are named 'small-gantry'" in stderr
+    assert "skipped: two machines have the name 'small-gantry'" in stderr
 
 
 @pytest.mark.parametrize(
@@ -473,9 +473,9 @@ def test_two_machines_with_one_name_are_refused_where_that_name_is_used(call, sm
         ((), "Missing option '--controller'"),
         (("--controller", "isg-csv", "--smoothness", "-1"), "smoothness"),
         (("--controller", "isg-csv", "--smoothness", "nan"), "smoothness"),
-        (("--controller", "isg-csv", "--smoothness", "a"), "'a': a number is expected"),
+        (("--controller", "isg-csv", "--smoothness", "a"), "'a': expected a number"),
         (("--controller", "isg-csv", "--u-length-um", "-1"), "must be above zero"),
-        (("--controller", "isg-csv", "--u-length-um", "nan"), "'nan': a finite number is expected"),
+        (("--controller", "isg-csv", "--u-length-um", "nan"), "'nan': expected a finite number"),
         (("--controller", "isg-csv", "--outt", "x"), "No such option"),
         (("--controller", "isg-csv", "--templates", "nowhere"), "no such folder"),
     ],

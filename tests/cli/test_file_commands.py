@@ -207,7 +207,7 @@ FOUND = [
     (8, "[axes.Y] nodes", "'nodez' is not a key here, did you mean 'nodes'?"),
     (14, "[axes.Z] colour", "is not a known key"),
     (16, "[controllers.siemens-cec] sing", "did you mean 'sign'?"),
-    (17, "[controllers.siemens-cec] mult_mode", "one of 'S1', 'S2', 'S3', 'S4' is expected; got 'S9'"),
+    (17, "[controllers.siemens-cec] mult_mode", "expected one of 'S1', 'S2', 'S3', 'S4'; got 'S9'"),
     (18, "[controllers.siemens-ceck]", "is not a controller; did you mean 'siemens-cec'?"),
     (19, "[controllers.pmac] counts_per_mm", "is missing"),
     (20, "[controllers.pmac] motors", "three different motors are needed"),

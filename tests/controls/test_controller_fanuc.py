@@ -466,7 +466,7 @@ def test_positions_count_from_the_reference_point_of_the_machine(tmp_path):
 
 
 MALFORMED = [
-    (lambda t: "", r"holds no '%'", None),
+    (lambda t: "", r"contains no '%'", None),
     (lambda t: t.replace("%", ""), r"N03620A1P40.*outside", 2),
     (lambda t: t[: t.rindex("%")], r"last '%' is missing", 24),
     (lambda t: t[: t.index("N10040")], r"last '%' is missing", None),

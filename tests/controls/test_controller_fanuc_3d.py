@@ -242,7 +242,7 @@ def test_records_follow_the_sample_and_hold_what_the_csv_holds(name, order, smal
 @pytest.mark.parametrize(
     ("text", "words", "line"),
     [
-        ("", "holds no '%'", None),
+        ("", "contains no '%'", None),
         ("%\n%\n", "no compensation data", 1),
         ("%\nN1P1\nN3P1\n%\n", "does not follow N1", 3),
         ("%\nN1P1\nN2X1Y1Z1\n%\n", "differ from those of line 2", 3),
@@ -262,9 +262,9 @@ def test_a_sample_that_is_not_understood_is_refused_with_its_line(text, words, l
 # --- malformed -------------------------------------------------------------------------------------------------------
 
 MALFORMED = [
-    (lambda t: "", "holds no vertex", 1),
+    (lambda t: "", "contains no vertex", 1),
     (lambda t: t.replace(HEADER, "x,y,z"), "header", 3),
-    (lambda t: "\n".join(t.split("\n")[:-2]) + "\n", "declares 8 rows but holds 7", 2),
+    (lambda t: "\n".join(t.split("\n")[:-2]) + "\n", "declares 8 rows but contains 7", 2),
     (lambda t: t.rstrip("\n"), "no line end", 11),
     (lambda t: t.replace("# rows = 8\n", ""), "declares none rows", None),
     (lambda t: t.replace("# magnification = 1 1 1\n", ""), "magnification", None),

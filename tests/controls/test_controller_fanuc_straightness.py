@@ -354,7 +354,7 @@ def test_reading_says_what_was_assumed_kept_apart_and_passed_over():
 
 MALFORMED = [
     (lambda t: t[: t.rindex("%")], "last '%' is missing", None),
-    (lambda t: t.replace("N05711P1\n", ""), "holds no moving axis", None),
+    (lambda t: t.replace("N05711P1\n", ""), "contains no moving axis", None),
     (lambda t: t.replace("N05763P4\n", ""), "parameter 5763 is missing", 6),
     (lambda t: t.replace("N05763P4", "N05763P4\nN05763P5"), r"second time \(first in", 15),
     (lambda t: t.replace("N05763P4", "N05763P4.5"), "whole number", 14),

@@ -362,8 +362,8 @@ def test_blanks_that_fill_up_a_record_are_followed(tmp_path):
 
 
 MALFORMED = [
-    (lambda t: "", "holds no '%'", None),
-    (lambda t: "%\n%\n", "holds no record", 1),
+    (lambda t: "", "contains no '%'", None),
+    (lambda t: "%\n%\n", "contains no record", 1),
     (lambda t: t.replace("N10036P-2", "O1234"), "is not a block", 10),
     (lambda t: t.replace("N10036P-2", "N10036P-2,5"), "no place", 10),
     (lambda t: t.replace("N10036P-2", "N10036P-2E1"), "single value word", 10),

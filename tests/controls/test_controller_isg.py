@@ -501,9 +501,9 @@ CSV = "// head\nX EXX EYX\n-300 0.001 0.002\n500 0.003 0.004\n#\nC0Y\n0.00001\n"
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("", None, "holds no data"),
-        ("// only a comment\n", None, "holds no data"),
-        ("#\n#\n", None, "holds no block"),
+        ("", None, "contains no data"),
+        ("// only a comment\n", None, "contains no data"),
+        ("#\n#\n", None, "contains no block"),
         (CSV.replace("X EXX EYX", "X EXX EXX"), 2, "twice .*70469"),
         (CSV.replace("X EXX EYX", "X EXX EQX"), 2, "'EQX' is not a parameter .*70468"),
         (CSV.replace("X EXX EYX", "X exx EYX"), 2, "did you mean 'EXX'"),
@@ -546,7 +546,7 @@ ETALON = "// head\n[C0Y]\nVALUE = 0.00001\n[EXX]\nGridpoints = {\n-300 0.001\n50
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("", None, "holds no data"),
+        ("", None, "contains no data"),
         ("VALUE = 1\n", 1, "name in brackets"),
         (ETALON.replace("} // end\n", ""), 4, "no closing brace"),
         ("[C0Y] VALUE = 1\n[B0Z] VALUE = 2\n[EXX] Gridpoints = {\n0 1\n", 3, r"\[EXX\] has no closing brace"),
@@ -588,10 +588,10 @@ LIST = "# head\nX 1\nY 2\nZ 3\nchain XYZ\nworkpiece_axes 2\nfile[0] a.csv\nfile_
         (LIST.replace("workpiece_axes 2", "workpiece_axes two"), 6, "from 0 to 3"),
         (LIST.replace("workpiece_axes 2", "negate XA"), 6, "letters X, Y, Z"),
         (LIST.replace("workpiece_axes 2", "set_to_zero XX"), 6, "letters X, Y, Z"),
-        (LIST.replace("workpiece_axes 2", "interpolation SCATTER"), 6, "one of 'GRID', 'AUTO' is expected"),
+        (LIST.replace("workpiece_axes 2", "interpolation SCATTER"), 6, "expected one of 'GRID', 'AUTO'"),
         (LIST.replace("file[0] a.csv\n", ""), None, r"file\[0\] is missing"),
         (LIST.replace("X 1", "X one"), 2, "whole number"),
-        ("", None, "holds no data"),
+        ("", None, "contains no data"),
     ],
 )
 def test_a_malformed_list_file_is_refused_with_its_line(text, line, words):
@@ -674,7 +674,7 @@ def test_a_folder_of_the_control_ends_with_one_slash_of_its_kind(path, written):
 
 
 def test_a_folder_of_the_control_has_at_most_200_characters():
-    with pytest.raises(InputError, match="a folder on the control is expected"):
+    with pytest.raises(InputError, match="expected a folder on the control"):
         CONTROLLERS["isg-csv"].read_settings(machine_with(path="p" * 201))
 
 

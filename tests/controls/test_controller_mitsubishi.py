@@ -248,7 +248,7 @@ def test_order_crlf_blank_lines_and_missing_signs_do_no_harm(tmp_path):
         ("#4102,20,", "#4102;20;", 18, "not the number"),
         ("#4102,20,", "#4103,20,", 19, "second time"),
         ("#4102,20,X at -100\n", "", 7, "#4102 \\(1 in all\\) missing"),
-        ("#4102,20,X at -100", "#4102,2", 18, "is the file cut"),
+        ("#4102,20,X at -100", "#4102,2", 18, "is the file truncated"),
         ("#4003,4103", "#4003,4106", 5, "none of 4101 to 4105"),
         ("#4003,4103", "#4003,", 3, "#4003 of set 1 missing"),
         ("#4003,4103", "#4003,40", 5, "4101 to 5999"),
@@ -420,7 +420,7 @@ def test_options_assume_a_mode_and_say_so(tmp_path, make_errors):
     machine = machine_of(tmp_path)
     machine.controllers["mitsubishi"].data.pop("mode")
     ((variant, changed),) = _variants(machine, "mitsubishi")
-    assert variant.notes == ("mode is not stated in the machine file; 'incremental' is taken here",)
+    assert variant.notes == ("mode is not stated in the machine file; 'incremental' is assumed here",)
     assert export(changed, make_errors(machine), "mitsubishi").violations == []
     assert _variants(machine_of(tmp_path), "mitsubishi")[0][0].notes == ()
 
@@ -518,7 +518,7 @@ def test_a_set_of_ours_that_is_no_longer_used_is_switched_off(tmp_path, make_err
     [
         (lambda t: t, 'mode = "incremental"\n' + ONLY_OWN, "#4000 = 0"),
         (lambda t: t, "", "9|8 new sets are needed and 7 of the 10 sets"),
-        (lambda t: t[: t.rindex("%")], ONLY_OWN, "is the file cut"),
+        (lambda t: t[: t.rindex("%")], ONLY_OWN, "is the file truncated"),
         (lambda t: t.replace("N4000P0\r\n", ""), ONLY_OWN, "#4000 .* is missing"),
         (lambda t: t.replace("N4102P-3", "N4102P-3\r\nN4102P1"), ONLY_OWN, "second time"),
         (lambda t: t.replace("N4102P-3", "N4102A1P-3"), ONLY_OWN, "the word A1"),

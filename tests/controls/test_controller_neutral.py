@@ -151,7 +151,7 @@ JSON = json.dumps(
     [
         ("", "is empty"),
         (FIELD.replace("x_mm", "x_in"), "x_mm"),
-        (FIELD.rsplit("\n", 2)[0] + "\n", "declares 8 rows but holds 7"),
+        (FIELD.rsplit("\n", 2)[0] + "\n", "declares 8 rows but contains 7"),
         (FIELD.replace("# rows = 8\n", "").rsplit("\n", 2)[0] + "\n", "do not fill the grid"),
         (FIELD.replace("1,1,1,48", "1,0,1,48"), "is given again"),
         (FIELD.replace("48", "4.8.0"), "not a number"),

@@ -389,8 +389,8 @@ def test_counts_per_mm_are_mandatory_and_say_why():
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("", None, "holds no data"),
-        ("; nothing\n", None, "holds no data"),
+        ("", None, "contains no data"),
+        ("; nothing\n", None, "contains no data"),
         ("I51=1\n", None, "no compensation table"),
         (GOLDEN.replace("#1\n", ""), 1, "no motor is addressed"),
         (GOLDEN.replace("#1\n", "#99\n"), 1, "motor #99 does not exist; use 1 to"),
@@ -408,7 +408,7 @@ def test_counts_per_mm_are_mandatory_and_say_why():
         (GOLDEN + GOLDEN.replace("I51=1\n", ""), 6, "motor 1 gets a table a second time"),
         (GOLDEN.replace("I51=1", "I52=1"), 4, "is not part of compensation"),
         (GOLDEN.replace("I51=1", "MOVE"), 4, "not understood"),
-        ("; tables: 2\n" + GOLDEN, None, "declares 2 tables but holds 1"),
+        ("; tables: 2\n" + GOLDEN, None, "declares 2 tables but contains 1"),
         (GOLDEN.replace("#1\n", "#9\n"), None, "is not an axis of the machine file"),
         (GOLDEN + "\N{MICRO SIGN}\n", 5, "ASCII"),
     ],

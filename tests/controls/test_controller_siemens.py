@@ -714,7 +714,7 @@ def test_equal_indices_and_two_active_encoders_are_refused(simple, tmp_path):
     with pytest.raises(InputError, match="a list of different table indices"):
         simple("kept_tables = [6, 6]")
     both = simple_machine(tmp_path, "encoder = [0, 1]\nactive_encoder = [0, 1]", "siemens-eec")
-    with pytest.raises(InputError, match="active_encoder: one of the encoders of X"):
+    with pytest.raises(InputError, match="active_encoder: expected one of the encoders of X"):
         controller_named("siemens-eec").read_settings(both)
 
 
@@ -867,7 +867,7 @@ def test_a_number_of_tables_that_nobody_stated_is_in_the_verdict(tmp_path, own, 
 @pytest.mark.parametrize(
     ("own", "message"),
     [
-        ('sign = "minus"', "one of 'error', 'correction' is expected"),
+        ('sign = "minus"', "expected one of 'error', 'correction'"),
         ('sign = "error"\nmult_mode = "S5"', "one of 'S1', 'S2', 'S3', 'S4'"),
         ('sign = "error"\nmultmode = "S1"', "is not a known key; did you mean 'mult_mode'"),
         ('sign = "error"\naxis_names = { X = "AX2" }', "two axes have one name"),
@@ -961,12 +961,12 @@ GOOD = "%_N_NC_CEC_INI\nCHANDATA(1)\n" + constant(0, "0.1") + "M17\n"
         ("MODULO[0]=0", "MODULO[0]=-1", "-1 is not a whole number from 0 to 1", 12),
         ("MULT_BY_TABLE[0]=0", "MULT_BY_TABLE[0]=-1", "is not a whole number from 0", 11),
         ("CHANDATA(1)", "CHANDATA(1", "is not an assignment", 2),
-        ("[0,1]=0.1", "[0,1]=0.1\u00a0", "holds the character '\\xa0'", 4),
-        ("[0,1]=0.1", "[0,1]=0.1\0", "holds the character '\\x00'", 4),
-        ("[0,1]=0.1", "[0,1]=\u0661", "holds the character", 4),
+        ("[0,1]=0.1", "[0,1]=0.1\u00a0", "contains the character '\\xa0'", 4),
+        ("[0,1]=0.1", "[0,1]=0.1\0", "contains the character '\\x00'", 4),
+        ("[0,1]=0.1", "[0,1]=\u0661", "contains the character", 4),
         ("[0,1]=0.1", "[0,1]=" + "1" * 2000, "the line has 2013 characters", 4),
         (GOOD, "", "the end mark M17 is missing", 1),
-        (GOOD, "M17", "holds no table", None),
+        (GOOD, "M17", "contains no table", None),
     ],
 )
 def test_malformed_text_is_an_error_at_its_line(simple, old, new, message, line):

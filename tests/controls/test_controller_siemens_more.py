@@ -142,7 +142,7 @@ def test_the_order_of_the_two_files_does_not_matter_and_one_alone_is_an_error():
     _, _, turned = parsed(machine, "siemens-cec-eec", dict(reversed(made.files.items())))
     assert tables == turned
     for file, missing in (("AX_EEC.INI", "cross"), ("NC_CEC.INI", "encoder")):
-        with pytest.raises(InputError, match=f"hold no {missing} tables .* give both AX_EEC and NC_CEC"):
+        with pytest.raises(InputError, match=f"contain no {missing} tables .* give both AX_EEC and NC_CEC"):
             parsed(machine, "siemens-cec-eec", {file: made.files[file]})
 
 
@@ -552,13 +552,13 @@ def test_only_the_active_measuring_system_acts():
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ({"encoder": 2}, "0 (measuring system 1), 1 (measuring system 2) or [0, 1] is expected"),
-        ({"encoder": [0, 0]}, "or [0, 1] is expected"),
+        ({"encoder": 2}, "expected 0 (measuring system 1), 1 (measuring system 2) or [0, 1]"),
+        ({"encoder": [0, 0]}, "expected 0 (measuring system 1), 1 (measuring system 2) or [0, 1]"),
         ({"encoder": {"A": 0}}, "a table of these with the keys X, Y, Z"),
-        ({"encoder": True}, "or [0, 1] is expected"),
-        ({"encoder": 0, "active_encoder": 1}, "active_encoder: one of the encoders of X, [0], is expected"),
+        ({"encoder": True}, "expected 0 (measuring system 1), 1 (measuring system 2) or [0, 1]"),
+        ({"encoder": 0, "active_encoder": 1}, "active_encoder: expected one of the encoders of X, [0]"),
         ({"program_enables": True}, 'needs container = "program"'),
-        ({"container": "spf"}, "one of 'ini', 'program' is expected"),
+        ({"container": "spf"}, "expected one of 'ini', 'program'"),
     ],
 )
 def test_wrong_settings_of_encoder_tables_say_what_is_expected(data, message):
@@ -681,15 +681,17 @@ def test_a_switch_or_a_step_is_no_table():
         ("NC_CEC.INI", "$AA_ENC_COMP_STEP[0,AX1]=1.0", "encoder"),
     ):
         with pytest.raises(
-            InputError, match=f"other: the files hold no {missing} tables .* give both AX_EEC and NC_CEC"
+            InputError, match=f"other: the files contain no {missing} tables .* give both AX_EEC and NC_CEC"
         ):
             parsed(machine, "siemens-cec-eec", {file: made[file], "other": f"{other}\nM17\n"})
         with pytest.raises(
-            InputError, match=f"{file}: the files hold no {missing} tables .* give all that the control"
+            InputError, match=f"{file}: the files contain no {missing} tables .* give all that the control"
         ):
             of_control.parse_foreign([SourceFile(Path(file), made[file])])
         both = [SourceFile(Path(file), made[file]), SourceFile(Path("other"), f"{other}\nM17\n")]
-        with pytest.raises(InputError, match=f"other: the files hold no {missing} tables .* give all that the control"):
+        with pytest.raises(
+            InputError, match=f"other: the files contain no {missing} tables .* give all that the control"
+        ):
             of_control.parse_foreign(both)
 
 
@@ -712,9 +714,9 @@ def test_a_factor_that_is_switched_off_or_weighted_is_a_violation(switch):
         ),
         ("$MA_CEC_ENABLE[AX1]=2\n" + constant(0, "0.1"), "2 is not a whole number from 0 to 1", 1),
         ("$MA_CEC_ENABLE[AX7]=0\n" + constant(0, "0.1"), "no axis of the machine file is named 'AX7'", 1),
-        (constant(0, "0.1") + "$SN_CEC_TABLE_ENABLE[5]=1\n", "the files hold no table 5", 11),
+        (constant(0, "0.1") + "$SN_CEC_TABLE_ENABLE[5]=1\n", "the files contain no table 5", 11),
         (constant(0, "0.1") + "$SN_CEC_TABLE_WEIGHT[0]=1E0\n", "has an exponent", 11),
-        ("$MA_CEC_ENABLE[AX1]=0\nNEWCONF\n", "holds no table", None),
+        ("$MA_CEC_ENABLE[AX1]=0\nNEWCONF\n", "contains no table", None),
         ("NEWCONFIG\n" + constant(0, "0.1"), "'NEWCONFIG' is not an assignment", 1),
     ],
 )
@@ -836,8 +838,8 @@ def test_line_ends_of_a_users_file_follow_the_name_of_its_template(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("NC_CEC.INI.j2", "x", "'NC_CEC.INI' is not free as a file name"),
-        ("result.json.j2", "x", "'result.json' is not free as a file name"),
+        ("NC_CEC.INI.j2", "x", "'NC_CEC.INI' is a reserved file name"),
+        ("result.json.j2", "x", "'result.json' is a reserved file name"),
         ("V.TXT.j2", "{{ errors21[0].valu }}", "has no attribute 'valu'"),
         ("V.TXT.j2", "{{ errors22 }}", "'errors22' is undefined"),
         ("V.TXT.j2", "{% for %}", "the template cannot be rendered"),
@@ -889,8 +891,8 @@ def test_a_hundred_megabytes_of_garbage_are_refused_within_a_second(name, garbag
         (lambda text: text.replace("$AA_ENC_COMP[0,2,AX1]", "$AA_ENC_COMP[0,1,AX1]"), "is assigned a second time"),
         (lambda text: re.sub(r"\$AA_ENC_COMP\[0,1,AX2\]=.*\n", "", text), "node 1 of 0 ..."),
         (lambda text: text.replace("MAX[0,AX3]=", "MAX[0,AX3]=1"), "node"),
-        (lambda text: "\ufeff" + text, "holds the character '\\ufeff'"),
-        (lambda text: "".join(f"{char}\x00" for char in text), "holds the character '\\x00'"),
+        (lambda text: "\ufeff" + text, "contains the character '\\ufeff'"),
+        (lambda text: "".join(f"{char}\x00" for char in text), "contains the character '\\x00'"),
     ],
     ids=["cut", "comma", "exponent", "twice", "gap", "count", "mark", "wide"],
 )

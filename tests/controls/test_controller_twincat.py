@@ -250,8 +250,8 @@ CROSS, PLANE = golden("crosscomp_z.lis"), golden("crosscomp2_x.lis")
 @pytest.mark.parametrize(
     ("text", "line", "words"),
     [
-        ("", None, "holds no data"),
-        ("# nothing\n", None, "holds no data"),
+        ("", None, "contains no data"),
+        ("# nothing\n", None, "contains no data"),
         (LIST.replace("kw.ssfk.table[2].pos   34\n", ""), None, r"kw.ssfk.table\[2\].pos is missing"),
         (LIST.replace("table[2]", "table[1]"), 10, "second time; the first is in line 9"),
         (LIST.replace("table[2]", "table[3]"), 10, "the table goes over"),

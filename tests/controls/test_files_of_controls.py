@@ -167,7 +167,7 @@ def test_what_could_change_a_table_and_is_not_understood_is_refused_with_its_lin
 def test_an_archive_that_was_cut_within_its_machine_data_is_refused(tmp_path):
     content = cec_archive()
     cut = content[: content.index(b"N32710 $MA_CEC_ENABLE[AX2]")]
-    with pytest.raises(InputError, match="the archive ends within INITIAL.INI: it was cut") as caught:
+    with pytest.raises(InputError, match="the archive ends within INITIAL.INI: it is truncated") as caught:
         read(tmp_path, cut)
     assert caught.value.line
 
@@ -396,7 +396,7 @@ def test_a_pmac_backup_is_read_and_other_motors_are_kept_apart(tmp_path):
     ("old", "new", "line", "words"),
     [
         ("-8000 , 0", "-8000.5 , 0", 13, "not a whole number"),
-        (" 0,0\n0,0,0,0\n", " 0,0\n0,0,0\n", None, "the file was cut"),
+        (" 0,0\n0,0,0,0\n", " 0,0\n0,0,0\n", None, "the file is truncated"),
         ("P1=0", "I51=P1", 6, "not understood"),
         ("P1=0", "DEFINE COMP ALL", 6, "not understood"),
         ("P1=0", "I51..53=0", 6, "not understood"),
@@ -452,7 +452,7 @@ def test_axis_lists_of_other_axes_are_kept_apart_and_unknown_entries_refused(tmp
     other.write_text(AXIS_LIST.replace("achs_nr            1", "achs_nr            5"), encoding="utf-8")
     tables = read_tables(machine, [first, other], "twincat-lists", foreign=True)
     assert any("the list of axis 5 (a5.lis)" in remark for remark in tables.remarks)
-    with pytest.raises(InputError, match="holds no table of an axis of the machine file"):
+    with pytest.raises(InputError, match="contains no table of an axis of the machine file"):
         read_tables(machine, other, "twincat-lists", foreign=True)
     first.write_text(AXIS_LIST.replace("kw.ssfk.res1 ", "kw.ssfk.gain "), encoding="utf-8")
     with pytest.raises(InputError, match="not a parameter of these lists") as caught:

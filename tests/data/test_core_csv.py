@@ -49,7 +49,7 @@ def test_a_header_without_rows_is_refused(saved):
 
 def test_a_missing_column_is_named_with_what_is_needed_and_what_is_there(saved):
     message = refusal(saved("# a comment\nname,valu\na,1\n"))
-    assert ":2: column 'value' is missing; needed are name, value; the header has name, valu" in message
+    assert ":2: column 'value' is missing; required are name, value; the header has name, valu" in message
 
 
 def test_semicolons_between_columns_get_a_hint(saved):
@@ -76,7 +76,7 @@ def test_a_column_that_misses_an_allowed_pattern_is_left_out(saved):
 
 
 def test_a_doubled_column_is_refused(saved):
-    assert "names 'value' twice" in refusal(saved("name,value,value\na,1,2\n"))
+    assert "contains 'value' twice" in refusal(saved("name,value,value\na,1,2\n"))
 
 
 @pytest.mark.parametrize(("row", "fields"), [("b", 1), ("b,2,3", 3)])
@@ -117,7 +117,7 @@ def test_a_quote_that_is_never_closed_is_refused(saved):
 
 
 def test_a_quoted_field_over_a_line_end_is_refused(saved):
-    assert "runs over a line end" in refusal(saved('name,value\n"a\nb",1\n'))
+    assert "contains a line end" in refusal(saved('name,value\n"a\nb",1\n'))
 
 
 def test_text_after_a_closing_quote_is_refused_with_its_line(saved):
@@ -134,7 +134,7 @@ def test_text_that_is_not_utf_8_is_refused_with_its_line(saved):
 
 
 def test_a_folder_or_a_file_that_is_not_there_is_refused(tmp_path):
-    assert "is a folder; a file is needed" in refusal(tmp_path)
+    assert "is a folder; expected a file" in refusal(tmp_path)
     assert "no such file" in refusal(tmp_path / "missing.csv")
     (tmp_path / "file").write_text("x")
     assert "cannot be read" in refusal(tmp_path / "file" / "below.csv")
@@ -205,7 +205,7 @@ def test_a_direction_is_plus_one_minus_one_or_zero(saved):
 
 
 def test_a_file_that_declares_more_rows_than_it_holds_is_refused(saved):
-    assert "declares 3 rows but holds 2" in refusal(saved("# rows = 3\nname,value\na,1\nb,2\n"))
+    assert "declares 3 rows but contains 2" in refusal(saved("# rows = 3\nname,value\na,1\nb,2\n"))
 
 
 def test_without_a_declared_number_a_shorter_last_number_without_line_end_is_refused(saved):
@@ -441,7 +441,7 @@ def test_a_comment_is_no_formula_after_its_commas(tmp_path):
 def test_an_equals_sign_in_the_name_of_a_station_is_refused(small_lengths_file, tmp_path):
     path = tmp_path / "x.lengths.csv"
     path.write_text(small_lengths_file.read_text().replace("\nS2,", "\nS=2,"))
-    with pytest.raises(InputError, match=r"column station: 'S=2' is not a name: '=' is not allowed"):
+    with pytest.raises(InputError, match=r"column station: 'S=2' is not a valid name; remove the '='"):
         compgen.read_lengths(path)
 
 

@@ -80,7 +80,7 @@ def test_a_byte_order_mark_and_windows_line_ends_are_understood(saved):
 def test_a_wrong_value_is_shown_with_its_line_and_what_is_expected(saved):
     path = saved(TEXT)
     message = message_of(toml_files.read_toml(path).take, "count", toml_files.text)
-    assert message == f"{path}:2: count: one line of text is expected; got 3"
+    assert message == f"{path}:2: count: expected one line of text; got 3"
 
 
 def test_a_missing_key_names_the_nearest_one_that_is_there_and_the_line_of_its_table(saved):
@@ -116,8 +116,8 @@ def test_a_wrong_key_in_the_second_table_of_an_array_points_there(saved):
 
 def test_a_section_that_is_a_value_and_a_value_that_is_a_section_are_refused(saved):
     root = toml_files.read_toml(saved(TEXT))
-    assert ":2: count: a table ([section]) is expected; got 3" in message_of(root.section, "count")
-    assert ":2: count: an array of tables ([[section]]) is expected" in message_of(root.sections, "count")
+    assert ":2: count: expected a table ([section]); got 3" in message_of(root.section, "count")
+    assert ":2: count: expected an array of tables ([[section]])" in message_of(root.sections, "count")
     assert "name: is missing" in message_of(toml_files.read_toml(saved("nmae = 1\n")).take, "name", toml_files.text)
 
 

@@ -96,7 +96,7 @@ def test_each_curve_is_taken_at_the_position_of_its_own_axis_linear_between_and_
 def test_leaving_the_range_of_a_curve_warns_and_staying_inside_does_not():
     table = example()
     table.warn_outside(np.array([[-800.0, 5000.0, -400.0]]))
-    with pytest.warns(CompgenWarning, match="EXX is known from -800 to 0 mm, but positions go from -801 to -5 mm"):
+    with pytest.warns(CompgenWarning, match="EXX is known from -800 to 0 mm, but positions range from -801 to -5 mm"):
         table.warn_outside(np.array([[-801.0, 0.0, -400.0], [-5.0, 0.0, -400.0]]))
 
 

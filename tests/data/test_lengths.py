@@ -98,7 +98,7 @@ def test_the_same_rows_in_two_files_are_refused(saved):
     first, copy = saved(text), saved("# copied\n" + text, "copy.lengths.csv")
     for again in (first, copy):
         message = refusal(first, again)
-        assert message == f"{again}: holds the same rows as {first}; give each measurement once"
+        assert message == f"{again}: contains the same rows as {first}; give each measurement only once"
 
 
 def test_no_file_at_all_is_refused():

@@ -94,7 +94,7 @@ def test_a_machine_file_switches_effects_on(extended):
         ("[effects.backlsh_X]\nc_um = 1.0\n", "unknown effect 'backlsh_X'; did you mean 'backlash_X'"),
         ("[effects.backlash_X]\nc_mm = 1.0\n", "c_mm: is not a known key; did you mean 'c_um'"),
         ("[effects.backlash_X]\n", "c_um: is missing"),
-        ("[effects.backlash_X]\nc_um = '4'\n", "a finite number is expected"),
+        ("[effects.backlash_X]\nc_um = '4'\n", "expected a finite number"),
         ("[effects.outliers]\n", "cannot be switched on"),
         ("[effects.machine_jump]\ncx_um = 1.0\n", "time_s: is missing"),
         ("[effects.periodic_X]\ns1_um = 1.0\n", "pitch_mm: is missing"),

@@ -76,7 +76,7 @@ def site(tmp_path, small_machine_file, monkeypatch):
         (MACHINE.replace('measured_with = "bare"\n', ""), "compensates twice or not at all", 1),
         (MACHINE.replace('"bare"', '"off"'), "'active', 'bare'", 6),
         (MACHINE.replace("siemens-cec", "simens-cec"), "siemens-cec", 4),
-        (MACHINE + "schedule = '0 25 * * *'\n", "'25' is not a valid hour; 0 to 23", 7),
+        (MACHINE + "schedule = '0 25 * * *'\n", "'25' is not a valid hour; expected 0 to 23", 7),
         (MACHINE + "schedule = '0 6 * * *'\nevery_minutes = 5\n", "give one of the two", 7),
         (MACHINE + "[machines.mill.policy]\nconfidence = 95\n", "0.95", 8),
         (MACHINE + "[machines.mill.policy]\ntemperature_c = [22, 18]\n", "lower number first", 8),

@@ -110,7 +110,7 @@ def test_every_proposed_table_has_a_significant_change_behind_it(year):
 def test_measurements_that_cannot_be_right_are_refused_with_the_cause(year):
     exchanged, wrong_sign, right = rows_of(year, "mill-b")[:3]
     assert exchanged.outcome.state == wrong_sign.outcome.state == "failed"
-    assert "column y_mm: -400 mm lies outside the travel" in exchanged.outcome.messages[0]
+    assert "column y_mm: -400 mm is outside the travel" in exchanged.outcome.messages[0]
     assert "opposite sign" in wrong_sign.outcome.messages[0]
     assert all(message.startswith("2026-01-04-") for row in (exchanged, wrong_sign) for message in row.outcome.messages)
     assert exchanged.table is wrong_sign.table is None and wrong_sign.active is None

@@ -225,7 +225,7 @@ def test_the_store_of_the_job_file_may_be_given_by_its_path(tmp_path, monkeypatc
     for given in (None, "recal.sqlite", str(tmp_path / "recal.sqlite"), url):
         assert serve_commands._store_url(given, Path("recal.toml")) == url
     with pytest.raises(
-        InputError, match=r"h/n is not the store of recal.toml, which is sqlite:.*recal.sqlite; leave --store out"
+        InputError, match=r"h/n is not the store of recal.toml, which is sqlite:.*recal.sqlite; omit --store"
     ) as found:
         serve_commands._store_url("postgresql://u:secret@h/n", Path("recal.toml"))
     assert "secret" not in str(found.value)

@@ -79,7 +79,7 @@ def test_the_evaluation_of_the_imported_example_has_the_golden_means_and_reversa
     )
     np.testing.assert_allclose(up, UP, rtol=0, atol=1e-9)
     np.testing.assert_allclose(np.subtract(up, down), [3, 4, 3, 4, 3], rtol=0, atol=1e-9)
-    with pytest.warns(CompgenWarning, match="taken as: renishaw"):
+    with pytest.warns(CompgenWarning, match="read as: renishaw"):
         errors = open_errors(GOLDEN / "linear.rtl")
     np.testing.assert_allclose(1e3 * errors.curves["EXX"].value, [0.5, 4, -1.5, -4, 3.5], rtol=0, atol=1e-9)
 
@@ -143,16 +143,16 @@ def test_sorted_rows_of_a_two_way_test_are_not_taken_for_one_direction(tmp_path)
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (rtl(ROWS[:-1]), "2 runs of 5 targets are 10 readings, the file holds 9"),
-        (rtl(ROWS[:-1], tail=""), "it was cut"),
-        (rtl(ROWS, tail="")[:-6], "three numbers|it was cut"),
-        (rtl(ROWS)[: rtl(ROWS).index("DEVIATIONS")], "holds no readings"),
-        (rtl(ROWS)[: rtl(ROWS).index("Targets")], "holds no target positions"),
-        (rtl(ROWS, count=6), "declares 6 targets but holds 5"),
+        (rtl(ROWS[:-1]), "2 runs of 5 targets are 10 readings, the file contains 9"),
+        (rtl(ROWS[:-1], tail=""), "it is truncated"),
+        (rtl(ROWS, tail="")[:-6], "three numbers|it is truncated"),
+        (rtl(ROWS)[: rtl(ROWS).index("DEVIATIONS")], "contains no readings"),
+        (rtl(ROWS)[: rtl(ROWS).index("Targets")], "contains no target positions"),
+        (rtl(ROWS, count=6), "declares 6 targets but contains 5"),
         (rtl([*ROWS[:-1], "2 2 1.0"]), "appears twice"),
         (rtl([*ROWS[:-1], "2 9 1.0"]), "beyond 2 runs and 5 targets"),
         (rtl([*ROWS[:-1], "2 1 abc"]), "expected three numbers 'run target deviation'"),
-        (rtl([*ROWS[:-1], "2 1"]), "was the file cut"),
+        (rtl([*ROWS[:-1], "2 1"]), "is the file truncated"),
         (rtl([*ROWS[:-1], "2 1 nan"]), "expected three numbers 'run target deviation'"),
         (rtl(ROWS, runs="many"), "whole number from 1"),
         (rtl(ROWS, targets="0 100 x 300 400"), "expected a target position"),
@@ -189,7 +189,7 @@ def test_angular_runs_become_the_error_that_the_user_names_in_rad():
     item = import_file(path, ImportOptions(error="EBX"))
     curve = item.data.curves["EBX"]
     np.testing.assert_allclose(curve.value, [1e-6, 5e-6, 11e-6, 13e-6, 21e-6], rtol=0, atol=1e-15)
-    for wrong, message in (("EXX", "holds an angle"), ("EBY", "belongs to axis Y"), ("EQX", "did you mean|Known")):
+    for wrong, message in (("EXX", "contains an angle"), ("EBY", "belongs to axis Y"), ("EQX", "did you mean|Known")):
         with pytest.raises(InputError, match=message):
             import_file(path, ImportOptions(error=wrong))
 
@@ -229,7 +229,7 @@ def test_forward_runs_of_descending_targets_move_in_negative_direction(tmp_path)
     assert runs.covariates["order"].tolist() == [1, 2, 3, 4]  # down first: rows by themselves never tell the time
     with pytest.raises(InputError, match="declares 3 targets"):
         import_file(written(tmp_path, text.replace("POSITIONS=2", "POSITIONS=3"), "b.dat"))
-    with pytest.raises(InputError, match="is missing: was it cut"):
+    with pytest.raises(InputError, match="is missing; is it truncated"):
         import_file(written(tmp_path, text.rpartition("REF")[0], "c.dat"))
     turned = text.replace("=10.00", "=-10.00").replace("=-.49", "=.49")
     assert any("slope" in doubt for doubt in import_file(written(tmp_path, turned, "d.dat")).doubts)
@@ -285,7 +285,7 @@ def test_without_a_unit_the_size_of_the_numbers_decides_and_says_so(tmp_path, fa
     text = long_table(factor=factor, header=["position", "deviation", "direction", "run", "axis"])
     item = import_file(written(tmp_path, text, "t.csv"))
     assert item.understood["unit"] == unit
-    assert any("by the size" in text for text in item.notes)
+    assert any("by the magnitude" in text for text in item.notes)
     assert_is_the_example(item.data)
 
 
@@ -391,7 +391,7 @@ def test_error_tables_have_a_column_or_a_row_for_each_value(tmp_path):
     np.testing.assert_allclose(item.data.curves["EBX"].value, np.deg2rad([0, 1 / 3600, 2 / 3600]), atol=1e-12)
     long = "parameter;pos [mm];value [mm]\nEXX;0;0\nEXX;100;0,004\n"
     np.testing.assert_allclose(import_file(written(tmp_path, long, "f.csv")).data.curves["EXX"].value, [0, 4e-3])
-    with pytest.warns(CompgenWarning, match="taken as: table, errors"):
+    with pytest.warns(CompgenWarning, match="read as: table, errors"):
         assert set(open_errors(written(tmp_path, wide, "g.csv")).names) == {"EXX", "EBX"}
 
 
@@ -412,7 +412,7 @@ def test_sheets_of_several_axes_are_one_measurement(tmp_path):
     item = import_file(path)
     assert item.data.axes == (0, 1)
     assert len(item.data) == 10
-    assert any("sheet left out" in text for text in item.notes)
+    assert any("sheet skipped" in text for text in item.notes)
     assert import_file(path, ImportOptions(sheet="Y")).data.axes == (1,)
     with pytest.raises(InputError, match="no sheet 'Z'"):
         import_file(path, ImportOptions(sheet="Z"))
@@ -442,8 +442,8 @@ def test_zip_bombs_entities_and_damaged_workbooks_are_refused_at_once(tmp_path):
         (packed("entity.xlsx", **{"xl/worksheets/sheet1.xml": entity}), "XML entities"),
         (packed("entity16.xlsx", **{"xl/worksheets/sheet1.xml": wide}), "XML entities"),
         (packed("odd.xlsx", **{"xl/workbook.xml": b"<nonsense/>"}), "damaged|without any"),
-        (written(tmp_path, good.read_bytes()[:-40], "cut.xlsx"), "damaged or cut"),
-        (written(tmp_path, b"PK\x03\x04" + b"\0" * 100, "zip.xlsx"), "damaged or cut"),
+        (written(tmp_path, good.read_bytes()[:-40], "cut.xlsx"), "damaged or truncated"),
+        (written(tmp_path, b"PK\x03\x04" + b"\0" * 100, "zip.xlsx"), "damaged or truncated"),
         (written(tmp_path, b"\xd0\xcf\x11\xe0" + b"\0" * 100, "old.xlsx"), "old Excel workbook"),
     ):
         with pytest.raises(InputError, match=message):
@@ -470,17 +470,17 @@ def test_files_of_500_megabytes_are_refused_within_a_second(tmp_path):
         (b"\0\x01\x02" * 100, "NUL bytes|no table"),
         (b"%PDF-1.4 ...", "PDF"),
         (b"<?xml version='1.0'?><a/>", "XML or HTML"),
-        (b"only words here\nand here\n", "holds no table"),
-        ("position [mm],deviation [um]\n0,1\n100".encode("utf-16")[:-1], "cut or damaged UTF-16"),
+        (b"only words here\nand here\n", "contains no table"),
+        ("position [mm],deviation [um]\n0,1\n100".encode("utf-16")[:-1], "truncated or damaged UTF-16"),
         (b"position [mm],deviation [um]\n0,1\n100,x\n", "3: column deviation .um.: 'x' is not a number"),
         (b"position [mm],deviation [um]\n0,1\n100,1e999\n", "'1e999' is not a number"),
         (b"position [mm],deviation [um]\n0,5,1,2\n1,5,1,2\n", "decimal commas and commas between columns"),
-        (b"position [mm];deviation [um]\n0,5;1.2\n1,5;1,2\n", "write all numbers in one way"),
-        (b"position [mm],deviation [um]\n0,1\n1,2\n3", "it was cut"),
+        (b"position [mm];deviation [um]\n0,5;1.2\n1,5;1,2\n", "write all numbers alike"),
+        (b"position [mm],deviation [um]\n0,1\n1,2\n3", "it is truncated"),
         (b"position [mm],deviation [um],direction\n0,1,up\n1,2,sideways\n", "'sideways' is not a direction"),
         (b"pos [mm],deviation [um],deviation [um]\n0,1,2\n", "twice"),
         (b"position [kg],deviation [um]\n0,1\n0,2\n", "kg is not a unit of length"),
-        (b"weight [kg],force [N]\n0,1\n0,2\n", "its columns are not known"),
+        (b"weight [kg],force [N]\n0,1\n0,2\n", "its columns are not recognised"),
     ],
 )
 def test_what_is_no_measurement_is_refused_with_the_place(tmp_path, content, message):

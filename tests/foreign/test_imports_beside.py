@@ -135,12 +135,12 @@ def test_temperatures_by_name_by_unit_and_by_the_user(tmp_path, header, cells, o
 @pytest.mark.parametrize(
     ("header", "cells", "reason"),
     [
-        ("Temp X", ("1", "2"), "the file gives no unit"),
+        ("Temp X", ("1", "2"), "the file states no unit"),
         ("Temp X [K]", ("20", "21"), "another unit"),
         ("Temp X [degC]", ("20", ""), "is empty"),
         ("Temp X [degC]", ("20", "warm"), "'warm' is not a number"),
-        ("Time", ("1", "2"), "say --unit time=s"),
-        ("Time", ("10:00", "09:00"), "do not ascend"),
+        ("Time", ("1", "2"), "give --unit time=s"),
+        ("Time", ("10:00", "09:00"), "are not ascending"),
         ("Time", ("10:00", "soon"), "'soon' is not a date or time"),
         ("Feed", ("1", "2"), "has no column"),
     ],
@@ -212,7 +212,7 @@ def test_repeated_rows_are_numbered_and_copies_refused(tmp_path):
     item = import_file(written(tmp_path, again))
     assert isinstance(item.data, Deviations)
     assert item.data.labels["repeat"].tolist() == [1] * 6 + [2] * 6
-    assert any("numbered as they come" in text for text in item.notes)
+    assert any("numbered in order of occurrence" in text for text in item.notes)
     assert len(read_deviations(written(tmp_path, item.files()["t.deviations.csv"], "o.deviations.csv"))) == 12
     copied = head + "".join(f"{x},{y},0,{d}\n" for _ in (0, 1) for x, y, d in rows)
     with pytest.raises(InputError, match="6 rows repeat earlier ones to the last digit"):
@@ -264,7 +264,7 @@ def test_thousands_and_decimal_marks(tmp_path, cells, decimal, values):
 
 def test_numbers_that_may_have_a_comma_or_thousands_are_asked_for(tmp_path):
     path = written(tmp_path, "position [mm];deviation [um];axis\n0;1;X\n1,000;2;X\n")
-    with pytest.raises(InputError, match=r"t.csv:3: numbers such as 1,000 may be 1000 or 1.000; say --decimal"):
+    with pytest.raises(InputError, match=r"t.csv:3: numbers such as 1,000 may be 1000 or 1.000; give --decimal"):
         import_file(path)
     mixed = written(tmp_path, "position [mm];deviation [um];axis\n0;0.1;X\n1,000;0.2;X\n")
     with pytest.raises(InputError, match="a decimal point in line 2"):
@@ -287,7 +287,7 @@ def test_options_that_a_format_cannot_take_and_unknown_fields_are_refused(tmp_pa
         InputError, match="--map: does not apply to a file of the format etalon-exchange; --sign, --unit do"
     ):
         import_file(exchange, ImportOptions(columns={"position": "A"}))
-    with pytest.raises(InputError, match="say linear= or angle="):
+    with pytest.raises(InputError, match="give linear= or angle="):
         import_file(exchange, ImportOptions(units={"value": "um"}))
     table = written(tmp_path, "position [mm],deviation [um],axis\n0,1,X\n1,2,X\n")
     with pytest.raises(InputError, match="--sheet: does not apply"):

@@ -82,7 +82,7 @@ def test_positions_beyond_the_travel_are_named(capsys, tmp_path, machine):
     path.write_text("position [mm],deviation [um],axis\n0,1,X\n4000,2,X\n")
     code, out, _ = call(capsys, "import", path, "--machine", machine, "--out", tmp_path / "o")
     assert code == 2
-    assert "0 to 4000 mm, the travel of imported from 0 to 400 mm" in out
+    assert "0 to 4000 mm, but imported travels from 0 to 400 mm" in out
     assert not (tmp_path / "o").exists()
 
 
@@ -126,7 +126,7 @@ def test_damaged_own_files_options_that_convert_and_unknown_sheets_are_usage_err
     assert not (tmp_path / "o").exists()
     code, _, err = call(capsys, "import", OWN["lengths"], "--sign", "correction")
     assert code == 2
-    assert "--sign: is already in compgen's own format (lengths)" in err
+    assert "--sign: is already in the native format (lengths)" in err
     code, _, err = call(capsys, "import", OWN["lengths"], "--machine", "jia-xytz", "--out", tmp_path / "o")
     assert code == 2
     code, _, err = call(capsys, "import", GOLDEN / "wide.xlsx", "--sheet", "Q", "--json")
@@ -146,7 +146,7 @@ def test_from_a_foreign_measurement_to_accepted_tables_in_one_command(capsys, tm
     assert code == 0, err
     facts = json.loads(out)
     assert facts["accepted"] is True
-    assert "was taken as" in err
+    assert "was read as" in err
     assert facts["identify"]["method"] == "axis-runs"
     assert facts["before"]["v_x_um"] == pytest.approx(8.0, abs=1e-6)  # M of ISO 230-2 in the golden example
     assert facts["after"]["max_um"] < 0.01

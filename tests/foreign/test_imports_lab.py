@@ -104,7 +104,7 @@ def test_no_column_of_numbers_is_left_out_without_a_word_of_the_user(tmp_path, e
     assert "--map run1-=" in doubt
     left_out = import_file(path, ImportOptions(axis="X", sign="error", ignore=[extra[0]]))
     assert left_out.doubts == ()
-    assert left_out.understood["not_used"] == {extra[0]: "left out by --ignore"}
+    assert left_out.understood["not_used"] == {extra[0]: "excluded by --ignore"}
     assert_is_the_example(left_out.data)
 
 
@@ -118,7 +118,7 @@ def test_runs_whose_names_nobody_knows_are_said_by_the_user(tmp_path):
     assert_is_the_example(item.data)
     del columns["run2-"]
     assert (
-        "'Nord zum zweiten' holds numbers"
+        "'Nord zum zweiten' contains numbers"
         in import_file(path, ImportOptions(axis="X", columns=columns, sign="error")).doubts[0]
     )
 
@@ -181,7 +181,7 @@ def test_directions_may_be_part_of_the_number_of_the_run_or_of_the_axis(tmp_path
         item = import_file(written(tmp_path, text))
         assert item.doubts == ()
         assert_is_the_example(item.data)
-        with pytest.raises(InputError, match="'2x' names no direction"):
+        with pytest.raises(InputError, match="'2x' gives no direction"):
             import_file(written(tmp_path, text.replace(f",{ways[1].format(n=2)},", ",2x,")))
     lines = [f"{t},{v},{n},X{'+' if w > 0 else '-'}" for t, v, n, w in rows]
     item = import_file(written(tmp_path, "Position [mm],Abweichung [µm],run,axis\n" + "\n".join(lines) + "\n"))
@@ -392,7 +392,7 @@ def test_comments_of_own_files_survive_semicolons_and_utf_16_and_cut_ones_are_se
         assert isinstance(item.data, Lengths)
         assert item.data.metadata["u_length_um"] == "0.2"
         assert item.data.length_mm.tolist() == [100.5, 190.5, 260.5]
-    with pytest.raises(InputError, match="declares '3' rows but holds 2: is it cut"):
+    with pytest.raises(InputError, match="declares '3' rows but contains 2: is it truncated"):
         import_file(written(tmp_path, text.rpartition("A,3")[0].replace(",", ";"), "d.csv"))
 
 
@@ -402,7 +402,7 @@ def test_the_axis_is_known_by_the_title_and_asked_for_where_the_name_of_the_file
         assert (
             import_file(written(tmp_path, text))
             .doubts[0]
-            .startswith("the lines above the table say axis Y, the sheet or file is")
+            .startswith("the lines above the table give axis Y, but the sheet or file is")
         )
         assert_is_the_example(import_file(written(tmp_path, text, "measured.csv")).data, axis=1)
 
@@ -451,7 +451,7 @@ def test_messages_keep_umlauts_and_signs_and_escape_what_commands_a_terminal(tmp
             "Fehler vor;;\nPosition;1;2\n0;1;1\n100;2;2\nFehler zurück;;\nPosition;1;2\n0;3;3\n100;4;4\n",
             "rows of numbers",
         ),
-        ("Position;vor;hoppla\n0;1;1;7\n100;2;2;7\n", "holds no table"),
+        ("Position;vor;hoppla\n0;1;1;7\n100;2;2;7\n", "contains no table"),
     ],
 )
 def test_a_second_block_of_numbers_is_never_left_out(tmp_path, text, message):
@@ -504,7 +504,7 @@ def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_ur
     found = {name: 1e6 * value for name, (value, _) in item.beside.squareness.items()}
     assert found == pytest.approx(expected_urad, abs=1e-6)
     assert set(item.files()) == {"lab.axis.csv", "lab.errors.csv"}
-    with pytest.raises(InputError, match="holds runs of axes and errors as well .E"):
+    with pytest.raises(InputError, match="contains runs of axes and errors as well .E"):
         open_measurement([path])
     alone = import_file(path, ImportOptions(ignore=["Squareness"]))
     assert alone.beside is None
@@ -514,10 +514,10 @@ def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_ur
 @pytest.mark.parametrize(
     ("rows", "doubt"),
     [
-        ([["XY", 25, "µrad"]], "the sign of 'XY' is not known; write EC0Y in its place"),
+        ([["XY", 25, "µrad"]], "the sign of 'XY' is not clear; write EC0Y instead"),
         ([["EC0Y", 25]], "no unit of 'EC0Y'"),
-        ([["Rechtwinkligkeit"], ["Spindel", 25, "µm"]], "'Squareness' holds numbers that are not understood"),
-        ([["a", "b"], ["c", 1, 2, 3], ["d", 4, 5, 6]], "'Squareness' holds numbers that are not understood"),
+        ([["Rechtwinkligkeit"], ["Spindel", 25, "µm"]], "'Squareness' contains numbers that are not understood"),
+        ([["a", "b"], ["c", 1, 2, 3], ["d", 4, 5, 6]], "'Squareness' contains numbers that are not understood"),
     ],
 )
 def test_a_sheet_that_is_not_understood_is_asked_for(tmp_path, rows, doubt):
@@ -536,11 +536,11 @@ def test_a_sheet_of_statistics_is_left_out_and_one_of_mean_errors_is_held_agains
     results = [["Parameter", "vor", "zurück"], ["Umkehrspanne B", 2.4, 2.4], ["Wiederholpräzision R", 0.4, 0.3]]
     item = import_file(workbook(tmp_path, {"X": axis_sheet(), "Ergebnis": results}))
     assert item.doubts == ()
-    assert any("sheet left out: 'Ergebnis'" in note for note in item.notes)
+    assert any("sheet skipped: 'Ergebnis'" in note for note in item.notes)
     means = [["Position [mm]", "EXX [µm]", "EYX [µm]"], [-800, 2.075, 0.5], [-400, 3.25, 1], [0, 6.325, 0]]
     path = workbook(tmp_path, {"X": axis_sheet(), "Mittel": means})
     (doubt,) = import_file(path).doubts
-    assert "holds EXX, and the runs of X give it as well (their means differ by up to " in doubt
+    assert "contains EXX, and the runs of X give it, too (their means differ by up to " in doubt
     assert float(doubt.partition("up to ")[2].split()[0]) < 1e-6
     straight = workbook(tmp_path, {"X": axis_sheet(), "Geradheit": [[row[0], row[2]] for row in means]})
     item = import_file(straight)
@@ -591,7 +591,7 @@ def test_further_sheets_without_any_option(tmp_path, name):
             "no table|no row|not a number",
         ),
         ("Kompensation X-Achse\nPosition [mm];vor [µm];zurück [µm]\n-800;1;3\n0;5;7\n", "--sign"),
-        ("X axis error\nPosition [mm];Run 1 fwd;Run 1 rtrn\n-800;1;3\n0;5;7.5\n", "'Run 1 rtrn' holds numbers"),
+        ("X axis error\nPosition [mm];Run 1 fwd;Run 1 rtrn\n-800;1;3\n0;5;7.5\n", "'Run 1 rtrn' contains numbers"),
         ("X-Achse\nPosition [mm];X vor [µm];Y vor [µm]\n-800;1;3\n0;5;7\n", "no deviations or readings"),
         ("X-Achse Fehler\nPosition [mm];vor [µm];zurück [µm]\n-800;1;3\n0;5;\n;;9\n", "is empty|not a number"),
     ],
@@ -612,7 +612,7 @@ def test_runs_without_a_direction_that_differ_like_two_directions_are_asked_for(
     alike = "Position [mm];Run 1;Run 2;Run 3;Run 4\n-800;1,0;1,2;1,3;1,1\n-400;2,2;2,0;2,1;2,2\n0;5,1;5,2;5,0;5,1\n"
     item = import_file(written(tmp_path, alike), ImportOptions(axis="X"))
     assert item.doubts == ()
-    assert any("no run names a direction" in note for note in item.notes)
+    assert any("no run gives a direction" in note for note in item.notes)
     assert item.data.direction.tolist() == [1] * 12
 
 

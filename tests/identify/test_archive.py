@@ -188,7 +188,7 @@ def test_options_that_need_all_readings_at_once_are_refused(machine, columns, tm
         ({"station": np.full(COUNT, 4)}, "not one of the 4 stations"),
         ({"x_mm": np.zeros(5)}, r"has the shape \(5,\)"),
         ({"y_mm": np.full(COUNT, np.nan)}, "reading 1 is not a finite number"),
-        ({"z_mm": np.full(COUNT, 1000.0)}, "lies outside the travel"),
+        ({"z_mm": np.full(COUNT, 1000.0)}, "is outside the travel"),
         ({"colour": np.zeros(COUNT)}, "not a column"),
         ({"u_length_um": np.full(COUNT, 0.1)}, "is a column"),
         ({"temp_x_c": np.full(COUNT, 25.0)}, "needs a correction"),
@@ -211,7 +211,7 @@ def test_damaged_and_compressed_files_are_refused(columns, tmp_path):
     with pytest.raises(InputError, match=r"numpy.savez, not numpy.savez_compressed"):
         open_archive(path)
     np.savez(path, **{**columns, "point": np.array([object()] * COUNT)})
-    with pytest.raises(InputError, match="holds objects"):
+    with pytest.raises(InputError, match="contains objects"):
         open_archive(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("note.txt", "nothing")

@@ -328,7 +328,11 @@ def test_two_axes_alone_give_their_errors_and_one_squareness(tmp_path):
         ("glass_index = 1.5151", "glass_index = 15.151", "between 1 and 4"),
         ("focal_length_mm = 100.0\n", "", "focal_length_mm: is missing"),
         ("[axes.X]\nmode = 2", "[axes.X]\nmode = 3", "from 1 to 2"),
-        ("[axes.X]\nmode = 2\nbeam_direction = 1", "[axes.X]\nmode = 2\nbeam_direction = 0", "or -1 is expected"),
+        (
+            "[axes.X]\nmode = 2\nbeam_direction = 1",
+            "[axes.X]\nmode = 2\nbeam_direction = 0",
+            "expected 1 (beam along",
+        ),
         ("eps_PEy_arcsec = 4.0", "eps_PEy_deg = 4.0", "is not a systematic parameter"),
         ("eps_PEy_arcsec = 4.0", "eps_PEy_arcsec = 4.0\neps_PEy_urad = 4.0", "twice, in two units"),
         ("eps_PEy_arcsec = 0.05", "eps_PEy_arcsec = -0.05", "not negative"),

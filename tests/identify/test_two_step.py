@@ -508,7 +508,7 @@ def test_stations_located_with_the_nominal_machine_are_weighted_by_what_they_are
     machine = replace(GANTRY, errors=("EXX", "EYY"))
     truth = make_errors(machine)
     lengths = measured(machine, truth, sigma_mm=SIGMA_MM, stations=STATIONS[:1])
-    with pytest.warns(CompgenWarning, match="taken as perfect"):
+    with pytest.warns(CompgenWarning, match="assumed perfect"):
         result = identify(machine, lengths, IdentifyOptions(stations="nominal"))
     value, u, _ = all_values(result.errors)
     exact = all_values(identify(machine, lengths, IdentifyOptions(stations=known())).errors)[1]

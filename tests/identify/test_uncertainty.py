@@ -415,7 +415,7 @@ def test_damaged_bytes_are_noticed(written, tmp_path):
     [
         ({"format": np.array("other 7")}, "is not a covariance file of this version"),
         ({"factor": None}, "lacks factor"),
-        ({"factor": np.zeros((3, 3))}, "do not fit together"),
+        ({"factor": np.zeros((3, 3))}, "do not match"),
         ({"factor": np.array(["x"])}, "something other than numbers"),
         ({"factor": np.array([{}], dtype=object)}, "truncated or damaged"),
         ({"position_mm": "reversed"}, "ascending"),
@@ -496,7 +496,7 @@ def test_predict_refuses_a_covariance_of_other_errors(command, files, small_mach
     target = tmp_path / "never.csv"
     words = ("--points", points, "--out", target)
     code, _, stderr = command("predict", small_machine_file, out / "fitted.errors.csv", *words, "--uncertainty")
-    assert (code, "names no covariance file" in stderr) == (2, True)
+    assert (code, "refers to no covariance file" in stderr) == (2, True)
     words = (*words, "--uncertainty", out / FILE_NAME)
     code, _, stderr = command("predict", small_machine_file, out / "fitted.errors.csv", *words)
     assert (code, "belongs to another errors file" in stderr) == (2, True)

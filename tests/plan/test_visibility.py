@@ -132,7 +132,7 @@ def test_the_plan_says_what_it_can_never_see(machine, tmp_path, capsys):
     stations.write_text("\n".join(["station,x_mm,y_mm,z_mm", *rows]) + "\n")
     code = run_command(cli, ["plan", "zha-gantry", "--stations", str(stations), "--grid", "--out", str(tmp_path / "p")])
     said = " ".join(capsys.readouterr().out.split())
-    assert code == 0 and "what this plan can never see" in said and "one tool offset" in said
+    assert code == 0 and "what this plan cannot show" in said and "one tool offset" in said
     report = json.loads((tmp_path / "p" / "plan.json").read_text())["visibility"]
     never = {entry["name"]: entry for entry in report["never"]}
     assert never["laser_scale"]["measure"].startswith("measure a calibrated length")

@@ -684,7 +684,7 @@ def test_report_says_which_schema_a_document_is_valid_by(folders, tmp_path, caps
     schema = small_schema(tmp_path / "schema")
     out = tmp_path / "out"
     assert call("report", folders["identify"], "--out", out, "--dcc", EXAMPLE, "--dcc-schema", schema) == 0
-    assert f"dcc.xml: DCC 3.3.0, valid by {schema}" in capsys.readouterr().out
+    assert f"dcc.xml: DCC 3.3.0, valid against {schema}" in capsys.readouterr().out
     assert (out / "dcc.xml").is_file()
 
 

@@ -458,11 +458,11 @@ def test_compensating_positioning_alone_is_not_adverse_in_the_example(gantry):
         (BASE + "sede = 3\n", r"\[instrument.stations\] sede: is not a known key"),
         ("colour = 1\n" + BASE, r":1: colour: is not a known key"),
         (BASE.replace("seed = 7", "name = 'x'"), "seed: is missing"),
-        (BASE.replace("seed = 7", "seed = -1"), r":2: seed: a whole number of at least 0"),
-        (BASE.replace("seed = 7", "seed = 7\nname = '../x'"), r":3: name: a file name of letters"),
+        (BASE.replace("seed = 7", "seed = -1"), r":2: seed: expected a whole number of at least 0"),
+        (BASE.replace("seed = 7", "seed = 7\nname = '../x'"), r":3: name: expected a file name of letters"),
         (
             BASE.replace('"laser-tracer"', '"laser-tracker"'),
-            "type: one of 'laser-tracer', 'sixdof', 'axis-laser', 'diagonal-laser' is expected",
+            "type: expected one of 'laser-tracer', 'sixdof', 'axis-laser', 'diagonal-laser'",
         ),
         (BASE.replace('"laser-tracer"\n', '"laser-tracer"\nnoise_nm = 1\n'), "did you mean 'noise_um'"),
         (BASE.replace('"laser-tracer"\n', '"laser-tracer"\nnoise_um = -1\n'), "not negative"),
@@ -475,7 +475,7 @@ def test_compensating_positioning_alone_is_not_adverse_in_the_example(gantry):
         (BASE + "[errors]\nfile = 'missing.errors.csv'\n", "missing.errors.csv: no such file"),
         (BASE + "[errors]\nrandom = false\nlinear_peak_um = [1, 2]\n", "linear_peak_um: is not a known key"),
         (BASE + "[errors.squareness_urad]\nEC0X = 1\n", "EC0X: is not a known key; did you mean 'EC0Y'"),
-        (BASE + "[[errors.curve]]\nname = 'EC0Y'\n", "belongs in .errors.squareness_urad"),
+        (BASE + "[[errors.curve]]\nname = 'EC0Y'\n", "give it in .errors.squareness_urad"),
         (BASE + "[[errors.curve]]\nname = 'EXW'\n", "one of the 18 error curves"),
         (
             BASE + "[[errors.curve]]\nname = 'EXX'\nposition_mm = [0, 600]\nvalue_urad = [0, 1]\n",
@@ -491,7 +491,7 @@ def test_compensating_positioning_alone_is_not_adverse_in_the_example(gantry):
         (BASE + "[trajectory]\nruns = 'twice'\n", "'there-and-back', 'once'"),
         (BASE + "[trajectory]\nx_mm = [3, 2]\n", "ascending"),
         (BASE + "[trajectory]\ntools_mm = [0, 0, 1]\n", "three numbers, for X, Y and Z"),
-        (BASE + "[trajectory]\ntools_mm = [[0, 0, 1], [0, 0, 1.0]]\n", "may be given once"),
+        (BASE + "[trajectory]\ntools_mm = [[0, 0, 1], [0, 0, 1.0]]\n", "may be given only once"),
         (BASE + "[trajectory]\nfeed_mm_min = 0\n", "above zero"),
     ],
 )
@@ -509,5 +509,5 @@ def test_a_file_of_errors_and_random_errors_exclude_each_other(tmp_path):
 
 def test_a_trajectory_outside_the_travel_is_refused_with_file_axis_and_travel(tmp_path, mill):
     scenario = scenario_of(tmp_path, BASE + "[trajectory]\ny_mm = [0, 450]\n")
-    with pytest.raises(InputError, match=r"x.scenario.toml: \[trajectory\]: Y = 450 mm lies outside .* 0 ... 400 mm"):
+    with pytest.raises(InputError, match=r"x.scenario.toml: \[trajectory\]: Y = 450 mm is outside .* 0 ... 400 mm"):
         simulate(mill, scenario)

@@ -113,7 +113,7 @@ def test_the_command_writes_readings_and_truth(folder, capsys):
         (BASE.replace("instrument.toml", "none.toml"), "no such file"),
         (BASE + "run = 3\n", "did you mean 'runs'"),
         (BASE + "runs = 0\n", "from 1 to 100"),
-        (BASE + 'scatter = "table9"\n', "is expected"),
+        (BASE + 'scatter = "table9"\n', "expected"),
         (BASE + "[instrument.scatter.X]\nroll_um = 1\n", "is not a known key"),
         (BASE + "[instrument.uncalibrated]\neps_zzz_arcsec = 1\n", "is not a systematic parameter"),
         (BASE + "[instrument.positions_mm]\nX = { from = 0, to = 800 }\n", "from = .., to = .., step = .."),
@@ -132,7 +132,7 @@ def test_a_scenario_that_cannot_be_used_is_refused(folder, text, message):
 
 def test_positions_outside_the_travel_and_the_wrong_function_are_refused(folder):
     scenario = scenario_of(folder, BASE + "[instrument.positions_mm]\nX = [0, 900]\n")
-    with pytest.raises(InputError, match="leave the travel of X"):
+    with pytest.raises(InputError, match="exceed the travel of X"):
         simulate_sixdof(MACHINE, scenario)
     with pytest.raises(InputError, match="has no lengths"):
         simulate(MACHINE, scenario)

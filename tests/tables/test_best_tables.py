@@ -374,7 +374,7 @@ def test_zone_and_tools_are_read_from_the_machine_file_and_the_command_line(smal
     with pytest.raises(InputError, match="--tools"):
         emphasised(machine, None, None, ("1,2",))
     path.write_text(text.replace("[axes.X]", "[work_zone_mm]\nX = [-1000.0, 0.0]\n[axes.X]", 1))
-    with pytest.raises(InputError, match="leaves the travel"):
+    with pytest.raises(InputError, match="exceeds the travel"):
         read_machine(path)
 
 

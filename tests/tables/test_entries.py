@@ -79,7 +79,7 @@ def test_an_angle_without_lever_is_refused_with_the_tool_that_shows_it(name, val
     assert reasons
     assert not result.accepted
     if value_rad == 0.3:
-        found = re.search(r"([+-]\d+\.\d+) um in the table, the errors ask for ([+-]\d+\.\d+) um", reasons[0])
+        found = re.search(r"([+-]\d+\.\d+) um in the table, the errors require ([+-]\d+\.\d+) um", reasons[0])
         assert abs(float(found[1]) - float(found[2])) == pytest.approx(60_000, abs=1)
 
 
@@ -228,7 +228,7 @@ def test_the_uncertainty_excuses_no_few_numbers_of_a_list(gantry):
     lists = {**tables.tables.lists, key: replace(item, plane=plane)}
     changed = replace(tables, tables=replace(tables.tables, lists=lists))
     reasons = verify(machine, changed, uncertain(errors, 1e-3)).reasons
-    assert any("the errors ask for" in reason for reason in reasons)
+    assert any("the errors require" in reason for reason in reasons)
     assert not verify(machine, tables, uncertain(errors, 1e-3)).reasons
 
 

@@ -499,7 +499,7 @@ def test_export_explains_beside_the_tables_only_when_asked(call, small_machine_f
     assert code == 0
     text = (tmp_path / "told" / "explain.md").read_text()
     assert text.strip() in stdout
-    headings = ("What it corrects", "What remains, and why", "What the next option would buy", "Limits used")
+    headings = ("What it corrects", "What remains, and why", "What the next option would gain", "Limits used")
     assert all(f"## {heading}\n" in text for heading in headings)
     same = "NC_CEC.INI"
     assert (tmp_path / "told" / same).read_bytes() == (tmp_path / "plain" / same).read_bytes()

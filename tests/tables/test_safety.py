@@ -111,7 +111,7 @@ def test_a_jump_at_the_reference_point_is_a_note(small_machine, small_errors):
     errors = small_errors.replace(squareness={**small_errors.squareness, "EC0Y": (1e-3, 1e-6)})
     result = verify(small_machine, exported_tables(small_machine, errors, "isg-csv"), errors)
     assert result.accepted
-    assert any("at the reference point the correction is X +" in note for note in result.notes)
+    assert any("the correction at the reference point is X +" in note for note in result.notes)
 
 
 class Dropping(SiemensEec):

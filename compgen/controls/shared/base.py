@@ -347,7 +347,7 @@ def _contradiction(text: str, wanted: Mapping[str, Any]) -> str:
     except (ValueError, RecursionError) as problem:
         return f"is not JSON: {problem}"
     if not isinstance(found, dict):
-        return f"holds {_short(found)}, a plan is an object with {', '.join(wanted)}"
+        return f"contains {_short(found)}, a plan is an object with {', '.join(wanted)}"
     differing = list(_differences({key: found.get(key) for key in wanted}, wanted, ""))
     if not differing:
         return ""

@@ -81,7 +81,7 @@ def plain_lines(source: SourceFile, most: int, longest: int) -> list[str]:
     _check_lines(source)
     text = source.text.replace("\r\n", "\n").replace("\r", "\n")
     if strange := re.search(r"[^\t\n -~]", text):
-        message = f"holds the character {ascii(strange.group())}; the file is printable ASCII text"
+        message = f"contains the character {ascii(strange.group())}; the file is printable ASCII text"
         raise source.fail(message, text.count("\n", 0, strange.start()) + 1)
     lines = text.split("\n")
     for number, line in enumerate(lines, start=1):
@@ -102,11 +102,11 @@ def content_lines(source: SourceFile, comment: str = "//", longest: int = 4000) 
             raise source.fail(f"the line has {len(line)} characters; at most {longest} are read", number)
         text = line.partition(comment)[0].strip(" \t\r\f")
         if not (text.isascii() and text.replace("\t", " ").isprintable()):
-            raise source.fail(f"{one_line(text)[:SHOWN]!r} holds characters that are not printable ASCII", number)
+            raise source.fail(f"{one_line(text)[:SHOWN]!r} contains characters that are not printable ASCII", number)
         if text:
             found.append((number, text))
     if not found:
-        raise source.fail("holds no data; is it the right file, or was it cut?")
+        raise source.fail("contains no data; is it the right file, or is it truncated?")
     return found
 
 
@@ -147,6 +147,8 @@ def check_complete(source: SourceFile, count: int, what: str = "records") -> Non
     if declared is None:
         return
     if int(declared.group(1)) != count:
-        raise source.fail(f"declares {declared.group(1)} {what} but holds {count}: it was cut or edited by hand")
+        raise source.fail(
+            f"declares {declared.group(1)} {what} but contains {count}: it is truncated or was edited by hand"
+        )
     if not source.text.endswith("\n"):
-        raise source.fail("the last line has no line end: the file was cut", source.text.count("\n") + 1)
+        raise source.fail("the last line has no line end: the file is truncated", source.text.count("\n") + 1)

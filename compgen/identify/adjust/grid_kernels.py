@@ -11,7 +11,7 @@ from compgen.kinematics.kernel_switch import FAST, loop
 
 # Compiled passes along the chain on a grid of levels (numba): cost and gradient, and distances.
 #
-# Loops over a whole plane write one array each, and divide without checks, so that they run in vector registers.
+# Loops over a whole plane write one array each, and divide without checks, so that they are vectorised.
 
 
 @loop(fastmath=FAST)
@@ -146,7 +146,9 @@ def _forces(
     cost = by_dead = by_x = by_y = by_z = 0.0
     for m in range(len(weight)):
         x, y, z = tx[m] - sx, ty[m] - sy, tz[m] - sz
-        distance = np.sqrt(x * x + y * y + z * z + 1e-200)  # never zero where a cell without reading meets the station
+        distance = np.sqrt(
+            x * x + y * y + z * z + 1e-200
+        )  # never zero, even if a cell without reading coincides with the station
         residual = distance - length[m] - dead
         pull = weight[m] * residual
         cost += pull * residual
@@ -186,7 +188,7 @@ def chain_gradient(  # noqa: PLR0913 - a compiled loop takes its arrays one by o
     """Cost of the readings of one tool (groups, n_out, n_mid * n_in); adds its ``gradient`` (size,).
 
     The first arguments as in :func:`carriages`; ``directions`` and ``derivatives`` as ``travel_directions`` returns
-    them; ``squareness`` (3,) is the place of EC0Y, EB0Z, EA0Z among the unknowns, -1 where it is none.
+    them; ``squareness`` (3,) is the place of EC0Y, EB0Z, EA0Z among the unknowns, -1 if not modelled.
     """
     rotation, jacobian, shift = carriages(chain, levels, directions, rows, columns, values, errors)
     inner, middle = inner_points(chain, rotation, shift, tool)
@@ -379,7 +381,7 @@ def moment_tables(  # noqa: PLR0913 - a compiled loop takes its arrays one by on
     station_of: IntArray,
     weight: FloatArray,
 ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """Moments of the readings of one tool, as ``grid_problem.Moments`` holds them; arguments as in ``chain_gradient``."""
+    """Moments of the readings of one tool, as in ``grid_problem.Moments``; arguments as in ``chain_gradient``."""
     rotation, _, shift = carriages(chain, levels, directions, rows, columns, values, errors)
     _, middle = inner_points(chain, rotation, shift, tool)
     axis_in, axis_mid, axis_out = chain[0, 0], chain[0, 1], chain[0, 2]
@@ -506,10 +508,10 @@ def add_pair(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     own_b: bool,
     matrix: FloatArray,
 ) -> None:
-    """Add what a pair of axes gives to ``matrix`` (levels * 6, levels * 6): its block, and the own blocks asked for.
+    """Add the contribution of a pair of axes to ``matrix`` (levels * 6, levels * 6): its block, and diagonal blocks.
 
     ``axes`` (3,) are the pair and the third axis; ``levers`` [axis, lever, component] the direction of each axis that
-    is part of another's lever arm, zero where it is none.
+    is part of another's lever arm, otherwise zero.
     """
     a, b, t = axes[0], axes[1], axes[2]
     arm_a, arm_b, across, work = np.empty(3), np.empty(3), np.empty((6, 6)), np.empty((5, 3, 3))
@@ -564,7 +566,7 @@ def add_stations(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     values: FloatArray,
     by_group: FloatArray,
 ) -> None:
-    """Add what the levels of one axis give to ``by_group`` (n, groups, 4): sums of derivative times w u (x, y, z) and w.
+    """Add the levels of one axis to ``by_group`` (n, groups, 4): sums of derivative times w u (x, y, z) and w.
 
     ``table`` (groups, levels, 3, 10) as in ``grid_problem.Moments``; ``axes`` (3,) are the axis and the two others in the
     order of the table; the map of the curves is given by its entries.
@@ -611,7 +613,7 @@ def add_stations(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
 
 @loop(fastmath=False, error_model="python")
 def find_levels(position: FloatArray, most: int) -> tuple[FloatArray, IntArray]:
-    """Distinct values (k,) of (n,) and the index of each position; no values where there are more than ``most``."""
+    """Distinct values (k,) of (n,) and the index of each position; no values if there are more than ``most``."""
     levels, names = np.empty(most), np.empty(most, dtype=np.int64)  # ascending, and in the order in which they came
     index = np.empty(len(position), dtype=np.int64)
     count = last = 0
@@ -692,7 +694,7 @@ def start_sums(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
 ) -> None:
     """Add the products of (2 p, 2 L, 1, |p|^2 - L^2) of the readings of one group (n_out, m): ``sums`` (6, 6).
 
-    Each product is entered once: at one of its two places, above or below the diagonal.
+    Each product is added at only one of its two places, above or below the diagonal.
 
     ``axes`` (3,) are the outermost, middle and innermost axis; ``p_out`` (n_out,) and ``plane`` (2, m) the coordinates
     along them; L is the reading over ``scale`` minus ``offset``.
@@ -746,5 +748,5 @@ def start_sums(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
         sums[5, 5] += tt
 
 
-# Compiled loops of the fast path (numba, ``pip install compgen[fast]``);
-# import only where ``compgen.kinematics.kernel_switch`` says so.
+# Compiled loops of the fast path (numba, ``pip install compgen[fast]``); import only if
+# ``compgen.kinematics.kernel_switch`` allows it.

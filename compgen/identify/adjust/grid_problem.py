@@ -88,7 +88,7 @@ def motion_map(parameters: ErrorParameters, bases: Sequence[FloatArray]) -> Moti
         rows.append(level + (curve.error.direction + (3 if curve.error.kind == "angular" else 0)))
         columns.append(column + curve.columns.start)
         values.append(value)
-    nothing = np.zeros(0, dtype=np.int64)  # a model may hold squareness errors only
+    nothing = np.zeros(0, dtype=np.int64)  # a model may consist of squareness errors only
     return MotionMap(
         np.concatenate([nothing, *rows]),
         np.concatenate([nothing, *columns]),
@@ -97,7 +97,7 @@ def motion_map(parameters: ErrorParameters, bases: Sequence[FloatArray]) -> Moti
     )
 
 
-# A full grid of levels with the merged readings on it, and the unknowns: what all parts of the fast path share.
+# A full grid of levels with the merged readings on it, and the unknowns: common to all parts of the fast path.
 
 
 #: Chain, levels, directions, rows, columns and values of the map, errors.
@@ -125,7 +125,7 @@ class LevelGrid(TracerUnknowns):
     motion : from the unknowns to delta and eps at the levels of X, Y, Z in a row.
     tools : the data by tool.
     station_of : station of each group (dead length).
-    compiled : whether the compiled loops do the work (:mod:`compgen.kinematics.kernel_switch`), decided once for the problem.
+    compiled : whether compiled loops are used (:mod:`compgen.kinematics.kernel_switch`), decided once for the problem.
     """
 
     parameters: ErrorParameters
@@ -145,7 +145,7 @@ class LevelGrid(TracerUnknowns):
 
     @cached_property
     def squareness_columns(self) -> IntArray:
-        """Places of EC0Y, EB0Z, EA0Z among the unknowns, -1 where one is not modelled."""
+        """Places of EC0Y, EB0Z, EA0Z among the unknowns, -1 if not modelled."""
         columns = np.full(3, -1, dtype=np.int64)
         names = self.parameters.squareness
         for k, name in enumerate(names):
@@ -153,7 +153,7 @@ class LevelGrid(TracerUnknowns):
         return columns
 
     def kernel_arguments(self, state: State) -> KernelArguments:
-        """Chain, levels, directions, map and errors as the compiled loops take them, see ``grid_kernels.carriages``."""
+        """Chain, levels, directions, map and errors as arguments of the compiled loops, see ``grid_kernels.carriages``."""
         sides = dict(passing_order(self.parameters.machine))
         counts = [len(levels) for levels in self.levels_mm]
         side = [int(sides[axis]) for axis in range(3)]
@@ -180,7 +180,7 @@ def nominal_targets(grid: LevelGrid) -> list[FloatArray]:
     return [target.reshape(3, -1) + data.tool_mm[:, None] for data in grid.tools]
 
 
-# Readings sorted into the levels and cells of a grid, and merged where several fall into one cell.
+# Readings sorted into the levels and cells of a grid, and merged if several fall into one cell.
 
 
 #: More levels of an axis than this are found by sorting.
@@ -196,7 +196,7 @@ def levels_of(position_mm: FloatArray, *, compiled: bool = False) -> tuple[Float
         if len(levels):
             return levels, index
     position_mm = np.ascontiguousarray(position_mm)
-    sample = distinct(position_mm[:: max(1, len(position_mm) // 1999) | 1])  # tried first, sorting all is slow
+    sample = distinct(position_mm[:: max(1, len(position_mm) // 1999) | 1])  # tried first, because sorting all is slow
     found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
     if np.array_equal(sample[found], position_mm):
         return sample, found
@@ -233,11 +233,11 @@ def merge(
 
 
 def _plain(values: FloatArray) -> FloatArray:
-    """Return the array as the compiled loops were made for: float64, in a row, writeable."""
+    """Return the array in the form of the compiled loops: float64, contiguous, writeable."""
     return np.require(values, np.float64, ["C", "W"])
 
 
-# The chain of the machine on a grid of levels: points after each body, and the gradient back along the same way.
+# The chain of the machine on a grid of levels: points after each body, and the gradient back along the same path.
 
 
 @dataclass(frozen=True)
@@ -338,10 +338,11 @@ def pull_back(
 
 # Moments of w u u^T per level and per pair of levels (u the line of sight): all that the normal matrix needs.
 #
-# Every entry of C is linear in the coordinate of each axis, so small tables of moments hold what the readings say.
+# Every entry of C is linear in the coordinate of each axis, so small tables of moments contain all the information of
+# the readings.
 
 
-#: Numbers that a batch of stations may hold: small ones save calls, larger ones leave the cache.
+#: Numbers in a batch of stations: larger batches save calls, smaller ones fit in the cache.
 BATCH = 60_000
 
 
@@ -437,9 +438,9 @@ def _contract_first(table: FloatArray, powers: FloatArray) -> FloatArray:
 
 # The normal matrix of a grid from the moments of its readings.
 #
-# It uses C in place of the exact derivative: the matrix steers the iteration, the optimum is where the exact gradient
-# vanishes. First the derivatives are those by delta and eps of every level (delta: u, eps: r x u with the lever arm r), then
-# the map of the curves brings them to the unknowns.
+# It uses C instead of the exact derivative: the matrix only steers the iteration; the optimum is where the exact
+# gradient vanishes. The derivatives are first those by delta and eps of every level (delta: u, eps: r x u with the
+# lever arm r), then the map of the curves converts them to the unknowns.
 
 
 #: Place of the entries of w u u^T and w u in the ten moments, one row for each component of u.
@@ -512,7 +513,7 @@ def add_own_blocks(
 
 
 def _ordered(grid: LevelGrid, moments: Moments) -> list[tuple[IntArray, FloatArray, bool, bool]]:
-    """Pairs of axes with the third, their table, and whether the diagonal block of the first and of the second is made of it."""
+    """Pairs of axes with the third, their table, and whether it gives the diagonal block of the first and of the second."""
     out, mid, inner = grid.order
     first, second, third = moments.pairs
     return [
@@ -597,8 +598,8 @@ def _stations(grid: LevelGrid, moments: Moments, levers: FloatArray, tool_mm: Fl
 # * One pass (``evaluate``) gives cost and gradient of the EXACT model. The chain is passed body by body; each adds one
 #   axis, so that only the outermost works on the full grid. The gradient runs back along the same chain.
 # * ``normal_matrix`` needs only small moment tables of w u u^T over pairs of levels, because every entry of C is a
-#   monomial in the axis coordinates. It uses C in place of the exact derivative: the matrix steers the iteration, the
-#   optimum is where the exact gradient vanishes.
+#   monomial in the axis coordinates. It uses C instead of the exact derivative: the matrix only steers the
+#   iteration; the optimum is where the exact gradient vanishes.
 
 
 @dataclass(frozen=True)
@@ -611,7 +612,7 @@ class GridProblem(LevelGrid):
     reading_mm, reading_weight : the readings before merging.
     scatter : weighted square sum of the readings about their means, half of it is part of the cost.
     single : whether no cell holds more than one reading.
-    known : stations whose coordinates were observed as well.
+    known : stations whose coordinates were also observed.
     """
 
     cell: tuple[IntArray, IntArray]
@@ -715,7 +716,7 @@ class GridProblem(LevelGrid):
         return np.asarray(np.stack([part.ravel() for part in parts])[tool, cell])
 
     def normal_matrix(self, state: State) -> FloatArray:
-        """J^T W J (size, size) with C in place of the exact derivative."""
+        """Return J^T W J (size, size) with C instead of the exact derivative."""
         matrix = np.zeros((self.size, self.size))
         places = [] if self.compiled else self._geometry(state)[1]
         for k, data in enumerate(self.tools):
@@ -726,9 +727,9 @@ class GridProblem(LevelGrid):
         return matrix
 
 
-#: Readings from which the compiled loops pay for a single identification.
+#: Number of readings from which the compiled loops pay off for a single identification.
 LARGE = 100_000
-#: A grid is used when at least this share of its cells holds readings.
+#: A grid is used if at least this share of its cells has readings.
 LEAST_FILL = 0.1
 
 
@@ -740,7 +741,7 @@ def grid_problem(
     group: IntArray,
     reading_mm: FloatArray,
 ) -> GridProblem | None:
-    """Sort readings into a grid of levels, all weights 1; None where their positions form no grid.
+    """Sort readings into a grid of levels, all weights 1; None if their positions do not form a grid.
 
     Parameters
     ----------

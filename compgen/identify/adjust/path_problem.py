@@ -1,11 +1,11 @@
-"""Lengths at positions that form no grid, as a tracer reads them on the fly: the compiled form, and large numbers in chunks.
+"""Lengths at positions off a grid, as from measurements on the fly: the compiled form, and large numbers in chunks.
 
-The normal matrix needs the derivative of the tip by delta and eps of each carriage, interpolated between the nodes next to
-the reading. In the cell of those nodes everything is a polynomial of the local coordinates, x = left + h xi: a hat
-function is 1 - xi or xi, a lever arm is linear, so the derivative is u times a polynomial of degree 2, with u the line of
-sight. Hence the sums of w u u^T times the 35 monomials of degree 4 and less hold all that the readings of a cell say, and
-the cost of the matrix does not grow with the number of unknowns. As on a grid, it uses C in place of the exact
-derivative: the matrix steers the iteration, the optimum is where the exact gradient vanishes.
+The normal matrix needs the derivative of the tip by delta and eps of each carriage, interpolated between the nodes next
+to the reading. In the cell of those nodes everything is a polynomial of the local coordinates, x = left + h xi: a hat
+function is 1 - xi or xi, a lever arm is linear, so the derivative is u times a polynomial of degree 2, with u the line
+of sight. Hence the sums of w u u^T times the 35 monomials of degree 4 and less contain all the information of the
+readings of a cell, and the cost of the matrix does not grow with the number of unknowns. As on a grid, it uses C
+instead of the exact derivative: the matrix only steers the iteration; the optimum is where the exact gradient vanishes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _PLACE = {tuple(power): k for k, power in enumerate(POWERS.tolist())}
 LOW = 10
 #: Place of the product of two of them, (10, 10).
 PRODUCT = np.array([[_PLACE[tuple((a + b).tolist())] for b in POWERS[:LOW]] for a in POWERS[:LOW]], dtype=np.int64)
-#: Two monomials of degree 2 and less whose product each one is.
+#: Two monomials of degree 2 and less with this product.
 HIGH = len(POWERS)
 _FIRST, _SECOND = np.array([np.argwhere(k == PRODUCT)[0] for k in range(HIGH)], dtype=np.int64).T.copy()
 #: Room for the monomials of degree 4, and of degree 2: whole vector registers.
@@ -45,7 +45,7 @@ _HIGH_ROOM, _LOW_ROOM = 36, 12
 
 @loop(fastmath=FAST, nogil=True)
 def _add_products(table: FloatArray, factors: FloatArray, values: FloatArray) -> None:
-    """Add the products of factors (k,) and values (m,) to a table (k, m); a loop of its own runs in vector registers."""
+    """Add the products of factors (k,) and values (m,) to a table (k, m); a separate loop is vectorised."""
     for j in range(len(factors)):
         line, factor = table[j], factors[j]
         for m in range(len(values)):
@@ -76,7 +76,7 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     of_cells: FloatArray,
     of_groups: FloatArray,
 ) -> float:
-    """Add what n readings say, and return their weighted sum of squares.
+    """Add the contributions of n readings, and return their weighted sum of squares.
 
     Parameters
     ----------
@@ -87,13 +87,13 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     tool, stations, dead : (3,), (S, 3), (G,).
     position, station, group, length, weight : of the readings, each (n,).
     noise : a, b, s and limit: the weight of a reading over the distance d is multiplied by (s / (a + b d))^2, and is 0
-        where the residual exceeds limit (a + b d).
+        if the residual exceeds limit (a + b d).
     by_motion, by_travel, by_station : gradient by motion (k, 6), by travel of each axis (3, 3), by stations (S, 3).
     by_group : of each dead length its gradient, the readings used, the square sum of their residuals, weights (G, 4).
-    residual : takes model minus reading (n,), nan for a rejected reading.
-    moments : whether sums for the normal matrix are wanted: of w u u^T times the 35 monomials of the local coordinates by
-        cell, ``of_cells`` (cells, 6, 36), and of w u u^T and w u times 10 monomials by dead length and cell,
-        ``of_groups`` (G, cells, 9, 12); what is left over stays zero.
+    residual : output, model minus reading (n,), nan for a rejected reading.
+    moments : whether to add the sums for the normal matrix: of w u u^T times the 35 monomials of the local coordinates
+        by cell, ``of_cells`` (cells, 6, 36), and of w u u^T and w u times 10 monomials by dead length and cell,
+        ``of_groups`` (G, cells, 9, 12); unused entries remain zero.
     """
     constant, slope, scale, limit = noise
     left, share, travel = np.zeros(3, dtype=np.int64), np.empty(3), np.full(3, np.nan)
@@ -105,7 +105,7 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     cost = x = y = z = fx = fy = fz = 0.0
     cell, count = 0, len(length)
     for i in range(count + 1):
-        # stations that read at the same stop follow each other: chain and gradient are passed once for all of them
+        # stations that read at the same stop are consecutive: chain and gradient are passed once for all of them
         if i == count or (position[0][i] != travel[0] or position[1][i] != travel[1] or position[2][i] != travel[2]):
             if i > 0:  # forces on the tip, back along the chain
                 for step in range(3):
@@ -142,7 +142,7 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
                 fx = fy = fz = 0.0
             if i == count:
                 break
-            # the interval between nodes, most often that of the stop before, and the share of its right end
+            # the interval between nodes, usually that of the previous stop, and the share of its right end
             for axis in range(3):
                 q = position[axis][i]
                 travel[axis] = q
@@ -227,7 +227,7 @@ def pass_over(  # noqa: PLR0913 - a compiled loop takes its arrays one by one
     return cost
 
 
-#: Numbers that the sums of all cells may hold; with more nodes the plain form is used.
+#: Largest count of numbers in the sums of all cells; with more nodes the plain form is used.
 MOST_SUMS = 40_000_000
 #: Cells whose blocks are made at a time.
 CELLS = 512
@@ -259,7 +259,7 @@ class DistanceNoise:
 
 @dataclass
 class Sums:
-    """What passes over readings add up: see :func:`compgen.identify.adjust.path_problem.pass_over`."""
+    """The sums over readings: see :func:`compgen.identify.adjust.path_problem.pass_over`."""
 
     gradient: FloatArray
     #: Of each dead length: readings used, the square sum of their residuals, and their weights, (G, 3).
@@ -270,7 +270,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class PathModel(TracerUnknowns):
-    """The unknowns of a machine with one tool, laid out for the compiled pass; only curves that are linear between nodes.
+    """The unknowns of a machine with one tool, laid out for the compiled pass; only for curves linear between nodes.
 
     ``station_of`` (G,) is the station of each dead length.
     """
@@ -311,7 +311,7 @@ class PathModel(TracerUnknowns):
         matrix: bool,
         look: Callable[[Chunk, FloatArray], None] = lambda *_: None,
     ) -> Sums:
-        """Pass over chunks of readings with their weights (n,) and room for their residuals (n,), which ``look`` sees."""
+        """Pass over chunks of readings with their weights (n,) and room for their residuals (n,), passed to ``look``."""
         from compgen.identify.adjust.path_problem import pass_over
 
         directions, derivatives = self.directions(state)
@@ -413,7 +413,7 @@ class PathModel(TracerUnknowns):
 
 
 def path_model(parameters: ErrorParameters, tool_mm: FloatArray, station_of: IntArray) -> PathModel | None:
-    """Lay out the compiled pass; None for several tools, cubic curves, or so many nodes that the sums grow too large."""
+    """Lay out the compiled pass; None for several tools, cubic curves, or too many nodes for the sums."""
     machine = parameters.machine
     if tool_mm.ndim != 1 or machine.curves != "linear":
         return None
@@ -424,7 +424,7 @@ def path_model(parameters: ErrorParameters, tool_mm: FloatArray, station_of: Int
 
 @dataclass(frozen=True)
 class PathProblem:
-    """n readings in memory, their weights (n,), and stations whose coordinates were observed as well."""
+    """n readings in memory, their weights (n,), and stations whose coordinates were also observed."""
 
     model: PathModel
     readings: Chunk
@@ -481,7 +481,7 @@ def path_problem(
     group: IntArray,
     reading_mm: FloatArray,
 ) -> PathProblem | None:
-    """Sort readings for the compiled pass, all weights 1; None where :func:`path_model` has no such form."""
+    """Sort readings for the compiled pass, all weights 1; None if :func:`path_model` has no such form."""
     station_of = np.zeros(int(group.max()) + 1, dtype=np.int64)
     station_of[group] = station
     model = path_model(parameters, tool_mm, station_of)
@@ -496,7 +496,7 @@ def chunk_of(
     group: IntArray,
     length_mm: FloatArray,
 ) -> Chunk:
-    """Return readings as the compiled pass takes them: numbers of 8 bytes, in a row, positions by axis (3, n)."""
+    """Return readings in the form of the compiled pass: 8-byte numbers, contiguous, positions by axis (3, n)."""
     x, y, z = (np.require(along, np.float64, ["C", "W"]) for along in position_mm)
     whole = [np.require(values, np.int64, ["C", "W"]) for values in (station, group)]
     return Chunk((x, y, z), whole[0], whole[1], np.require(length_mm, np.float64, ["C", "W"]))

@@ -23,18 +23,18 @@ from compgen.kinematics.first_order import tool_of
 
 # Normal equations point by point, for lengths, positions, and networks of distances alike.
 #
-# A reading says something about one point p, which moves by dx, and about the unknowns q of the instrument:
+# A reading depends on one point p, which moves by dx, and on the unknowns q of the instrument:
 #
 #     r = r0 + u . dx + a . dq        minimise sum of w r^2
 #
-# Only five sums are needed, whatever the number of readings: U = sum w u u^T and K = sum w u a^T of each point, and
-# N = sum w a a^T; f = sum w r0 u of each point, and g = sum w r0 a. Where points move with the errors P of the machine,
-# dx = D dP, the normal equations are
+# Five sums are enough, whatever the number of readings: U = sum w u u^T and K = sum w u a^T of each point, and N = sum
+# w a a^T; f = sum w r0 u of each point, and g = sum w r0 a. If the points move with the errors P of the machine, dx = D
+# dP, the normal equations are
 #
 #     | sum D^T U D   sum D^T K |          | sum D^T f |
 #     | sum K^T D         N     |   and    |     g     |
 #
-# Where every point is unknown (self-calibration), the points are eliminated: N - sum K^T U^-1 K.
+# If every point is unknown (self-calibration), the points are eliminated: N - sum K^T U^-1 K.
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PointEquations:
         self.add_gradient(design, gradient)
 
     def add_gradient(self, design: FloatArray, gradient: FloatArray) -> None:
-        """Add the gradient alone."""
+        """Add only the gradient."""
         count = design.shape[2]
         gradient[:count] += design.reshape(-1, count).T @ self.force.ravel()
         gradient[count:] += self.own_force
@@ -127,7 +127,7 @@ class LinesOfSight:
         )
 
 
-# What problems at poses of the machine have in common: tips and their derivatives, in chunks of constant memory.
+# Common part of problems at poses of the machine: tips and their derivatives, in chunks of constant memory.
 
 
 CHUNK_POSES = 2048
@@ -172,8 +172,8 @@ class LengthProblem(MachinePoses):
     pose, station, group : index of pose, station and dead length of each reading, each (n,).
     length_mm : readings, (n,).
     weight : 1/variance of each reading in 1/mm^2, zero for a rejected one, (n,).
-    known : stations whose coordinates were observed as well.
-    numbers : of stations and dead lengths, where these readings are some of all.
+    known : stations whose coordinates were also observed.
+    numbers : of stations and dead lengths, if these readings are only a part.
     """
 
     pose: IntArray
@@ -262,22 +262,23 @@ def length_problem(
     )
 
 
-# Errors from measured positions (Zha & Zhang 2024, eq. 21-28, with positions in place of lengths) and the exact model.
+# Errors from measured positions (Zha & Zhang 2024, eq. 21-28, with positions instead of lengths) and the exact model.
 #
-# Measured position of pose j, already close to the machine frame, against the tip of the model:
+# Residual of pose j: measured position, already close to the machine frame, and tip of the model:
 #
 #     r_j = R(-w) (tip(q_j; P) - c - t) + c - m_j - L_j b
 #
-# Unknown are the errors P, the rigid placement (t, w) of the measured frame about the centre c, and, for positions that
-# tracers have located, the errors b of their stations and dead lengths, which move every point by L_j b. Minimised is
+# Unknown are the errors P, the rigid placement (t, w) of the measured frame about the centre c, and, for positions
+# located by tracers, the errors b of their stations and dead lengths, which move every point by L_j b. The minimum is
+# of
 #
 #     sum of r_j^T U_j r_j + b^T B b
 #
-# U_j is the information of the point with the stations fixed, B that of the stations from their self-calibration. So the
-# correlation between the points counts in full, and nothing larger than the unknowns is ever inverted.
+# U_j is the information of the point with the stations fixed, B that of the stations from their self-calibration. So
+# the correlation between the points is fully taken into account, and nothing larger than the unknowns is inverted.
 
 
-#: The unknown rotation of the frame is counted in mm at this lever, as the solver counts angles.
+#: The unknown rotation of the frame is expressed in mm at this lever, like angles in the solver.
 LEVER_MM = 1000.0
 
 
@@ -291,7 +292,7 @@ class SeparationProblem(MachinePoses):
     Parameters
     ----------
     parameters, position_mm, tool_mm, bases : as for :class:`MachinePoses`.
-    measured_mm : measured tip positions (m, 3), the placement known roughly.
+    measured_mm : measured tip positions (m, 3), roughly placed.
     information : U_j, (m, 3, 3), 1/mm^2; zero in the directions that were not measured.
     lever, station_information : L_j (m, 3, q) and B (q, q).
     """
@@ -354,7 +355,7 @@ class SeparationProblem(MachinePoses):
         return matrix
 
     def _equations(self, state: State) -> Iterator[tuple[PointEquations, FloatArray]]:
-        """The five sums: r_j moves by R(-w) with its tip, by a shift, a turn and -L_j with placement and stations."""
+        """Return the five sums: derivatives of r_j by its tip R(-w), by shift and rotation of the placement, by stations -L_j."""
         back, jacobian = frame_rotation(-state.stations_mm[1])
         for rows, tip, design in self.chunks(state):
             seen = self._seen(state, tip)
@@ -380,7 +381,7 @@ class SeparationProblem(MachinePoses):
         for curve in self.parameters.curves:
             strongest = [int(np.argmax(np.abs(column))) for column in curve.free.T]
             names += [f"{curve.error.name} at {curve.nodes_mm[k]:g} mm" for k in strongest]
-        placement = [f"{what}-{axis} of the frame" for what in ("shift", "turn") for axis in "xyz"]
+        placement = [f"{what}-{axis} of the frame" for what in ("shift", "rotation") for axis in "xyz"]
         return [*names, *self.parameters.squareness, *placement, *station_unknowns]
 
 

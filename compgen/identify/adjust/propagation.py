@@ -1,4 +1,4 @@
-"""From the optimum to uncertainty: the joint covariance, and inputs that all readings share."""
+"""From the optimum to uncertainty: the joint covariance, and inputs common to all readings."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, State
 if TYPE_CHECKING:
     from compgen.identify.adjust.problem import LengthProblem
 
-# What an identification leaves behind for later: the optimum, its factor, and the joint covariance.
+# What an identification keeps: the optimum, its factor, and the joint covariance.
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Adjustment:
     weight : dimensionless weight of each reading (n,), zero for a rejected one.
     group : index of the dead length of each reading, (n,).
     sigma_mm : standard uncertainty of a reading of weight 1, so that the covariance is sigma^2 (J^T W J)^-1.
-    known_weight : weight of unknowns that were known beforehand, (size,), part of the normal matrix; None without any.
+    known_weight : weight of a priori known unknowns, (size,), part of the normal matrix; None if there are none.
     """
 
     state: State
@@ -57,7 +57,7 @@ class Adjustment:
         return self._root
 
 
-# What inputs that repeated reading does not average out contribute to the uncertainty of the errors.
+# Contribution of inputs that repetition does not average out to the uncertainty of the errors.
 #
 # Each input disturbs all readings at once by a known pattern d (one column for each independent quantity, scaled to its
 # standard uncertainty). To first order the unknowns move by H^-1 J^T W d, with J the Jacobian of the readings, W their
@@ -65,22 +65,22 @@ class Adjustment:
 # linear propagation agrees with identification from disturbed readings.
 
 
-#: The factor belongs to a matrix close to J^T W J; so many passes make the response exact.
+#: The factor is that of a matrix close to J^T W J; this many passes make the response exact.
 PASSES = 4
 
 
 @dataclass(frozen=True)
 class SystematicInputs:
-    """Standard uncertainties of inputs that all readings share; 0 leaves one out.
+    """Standard uncertainties of inputs common to all readings; 0 omits one.
 
     Parameters
     ----------
     wavelength_ppm : relative error of the length scale of all stations together (wavelength, air), 1e-6.
-    temperature_k : temperature of each axis, by which its expansion to 20 degC was corrected, K; independent between
-        the axes. It acts with the axis' ``expansion_um_per_m_k`` and the distance from the reference point.
-    target_um : position of the target against the tool offset, um per coordinate; one for every tool and set-up,
-        common to all stations.
-    target_station_um : the same, for every tool, set-up and station by itself.
+    temperature_k : temperature of each axis in the correction to 20 degC, K; independent between the axes. It acts with
+        the axis' ``expansion_um_per_m_k`` and the distance from the reference point.
+    target_um : position of the target relative to the tool offset, um per coordinate; one for every tool and set-up,
+    common to all stations.
+    target_station_um : the same, separately for every tool, set-up and station.
     drift_um : movement of each station from its first to its last reading, linear in time, um per coordinate.
     """
 
@@ -98,7 +98,7 @@ class SystematicInputs:
         name="--u-target-um",
     )
     target_station_um: float = option(
-        0.0, "The same, for every tool, set-up and station by itself, um.", name="--u-target-station-um"
+        0.0, "The same, separately for every tool, set-up and station, um.", name="--u-target-station-um"
     )
     drift_um: float = option(
         0.0,
@@ -109,20 +109,20 @@ class SystematicInputs:
     def __post_init__(self) -> None:
         for name, value in self.items():
             if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"the uncertainty {name} is {value:g}; a finite number, zero or more, is expected")
+                raise InputError(f"the uncertainty {name} is {value:g}; expected a finite number, zero or more")
 
     def items(self) -> Iterator[tuple[str, float]]:
         """Names and values."""
         return ((item.name, float(getattr(self, item.name))) for item in fields(self))
 
     def __bool__(self) -> bool:
-        """Whether any input counts."""
+        """Whether any input is given."""
         return any(value > 0 for _, value in self.items())
 
 
 @dataclass(frozen=True)
 class Contribution:
-    """One input: its standard uncertainty ``u`` and what it does to the unknowns.
+    """One input: its standard uncertainty ``u`` and its effect on the unknowns.
 
     ``response`` (unknowns, quantities) is their change for one standard uncertainty of each independent quantity;
     ``worst`` the largest standard uncertainty that it gives an error, by unit, with the error's name.
@@ -136,7 +136,7 @@ class Contribution:
 
 @dataclass(frozen=True)
 class Systematic:
-    """All contributions of systematic inputs; ``random_worst`` is what the readings' noise alone gives."""
+    """All contributions of systematic inputs; ``random_worst`` is the contribution of the readings' noise alone."""
 
     contributions: tuple[Contribution, ...]
     random_worst: dict[str, tuple[float, str]]
@@ -180,7 +180,7 @@ def responses(
     adjustment: Adjustment,
     inputs: SystematicInputs,
 ) -> dict[str, FloatArray]:
-    """Return the response (unknowns, quantities) of every input that counts, mm and rad.
+    """Return the response (unknowns, quantities) of every given input, mm and rad.
 
     Raises
     ------
@@ -202,7 +202,7 @@ def _temperature(machine: Machine, lengths: Lengths, sight: Sight) -> FloatArray
     for name, axis in zip(AXES, machine.axes, strict=True):
         if axis.expansion_um_per_m_k is None:
             raise InputError(
-                "is missing; an uncertainty of temperature acts through it: give it for all three axes",
+                "is missing; an uncertainty of temperature requires it: give it for all three axes",
                 file=machine.source,
                 field=f"[axes.{name}] expansion_um_per_m_k",
             )
@@ -237,7 +237,7 @@ def _drift(lengths: Lengths, sight: Sight) -> FloatArray:
 
 
 def _mountings(lengths: Lengths) -> IntArray:
-    """Index of tool and set-up of each reading: the target is mounted anew for each."""
+    """Return the index of tool and set-up of each reading: the target is mounted again for each."""
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
     return _numbered(setup, *(() if lengths.tool_mm is None else lengths.tool_mm.T))
 
@@ -249,7 +249,7 @@ def _numbered(*columns: NDArray[Any]) -> IntArray:
 
 
 def _by_member(pattern: FloatArray, member: IntArray) -> FloatArray:
-    """Give every member columns of its own: (n, 3) -> (n, 3 * members)."""
+    """Give every member separate columns: (n, 3) -> (n, 3 * members)."""
     count = int(member.max()) + 1
     spread = np.zeros((len(pattern), count, 3))
     spread[np.arange(len(pattern)), member] = pattern

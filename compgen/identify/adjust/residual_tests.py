@@ -1,4 +1,4 @@
-"""Are the residuals noise? Their size and its causes, and tests along time, stations, distance and axes."""
+"""Tests of the residuals: their size and its causes, and whiteness over time, stations, distance and axes."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ if TYPE_CHECKING:
 
 # Whether the residuals are larger than their uncertainty allows, and whether a step or a drift explains most of them.
 #
-# ``whiteness`` tests whether residuals look like noise; this asks how large they are, and for the causes that make a
-# measurement worthless although every uncertainty can be computed: something moved between two runs, at one moment, or
-# slowly. Such a cause is looked for with the sum of squares that it takes away, in the residuals as they are and in those
-# with the reversal put back: a step between two runs that came from opposite sides looks like a reversal at first.
+# ``whiteness`` tests whether residuals look like noise; this part tests how large they are, and searches for causes
+# that make a measurement worthless although every uncertainty can be computed: something moved between two runs, at one
+# moment, or slowly. A cause is measured by its reduction of the sum of squares, in the residuals and in the residuals
+# with the reversal restored: a step between two runs from opposite sides first looks like a reversal.
 
 
 #: Probability that noise of the stated uncertainty alone gives a larger reduced chi-square than the limit.
 FALSE_ALARM = 0.001
-#: An uncertainty that was assumed, not stated, may be wrong by this factor before the residuals speak against the model.
+#: An assumed uncertainty may be wrong by this factor before the residuals count against the model.
 ASSUMED_FACTOR = 5.0
-#: A cause is named when it takes away this share of the sum of squares, ...
+#: A cause is reported if it explains this share of the sum of squares, ...
 EXPLAINS = 0.5
-#: ... with at least so many readings for each of its parameters.
+#: ... with at least this many readings for each of its parameters.
 READINGS_PER_PARAMETER = 10
-#: Degree of the polynomial in time that a drift is looked for with.
+#: Degree of the polynomial in time for a drift.
 DRIFT_DEGREE = 3
-#: Degree of the polynomial in time that repeated readings are compared with.
+#: Degree of the polynomial in time for repeated readings.
 REPEATS_DEGREE = 5
-#: Moments at which a step is tried.
+#: Number of moments at which a step is tried.
 MOMENTS = 200
-#: Times the uncertainty from which the machine file or the units, and not the measurement, are in doubt.
+#: Multiple of the uncertainty from which the machine file or the units are in doubt, not the measurement.
 LARGEST_CHI_SQUARE = {"stated": 25.0, "assumed": 1000.0}
 
 
 @dataclass(frozen=True)
 class Cause:
-    """Something that explains most of the residuals: ``code`` for programs, ``text`` for people, share of the squares."""
+    """A cause of most of the residuals: ``code`` for programs, ``text`` for people, share of the squares."""
 
     code: str
     text: str
@@ -65,16 +65,16 @@ class Cause:
 
 @dataclass(frozen=True)
 class ResidualSeries:
-    """Residuals in the order in which they were read, n of them, for the search for causes.
+    """n residuals in the order of the readings, for the search for causes.
 
     Parameters
     ----------
     residual_um : residuals, (n,).
-    bare_um : the same with the reversal put back where one was taken out, (n,); None where none was.
+    bare_um : the same with the removed reversal restored, (n,); None if none was removed.
     sigma_um : standard uncertainty of each, (n,).
-    group : what has an unknown constant of its own, (n,): the dead length of a length, the component of a deviation.
-    labels : what may have moved between readings of different value: run, block, file, each (n,).
-    time_s : moments, (n,); None where the order of the rows is all that is known.
+    group : index of the unknown constant, (n,): the dead length of a length, the component of a deviation.
+    labels : labels between whose values something may have moved: run, block, file, each (n,).
+    time_s : times, (n,); None if only the order of the rows is known.
     """
 
     residual_um: FloatArray
@@ -97,7 +97,7 @@ class ResidualSeries:
 
     @property
     def clock(self) -> FloatArray:
-        """Time of each reading, scaled to -1 ... 1; the order of the rows where no time is known."""
+        """Time of each reading, scaled to -1 ... 1; the order of the rows if the time is unknown."""
         return scaled_clock(np.arange(len(self.group)) if self.time_s is None else self.time_s)
 
 
@@ -109,7 +109,7 @@ def residual_series(
     group: IntArray,
     bare_mm: FloatArray | None = None,
 ) -> ResidualSeries:
-    """Gather the residuals (k,) of the readings at ``rows`` with what may explain them, see :class:`ResidualSeries`."""
+    """Collect the residuals (k,) of the readings at ``rows`` with their labels, see :class:`ResidualSeries`."""
     station = readings.station if isinstance(readings, Lengths) else None
     labels = labels_of(readings.labels, readings.origin, readings.position_mm, station)
     time = readings.covariates.get("time_s")
@@ -125,17 +125,17 @@ def residual_series(
 
 @dataclass(frozen=True)
 class Misfit:
-    """How far the residuals are above what their uncertainty allows.
+    """How far the residuals exceed their uncertainty.
 
     Parameters
     ----------
-    reduced_chi_square, degrees_of_freedom : of the readings that were used.
-    limit : reduced chi-square that noise exceeds with probability ``FALSE_ALARM``; ``ASSUMED_FACTOR`` squared times that
-        where the uncertainty was assumed.
-    scaled_by : by how much all standard uncertainties were widened.
-    source : where the uncertainty of the readings comes from, "stated" or "assumed".
+    reduced_chi_square, degrees_of_freedom : of the used readings.
+    limit : reduced chi-square that noise exceeds with probability ``FALSE_ALARM``; ``ASSUMED_FACTOR`` squared times
+        that if the uncertainty was assumed.
+    scaled_by : factor by which all standard uncertainties were increased.
+    source : source of the uncertainty of the readings, "stated" or "assumed".
     causes : steps and drifts that explain most of the residuals, the strongest first.
-    series : the residuals that they were looked for in; None where there are none.
+    series : the residuals that were searched; None if there are none.
     """
 
     reduced_chi_square: float
@@ -179,9 +179,9 @@ def misfit_of(
     source: str,
     series: Callable[[], ResidualSeries] | None = None,
 ) -> Misfit:
-    """Judge the size of the residuals, and look for causes where it is beyond the limit.
+    """Judge the size of the residuals, and search for causes if it exceeds the limit.
 
-    ``series`` makes the readings that were used, where they are looked at.
+    ``series`` returns the used readings when they are needed.
     """
     noise_alone = chi_square_limit(degrees_of_freedom, FALSE_ALARM) / degrees_of_freedom
     limit = noise_alone * (ASSUMED_FACTOR**2 if source == "assumed" else 1.0)
@@ -189,7 +189,7 @@ def misfit_of(
     if series is None or not reduced_chi_square > noise_alone:
         return misfit
     readings = series()
-    # causes that take away most of the sum of squares, the strongest first
+    # causes that explain most of the sum of squares, the strongest first
     whole, count = readings.square_sum(readings.residual_um), len(readings.group)
     found: dict[str, Cause] = {}
     for values_um in (readings.residual_um, readings.bare_um):
@@ -203,7 +203,8 @@ def misfit_of(
             if share > EXPLAINS and (code not in found or share > found[code].share):
                 found[code] = Cause(code, text, round(share, 4))
     causes = sorted(found.values(), key=lambda item: -item.share)
-    # a step between runs is a step at one moment, too, and much of a drift: what leaves twice as much is not named
+    # a step between runs is also a step at one moment, and partly a drift: a cause that leaves twice as much is not
+    # reported
     named = [item for item in causes if 1.0 - item.share < 2.0 * (1.0 - causes[0].share) + 1e-9]
     return replace(misfit, causes=tuple(named), series=readings)
 
@@ -248,10 +249,10 @@ def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
 
 
 def split_labels(series: ResidualSeries) -> Iterator[tuple[str, str, IntArray]]:
-    """Yield code, text and label (n,) of what may have given the readings another constant: run, block, file, a moment.
+    """Yield code, text and label (n,) of possible changes of the constants: run, block, file, a moment.
 
-    With a constant of its own for each value of the label, a second adjustment tells whether that explains a misfit;
-    residuals alone do not, where a step was taken for a reversal and bent everything else.
+    With separate constants for each value of the label, a second adjustment shows whether that explains a misfit;
+    residuals alone do not, if a step was mistaken for a reversal and distorted everything else.
     """
     for name, label in series.labels.items():
         if label.min() < label.max():
@@ -271,7 +272,7 @@ def _moment(series: ResidualSeries, late: IntArray) -> str:
 
 
 def _candidates(series: ResidualSeries, value_um: FloatArray) -> Iterator[tuple[str, str, int, FloatArray]]:
-    """Yield code, text and number of parameters of each cause, and what it leaves of values (n,) without group means."""
+    """Yield code, text and number of parameters of each cause, and the rest of values (n,) without group means."""
     for name, label in series.labels.items():
         _, place = np.unique(label, return_inverse=True)
         if place.max() > 0:
@@ -302,7 +303,7 @@ def _pairs(first: IntArray, second: IntArray) -> IntArray:
 
 
 def _best_split(series: ResidualSeries, value_um: FloatArray, clock: FloatArray) -> IntArray | None:
-    """Return which readings (1) lie after the moment that splits values without group means best; None if none does."""
+    """Return which readings (1) are after the moment that best splits values without group means; None if none does."""
     weight = 1.0 / series.sigma_um**2
     groups = int(series.group.max()) + 1
     total = np.bincount(series.group, weight, groups)
@@ -333,7 +334,7 @@ def _drift(series: ResidualSeries, value_um: FloatArray, clock: FloatArray) -> F
 def drift_of_repeats(lengths: Lengths) -> FloatArray | None:
     """Return the drift of each station with time that repeated readings show, (n,), mm; None if too few are repeated.
 
-    Two readings of one station at one position differ by what drifted between them, whatever the machine's errors are. The
+    Two readings of one station at one position differ by the drift between them, whatever the machine's errors. The
     drift is a polynomial in time for each station, zero on average.
     """
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
@@ -367,17 +368,17 @@ def labels_of(
     position_mm: FloatArray,
     group: IntArray | None = None,
 ) -> dict[str, IntArray]:
-    """Return what may have moved between readings (n,): the labels run and block, and the file of each.
+    """Return the labels between which something may have moved (n,): run and block, and the file of each reading.
 
-    Where no run is labelled, the readings that come to a position (n, 3) for the k-th time are the k-th run of it; ``group``
-    (n,) says which readings belong to another station.
+    Without run labels, the k-th reading at a position (n, 3) belongs to the k-th run; ``group`` (n,) distinguishes
+    stations.
     """
     found = {name: labels[name] for name in ("run", "block") if name in labels}
     if "run" not in found:
         keys = np.round(np.asarray(position_mm), 4)
         keys = keys if group is None else np.column_stack([keys, group])
         _, stop = np.unique(keys, axis=0, return_inverse=True)
-        # how often, from 0, each value has been there before
+        # number of earlier occurrences of each value
         stop = stop.ravel()
         order = np.argsort(stop, kind="stable")
         first = np.flatnonzero(np.diff(stop[order], prepend=-1))
@@ -391,30 +392,30 @@ def labels_of(
 
 # Whether the residuals are noise: tests along time, between stations, over distance and along the axes.
 #
-# Residuals of a model that describes the readings are independent, with the variance that was stated. Every test is made
-# so that it errs on the quiet side, because fitting takes part of the noise out of the residuals.
+# Residuals of a model that describes the readings are independent, with the stated variance. Every test is
+# conservative, because fitting removes part of the noise from the residuals.
 
 
 #: Probability of a false alarm of each of the four kinds of test, over all stations and axes; together below 1 %.
 WHITENESS_FALSE_ALARM = 0.001
-#: Variance ratios between stations, and between near and far readings, that are small enough to be of no interest.
+#: Variance ratios between stations, and between near and far readings, that are too small to matter.
 STATION_RATIO = 2.0
 DISTANCE_RATIO = 1.5
-#: Fewer readings than this say nothing.
+#: Fewer readings than this are not tested.
 LEAST_READINGS = 30
 #: Residuals smaller than this share of their uncertainty are rounding.
 ROUNDING = 0.02
-#: Levels of an axis are gathered into at most so many bins.
+#: Levels of an axis are combined into at most this many bins.
 MOST_BINS = 60
-#: An error is hardly determined when its standard uncertainty in um or urad is so many times that of a reading in um.
+#: An error is weakly determined if its standard uncertainty in um or urad is this many times that of a reading in um,
 WEAK = 50.0
-#: ... or when it is more than this share of the error, and moves the tool by so many times that of a reading.
+#: ... or if it is more than this share of the error, and moves the tool by this many times that of a reading.
 WEAK_SHARE, WEAK_READINGS = 1.0 / 6.0, 3.0
 
 
 @dataclass(frozen=True)
 class StationWhiteness:
-    """One station: autocorrelation of successive residuals, Durbin-Watson statistic, variance against the mean of all.
+    """One station: autocorrelation of successive residuals, Durbin-Watson statistic, variance relative to the mean of all.
 
     ``limit`` is the autocorrelation from which the test fires.
     """
@@ -435,7 +436,7 @@ class Whiteness:
     far_to_near : variance of the far half of the readings over that of the near half.
     axes : for each axis the variance of the means of the levels, station by station, over what noise would give, and
         the limit of that.
-    messages : what is not white, in words; empty for white residuals.
+    messages : deviations from whiteness, in words; empty for white residuals.
     """
 
     stations: Mapping[str, StationWhiteness]
@@ -462,7 +463,7 @@ class Whiteness:
 def check_whiteness(
     lengths: Lengths, group: IntArray, standardised: FloatArray, distance_mm: FloatArray, unknowns: int
 ) -> Whiteness:
-    """Test residuals of readings that were used.
+    """Test the residuals of the used readings.
 
     Parameters
     ----------
@@ -484,15 +485,15 @@ def check_whiteness(
     for name, item in stations.items():
         if item.lag_1 > item.limit:
             messages.append(
-                f"successive residuals of station {name} are alike: autocorrelation {item.lag_1:.2f} (limit "
-                f"{item.limit:.2f}), Durbin-Watson {item.durbin_watson:.2f} where noise has 2; drift, or another effect"
+                f"successive residuals of station {name} are correlated: autocorrelation {item.lag_1:.2f} (limit "
+                f"{item.limit:.2f}), Durbin-Watson {item.durbin_watson:.2f} (noise: 2); drift, or another effect"
             )
         pairs = (_normal_limit(1) / item.limit) ** 2
         chance = 2.0 * _normal_limit(2 * len(stations)) * np.sqrt(2.0 / pairs)  # of the ratio, with a margin
         if item.variance_ratio > STATION_RATIO + chance or item.variance_ratio < 1.0 / (STATION_RATIO + chance):
             messages.append(
-                f"the residuals of station {name} have {item.variance_ratio:.2f} times the variance of all, against the "
-                "stated uncertainty; give it another uncertainty, or look for what disturbs it"
+                f"the residuals of station {name} have {item.variance_ratio:.2f} times the variance of all, contrary to the "
+                "stated uncertainty; give it a separate uncertainty, or find what disturbs it"
             )
     messages += [
         *distance_message,
@@ -542,7 +543,7 @@ def _stations(
 
 
 def _distance(z: FloatArray, distance_mm: FloatArray) -> tuple[float, list[str]]:
-    """Ratio of the variances of far and near readings, and the message if it is not one."""
+    """Return the ratio of the variances of far and near readings, and the message if it is not one."""
     far = distance_mm > median(distance_mm)
     if min(np.count_nonzero(far), np.count_nonzero(~far)) < LEAST_READINGS:
         return 1.0, []
@@ -551,7 +552,7 @@ def _distance(z: FloatArray, distance_mm: FloatArray) -> tuple[float, list[str]]
     if abs(np.log(ratio)) < np.log(DISTANCE_RATIO) + chance:
         return ratio, []
     return ratio, [
-        f"the far half of the readings has {ratio:.2f} times the variance of the near half, against the stated "
+        f"the far half of the readings has {ratio:.2f} times the variance of the near half, contrary to the stated "
         "uncertainty a + b L: a and b do not describe the readings"
     ]
 
@@ -575,10 +576,10 @@ def _axis(lengths: Lengths, z: FloatArray, used: np.ndarray[Any, Any], axis: int
 def warn_of_weakness(
     machine: Machine, errors: ErrorTable, worst: Mapping[str, tuple[float, str]], sigma_mm: float
 ) -> None:
-    """Warn of errors that the set-up hardly shows.
+    """Warn of errors that the set-up determines only weakly.
 
-    That is a standard uncertainty far above that of a reading, or one that is a good part of the error itself and moves the
-    tool, by the lever arms of this machine, by more than the readings scatter.
+    That is a standard uncertainty far above that of a reading, or one that is a large part of the error itself and
+    moves the tool, by the lever arms of this machine, by more than the scatter of the readings.
 
     Parameters
     ----------
@@ -592,7 +593,7 @@ def warn_of_weakness(
         times = value * MM_PER_UM / sigma_mm
         if times > WEAK:
             warnings.warn(
-                f"{name} is hardly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
+                f"{name} is weakly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
                 f"times that of a reading; {advice}",
                 CompgenWarning,
                 stacklevel=4,
@@ -610,7 +611,7 @@ def warn_of_weakness(
             weak.append(name)
     if weak:
         warnings.warn(
-            f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} hardly determined: the standard uncertainty is more than a "
+            f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} weakly determined: the standard uncertainty is more than a "
             f"sixth of the largest value; {advice}",
             CompgenWarning,
             stacklevel=4,
@@ -618,7 +619,7 @@ def warn_of_weakness(
 
 
 def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source: str) -> None:
-    """Warn of residuals that are not white, unless they are too large for the model to be right at all."""
+    """Warn of residuals that are not white, unless they are too large for the model to be right."""
     if whiteness.messages and reduced_chi_square <= LARGEST_CHI_SQUARE[u_source]:
         more = f"; and {len(whiteness.messages) - 1} more in identify.json" if len(whiteness.messages) > 1 else ""
         warnings.warn(f"the residuals are not white: {whiteness.messages[0]}{more}", CompgenWarning, stacklevel=4)

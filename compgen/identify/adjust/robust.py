@@ -25,10 +25,10 @@ from compgen.kinematics.first_order import tool_of
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
 
-# Beam breaks: runs of consecutive readings of one station that are off by one amount, seen as a step in time.
+# Beam breaks: runs of consecutive readings of one station that are off by the same amount, a step in time.
 
 
-#: Readings on either side of a step whose medians are compared.
+#: Number of readings on either side of a step whose medians are compared.
 WINDOW = 12
 #: A step is a beam break when it exceeds this many robust standard deviations of the steps elsewhere in the series (of
 #: the readings, if it is shorter than LONG) ...
@@ -36,25 +36,25 @@ STEP_LIMIT = 8.0
 LONG = 8 * WINDOW
 #: ... and this size: smaller steps are left to the test for whiteness.
 SMALLEST_STEP_MM = 5.0 * MM_PER_UM
-#: Steps smaller than this share of the largest are looked at after it has been dealt with.
+#: Steps smaller than this share of the largest are examined after the largest.
 SHARE_OF_LARGEST = 0.2
-#: Levels that differ by less than this share of the largest step of the series are taken for one at first.
+#: Levels that differ by less than this share of the largest step of the series count as one at first.
 SAME_LEVEL = 0.3
-#: A segment of at least so many readings gets a dead length of its own; a shorter one is rejected.
+#: A segment of at least this many readings gets a separate dead length; a shorter one is rejected.
 LEAST_OWN_READINGS = 20
-#: More breaks than this at one station are no beam breaks but a model that does not describe the readings.
+#: More breaks than this at one station mean that the model does not describe the readings.
 MOST_BREAKS = 8
-#: Rejected readings that follow each other with the same offset are one segment from this number on.
+#: At least this many consecutive rejected readings with the same offset are one segment.
 LEAST_RUN = 3
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A run of readings of one station that is off by ``offset_mm`` against the rest (reading minus expected).
+    """A run of readings of one station that is off by ``offset_mm`` from the rest (reading minus expected).
 
-    ``kept`` says whether the readings were used, with a dead length of their own; ``rows`` are their
-    places among all readings in order of time, ``line`` and ``last_line`` the lines of the first and the last of them
-    in ``file`` (0 where there is no file).
+    ``kept`` says whether the readings were used, with a separate dead length; ``rows`` are their places among all
+    readings in order of time, ``line`` and ``last_line`` the lines of the first and the last of them in ``file`` (0
+    without a file).
     """
 
     station: str
@@ -70,7 +70,7 @@ class Segment:
     def text(self) -> str:
         """Return the report of the segment in one sentence."""
         where = f"line {self.line} to {self.last_line}" if self.line else f"reading {self.rows[0]} to {self.rows[-1]}"
-        done = "kept with a dead length of their own" if self.kept else "rejected"
+        done = "kept with a separate dead length" if self.kept else "rejected"
         return (
             f"station {self.station}: {self.offset_mm:+.3f} mm from {where}: beam break, dead length changed; "
             f"{self.readings} readings {done}"
@@ -97,7 +97,7 @@ class Segment:
 
 
 def time_order(lengths: Lengths) -> IntArray:
-    """Return the rows in order of ``time_s``; in order of the file where that is not known."""
+    """Return the rows in order of ``time_s``, or of the file if the time is unknown."""
     time = lengths.covariates.get("time_s")
     if time is None or not np.isfinite(time).all():
         return np.arange(len(lengths))
@@ -107,9 +107,9 @@ def time_order(lengths: Lengths) -> IntArray:
 def split_at_breaks(
     lengths: Lengths, group: IntArray, residual_mm: FloatArray, sight: FloatArray
 ) -> tuple[IntArray, FloatArray] | None:
-    """Give the readings behind a beam break a dead length of their own.
+    """Give the readings after a beam break a separate dead length.
 
-    A step that most stations show at the same stop is the machine's, not a station's, and splits nothing.
+    A step of most stations at the same stop comes from the machine, not from a station, and splits nothing.
 
     Parameters
     ----------
@@ -119,8 +119,8 @@ def split_at_breaks(
 
     Returns
     -------
-    group : new index of the dead length of each reading, (n,), and by how much the readings of each are off, mm;
-    None where no beam breaks.
+    group : new index of the dead length of each reading, (n,), and by how much the readings of each are off, mm; None
+    without beam breaks.
     """
     order = time_order(lengths)
     members = {k: order[group[order] == k] for k in range(int(group.max()) + 1)}
@@ -129,9 +129,9 @@ def split_at_breaks(
         series[k] = residual_mm[rows]
         if len(rows) < 2 * WINDOW:
             continue
-        # Take a wrong position of the station out, which a beam break leaves behind: differences of successive
-        # residuals show a beam break only once; least absolute deviations against the differences of the lines of
-        # sight therefore give the position's error.
+        # Remove the error of the station's position that a beam break causes: differences of successive residuals show
+        # a beam break only once, so least absolute deviations on the differences of the lines of sight give the error
+        # of the position.
         change, turn = np.diff(residual_mm[rows]), np.diff(sight[rows], axis=0)
         weight: FloatArray = np.ones(len(change))
         moved: FloatArray = np.zeros(3)
@@ -149,7 +149,7 @@ def split_at_breaks(
     for found in off.values():
         for rows, offset in found:
             if abs(offset) < SHARE_OF_LARGEST * largest:
-                continue  # may be what the largest one does to the others
+                continue  # may be caused by the largest one
             if len(rows) >= LEAST_OWN_READINGS:
                 new[rows] = len(offsets)
                 offsets.append(offset)
@@ -157,7 +157,7 @@ def split_at_breaks(
 
 
 def _steps(residual_mm: FloatArray) -> list[int]:
-    """Indices at which a series (n,) in time steps to another level; empty where there are too many."""
+    """Indices at which a series (n,) in time steps to another level; empty if there are too many."""
     count = len(residual_mm)
     if count < 2 * WINDOW:
         return []
@@ -186,7 +186,7 @@ def _steps(residual_mm: FloatArray) -> list[int]:
 def _without_common(
     steps: dict[int, list[int]], members: dict[int, IntArray], lengths: Lengths
 ) -> dict[int, list[int]]:
-    """Leave out the steps that more than half of the stations show within a few stops of each other."""
+    """Drop the steps that more than half of the stations show within a few stops."""
     shown: dict[tuple[int, str], set[int]] = {}
     run = lengths.labels.get("run", np.zeros(len(lengths), dtype=np.int64))
 
@@ -206,7 +206,7 @@ def _without_common(
 
 
 def _off_segments(rows: IntArray, residual_mm: FloatArray, steps: Sequence[int]) -> list[tuple[IntArray, float]]:
-    """Segments of one series that are off its longest one, and by how much their readings are off."""
+    """Return the segments of one series that are off its longest one, and their offsets."""
     if not steps:
         return []
     bounds = [0, *steps, len(rows)]
@@ -225,7 +225,7 @@ def _off_segments(rows: IntArray, residual_mm: FloatArray, steps: Sequence[int])
 
 
 def merged_groups(first: IntArray, group: IntArray, dead_mm: FloatArray, limit_mm: float) -> IntArray | None:
-    """Join dead lengths of one station and set-up that agree within ``limit_mm``; None where all differ.
+    """Join dead lengths of one station and set-up that agree within ``limit_mm``; None if all differ.
 
     ``first`` and ``group`` (n,) are the indices before and after the splitting, ``dead_mm`` the dead lengths.
     """
@@ -263,7 +263,7 @@ def kept_segments(lengths: Lengths, first: IntArray, group: IntArray, dead_mm: F
 def rejected_runs(
     lengths: Lengths, group: IntArray, accepted: NDArray[np.bool_], residual_mm: FloatArray, spread_mm: FloatArray
 ) -> tuple[Segment, ...]:
-    """Gather rejected readings that follow each other in time at one station with the same offset.
+    """Combine consecutive rejected readings of one station with the same offset.
 
     ``spread_mm`` (n,) is the robust standard deviation of each reading.
     """
@@ -301,20 +301,20 @@ def _segment(lengths: Lengths, rows: IntArray, offset_mm: float, *, kept: bool) 
     )
 
 
-# Readings that do not belong: found by a robust limit, explained where the data allow it, never dropped silently.
+# Gross errors: found by a robust limit, explained if the data allow it, never dropped silently.
 
 
 #: A reading is rejected when its residual exceeds this many robust standard deviations (1.4826 MAD).
 LIMIT = 6.0
-#: The robust standard deviation is not let below this share of the stated uncertainty.
+#: Lower limit of the robust standard deviation, as a share of the stated uncertainty.
 LEAST_SPREAD = 0.02
-#: Residuals that scatter more than so many standard uncertainties are looked at for gross mistakes.
+#: Residuals with a scatter above this many standard uncertainties are searched for gross mistakes.
 LARGEST_SPREAD = 10.0
-#: Residuals that are enough to see whether they scatter that much.
+#: Number of residuals sufficient to estimate that scatter.
 SAMPLE = 2000
-#: A reading fits another point or station when it agrees within so many standard deviations.
+#: A reading fits another point or station if it agrees within this many standard deviations.
 CLOSE = 10.0
-#: Below this size a residual is no exchange of points: neighbours in the volume are further apart.
+#: A smaller residual cannot be an exchange of points: neighbours in the volume are further apart.
 SMALLEST_EXCHANGE_MM = 0.05
 
 
@@ -334,23 +334,23 @@ class Rejected:
 def standardised_spread(standardised: FloatArray) -> float:
     """Robust standard deviation (1.4826 MAD) of residuals over their standard uncertainties (n,).
 
-    Not let below ``LEAST_SPREAD``, so that rounding in noise-free data rejects nothing.
+    At least ``LEAST_SPREAD``, so that rounding in noise-free data rejects nothing.
     """
     return max(1.4826 * median(np.abs(standardised - median(standardised))), LEAST_SPREAD)
 
 
 def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
-    """Mark the readings whose residual over its standard uncertainty (n,) lies within the robust limit."""
+    """Mark the readings whose residual over its standard uncertainty (n,) is within the robust limit."""
     size = np.abs(standardised)
     largest = float(size.max())
-    quick = 1.25 * median(size[:: max(1, len(size) // 500) | 1])  # of a sample, and on the safe side
+    quick = 1.25 * median(size[:: max(1, len(size) // 500) | 1])  # of a sample, conservative
     if largest <= LIMIT * max(quick, LEAST_SPREAD):
         return np.ones(len(size), dtype=bool)
     return np.asarray(size <= LIMIT * standardised_spread(standardised))
 
 
 def belonging(standardised: FloatArray) -> bool:
-    """Whether all readings belong: none beyond the limit, and no residuals so large that a mistake may hide in them."""
+    """Whether all readings are consistent: none beyond the limit, and no residuals large enough to hide a mistake."""
     return (
         bool(accepted_readings(standardised).all())
         and standardised_spread(standardised[:: max(7, len(standardised) // SAMPLE) | 1]) < LARGEST_SPREAD
@@ -360,7 +360,7 @@ def belonging(standardised: FloatArray) -> bool:
 #: Share of all readings, and of those of one station, that may be rejected.
 MOST_REJECTED = 0.3
 MOST_REJECTED_OF_STATION = 0.5
-#: Rounds after which the set of kept readings is taken as it is.
+#: Rounds after which the set of kept readings is final.
 MOST_ROUNDS = 20
 
 S = TypeVar("S")
@@ -374,13 +374,13 @@ def fit_accepted(
     *,
     reject: bool,
 ) -> tuple[S, NDArray[np.bool_]]:
-    """Fit, reject what lies beyond the robust limit, and repeat until the same readings are kept.
+    """Fit, reject what is beyond the robust limit, and repeat until the set of kept readings is stable.
 
     Parameters
     ----------
-    fit : solves with the accepted readings (count,), from the solution before (None at first).
+    fit : solves with the accepted readings (count,), from the previous solution (None at first).
     standardised : residuals of a solution over their standard uncertainty, (count,).
-    advice : ends the message "n of count ...".
+    advice : end of the message "n of count ...".
 
     Raises
     ------
@@ -400,7 +400,7 @@ def fit_accepted(
 
 
 def check_rejected(keep: NDArray[np.bool_], advice: str) -> None:
-    """Raise ConvergenceError where more than ``MOST_REJECTED`` of the readings (n,) are not kept."""
+    """Raise ConvergenceError if more than ``MOST_REJECTED`` of the readings (n,) are not kept."""
     rejected = int(np.count_nonzero(~keep))
     if rejected > MOST_REJECTED * len(keep):
         raise ConvergenceError(f"{rejected} of {len(keep)} {advice} before anything is rejected")
@@ -428,7 +428,7 @@ def explain_rejected(
     sigma_mm: FloatArray,
     segments: Sequence[Segment] = (),
 ) -> tuple[Rejected, ...]:
-    """Give every rejected reading a reason: another station's or another point's length, a beam break, or its size.
+    """Give every rejected reading a reason: length of another station or point, a beam break, or its size.
 
     Parameters
     ----------
@@ -447,7 +447,7 @@ def explain_rejected(
     for row in rows:
         size = f"differs from the model by {-residual_mm[row] * 1000.0:+.1f} um, "
         size += f"{abs(residual_mm[row]) / sigma_mm[row]:.0f} standard deviations"
-        # is it another station's length at this point?
+        # the length of another station at this point?
         predicted = expected.distance_mm[expected.pose[row], expected.station_of] - expected.dead_mm
         off = np.abs(predicted - lengths.length_mm[row])
         off[expected.station_of == lengths.station[row]] = np.inf
@@ -505,7 +505,7 @@ def _rows_of(lengths: Lengths, segments: Sequence[Segment], rejected: set[int]) 
 
 
 def _exchanges(lengths: Lengths, expected: _Expected, rows: Sequence[int], residual_mm: FloatArray) -> dict[int, str]:
-    """Find readings that belong to another point: two points exchanged, or one point's reading given twice.
+    """Find readings that belong to another point: two points exchanged, or a duplicate reading of one point.
 
     All rejected readings of one stop must agree on the other point.
     """
@@ -545,7 +545,7 @@ def rejected_components(
     sigma_mm: FloatArray,
     accepted: NDArray[np.bool_],
 ) -> tuple[Rejected, ...]:
-    """Name the measured components (k,) that were rejected: row and component of each, residual as model minus measured."""
+    """Describe the rejected measured components (k,): row and component of each, residual as model minus measured."""
     found = []
     for k in np.flatnonzero(~accepted).tolist():
         at = int(row[k])
@@ -561,8 +561,8 @@ def rejected_components(
 
 # Adjustment in spite of gross errors: iteratively reweighted least squares, beam breaks, then plain least squares.
 #
-# Weights of Huber (1964), which have one optimum, lead to those of Tukey (Beaton & Tukey 1974), which leave gross errors
-# without any weight. What then lies beyond the robust limit is rejected and all other readings count fully.
+# Weights of Huber (1964), which have a single optimum, are followed by those of Tukey (Beaton & Tukey 1974), which give
+# gross errors zero weight. Readings beyond the robust limit are then rejected, and all others have full weight.
 
 
 #: Huber's constant: 95 % efficiency for normal readings.
@@ -570,14 +570,14 @@ HUBER = 1.345
 HUBER_STEPS = 5
 TUKEY_STEPS = 15
 HARD_STEPS = 20
-#: Shares from which a warning is given.
+#: Shares of rejected readings from which a warning is given.
 MANY_REJECTED = 0.1
 MANY_REJECTED_OF_STATION = 0.25
-#: A reading of less weight is named as one that does not fit when nothing converges.
+#: A reading of less weight is reported as not fitting if nothing converges.
 SUSPICIOUS_WEIGHT = 0.2
-#: Rounds in which beam breaks may come to light.
+#: Rounds in which beam breaks may be found.
 BREAK_ROUNDS = 6
-#: At the start, before the errors of the machine are known, a reading this many deviations off counts nothing.
+#: At the start, before the errors of the machine are known, a reading this many deviations off gets no weight.
 FAR_AT_START = 10.0
 
 P = TypeVar("P", bound=LeastSquaresProblem)
@@ -599,9 +599,9 @@ class WeightedReadings:
 
 @dataclass(frozen=True)
 class RobustFit(Generic[P]):
-    """The problem with the dead lengths that beam breaks added, its optimum, and what became of the readings.
+    """The problem with the dead lengths that beam breaks added, its optimum, and the state of the readings.
 
-    ``accepted`` (n,) marks those that were used, ``residual_mm`` (n,) is model minus reading of all.
+    ``accepted`` (n,) marks the used ones, ``residual_mm`` (n,) is model minus reading of all.
     """
 
     problem: P
@@ -621,7 +621,7 @@ def fit_robustly(
     *,
     disturbed: bool,
 ) -> RobustFit[P]:
-    """Adjust, reject what does not belong, and give the readings behind a beam break a dead length of their own.
+    """Adjust, reject gross errors, and give the readings after a beam break a separate dead length.
 
     Parameters
     ----------
@@ -635,7 +635,7 @@ def fit_robustly(
     ConvergenceError
         if more than 30 % of the readings, or more than half of those of a station, do not fit.
     """
-    if disturbed:  # readings that are far off at the start do not take part in the first adjustment
+    if disturbed:  # readings far off at the start are excluded from the first adjustment
         residual = problem.residuals(start)
         near = np.ones(len(residual), dtype=bool)
         for k in range(int(readings.group.max()) + 1):
@@ -649,7 +649,7 @@ def fit_robustly(
         return RobustFit(problem, readings.group, solution, accepted, residual)
     problem, group, solution = _split(problem, solution, readings, rebuild)
     solution = _tukey(problem, solution, readings)
-    # dead lengths that turn out to be the same are taken together
+    # dead lengths that turn out to be equal are merged
     spread, dead = standardised_spread(_standardised(problem, solution, readings)), solution.state.dead_length_mm
     again = merged_groups(readings.group, group, dead, LIMIT * spread * float(np.median(readings.sigma_mm)))
     if again is not None:
@@ -660,7 +660,7 @@ def fit_robustly(
     fit = _rejected(problem, group, solution, readings)
     if 1.0 - np.mean(fit.accepted) > MANY_REJECTED or _shares(fit.accepted, readings).max() > MANY_REJECTED_OF_STATION:
         warnings.warn(
-            f"{_suspicion(fit.accepted, readings)}; they were left out, but so many point to a mistake in the "
+            f"{_suspicion(fit.accepted, readings)}; they were excluded, but their number suggests a mistake in the "
             "readings, their labels or the machine file",
             CompgenWarning,
             stacklevel=4,
@@ -675,7 +675,7 @@ def fit_robustly(
 def _split(
     problem: P, solution: LeastSquaresSolution, readings: WeightedReadings, rebuild: Callable[[IntArray], P]
 ) -> tuple[P, IntArray, LeastSquaresSolution]:
-    """Reweighted adjustment in which beam breaks get dead lengths of their own until no more come to light."""
+    """Reweighted adjustment in which beam breaks get separate dead lengths until no more are found."""
     group = readings.group
     for _ in range(BREAK_ROUNDS):
         for _ in range(HUBER_STEPS):
@@ -690,7 +690,7 @@ def _split(
             break
         group, offset_mm = split
         problem = rebuild(group)
-        # the groups that a break split off begin with the dead length of theirs, less what their readings are off
+        # the groups split off by a break start with the original dead length minus the offset of their readings
         known, main = len(state.dead_length_mm), np.zeros(len(offset_mm), dtype=np.int64)
         main[group] = readings.group
         own = state.dead_length_mm[main[known:]] - offset_mm[known:]
@@ -708,7 +708,7 @@ def _standardised(
 def _tukey(
     problem: LeastSquaresProblem, solution: LeastSquaresSolution, readings: WeightedReadings
 ) -> LeastSquaresSolution:
-    """Iteratively reweighted least squares with Tukey's weights, until the same readings count."""
+    """Iteratively reweighted least squares with Tukey's weights, until the set of used readings is stable."""
     kept: NDArray[np.bool_] | None = None
     for _ in range(TUKEY_STEPS):
         standardised = _standardised(problem, solution, readings)
@@ -722,7 +722,7 @@ def _tukey(
 
 
 def _rejected(problem: P, group: IntArray, solution: LeastSquaresSolution, readings: WeightedReadings) -> RobustFit[P]:
-    """Least squares of the readings within the limit, until the same ones are kept."""
+    """Least squares of the readings within the limit, until the set is stable."""
     accepted: NDArray[np.bool_] | None = None
     for _ in range(HARD_STEPS):
         residual = problem.residuals(solution.state)
@@ -739,14 +739,14 @@ def _rejected(problem: P, group: IntArray, solution: LeastSquaresSolution, readi
 def _weighted(
     problem: LeastSquaresProblem, start: State, readings: WeightedReadings, weight: FloatArray | NDArray[np.bool_]
 ) -> LeastSquaresSolution:
-    """Adjust with other weights; an error names the stations whose readings were left out."""
+    """Adjust with other weights; an error names the stations of the excluded readings."""
     try:
         return solve(problem.weighted(readings.weight * weight), start)
     except ConvergenceError as error:
         keep = np.asarray(weight > SUSPICIOUS_WEIGHT)
         if keep.all():
             raise
-        raise ConvergenceError(f"{_suspicion(keep, readings)}; as for the rest, {error}") from error
+        raise ConvergenceError(f"{_suspicion(keep, readings)}; for the rest: {error}") from error
 
 
 def _suspicion(keep: NDArray[np.bool_], readings: WeightedReadings) -> str:
@@ -771,7 +771,7 @@ def _check_share(keep: NDArray[np.bool_], readings: WeightedReadings) -> None:
         return
     name = readings.lengths.stations[int(np.argmax(out))]
     if np.count_nonzero(out > MOST_REJECTED) > len(out) / 2:
-        advice = "most stations are concerned: check chain, travel and errors of the machine file, the axis order and "
+        advice = "most stations are affected: check chain, travel and errors of the machine file, the axis order and "
         advice += "the units before anything is rejected"
     else:
         advice = f"check station {name!r}: its label, its unit, and whether readings of another station are "

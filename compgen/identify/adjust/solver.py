@@ -1,6 +1,6 @@
 """Levenberg-Marquardt on the scaled normal equations (Zha & Zhang 2024, eq. 28), and what the data leave undetermined.
 
-The factor of one normal matrix serves as long as it makes good progress: convergence is then linear with a small
+The factor of one normal matrix is kept as long as it makes good progress: convergence is then linear with a small
 ratio, and every pass costs only residuals and gradient. The exact gradient decides where the optimum is.
 """
 
@@ -18,15 +18,15 @@ from compgen.errors import ConvergenceError, UndeterminedError
 from compgen.identify.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State
 from compgen.kinematics.kernel_switch import lapack
 
-#: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles count
-#: at a lever of one metre).
+#: The remaining distance to the optimum, estimated from the last two steps, that ends the iteration (mm; angles at a
+#: lever of one metre).
 TOLERANCE_MM = 1e-10
-#: A step of a new factor below this that does not lower the cost shows that the cost is nothing but rounding.
+#: If a smaller step of a new factor does not lower the cost, only rounding is left.
 STALLED_MM = 1e-8
 MAX_ITERATIONS = 80
-#: After a step of this size the lines of sight have turned so much that a new factor pays.
+#: After a step of this size the lines of sight have rotated so much that a new factor pays off.
 FAR_MM = 0.5
-#: A step that shrinks less than this against the one before asks for a new factor.
+#: A step that shrinks less than this relative to the previous one requires a new factor.
 SLOW = 0.2
 
 
@@ -55,7 +55,7 @@ class Factor:
         return np.multiply(self.scale[:, None], inverse.T)
 
 
-#: Triangles up to this size are inverted at once; larger ones in halves, where most of the work is matrix products.
+#: Triangles up to this size are inverted directly; larger ones in halves, mostly by matrix products.
 _WHOLE = 64
 
 
@@ -81,7 +81,7 @@ def factorise(matrix: FloatArray, damping: float = 0.0) -> Factor:
     if damping:
         scaled[np.diag_indices(len(scaled))] += damping
     norm = float(np.abs(scaled).sum(axis=0).max())
-    lower, failed = lapack().dpotrf(scaled.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
+    lower, failed = lapack().dpotrf(scaled.T, lower=1, overwrite_a=1)  # symmetric; this order needs no copy
     if failed:
         raise LinAlgError("not positive definite")
     rcond, _ = lapack().dpocon(lower, norm, uplo="L")
@@ -104,13 +104,13 @@ def solve(problem: LeastSquaresProblem, start: State, factor: Factor | None = No
 
     Parameters
     ----------
-    problem, start : what to minimise and from where.
-    factor : of a normal matrix near ``start``, if there is one already.
+    problem, start : the problem and its start values.
+    factor : of a normal matrix near ``start``, if available.
 
     Raises
     ------
     ConvergenceError
-        if no step lowers the cost, or no optimum is reached; never a silent wrong answer.
+        if no step lowers the cost, or no optimum is reached; it never returns a wrong result silently.
     """
     state = start
     cost, gradient = problem.evaluate(state)
@@ -128,13 +128,13 @@ def solve(problem: LeastSquaresProblem, start: State, factor: Factor | None = No
         new_cost, new_gradient = problem.evaluate(candidate)
         if not new_cost <= cost * (1 + 1e-9) + 1e-18:
             stalled = size < (STALLED_MM if fresh else TOLERANCE_MM)
-            if stalled and not damping:  # the cost cannot be told from its rounding any more
+            if stalled and not damping:  # the cost cannot be distinguished from its rounding
                 return LeastSquaresSolution(state, cost, factor, iteration, factorisations)
             if fresh:
                 damping = max(10.0 * damping, 1e-6)
                 if damping > 1e6:
                     raise ConvergenceError(
-                        "the iteration found no step that lowers the residuals; check stations and units"
+                        "the iteration found no step that reduces the residuals; check stations and units"
                     )
             factor = None
             continue
@@ -164,7 +164,7 @@ def _positive_factor(matrix: FloatArray, damping: float) -> tuple[Factor, float]
 
 
 def step_levers(parameters: ErrorParameters, size: int) -> FloatArray:
-    """Lever of each of ``size`` unknowns, errors first, in a step: 1 for lengths, 1000 mm for rotations, (size,)."""
+    """Return the lever of each of ``size`` unknowns, errors first, in a step: 1 for lengths, 1000 mm for rotations, (size,)."""
     levers = np.ones(size)
     for curve in parameters.curves:
         if curve.error.kind == "angular":
@@ -175,12 +175,12 @@ def step_levers(parameters: ErrorParameters, size: int) -> FloatArray:
 
 # What the data do not determine: numerical rank, unobservable combinations in words, nodes without data.
 
-#: Eigenvalues of the normal matrix with unit diagonal below this count as zero. A determined problem stays above
-#: about 1e-7, an undetermined direction falls to 1e-14: there is a wide gap.
+#: Eigenvalues of the normal matrix with unit diagonal below this count as zero. In a determined problem they are above
+#: about 1e-7, in an undetermined direction about 1e-14: a wide gap.
 ZERO_EIGENVALUE = 1e-11
-#: Reciprocal condition of the scaled normal matrix below which the rank is looked at in detail.
+#: Reciprocal condition of the scaled normal matrix below which the rank is examined in detail.
 SUSPICIOUS_RCOND = 1e-10
-#: Unknowns without data that a message names.
+#: Number of unknowns without data that a message lists.
 MOST_NAMED = 12
 
 
@@ -188,7 +188,7 @@ MOST_NAMED = 12
 class Rank:
     """Numerical rank of a problem.
 
-    ``undetermined`` marks the unknowns (size,) that take part in a direction without data, ``combinations`` names
+    ``undetermined`` marks the unknowns (size,) that take part in a direction without data, ``combinations`` describes
     these directions, ``condition`` is the ratio of the kept eigenvalues of the scaled normal matrix.
     """
 
@@ -202,14 +202,14 @@ class Rank:
 def determined_factor(
     matrix: FloatArray, names: Callable[[], list[str]], what: str, suspicious: float = SUSPICIOUS_RCOND
 ) -> tuple[Factor, Rank | None]:
-    """Return the factor of a normal matrix (size, size), and its rank where the condition gave reason to look at it.
+    """Return the factor of a normal matrix (size, size), and its rank if the condition requires it.
 
     ``names`` makes the names of the unknowns, ``what`` begins the message.
 
     Raises
     ------
     UndeterminedError
-        if the matrix is singular; it names the combinations that no data determine.
+        if the matrix is singular; it lists the undetermined combinations.
     """
     factor = None
     try:
@@ -240,14 +240,16 @@ def describe_rank(matrix: FloatArray, names: list[str], zero: float = ZERO_EIGEN
     if without:
         more = f" and {len(without) - MOST_NAMED} more" if len(without) > MOST_NAMED else ""
         texts.append(f"no data at all for: {', '.join(without[:MOST_NAMED])}{more}")
-    # each direction without data is named by the errors that take part in it, the leading one first
+    # each direction without data is described by the errors that take part in it, the leading one first
     others = vectors[:, null][:, np.sum(vectors[:, null][empty] ** 2, axis=0) < 0.5]
     for vector in _sparse_directions(others).T:
         share: dict[str, float] = {}
         for name, value in zip(names, vector, strict=True):
             share[name.split(" ")[0]] = share.get(name.split(" ")[0], 0.0) + float(value**2)
         leading = sorted((name for name in share if share[name] > 0.02), key=lambda name: -share[name])
-        texts.append("cannot be told apart: " + " and ".join(leading[:6]) + (" and others" if len(leading) > 6 else ""))
+        texts.append(
+            "cannot be distinguished: " + " and ".join(leading[:6]) + (" and others" if len(leading) > 6 else "")
+        )
     return Rank(
         rank=int(np.count_nonzero(~null)),
         size=len(matrix),

@@ -1,4 +1,4 @@
-"""Start values: stations in closed form, a first affine machine, and a start that withstands gross errors."""
+"""Start values: stations in closed form, a first affine machine, and a start that is robust against gross errors."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[n
     """Locate one station from nominal points (n, 3) and readings (n,).
 
     |P - s|^2 = (L + l)^2 gives |P|^2 - L^2 = 2 P.s + 2 l L - (|s|^2 - l^2), linear in s, l and a constant for every
-    set-up ``group`` (n,) = 0 ... groups - 1. Where the points do not determine it (all in a plane or on a line) or
-    where the result does not explain the readings, a search from many directions takes its place.
+    set-up ``group`` (n,) = 0 ... groups - 1. If the points do not determine it (all in a plane or on a line) or the
+    result does not explain the readings, a search from many directions replaces it.
     """
     centre, scale = points_mm.mean(axis=0), max(float(np.ptp(points_mm, axis=0).max()), 1.0)
     p = (points_mm - centre) / scale
@@ -62,9 +62,9 @@ def station_start(points_mm: FloatArray, length_mm: FloatArray, group: NDArray[n
 def station_start_from_moments(
     moments: FloatArray, offset: FloatArray, centre_mm: FloatArray, scale_mm: float
 ) -> StationStart | None:
-    """Locate one station from the moments of its set-ups (g, 6, 6) as :func:`start_moments` has them.
+    """Locate one station from the moments of its set-ups (g, 6, 6) from :func:`start_moments`.
 
-    None where they do not determine it.
+    None if they do not determine it.
     """
     groups = len(moments)
     size = 3 + 2 * groups
@@ -127,11 +127,11 @@ def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> Fl
     return best[1]
 
 
-# What the closed-form start of the stations needs of the readings on a grid.
+# Moments of the readings on a grid for the closed-form start of the stations.
 
 
 def start_moments(grid: LevelGrid) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Return what the closed-form start needs of the readings, in centred and scaled coordinates.
+    """Return the moments for the closed-form start, in centred and scaled coordinates.
 
     With p = (target - centre)/scale and L = reading/scale - offset of the group: sums over the readings of each group
     of products of (2 p, 2 L, 1, |p|^2 - L^2).
@@ -156,7 +156,7 @@ def start_moments(grid: LevelGrid) -> tuple[FloatArray, FloatArray, FloatArray, 
             for k in range(grid.groups):
                 readings = data.weight[k], data.length_mm[k], scale, float(offset[k])
                 start_sums(along[out], plane, axes, *readings, moments[k])
-        moments += moments.swapaxes(1, 2).copy()  # each product was entered once, on one side of the diagonal or on it
+        moments += moments.swapaxes(1, 2).copy()  # each product was added once, on one side of the diagonal or on it
         moments[:, np.arange(6), np.arange(6)] *= 0.5
         return moments, offset, centre, scale
     readings = np.sum([np.sum(data.length_mm * (data.weight > 0), axis=(1, 2)) for data in grid.tools], axis=0)
@@ -179,20 +179,20 @@ def start_moments(grid: LevelGrid) -> tuple[FloatArray, FloatArray, FloatArray, 
 
 # A better start: the machine as an affine map (scales and squareness), stations and dead lengths, from a few readings.
 #
-# A squareness of milliradians moves the stations of the closed form by millimetres. Taken out beforehand, the lines of
-# sight of the first normal matrix are right, and its factor serves until the end.
+# A squareness of milliradians moves the stations of the closed form by millimetres. If it is removed beforehand, the
+# lines of sight of the first normal matrix are right, and its factor can be used until the end.
 
 
-#: Cells of the grid that are looked at, spread over the volume.
+#: Number of cells of the grid used, spread over the volume.
 SAMPLE = 150
-#: One step leaves less than what the curves, which the map does not hold, do to it anyway.
+#: One step is enough: the rest is below the effect of the curves, which the map does not contain.
 STEPS = 1
-#: Reciprocal condition below which the readings do not determine the affine map, and the start is left as it is.
+#: Reciprocal condition below which the readings do not determine the affine map, and the start is left unchanged.
 LEAST_RCOND = 1e-12
 
 
 def affine_start(problem: GridProblem, start: State) -> State:
-    """Return ``start`` with squareness, scales, stations and dead lengths improved; unchanged where that fails."""
+    """Return ``start`` with squareness, scales, stations and dead lengths improved; unchanged if that fails."""
     if len(problem.tools) != 1:
         return start
     data = problem.tools[0]
@@ -251,7 +251,7 @@ def _step(
 
 
 def _errors(problem: GridProblem, affine: FloatArray) -> FloatArray:
-    """Put scales into the slopes of EXX, EYY, EZZ and squareness where they belong; what is not modelled is left out."""
+    """Store scales as slopes of EXX, EYY, EZZ, and squareness; skip what is not modelled."""
     parameters = problem.parameters
     errors = np.zeros(parameters.size)
     for curve in parameters.curves:
@@ -270,28 +270,28 @@ def _errors(problem: GridProblem, affine: FloatArray) -> FloatArray:
     return errors
 
 
-# Start values of the stations in spite of gross errors: a low quantile of the residuals, then a robust refinement.
+# Start values of the stations robust against gross errors: a low quantile of the residuals, then a robust refinement.
 #
-# Rousseeuw (1984), Least Median of Squares Regression: the closed form above is solved for many small random
-# subsets of a station's readings; the one whose residuals have the smallest quantile has met no bad reading.
+# Rousseeuw (1984), Least Median of Squares Regression: the closed form above is solved for many small random subsets of
+# a station's readings; the one whose residuals have the smallest quantile contains no bad reading.
 
 
-#: A station is looked at again when a residual at its start exceeds this many robust standard deviations ...
+#: A station is examined again if a residual at its start exceeds this many robust standard deviations ...
 START_LIMIT = 6.0
-#: ... or when their robust standard deviation is larger than this; errors of a machine are mostly below.
+#: ... or if their robust standard deviation is larger than this; errors of a machine are mostly below.
 ORDINARY_MM = 0.5
 #: Beyond this share of the extent of the targets the readings cannot be those of one station at these points.
 GROSS_SHARE = 0.01
 TRIALS = 200
-#: At most so many readings judge a trial.
+#: Number of readings that judge a trial.
 JUDGES = 400
-#: A station is never further away than so many times the extent of its targets.
+#: A station is never further away than this multiple of the extent of its targets.
 FARTHEST = 100.0
-#: Factors that a slip leaves between readings and displacements in millimetres.
+#: Factors between readings and displacements in millimetres due to a mistake.
 SLIPS = {
-    1000.0: "when they are taken as metres; the unit is mm: convert them",
-    0.001: "when they are taken as micrometres; the unit is mm: convert them",
-    25.4: "when they are taken as inches; the unit is mm: convert them",
+    1000.0: "if they are read as metres; the unit is mm: convert them",
+    0.001: "if they are read as micrometres; the unit is mm: convert them",
+    25.4: "if they are read as inches; the unit is mm: convert them",
     -1.0: "with the opposite sign; a reading grows with the distance: reverse the sign",
 }
 
@@ -315,7 +315,7 @@ class _Station:
 def robust_spread(values: FloatArray) -> float:
     """Return 1.907 times the 40 % quantile of the absolute values: the standard deviation of normal ones about zero.
 
-    Less than the median, so that one half of the readings may be off by a beam break.
+    Less than the median, so that half of the readings may be off by a beam break.
     """
     return 1.907 * float(np.quantile(np.abs(values), 0.4))
 
@@ -323,7 +323,7 @@ def robust_spread(values: FloatArray) -> float:
 def robust_state(
     start: State, lengths: Lengths, target_mm: FloatArray, station: IntArray, group: IntArray
 ) -> tuple[State, bool]:
-    """Return start values that gross errors do not move, and whether there are any gross errors.
+    """Return start values that gross errors do not affect, and whether there are gross errors.
 
     Parameters
     ----------
@@ -350,7 +350,7 @@ def robust_state(
         residual = part.part(_sample(len(rows), 2000)).residuals(first)
         spread = robust_spread(residual)
         if spread < ORDINARY_MM and np.abs(residual).max() <= START_LIMIT * max(spread, 1e-9):
-            continue  # looks sound
+            continue  # plausible
         better = _robust(part, first)
         stations[k], dead[own] = better.position_mm, better.dead_length_mm
         misfit_mm[k], parts[k] = robust_spread(part.residuals(better)), part
@@ -363,14 +363,14 @@ def robust_state(
 
 
 def _sample(count: int, most: int) -> IntArray:
-    """Rows spread over all, at most ``most``, at random distances so that no period of the data is met."""
+    """Return rows spread over all, at most ``most``, at random distances so that no period of the data is aliased."""
     if count <= most:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
 
 
 def _robust(part: _Station, first: StationStart) -> StationStart:
-    """Best of random subsets, of all readings and of parts that follow each other, and the given start; refined."""
+    """Return the refined best of random subsets of all readings and of consecutive parts, and the given start."""
     groups = len(first.dead_length_mm)
     rng = np.random.default_rng(1)
     judges = part.part(_sample(len(part.length_mm), JUDGES))
@@ -388,7 +388,7 @@ def _robust(part: _Station, first: StationStart) -> StationStart:
 
 
 def _closed_form(part: _Station, groups: int) -> StationStart | None:
-    """The linear equations of :func:`station_start` for a few readings; None where they determine nothing."""
+    """The linear equations of :func:`station_start` for a few readings; None if they determine nothing."""
     centre = part.target_mm.mean(axis=0)
     p = part.target_mm - centre
     scale = max(float(np.abs(p).max()), 1.0)
@@ -458,7 +458,7 @@ def _no_place(
 
 
 def _slip(part: _Station, misfit_mm: float) -> str:
-    """Say which slip of unit or sign explains the readings of a station; empty if none does."""
+    """Return which mistake in unit or sign explains the readings of a station; empty if none does."""
     extent_mm = float(np.ptp(part.target_mm, axis=0).max())
     groups = int(part.member.max()) + 1
     best, found = 0.02 * misfit_mm, ""

@@ -18,10 +18,10 @@ from compgen.errors import InputError
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
 
-# The unknown curves: their basis, the constraints that fix the gauge, and the place of each in the vector.
+# The unknown curves: basis, gauge constraints, and place in the vector of unknowns.
 
 
-#: Positions per node interval at which a cubic curve is written, so that linear interpolation loses nothing.
+#: Positions per node interval at which a cubic curve is written, so that linear interpolation is accurate enough.
 SUBDIVISION = 8
 
 
@@ -37,7 +37,7 @@ class CurveParameters:
 
 @dataclass(frozen=True)
 class ErrorParameters:
-    """All unknown errors of a machine and their place in the vector of unknowns (curves first, then squareness).
+    """All unknown errors of a machine and their place in the vector of unknowns (curves, then squareness).
 
     ``curves`` is the basis between nodes; ``size`` the number of unknowns.
     """
@@ -117,10 +117,10 @@ class ErrorParameters:
 def error_parameters(machine: Machine, names: Sequence[str], *, several_tools: bool = False) -> ErrorParameters:
     """Lay out the unknowns for the errors ``names`` and fix the gauge by elimination.
 
-    Constraints (Zha & Zhang 2024, eq. 25, taken together; 20 for 17 errors): positioning and angular curves are zero
-    at the reference point, straightness curves at both ends of the travel. If several tools were used, the angular
-    curves of the axis without any other axis in its lever arm stay free: with them comes the constant orientation
-    between tool and workpiece, which the tools show.
+    Constraints (Zha & Zhang 2024, eq. 25, taken together; 20 for 17 errors): positioning and angular curves are zero at
+    the reference point, straightness curves at both ends of the travel. If several tools were used, the angular curves
+    of the axis without any other axis in its lever arm remain free: they contain the constant orientation between tool
+    and workpiece, which the tools show.
     """
     single_tool = observable_errors(machine) if several_tools else ()
     bare = next(axis for axis in range(3) if not [lever for lever in machine.chain.lever_axes(axis) if lever != axis])
@@ -161,7 +161,7 @@ def common_tool(machine: Machine, tool_mm: FloatArray | None) -> FloatArray:
 
 
 def parameters_for_tools(machine: Machine, tool_mm: FloatArray) -> ErrorParameters:
-    """Lay out the errors that the machine's model contains for the tools that were used, (3,) or (n, 3)."""
+    """Lay out the errors of the machine's model for the tools in use, (3,) or (n, 3)."""
     several = tool_mm.ndim == 2
     names = modelled_errors(machine, np.unique(tool_mm, axis=0) if several else None)
     return error_parameters(machine, names, several_tools=several)
@@ -174,7 +174,7 @@ IntArray = NDArray[np.int64]
 
 
 class TracerUnknowns:
-    """Counts of the unknowns of tracer lengths: errors, three coordinates a station, one dead length a group.
+    """Counts of the unknowns of tracer lengths: errors, three coordinates per station, one dead length per group.
 
     ``station_of`` (G,) is the station of each dead length.
     """
@@ -220,7 +220,7 @@ class State:
 class KnownPositions:
     """Stations whose coordinates were observed: indices (k,), positions (k, 3) in mm, weight (k,) of each coordinate.
 
-    A weight counts on the scale of the weights of the readings.
+    A weight is on the scale of the weights of the readings.
     """
 
     station: IntArray
@@ -252,7 +252,7 @@ class KnownPositions:
 
 
 class LeastSquaresProblem(Protocol):
-    """What the solver needs of a least-squares problem; the unknowns are in the order of :meth:`State.moved`."""
+    """Interface of a least-squares problem for the solver; the unknowns are in the order of :meth:`State.moved`."""
 
     @property
     def parameters(self) -> ErrorParameters:
@@ -303,7 +303,7 @@ def dead_lengths_of(lengths: Lengths) -> IntArray:
     return group.ravel().astype(np.int64)
 
 
-# Measured positions must lie within the travel of the machine.
+# Measured positions must be within the travel of the machine.
 
 
 _ROUNDING_MM = 1e-3
@@ -312,7 +312,7 @@ _ROUNDING_MM = 1e-3
 def check_travel(machine: Machine, position_mm: FloatArray, origin: Sequence[tuple[str, int]] = ()) -> None:
     """Raise InputError, with file, line and column, for the first position (n, 3) outside the travel.
 
-    ``origin`` is file and line of each row; without it the message counts the points.
+    ``origin`` is file and line of each row; without it the message gives the number of the point.
     """
     for axis in range(3):
         along = np.ascontiguousarray(position_mm[:, axis])
@@ -322,7 +322,7 @@ def check_travel(machine: Machine, position_mm: FloatArray, origin: Sequence[tup
         low, high = machine.axes[axis].range_mm
         file, line = origin[row] if len(origin) else (None, None)
         raise InputError(
-            f"{along[row]:g} mm{'' if len(origin) else f' (point {row + 1})'} lies outside the travel {low:g} ... {high:g} mm "
+            f"{along[row]:g} mm{'' if len(origin) else f' (point {row + 1})'} is outside the travel {low:g} ... {high:g} mm "
             f"of {AXES[axis]} of machine {machine.name!r}: wrong machine file, wrong axis order or wrong unit?",
             file=file,
             line=line,
@@ -337,7 +337,7 @@ def check_axis_travel(
     origin: Sequence[tuple[str, int]],
     field: str | None = None,
 ) -> None:
-    """The same for readings along single axes: axis 0 ... 2 and position of each, both (n,)."""
+    """Do the same for readings along single axes: axis 0 ... 2 and position of each, both (n,)."""
     for k, letter in enumerate(AXES):
         rows = np.flatnonzero(axis == k)
         found = outside_travel(machine, k, position_mm[rows])
@@ -349,7 +349,7 @@ def check_axis_travel(
 
 
 def outside_travel(machine: Machine, axis: int, position_mm: FloatArray) -> int | None:
-    """First row of positions (n,) along an axis that lies outside its travel; None if all are within."""
+    """Return the first row of positions (n,) along an axis outside its travel; None if all are within."""
     low, high = machine.axes[axis].range_mm
     if not len(position_mm) or (position_mm.min() >= low - _ROUNDING_MM and position_mm.max() <= high + _ROUNDING_MM):
         return None

@@ -28,18 +28,18 @@ from compgen.report.dcc.xml import (
 )
 from compgen.report.html.write import PROBABILITY, UNITS, calibration_record
 
-# What a certificate says of itself: what it is and is not, signs, uncertainties, limitations, the laboratory's own words.
+# What a certificate says about itself: what it is and is not, signs, uncertainties, limitations, the laboratory's text.
 
 
 IS = (
     "The results of a measurement of a machine tool as the program compgen computed them from the files whose SHA-256 "
-    "stands with the results. Laboratory, customer, persons, dates, instruments and conditions are what the issuer "
-    "stated; the program checked their form, not their truth. The laboratory named here answers for the document."
+    "is given with the results. Laboratory, customer, persons, dates, instruments and conditions are as stated by the "
+    "issuer; the program checked their form, not their truth. The laboratory named here is responsible for the document."
 )
 IS_NOT = (
     "The program and its authors are no calibration laboratory, neither accredited nor certified; the document claims no "
-    "accreditation and no metrological traceability beyond what the issuer can show. It holds no electronic signature "
-    "or seal: without one of the issuer it proves nothing about where it came from. It is no statement of conformity of "
+    "accreditation and no metrological traceability beyond what the issuer can show. It contains no electronic signature "
+    "or seal: unless the issuer adds one, it does not prove its origin. It is not a statement of conformity of "
     "the machine, and its figures follow published formulas of the standards but are not certified against them."
 )
 SIGN = (
@@ -49,10 +49,10 @@ SIGN = (
     "position, so that difference has the opposite sign."
 )
 UNCERTAINTY = (
-    f"Stated is the expanded uncertainty: the standard uncertainty times the coverage factor k = {COVERAGE:g}, for a normal "
+    f"The uncertainties are expanded: the standard uncertainty times the coverage factor k = {COVERAGE:g}, for a normal "
     f"distribution a coverage probability of {100 * PROBABILITY:g} %. Where value and uncertainty are both zero the value "
-    "is fixed by the point or the line that the error is referred to. "
-    "A figure without uncertainty is marked as computed, or its uncertainty is not known."
+    "is fixed by the point or line to which the error is referred. "
+    "A figure without uncertainty is marked as computed, or its uncertainty is unknown."
 )
 
 
@@ -80,7 +80,7 @@ def _statement(name: str, text: str, *rules: Element) -> Element:
     return dcc("statement", said("name", name), *rules, said("declaration", text))
 
 
-# ``dcc:administrativeData``: the laboratory's data as they were given, the items, and what the document says of itself.
+# ``dcc:administrativeData``: the laboratory's data as given, the items, and the statements about the document.
 
 
 #: Namespaces of the refTypes in use: name, what it is, where its list is.
@@ -170,7 +170,7 @@ def _item(thing: Thing, name: str, description: Element | None) -> Element:
 
 
 def machine_text(data: Mapping[str, Any]) -> str:
-    """Say what the model knows of the machine: chain from workpiece to tool, reference axis, travel, tool."""
+    """Describe the machine as modelled: chain from workpiece to tool, reference axis, travel, tool."""
     machine = data["machine"]
     parts = [f"Machine file {machine.get('name', data['title'])}"]
     if machine.get("chain"):
@@ -186,7 +186,7 @@ def machine_text(data: Mapping[str, Any]) -> str:
 
 
 def manufacturer(thing: Thing) -> Element | None:
-    """Return the manufacturer, None where none was given."""
+    """Return the manufacturer, None if none was given."""
     return dcc("manufacturer", given("name", thing.manufacturer)) if flat(thing.manufacturer) else None
 
 
@@ -218,14 +218,14 @@ def _contact(tag: str, contact: Contact) -> Element:
     )
 
 
-# Instruments and conditions of a measurement, as far as they were stated or come with the readings.
+# Instruments and conditions of a measurement, if they were stated or are in the measurement files.
 
 
 NOT_STATED = "The conditions during the measurement were not stated."
 
 
 def measuring_equipments(options: Certificate) -> Element:
-    """Return the instruments; the hash of a calibration certificate where it was given."""
+    """Return the instruments, with the hash of a calibration certificate if given."""
     found = []
     for thing in options.equipment:
         certificate = None
@@ -252,7 +252,7 @@ def measuring_equipments(options: Certificate) -> Element:
 
 
 def influence_conditions(data: Mapping[str, Any], options: Certificate, version: str) -> Element:
-    """Return the conditions that were stated and the temperatures of the scales; says so where nothing is known."""
+    """Return the stated conditions and the temperatures of the scales; a statement if nothing is known."""
     found = []
     for item in (*options.conditions, *scale_temperatures(data)):  # a single value, or the lowest and the highest one
         parts = [("Min", item.lowest, "Lowest value"), ("Max", item.highest, "Highest value")]
@@ -271,7 +271,7 @@ def influence_conditions(data: Mapping[str, Any], options: Certificate, version:
 
 
 def scale_temperatures(data: Mapping[str, Any]) -> Iterator[Condition]:
-    """Yield the temperatures of the scales that came with the readings, for which they were corrected to 20 degC."""
+    """Yield the temperatures of the scales from the measurement; the readings were corrected from them to 20 degC."""
     corrections = data["measurement"].get("corrections") or {}
     for axis, item in dict(corrections.get("temperature") or {}).items():
         if {"lowest_c", "highest_c"} <= set(item):
@@ -287,25 +287,25 @@ def _ref_type(stem: str, end: str) -> dict[str, str]:
 
 
 METHODS = {
-    "joint": "Lengths from tracer stations: the errors, and what is not known of the stations, in one least-squares adjustment",
+    "joint": "Lengths from tracer stations: errors, station positions and dead lengths in one least-squares adjustment",
     "two-step": "Lengths from several tracer stations: points located first, errors fitted to their deviations",
     "deviations": "Errors fitted to deviations of the tool tip by least squares",
     "axis-runs": "Errors of single axes, each measured along a line",
     "sixdof": "Errors from readings of a six-degree-of-freedom laser instrument, axis by axis",
     "merged": "Errors of several measurements merged by their uncertainties",
-    "given": "Errors as they were given in a file",
+    "given": "Errors as given in a file",
 }
 
 
 def measurement_results(
     data: Mapping[str, Any], record: Mapping[str, Any], options: Certificate, version: str
 ) -> Element:
-    """Return the results; ``record`` is the contents of ``calibration.json``, whose numbers they are.
+    """Return the results; ``record``, the contents of ``calibration.json``, provides the numbers.
 
     Raises
     ------
     InputError
-        where nothing was measured: neither errors nor figures of a measurement.
+        if nothing was measured: neither errors nor figures of a measurement.
     """
     return dcc("measurementResults", *Results(data, record, options, version).all())
 
@@ -317,7 +317,7 @@ class Results:
         self.data, self.record, self.options, self.version = data, record, options, version
 
     def all(self) -> list[Element]:
-        """Measured results first, then what was computed for each control."""
+        """Return the measured results, then what was computed for each control."""
         errors, *verifications = self.record["measurementResults"]
         measured = [*self._errors(errors), *self._accuracy(), *self._comparison()]
         if not measured:
@@ -335,7 +335,7 @@ class Results:
     def _result(
         self, name: str, method: Element, results: Sequence[Element], notes: Sequence[tuple[str, str]] = ()
     ) -> Element:
-        """Return one ``dcc:measurementResult`` with everything that the schema wants around its results."""
+        """Return one ``dcc:measurementResult`` with everything that the schema requires around its results."""
         meta = [dcc("metaData", said("name", title), said("declaration", text)) for title, text in notes]
         return dcc(
             "measurementResult",
@@ -421,7 +421,7 @@ class Results:
     def _comparison(self) -> Iterator[Element]:
         compare = self.data["compare"]
         results = [item for group in compare.get("groups", []) for item in self._compared(group)]
-        if not results or compare.get("kind") == "prediction":  # a prediction was not measured
+        if not results or compare.get("kind") == "prediction":  # a prediction is not a measurement
             return
         text = f"The same figures from two files, one before and one after. {'; '.join(compare['statements'])}"
         method = _method("Comparison of two measurements", text, NORMS)
@@ -491,13 +491,13 @@ def certificate_xml(data: Mapping[str, Any], options: Certificate, version: str 
     Parameters
     ----------
     data : the numbers of a report (:func:`compgen.report.html.write.content`), only finite numbers or None.
-    options : what the laboratory stated.
+    options : the statements of the laboratory.
     version : release of the DCC schema, one of :data:`compgen.report.dcc.xml.VERSIONS`.
 
     Raises
     ------
     InputError
-        where nothing was measured, or for a release that cannot be written.
+        if nothing was measured, or for an unsupported release.
     """
     root = dcc(
         "digitalCalibrationCertificate",
@@ -512,12 +512,12 @@ def certificate_xml(data: Mapping[str, Any], options: Certificate, version: str 
 def certificate_files(
     data: Mapping[str, Any], options: Certificate, schema: DccSchema | None = None
 ) -> dict[str, bytes]:
-    """Return ``dcc.xml`` by its name: of the release of ``schema`` and valid by it, else of the newest release.
+    """Return ``dcc.xml`` by name: in the release of ``schema`` and validated by it, otherwise in the newest release.
 
     Raises
     ------
     InputError
-        where nothing was measured, or the document is not valid.
+        if nothing was measured, or the document is not valid.
     """
     document = certificate_xml(data, options, NEWEST if schema is None else schema.version)
     if schema is not None:

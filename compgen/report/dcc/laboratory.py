@@ -1,4 +1,4 @@
-"""``certificate.toml``: what only the laboratory knows of a calibration. Nothing in it has a default that says something."""
+"""``certificate.toml``: what only the laboratory knows about a calibration; no default makes a statement."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 
 from compgen.data.toml_files import Section, choice, flag, number, read_toml, text
 
-#: Where a calibration was done, as the schema names it.
+#: Where a calibration was done, in the words of the schema.
 LOCATIONS = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 MOST_CHARACTERS = 4000
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A laboratory or a customer; empty texts were not given."""
+    """A laboratory or a customer; empty means not given."""
 
     name: str
     city: str
@@ -32,7 +32,7 @@ class Contact:
 
 @dataclass(frozen=True)
 class Person:
-    """Somebody who answers for the certificate."""
+    """A person responsible for the certificate."""
 
     name: str
     role: str = ""
@@ -42,7 +42,7 @@ class Person:
 
 @dataclass(frozen=True)
 class Thing:
-    """The machine, its control or an instrument; ``name`` may be empty for the machine: its file names it."""
+    """The machine, its control or an instrument; ``name`` may be empty for the machine: its file has the name."""
 
     name: str
     serial_number: str
@@ -87,7 +87,7 @@ class Certificate:
     statements: tuple[tuple[str, str], ...] = ()
 
 
-#: Keys of ``[conditions]``: name, D-SI unit, refType of the public list, limits of sense.
+#: Keys of ``[conditions]``: name, D-SI unit, refType of the public list, plausible limits.
 CONDITIONS: dict[str, tuple[str, str, str, tuple[float, float]]] = {
     "air_temperature_c": ("Air temperature", "\\degreeCelsius", "basic_temperature", (-60.0, 100.0)),
     "machine_temperature_c": ("Temperature of the machine", "\\degreeCelsius", "basic_temperature", (-60.0, 100.0)),
@@ -99,28 +99,28 @@ CONDITIONS: dict[str, tuple[str, str, str, tuple[float, float]]] = {
 def date(value: Any) -> datetime.date:
     """A date without a time."""
     if not isinstance(value, datetime.date) or isinstance(value, datetime.datetime):
-        raise ValueError("a date as 2026-11-21, without quotation marks, is expected")
+        raise ValueError("expected a date such as 2026-11-21, without quotation marks")
     return value
 
 
 def country(value: Any) -> str:
     """A country code of ISO 3166-1."""
     if not isinstance(value, str) or not re.fullmatch("[A-Z]{2}", value):
-        raise ValueError("two capital letters of ISO 3166-1, such as DE, are expected")
+        raise ValueError("expected two capital letters of ISO 3166-1, such as DE")
     return value
 
 
 def sha256(value: Any) -> str:
     """A SHA-256 as hexadecimal digits."""
     if not isinstance(value, str) or not re.fullmatch("[0-9a-fA-F]{64}", value):
-        raise ValueError("64 hexadecimal digits are expected")
+        raise ValueError("expected 64 hexadecimal digits")
     return value.lower()
 
 
 def long_text(value: Any) -> str:
     """A text of several lines."""
     if not isinstance(value, str) or not value.strip() or len(value) > MOST_CHARACTERS:
-        raise ValueError(f"a text of at most {MOST_CHARACTERS} characters is expected")
+        raise ValueError(f"expected a text of at most {MOST_CHARACTERS} characters")
     return value
 
 
@@ -128,7 +128,7 @@ def range_within(limits: tuple[float, float]) -> Callable[[Any], tuple[float, fl
     """One number, or the lowest and the highest one, within ``limits``."""
 
     def check(value: Any) -> tuple[float, float]:
-        message = f"a number, or two numbers [lowest, highest], from {limits[0]:g} to {limits[1]:g} are expected"
+        message = f"expected a number, or two numbers [lowest, highest], from {limits[0]:g} to {limits[1]:g}"
         values = value if isinstance(value, list) else [value, value]
         if len(values) != 2:
             raise ValueError(message)
@@ -140,7 +140,7 @@ def range_within(limits: tuple[float, float]) -> Callable[[Any], tuple[float, fl
     return check
 
 
-#: Keys of every table, in the order in which they are read; "?" marks those that may be left out.
+#: Keys of every table, in the order in which they are read; "?" marks optional ones.
 KEYS: dict[str, tuple[str, ...]] = {
     "contact": ("name", "city", "country", "street?", "street_number?", "post_code?", "email?", "phone?"),
     "person": ("name", "role?", "email?", "main_signer?"),
@@ -151,7 +151,7 @@ KEYS: dict[str, tuple[str, ...]] = {
     ),
     "statement": ("name", "text"),
 }  # fmt: skip
-#: Keys that hold something else than one line of text.
+#: Keys whose value is not one line of text.
 CHECKS: dict[str, Callable[[Any], Any]] = {
     "country": country,
     "main_signer": flag,
@@ -166,7 +166,7 @@ def read_certificate(path: str | Path) -> Certificate:
     Raises
     ------
     InputError
-        for a key that is missing, not known, or holds something else than it should; the message names it.
+        for a key that is missing, unknown, or has an invalid value; the message names it.
     """
     root = read_toml(path)
     core = root.section("certificate")
@@ -204,7 +204,7 @@ def read_certificate(path: str | Path) -> Certificate:
 
 
 def _values(section: Section, kind: str) -> dict[str, Any]:
-    """Take the keys of a kind of table; those left out are empty."""
+    """Return the keys of a kind of table; omitted ones are empty."""
     found = {}
     for entry in KEYS[kind]:
         key = entry.removesuffix("?")
@@ -212,12 +212,14 @@ def _values(section: Section, kind: str) -> dict[str, Any]:
         empty = None if check is flag else ""
         found[key] = section.take(key, check, empty) if entry.endswith("?") else section.take(key, check)
     if found.get("certificate_sha256") and not found["certificate_number"]:
-        raise section.fail("certificate_sha256", "needs certificate_number: the certificate that it is the hash of")
+        raise section.fail(
+            "certificate_sha256", "needs certificate_number, the number of the certificate with this hash"
+        )
     return found
 
 
 def _closed(section: Section, kind: str) -> dict[str, Any]:
-    """The values of a table that has no further keys."""
+    """Return the values of a table without further keys."""
     found = _values(section, kind)
     section.finish()
     return found
@@ -228,10 +230,10 @@ def _all(root: Section, key: str) -> list[dict[str, Any]]:
 
 
 def _one_or_more(root: Section, key: str) -> list[dict[str, Any]]:
-    """An array of tables with at least one entry."""
+    """Return an array of tables with at least one entry."""
     found = _all(root, key)
     if not found:
-        raise root.fail(key, f"is missing; the schema or ISO/IEC 17025 asks for at least one [[{key}]]")
+        raise root.fail(key, f"is missing; the schema or ISO/IEC 17025 requires at least one [[{key}]]")
     return found
 
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from xmlschema import XMLSchema10
 
 
-# Elements of a certificate: names, texts that are safe in XML, and quantities as the D-SI schema has them.
+# Elements of a certificate: names, texts that are safe in XML, and quantities in the form of the D-SI schema.
 #
-# The tree is made with the standard library, which escapes every text; nothing is ever put together from strings.
+# The tree is made with the standard library, which escapes every text; XML is never assembled from strings.
 
 
 Element = ElementTree.Element
@@ -31,12 +31,12 @@ XSI = "http://www.w3.org/2001/XMLSchema-instance"
 #: Releases of the DCC schema that can be written, the newest last; 3.3.0 builds on D-SI 2.2.1, 3.2.1 on D-SI 2.1.0.
 VERSIONS = ("3.2.1", "3.3.0")
 NEWEST = VERSIONS[-1]
-#: Language of the program's own texts; texts of the user carry no language.
+#: Language of the program's texts; texts of the user have no language attribute.
 LANGUAGE = "en"
 
 _ILLEGAL = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-# the prefixes of PTB's documents; the standard library keeps them for the whole program
+# the prefixes of PTB's documents; the standard library registers them for the whole process
 ElementTree.register_namespace("dcc", DCC)
 ElementTree.register_namespace("si", SI)
 
@@ -51,7 +51,7 @@ def legal(text: object) -> str:
 
 
 def flat(text: object) -> str:
-    """Return ``text`` on one line without space at its ends, as ``dcc:notEmptyStringType`` asks for."""
+    """Return ``text`` on one line without space at its ends, as ``dcc:notEmptyStringType`` requires."""
     return " ".join(legal(text).split())
 
 
@@ -66,7 +66,7 @@ def _element(namespace: str, tag: str, parts: Sequence[Element | str | None], at
 
 
 def dcc(tag: str, *parts: Element | str | None, **attributes: str) -> Element:
-    """Return an element of the DCC namespace with its children in the given order; None is left out."""
+    """Return an element of the DCC namespace with its children in the given order; None is skipped."""
     return _element(DCC, tag, parts, attributes)
 
 
@@ -76,22 +76,22 @@ def si(tag: str, *parts: Element | str | None) -> Element:
 
 
 def said(tag: str, text: str) -> Element:
-    """Return a text of the program, in its language."""
+    """Return a text of the program, with its language."""
     return dcc(tag, dcc("content", text, lang=LANGUAGE))
 
 
 def given(tag: str, text: object) -> Element:
-    """Return a text of the user; its language is not known."""
+    """Return a text of the user, whose language is unknown."""
     return dcc(tag, dcc("content", flat(text)))
 
 
 def optional(tag: str, text: object) -> Element | None:
-    """Return a plain element with ``text``, None where there is none."""
+    """Return a plain element with ``text``, None if there is no text."""
     return dcc(tag, flat(text)) if flat(text) else None
 
 
 def plain_number(value: float | None) -> str:
-    """Return a number with all its digits, ``NaN`` where it is not known.
+    """Return a number with all its digits, ``NaN`` if it is unknown.
 
     >>> plain_number(0.1), plain_number(1e-07), plain_number(None)
     ('0.1', '1e-07', 'NaN')
@@ -187,14 +187,14 @@ class DccSchema:
 def read_schema(path: str | Path) -> DccSchema:
     """Read ``dcc.xsd`` and the schemas that it imports from the disk.
 
-    An import with a relative path is followed. One with a web address is looked for below the folder of the schema, by
-    the end of its path: for ``https://ptb.de/si/v2.2.1/SI_Format.xsd`` as ``si/v2.2.1/SI_Format.xsd``, then
+    An import with a relative path is followed. One with a web address is searched for below the folder of the schema,
+    by the end of its path: for ``https://ptb.de/si/v2.2.1/SI_Format.xsd`` as ``si/v2.2.1/SI_Format.xsd``, then
     ``v2.2.1/SI_Format.xsd``, then ``SI_Format.xsd``. The W3C's schema of XML signatures comes with the library.
 
     Raises
     ------
     InputError
-        where a file is missing or is not a DCC schema of a release that can be written.
+        if a file is missing or is not a DCC schema of a supported release.
     """
     try:
         import xmlschema

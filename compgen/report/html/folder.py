@@ -31,12 +31,12 @@ from compgen.tables.synthesis import projector
 
 Kind = Literal["run", "identify", "verify", "compare", "accuracy"]
 
-#: Files that say what the folder is.
+#: Files that show what the folder contains.
 MARKS = ("result.json", "identify.json", "compare.json", "accuracy.json")
 #: Lines and characters of a controller file that the report shows.
 PREVIEW_LINES, PREVIEW_CHARACTERS = 40, 4000
-#: What is raised where machine file, errors and tables of a folder do not fit each other any more. The figures are in
-#: result.json; only what needs the tables themselves is left out then.
+#: Raised if machine file, errors and tables of a folder no longer match. The figures are in result.json; only what
+#: needs the tables themselves is omitted.
 UNFIT = (CompgenError, ValueError, ArithmeticError, LookupError, OSError)
 #: A larger JSON file is not a result of compgen.
 MOST_JSON = 50_000_000
@@ -55,7 +55,7 @@ class Volume:
 class ListedFile:
     """One file for the control as it is in the folder.
 
-    ``preview`` is its beginning; ``intact`` is None where no hash of it is known.
+    ``preview`` is its beginning; ``intact`` is None if its hash is unknown.
     """
 
     name: str
@@ -72,7 +72,7 @@ class ListedFile:
 class ControlFolder:
     """What the folder contains for one control: ``result.json``, ``manifest.json``, ``preflight.md``, files and the volume.
 
-    ``tables`` are the files read back with ``machine``, which has the settings of the export; None where they cannot be
+    ``tables`` are the files read back with ``machine``, which has the settings of the export; None if they cannot be
     read with it.
     """
 
@@ -94,9 +94,9 @@ class ControlFolder:
 
 @dataclass(frozen=True)
 class ReadingResiduals:
-    """Residuals of the readings, mm, shape (n,); ``station`` and commanded ``position_mm`` (n, 3) where there are some.
+    """Residuals of the readings, mm, shape (n,); ``station`` and commanded ``position_mm`` (n, 3) if known.
 
-    ``stated`` is what the measurement says of its instrument and operator.
+    ``stated`` is what the measurement states about instrument and operator.
     """
 
     residual_mm: FloatArray
@@ -108,7 +108,7 @@ class ReadingResiduals:
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """Everything that the report is made of; what the folder does not contain is empty or None."""
+    """All input of the report; what the folder does not contain is empty or None."""
 
     folder: Path
     kind: Kind
@@ -125,12 +125,12 @@ class ResultFolder:
 
 
 def read_folder(folder: str | Path) -> ResultFolder:
-    """Read the results in ``folder``; nothing outside it is looked at.
+    """Read the results in ``folder``; nothing outside it is read.
 
     Raises
     ------
     InputError
-        where there is no such folder, no result in it, or a file of it that cannot be read.
+        if the folder does not exist, has no result, or has a file that cannot be read.
     """
     base = Path(folder)
     if not base.is_dir():
@@ -184,7 +184,7 @@ def _kind(base: Path, controls: list[Path]) -> Kind:
 
 
 def _json(path: Path) -> dict[str, Any]:
-    """Contents of a JSON object; empty if there is no such file."""
+    """Return the contents of a JSON object; empty if there is no such file."""
     if not path.is_file():
         return {}
     content = read_bytes(path, MOST_JSON + 1)
@@ -259,7 +259,7 @@ def _control(folder: Path, machine: Machine | None) -> ControlFolder:
 
 
 def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
-    """The control's files that ``result.json`` names and that are in its folder; never a path out of the folder."""
+    """Return the control's files that ``result.json`` lists and that are in its folder; never a path outside the folder."""
     found = []
     for item in result.get("files", []):
         name = str(item.get("name", "")) if isinstance(item, dict) else ""
@@ -287,8 +287,8 @@ def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
 class TableCurve:
     """Values of one table of a control over its axis, ``unit`` um or urad.
 
-    ``error`` is True where the table contains one of the 21 errors by its name, otherwise it contains a correction.
-    A constant has no axis and one value.
+    ``error`` is True if the table contains one of the 21 errors, otherwise it contains a correction. A constant has no
+    axis and one value.
     """
 
     name: str
@@ -300,10 +300,10 @@ class TableCurve:
 
 
 def table_curves(errors: ErrorTable | None, control: ControlFolder) -> tuple[TableCurve, ...]:
-    """Return the tables of a control as they act: its emulation, written in the basis of its tables.
+    """Return the tables of a control as they act: its emulation, expressed in the basis of its tables.
 
-    The values are those that reproduce the emulated correction over the volume best, which is all there is to tell
-    where one table of a control can replace another. Empty where errors are missing or the files cannot be read.
+    The values reproduce the emulated correction over the volume best, which is all that can be known if one table of a
+    control can replace another. Empty if errors are missing or the files cannot be read.
     """
     machine, tables = control.machine, control.tables
     if machine is None or tables is None or errors is None:

@@ -34,7 +34,7 @@ from compgen.report.html.folder import ReadingResiduals, TableCurve, Volume
 
 @dataclass(frozen=True)
 class CurveSeries:
-    """One line of a picture for hover and keyboard: its name, positions in mm, values and standard uncertainties."""
+    """One line of a chart for hover and keyboard: its name, positions in mm, values and standard uncertainties."""
 
     name: str
     position_mm: FloatArray
@@ -42,7 +42,7 @@ class CurveSeries:
     u: FloatArray | None = None
 
     def data(self) -> dict[str, Any]:
-        """Return the series as the page's script takes it."""
+        """Return the series as the page's script expects it."""
         found = {"name": self.name, "x": rounded(self.position_mm, 7), "y": rounded(self.value)}
         if self.u is not None and np.isfinite(self.u).any():
             found["U"] = rounded(COVERAGE * self.u, 2)
@@ -50,7 +50,7 @@ class CurveSeries:
 
 
 def describe_error(name: str) -> str:
-    """Say in words what an error is, e.g. ``"Straightness of X in Y"``."""
+    """Return an error in words, e.g. ``"Straightness of X in Y"``."""
     error = error_named(name)
     axis = AXES[error.axis]
     if error.kind == "linear":
@@ -65,7 +65,7 @@ def describe_error(name: str) -> str:
 def draw_curves(
     identified: ErrorTable, fitted: ErrorTable | None, tables: Mapping[str, Sequence[TableCurve]]
 ) -> list[Picture]:
-    """Return one picture for each of the 18 functions that was identified."""
+    """Return one picture for each identified error curve."""
     return [_draw_curve(name, identified, fitted, tables) for name in CURVE_NAMES if name in identified.curves]
 
 
@@ -109,7 +109,7 @@ def _draw_curve(
 
 
 def draw_tables(control: str, number: int, curves: Sequence[TableCurve]) -> list[Picture]:
-    """Return pictures of the tables of one control that contain corrections, those of one axis and unit together."""
+    """Return pictures of the tables of one control that contain corrections, one for each axis and unit."""
     groups: dict[tuple[str, str], list[TableCurve]] = {}
     for curve in curves:
         if curve.axis is not None and not curve.error:
@@ -135,7 +135,7 @@ def draw_tables(control: str, number: int, curves: Sequence[TableCurve]) -> list
 
 
 def draw_squareness(identified: ErrorTable) -> list[Picture]:
-    """Return the squareness errors as bars with expanded uncertainty; nothing where there are none."""
+    """Return the squareness errors as bars with expanded uncertainty; nothing if there are none."""
     names = list(identified.squareness)
     if not names:
         return []
@@ -175,7 +175,7 @@ class VolumeOnGrid:
 def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
     """Return the grid that the points of a volume fill; None if they do not.
 
-    Where the same point occurs several times (both directions of travel), the mean counts.
+    If a point occurs several times (both directions of travel), the mean is used.
     """
     if volume is None:
         return None
@@ -227,7 +227,7 @@ def nice(value: float) -> float:
 
 
 def thousands(value: float) -> str:
-    """Return a large number with its thousands set apart.
+    """Return a large number with its thousands separated.
 
     >>> thousands(2e6).split()
     ['2', '000', '000']
@@ -236,7 +236,7 @@ def thousands(value: float) -> str:
 
 
 def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
-    """Return the volume as a grid of lines, enlarged: before, after at the same scale, after at a scale of its own."""
+    """Return the volume as a grid of lines, enlarged: before, after at the same scale, after at its own scale."""
     longest = max(float(np.ptp(level)) for level in grid.levels_mm)
     before_scale, after_scale = (
         min(nice(DRAWN_SHARE * longest / max(float(np.linalg.norm(part, axis=-1).max()), 1e-9)), MOST_ENLARGED)
@@ -284,7 +284,7 @@ def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
 
 
 def _space(points: Sequence[FloatArray]) -> Plot:
-    """Axes of a picture in space: one scale for both directions, and a margin for texts."""
+    """Return the axes of a picture in space: one scale for both directions, and a margin for texts."""
     left, top, right, bottom = box = (0.0, 0.0, *WIDE)
     flat = np.concatenate([part.reshape(-1, 2) for part in points])
     low, high = np.nanmin(flat, axis=0), np.nanmax(flat, axis=0)
@@ -323,7 +323,7 @@ def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
 
 
 def _plane(grid: VolumeOnGrid, field_mm: FloatArray, axis: int) -> tuple[list[FloatArray], FloatArray]:
-    """The middle plane across ``axis``: edges of its cells along each axis, mm, and errors (up, across, 3), um."""
+    """Return the middle plane across ``axis``: edges of its cells along each axis, mm, and errors (up, across, 3), um."""
     edges = [np.linspace(level[0], level[-1], 2 if k == axis else CELLS + 1) for k, level in enumerate(grid.levels_mm)]
     centres = [0.5 * (part[:-1] + part[1:]) for part in edges]
     return edges, resampled(grid, field_mm, centres).squeeze(axis).swapaxes(0, 1) * 1e3
@@ -335,12 +335,12 @@ def _plane(grid: VolumeOnGrid, field_mm: FloatArray, axis: int) -> tuple[list[Fl
 BINS = 41
 #: Rays drawn for each station.
 RAYS = 60
-#: Histograms: stations beyond this number are drawn together.
+#: Histograms: more stations than this are drawn together.
 MOST_PANELS = 8
 
 
 def residual_groups(residuals: ReadingResiduals) -> dict[str, FloatArray]:
-    """Return the residuals of the used readings by station, um; all together where they have none or too many."""
+    """Return the residuals of the used readings by station, um; all together if they have none or too many."""
     used = residuals.used
     names = np.array(residuals.station)
     stations = list(dict.fromkeys(residuals.station))
@@ -380,7 +380,7 @@ def draw_residuals(residuals: ReadingResiduals) -> list[Picture]:
 
 
 def draw_stations(stations: Sequence[Mapping[str, Any]], residuals: ReadingResiduals | None) -> list[Picture]:
-    """Return the stations in space with rays to some of the points that they saw; nothing where none is known."""
+    """Return the stations in space with rays to some of their points; nothing if none is known."""
     places = {str(item["station"]): np.array(item["position_mm"], dtype=np.float64) for item in stations}
     if not places:
         return []

@@ -43,10 +43,10 @@ from compgen.resources import data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.verification import coverage_of
 
-# Figures of ISO 230 in the report: those of the folder, else those of the identified errors.
+# Figures of ISO 230 in the report: those in the folder, otherwise those of the identified errors.
 
 
-# The report as plain data: what `report.json` holds, with the figures of ISO 230 and the limitations.
+# The report as plain data: contents of `report.json`, with the figures of ISO 230 and the limitations.
 
 #: Reference line of straightness and squareness.
 LINE = "ls"
@@ -61,15 +61,15 @@ GROUPS = {
     "squareness indication": "Squareness, an indication from the diagonals",
 }
 
-#: Groups that every error of the machine has a part in: without all of them they would claim what was not measured.
+#: Groups to which every error of the machine contributes: without all errors they would claim what was not measured.
 VOLUMETRIC = ("volume", "orientation", "diagonals", "squareness indication")
 
 
 def accuracy_groups(source: ResultFolder) -> dict[str, Any]:
     """Return the figures by group with rows ``key, value, U, unit, meaning``, and in words what they refer to.
 
-    Those of ``accuracy.json`` where it is there; else the machine as it was identified, and beside its positioning and
-    diagonals what they become with the tables of each control as they were read back.
+    They come from ``accuracy.json`` if it exists; otherwise from the machine as identified, with positioning and
+    diagonals also for the tables of each control as read back.
     """
     if source.accuracy:
         figures = source.accuracy.get("figures", {})
@@ -79,7 +79,7 @@ def accuracy_groups(source: ResultFolder) -> dict[str, Any]:
         return {}
     try:
         return _of_errors(source, source.machine, source.identified)
-    except (CompgenError, ValueError, LookupError):  # errors that do not fit the machine file of the folder
+    except (CompgenError, ValueError, LookupError):  # errors that do not match the machine file of the folder
         return {}
 
 
@@ -91,7 +91,7 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
     coverage = coverage_of(machine, errors)
     for name in VOLUMETRIC if coverage.missing else ():
         found.pop(name, None)
-    partial = f"{coverage.text}: no figures of the volume and its diagonals, since the other errors are not known"
+    partial = f"{coverage.text}: no figures of the volume and its diagonals, because the other errors are unknown"
     groups = [
         {"name": GROUPS[name], "rows": _rows({key: item.summary() for key, item in group.items()})}
         for name, group in found.items()
@@ -151,12 +151,12 @@ def _compared(name: str, group: Any) -> dict[str, Any]:
     return {"name": GROUPS.get(name, name), "rows": rows}
 
 
-# What the figures of a report do not say, in words, as far as it follows from what was done.
+# What the figures of a report do not say, in words.
 
 
 ALWAYS = (
     "Before and after are computed: the exact model of the machine moves with the identified errors, without and with "
-    "what the files make the emulated control add. A measurement after loading is still needed.",
+    "what the emulated control adds with these files. A measurement after loading is still needed.",
     "Quasi-static geometric errors of three linear axes only: no thermal drift, load, dynamics, spindle or rotary axes.",
     "The figures follow published formulas of ISO 230-1 and ISO 230-2; the program is not certified against the "
     "standards.",
@@ -166,17 +166,17 @@ ALWAYS = (
 
 
 def limitations(source: ResultFolder) -> list[str]:
-    """Return what the reader should not take from this report."""
+    """Return the limitations of this report."""
     found = list(ALWAYS) if source.controls else list(ALWAYS[1:])
     identify = source.identify
     if identify.get("unobservable"):
-        found.append(f"Not observable, and left at zero: {'; '.join(map(str, identify['unobservable']))}.")
+        found.append(f"Not observable and set to zero: {'; '.join(map(str, identify['unobservable']))}.")
     if identify and not identify.get("systematic"):
         found.append(
-            "No systematic input (wavelength, temperature, target, drift) was stated; none is in the uncertainties."
+            "No systematic input (wavelength, temperature, target, drift) was stated; the uncertainties include none."
         )
     if identify.get("u_length", identify.get("u_deviation", {})).get("source") == "assumed":
-        found.append("The uncertainty of the readings was assumed, and scaled by the residuals.")
+        found.append("The uncertainty of the readings was assumed and scaled by the residuals.")
     for item in source.controls:
         found += [f"{item.name}: {text}" for text in item.manifest.get("unverified", [])]
         if not item.manifest:
@@ -189,7 +189,7 @@ def limitations(source: ResultFolder) -> list[str]:
     return found
 
 
-# The report as plain data: what ``report.json`` holds, and what page, dossier and terminal say.
+# The report as plain data: the contents of ``report.json``, for page, dossier and terminal.
 
 
 #: Figures of a residual field and what they are.
@@ -201,7 +201,7 @@ FIGURES = (
     ("v_y_um", "V_Y, range of the Y component (ISO 230-1)"),
     ("v_z_um", "V_Z, range of the Z component (ISO 230-1)"),
 )
-#: States of tables from the best to the worst, and how they are called; the middle ones are amber on the page.
+#: States of tables from best to worst, with their headings; the middle ones are amber on the page.
 VERDICTS = {
     "accepted": "Accepted",
     "partial": "Accepted, partial",
@@ -211,7 +211,7 @@ VERDICTS = {
 }
 
 
-#: What the report takes over from ``identify.json``, where there is something.
+#: What the report takes from ``identify.json``, if present.
 MEASUREMENT = (
     "method", "readings", "readings_used", "residual_rms_um", "residual_max_um", "reduced_chi_square", "degrees_of_freedom",
     "rank", "unknowns", "u_length", "u_deviation", "unobservable", "rejected", "segments", "stations", "corrections",
@@ -225,7 +225,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
     identified = {} if source.identified is None else source.identified.metadata
     manifests = [item.manifest for item in source.controls]
     results = (source.compare, source.accuracy, *(item.result for item in source.controls))
-    # a folder's name says nothing about what is in it
+    # the name of a folder says nothing about its contents
     title = "Machine without a name" if source.machine is None else source.machine.name
     if source.machine is None:
         named = chain(
@@ -303,7 +303,7 @@ def _mapping(value: Any) -> Mapping[str, Any]:
 
 
 def _state(result: Mapping[str, Any]) -> str:
-    """The state of a control's tables; results of earlier versions say only whether they are accepted, and partial."""
+    """The state of a control's tables; results of earlier versions only have accepted and partial."""
     if not result.get("accepted"):
         return "rejected"
     state = str(result.get("verdict", "partial" if result.get("partial") else "accepted"))
@@ -311,24 +311,24 @@ def _state(result: Mapping[str, Any]) -> str:
 
 
 def why_uncorrected(name: str) -> str:
-    """Say why an error remains, by its name: what the control would need to take it out."""
+    """Return why an error remains, by its name: what the control would need to correct it."""
     if name not in _KNOWN:
-        return "acts differently in the two directions of travel; these tables act in both alike"
+        return "differs between the two directions of travel; these tables act alike in both"
     error = error_named(name)
     if error.kind == "squareness":
-        return "an axis out of square moves another axis in proportion; that needs a table of one axis over another"
+        return "moves another axis in proportion to the travel; that needs a table of one axis over another"
     if error.is_straightness:
         return "moves another axis than the one that travels; that needs a table of one axis over another"
     if error.kind == "angular":
         return "acts through a lever that other axes change; that needs a table times an axis position, or a field"
-    return "the table's steps, rounding or zero point leave this part of it"
+    return "the interval, rounding or zero point of the table leave this part"
 
 
 _KNOWN = {f"E{d}{a}" for d in "XYZABC" for a in "XYZ"} | {"EC0Y", "EB0Z", "EA0Z"}
 
 
 def um(value: Any) -> str:
-    """A figure in um with a sensible number of digits; a dash where there is none.
+    """Return a figure in um with a sensible number of digits; a dash for None.
 
     >>> um(2964.4), um(12.34), um(0.3959), um(None)
     ('2964', '12.3', '0.40', '–')
@@ -338,8 +338,8 @@ def um(value: Any) -> str:
 
 #: Verdicts of a comparison in words.
 COMPARED = {
-    "better": "Better: the bands before and after separate",
-    "worse": "Worse: the bands before and after separate",
+    "better": "Better: the intervals before and after do not overlap",
+    "worse": "Worse: the intervals before and after do not overlap",
     "not separated": "No difference beyond the uncertainty",
     "smaller": "Smaller, by figures without uncertainty",
     "larger": "Larger, by figures without uncertainty",
@@ -351,7 +351,7 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
         state = max((str(item["state"]) for item in controls), key=list(VERDICTS).index)
         return {"state": state, "headline": _headline(state, controls), "text": _verdict_text(controls)}
     if source.kind == "compare":
-        # Green only where the bands separate.
+        # Green only if the intervals do not overlap.
         word = str(source.compare.get("verdict", ""))
         decided = ", ".join(map(str, source.compare.get("decided_by", [])))
         return {
@@ -381,12 +381,12 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
 
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
     if len(controls) == 1 and state == "partial" and not controls[0]["volumetric"]:
-        return f"Partial: {controls[0]['measured']}; the tables correct what was measured and nothing else"
+        return f"Partial: {controls[0]['measured']}; the tables correct only what was measured"
     if len(controls) == 1:
         return {
-            "accepted": "The tables may be loaded, by the preflight list",
-            "partial": "The tables may be loaded, by the preflight list, but much of the error is beyond this control",
-            "accepted_with_reservations": "The tables may be loaded, by the preflight list, with the reservations below",
+            "accepted": "The tables may be loaded, following the preflight list",
+            "partial": "The tables may be loaded, following the preflight list, but much of the error remains",
+            "accepted_with_reservations": "The tables may be loaded, following the preflight list, with the reservations below",
             "better_after_new_setup": "Better only after the workpiece is set up anew",
             "rejected": "Do not load these tables",
         }[state]
@@ -402,11 +402,11 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
     change = f"goes from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms"
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
-    bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is not known)"
+    bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is unknown)"
     if not best["volumetric"]:
         return (
-            f"{name} effect of the measured errors alone {change} {bounds}, by the files read back. The error "
-            "over the volume is not known: the other errors were not measured."
+            f"{name} effect of the measured errors alone {change} {bounds}, as read back from the files. The error "
+            "over the volume is unknown: the other errors were not measured."
         )
     text = (
         f"{name} error of the tool tip over the volume {change} {bounds}, with the reference point fixed, by the files "
@@ -419,7 +419,7 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _errors(table: ErrorTable | None) -> list[dict[str, Any]]:
-    """One row for each error: largest value and uncertainty, and all values, in the unit of the files."""
+    """Return a row for each error: largest value and uncertainty, and all values, in the unit of the files."""
     rows: list[dict[str, Any]] = []
     for name in table.names if table is not None else ():
         assert table is not None
@@ -458,7 +458,7 @@ def _machine(source: ResultFolder) -> dict[str, Any]:
 # The HTML page: Jinja2 with every text escaped, one style sheet, one script, and a policy that forbids the network.
 
 
-#: Markdown that the preflight lists are made of; no raw HTML, links or pictures.
+#: Markdown of the preflight lists; no raw HTML, links or pictures.
 _OFF = ("html_block", "html_inline", "link", "image", "autolink", "reference")
 
 
@@ -476,7 +476,7 @@ def render_page(
     data : from :func:`compgen.report.html.write.content`.
     pictures : by group: ``curves``, ``squareness``, ``measurement``, and ``space-K``, ``slices-K``, ``tables-K`` for
         control K.
-    seconds : how long the drawing took; None leaves it out.
+    seconds : how long the drawing took; None omits it.
     """
     environment = _environment()
     style, script, policy = page_assets("charts.js", "script.js")
@@ -516,7 +516,7 @@ def _environment() -> Environment:
 
 
 def script_data(value: Any) -> Markup:
-    r"""Return data as JSON that stays data inside a script element, whatever texts it holds.
+    r"""Return data as JSON that stays data inside a script element, whatever texts it contains.
 
     >>> print(script_data({"a": "</script><!--"}))
     {"a":"\u003c/script\u003e\u003c!--"}
@@ -540,11 +540,11 @@ def markdown(text: str) -> Markup:
 # geometric errors, determination, compensation, validation, documentation).
 
 
-#: Characters that mean something in Markdown or HTML.
+#: Characters with a meaning in Markdown or HTML.
 _SPECIAL = "\\`*_{}[]<>()#+!|&~"
 
 
-#: What the dossier says of the tables of a control, and of their verification.
+#: What the dossier contains about the tables of a control and their verification.
 TABLES = ("name", "format", "evidence", "settings", "sign_statement", "parameters", "files")
 VERIFICATION = (
     "name", "state", "headline", "measured", "objections", "points", "before", "after", "before_rigid", "after_rigid",
@@ -575,7 +575,7 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def plain_markdown(value: Any) -> str:
-    r"""Return a value as one line of Markdown that says just that, whatever it contains.
+    r"""Return a value as one line of Markdown that shows it literally, whatever it contains.
 
     >>> plain_markdown("a|b <img>")
     'a\\|b \\<img\\>'
@@ -629,11 +629,11 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
 
 
 def _section(title: str, lines: list[str]) -> list[str]:
-    return [f"## {title}", "", *(lines if any(lines) else ["The folder contains nothing about this."]), ""]
+    return [f"## {title}", "", *(lines if any(lines) else ["No data in the folder."]), ""]
 
 
 def _pairs(data: Mapping[str, Any]) -> list[str]:
-    """Values as a list; longer parts (stations, rejected readings) are counted, their numbers are in the JSON files."""
+    """Return values as a list; longer parts (stations, rejected readings) are counted, their numbers are in the JSON files."""
     lines = []
     for key, value in data.items():
         if value in (None, "", [], {}):
@@ -653,7 +653,7 @@ def _value(value: Any) -> str:
 
 
 def _table(head: list[str], rows: list[list[Any]], raw: int | None = None) -> list[str]:
-    """A Markdown table; column ``raw`` is Markdown already."""
+    """Return a Markdown table; column ``raw`` is already Markdown."""
     if not rows:
         return []
     lines = [f"| {' | '.join(head)} |", f"|{'---|' * len(head)}"]
@@ -698,7 +698,7 @@ def _statements(data: Mapping[str, Any]) -> list[str]:
 # ``calibration.json``: the results in the order of a Digital Calibration Certificate, as documented JSON.
 #
 # It is not a DCC: that is an XML document of PTB's schema (namespace ``https://ptb.de/dcc``), issued and signed by a
-# laboratory. Its parts and units are named alike, so that a laboratory can take the numbers over.
+# laboratory. Its parts and units have the same names, so that a laboratory can adopt the numbers.
 
 
 #: Share of values within the expanded uncertainty, for k = 2 and a normal distribution.
@@ -748,7 +748,7 @@ def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _list(values: Sequence[Any], unit: str, standard: Sequence[Any] = ()) -> dict[str, Any]:
-    """A list of real quantities as D-SI has it: values, one unit, expanded uncertainties where all are known."""
+    """Return a list of real quantities in the form of D-SI: values, one unit, expanded uncertainties if all are known."""
     found: dict[str, Any] = {"valueXMLList": list(values), "unitXMLList": [UNITS[unit]]}
     if standard and None not in standard:
         found["expandedUncXMLList"] = {
@@ -788,7 +788,7 @@ Further = Callable[[Mapping[str, Any]], Mapping[str, bytes]]
 
 @dataclass(frozen=True)
 class Report:
-    """A report in memory: the texts by file name, and the numbers that they hold."""
+    """A report in memory: the texts by file name, and their numbers."""
 
     files: Mapping[str, str]
     data: Mapping[str, Any]
@@ -800,7 +800,7 @@ def build_report(folder: str | Path) -> Report:
     Raises
     ------
     InputError
-        where the folder contains no results, or one of its files cannot be read.
+        if the folder contains no results, or one of its files cannot be read.
     """
     source = read_folder(folder)
     data = json_values(content(source))
@@ -824,7 +824,7 @@ def write_report(
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
-    ``also`` makes further files, by name, from the numbers of the report.
+    ``also`` makes additional files, by name, from the numbers of the report.
     """
     target = OutputFolder(out if out is not None else folder)
     report = build_report(folder)
@@ -862,7 +862,7 @@ STYLES = {"accepted": "bold green", "rejected": "bold red", "neutral": "bold"}
 
 
 def short_text(data: Mapping[str, Any]) -> Group:
-    """Return verdict, one line per control, the largest error that remains, and where to read on."""
+    """Return verdict, one line per control, the largest error that remains, and where to find more."""
     verdict = data["verdict"]
     lines = [Text(f"{data['title']}: {verdict['headline']}", STYLES.get(verdict["state"], "bold yellow"))]
     if verdict["text"]:

@@ -1,4 +1,4 @@
-"""Effects: what acts on a simulated machine and its tracers besides the geometric errors, as forward formulas."""
+"""Effects: what acts on a simulated machine and its tracers in addition to the geometric errors, as forward formulas."""
 
 from compgen.simulate.effects.forward import (
     EFFECTS,

@@ -98,7 +98,7 @@ def over_travel(machine: Machine, stops: Stops, axis: int) -> FloatArray:
 
 
 def from_reference(values: FloatArray, settings: Mapping[str, float], key: str) -> FloatArray:
-    """Values less the setting ``key``, by default less their mean."""
+    """Return values minus the setting ``key``, by default minus their mean."""
     return values - settings.get(key, float(values.mean()))
 
 
@@ -115,12 +115,12 @@ def _along(axis: int, moved_mm: FloatArray) -> FloatArray:
 
 
 def backlash(axis: int, p: Values, settings: Values) -> Displacement:
-    """Half the play, to the side that the axis came from."""
+    """Half the backlash, towards the side from which the axis came."""
     return lambda machine, stops: _along(axis, p["c_um"] * stops.approach[:, axis])
 
 
 def lost_motion(axis: int, p: Values, settings: Values) -> Displacement:
-    """Play that changes along the stroke."""
+    """Backlash that changes along the travel."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         s = over_travel(machine, stops, axis)
@@ -142,7 +142,7 @@ def periodic(axis: int, p: Values, settings: Values) -> Displacement:
 
 
 def servo_lag(axis: int, p: Values, settings: Values) -> Displacement:
-    """A time times the velocity of the axis on the way to the stop."""
+    """A time constant times the velocity of the axis before the stop."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         speed = channel(stops, "feed_mm_min") / SECONDS_PER_MIN
@@ -153,7 +153,7 @@ def servo_lag(axis: int, p: Values, settings: Values) -> Displacement:
 
 
 def thermal_scale(axis: int, p: Values, settings: Values) -> Displacement:
-    """A scale that grows about the point where it is fixed."""
+    """A scale that expands about its fixed point."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         fixed = settings.get("fixed_mm", machine.reference_point_mm[axis])
@@ -171,7 +171,7 @@ def spindle_growth(axis: int, p: Values, settings: Values) -> Displacement:
 
 
 def cosine_error(axis: int, p: Values, settings: Values) -> Displacement:
-    """A scale that leans by theta: it is at p cos(theta) when sent to p."""
+    """A scale inclined by theta: the axis is at p cos(theta) when commanded to p."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         theta = math.sqrt(max(2.0 * p["c_ppm"], 0.0))
@@ -181,7 +181,7 @@ def cosine_error(axis: int, p: Values, settings: Values) -> Displacement:
 
 
 def warmup_drift(p: Values, settings: Values) -> RunEffect:
-    """A drift that dies out: the readings of an axis that warms up, or of its sensor."""
+    """A decaying drift: the readings of an axis that warms up, or of its sensor."""
 
     def change(time_s: FloatArray) -> FloatArray:
         since = time_s - settings.get("start", float(time_s.min()))
@@ -191,7 +191,7 @@ def warmup_drift(p: Values, settings: Values) -> RunEffect:
 
 
 def linear_drift(p: Values, settings: Values) -> RunEffect:
-    """A drift at a constant rate that comes to ``c_um`` within ``span``, by default from the first to the last reading."""
+    """A drift at a constant rate that reaches ``c_um`` within ``span``, by default from the first to the last reading."""
 
     def change(time_s: FloatArray) -> FloatArray:
         since = time_s - settings.get("start", float(time_s.min()))
@@ -229,7 +229,7 @@ def off_between(name: str) -> Callable[[Values, Values], RunEffect]:
 
 
 def settling(axis: int, p: Values, settings: Values) -> Displacement:
-    """What is still missing at the reading, towards the side that the axis came from; the dwell makes it less."""
+    """Settling error at the reading, towards the side from which the axis came; the dwell reduces it."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         missing = p["c_um"] * np.exp(-channel(stops, "dwell_s") / settings["tau_s"])
@@ -262,7 +262,7 @@ AXIS_EFFECTS = {
 
 
 X, Y, Z = 0, 1, 2
-#: Angle by which a carriage is turned to see what an angular error moves, rad.
+#: Angle by which a carriage is rotated to find what an angular error moves, rad.
 SMALL_RAD = 1e-3
 
 
@@ -282,20 +282,20 @@ def _moved_by(machine: Machine, stops: Stops, name: str, value: FloatArray) -> F
 
 
 def lever(name: str, p: Values, settings: Values) -> Displacement:
-    """An angular error along its axis, turning all that hangs on it."""
+    """An angular error along its axis, which rotates everything mounted on it."""
     return lambda machine, stops: _moved_by(machine, stops, name, _curve(machine, stops, error_named(name).axis, p))
 
 
 def squareness(short: str, p: Values, settings: Values) -> Displacement:
-    """An axis that leans."""
+    """An axis out of square."""
     return lambda machine, stops: _moved_by(machine, stops, f"E{short}", np.full(len(stops), p["c_urad"]))
 
 
 def sign(name: str, p: Values, settings: Values) -> Displacement:
-    """One of two products of an angular error, taken with the other sign."""
+    """One of two products of an angular error, with the wrong sign."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
-        # what the angle moves: (component, axis whose travel is the lever, sign), by turning a carriage
+        # what the angle moves: (component, axis whose travel is the lever, sign), found by rotating a carriage
         arms = []
         for axis in (axis for axis in range(3) if axis != error_named(name).axis):
             errors = np.zeros((2, len(ERROR_INDEX)))
@@ -327,7 +327,7 @@ def beam_sag(p: Values, settings: Values) -> Displacement:
 
 
 def ram_droop(p: Values, settings: Values) -> Displacement:
-    """A ram that droops the more it leans out."""
+    """A ram that droops with its extension."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         y, z = over_travel(machine, stops, Y), over_travel(machine, stops, Z)
@@ -338,7 +338,7 @@ def ram_droop(p: Values, settings: Values) -> Displacement:
 
 
 def load_deflection(p: Values, settings: Values) -> Displacement:
-    """A bed that gives under the workpiece."""
+    """A bed that deflects under the load of the workpiece."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         x, y = over_travel(machine, stops, X), over_travel(machine, stops, Y)
@@ -365,12 +365,12 @@ def _vector(p: Values) -> FloatArray:
 
 
 def machine_jump(p: Values, settings: Values) -> Displacement:
-    """A displacement from a time on."""
+    """A displacement that begins at a time."""
     return lambda machine, stops: np.outer(stops.time_s >= settings["time_s"], _vector(p))
 
 
 def tool_offset_error(p: Values, settings: Values) -> Displacement:
-    """A displacement in one set-up: that of the label, else of the tool offsets in order of size."""
+    """A displacement in one set-up: that of the label, otherwise of the tool offsets in order of size."""
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         if "setup" in stops.labels:
@@ -409,7 +409,7 @@ def refractive_index(p: Values, settings: Values) -> Change:
 
 
 def dead_path(p: Values, settings: Values) -> Change:
-    """A piece of air for each station; without an entry a station has none."""
+    """An air path error for each station; none for a station without an entry."""
 
     def change(sights: Sights) -> FloatArray:
         path = np.array([p.get(f"c_{name}_um_per_k", 0.0) for name in sights.stations])
@@ -424,7 +424,7 @@ def laser_scale(p: Values, settings: Values) -> Change:
 
 
 def target_angle(p: Values, settings: Values) -> Change:
-    """A target that is longer the steeper the beam comes in."""
+    """A target whose reading grows with the angle of incidence."""
 
     def change(sights: Sights) -> FloatArray:
         steepness = (sights.tip_mm[:, 2] - sights.station_mm[:, 2]) / sights.range_mm
@@ -439,7 +439,7 @@ def _of(station: str, sights: Sights) -> FloatArray:
 
 
 def station_drift(station: str, p: Values, settings: Values) -> Change:
-    """A station that walks away, at its true distance at each time."""
+    """A station that drifts, at its true distance at each time."""
 
     def change(sights: Sights) -> FloatArray:
         velocity = np.array([p["vx_um_per_h"], p["vy_um_per_h"], p["vz_um_per_h"]])
@@ -451,12 +451,12 @@ def station_drift(station: str, p: Values, settings: Values) -> Change:
 
 
 def length_step(station: str, p: Values, settings: Values) -> Change:
-    """Counts that were lost at a time."""
+    """Counts lost at a time."""
     return lambda sights: p["c_um"] * _of(station, sights) * (sights.time_s >= settings["time_s"])
 
 
 def tracer_runout(station: str, p: Values, settings: Values) -> Change:
-    """A sphere that is not round: harmonics of the direction in which the head looks."""
+    """A reference sphere with form error: harmonics of the pointing direction of the head."""
 
     def change(sights: Sights) -> FloatArray:
         line = sights.tip_mm - sights.station_mm
@@ -476,7 +476,7 @@ LENGTH_EFFECTS: dict[str, Callable[[Values, Values], Change]] = {
 STATION_EFFECTS = {"station_drift": station_drift, "length_step": length_step, "tracer_runout": tracer_runout}
 
 
-# Sections ``[[effects]]`` of a scenario: names, parameters and settings of the catalogue, or those of a plug-in.
+# Sections ``[[effects]]`` of a scenario: names, parameters and settings of the catalogue, or of a plug-in.
 
 
 SimulatedEffect = Displacement | LengthEffect | RunEffect
@@ -506,7 +506,7 @@ def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, .
     found: list[SimulatedEffect] = []
     for section in sections:
         name = section.take("name", toml_files.text)
-        if name in EFFECTS:  # by the reader of a plug-in
+        if name in EFFECTS:  # has the reader of a plug-in
             moving = EFFECTS[name](section)
             section.finish()
             problems = call_problem(moving, ["machine", "stops"], f"the effect {name}")
@@ -528,13 +528,13 @@ def read_effects(sections: list[toml_files.Section]) -> tuple[SimulatedEffect, .
 
 
 def _stations(name: str, section: toml_files.Section) -> tuple[str, ...]:
-    """Stations that the name of an effect and its keys speak of."""
+    """Return the stations in the name of an effect and its keys."""
     of_name = STATION_NAME.fullmatch(name)
     return tuple(dict.fromkeys([*([of_name.group(1)] if of_name else []), *dead_path_stations(section.data)]))
 
 
 def _built_in(name: str, p: Mapping[str, float], settings: Mapping[str, float]) -> SimulatedEffect | None:
-    """Return the forward formula of an effect of the catalogue, parameters in SI units; None for one of a plug-in."""
+    """Return the forward formula of an effect of the catalogue, parameters in SI units; None for an effect of a plug-in."""
     if name in SINGLE_EFFECTS:
         return SINGLE_EFFECTS[name](p, settings)
     if name in RUN_EFFECTS:
@@ -552,9 +552,9 @@ def _built_in(name: str, p: Mapping[str, float], settings: Mapping[str, float]) 
 
 
 def _of_columns(effect: Effect, values: FloatArray) -> Displacement:
-    """Simulate an effect of a plug-in's family by its own columns."""
+    """Simulate an effect of a plug-in's family by its columns."""
     if not isinstance(effect, DisplacementEffect):
-        raise InputError(f"{effect.card.name} does not move the tip, so a plug-in has to bring a reader for it")
+        raise InputError(f"{effect.card.name} does not move the tip, so a plug-in must provide a reader for it")
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         covariates = {"time_s": stops.time_s, **stops.covariates}
