@@ -292,6 +292,16 @@ def test_a_table_spans_the_travel_and_the_zero_of_the_motor(home, needed):
         assert [f"the travel needs {needed}" in text for text in found] == [True] * named
 
 
+@pytest.mark.parametrize("home", [-300.0, 0.0, 100.0, 437.5, 500.0])
+def test_a_function_is_zero_at_the_zero_of_its_motor(home):
+    machine = machine_with(tool=(0.0, 0.0, 0.0), home_mm={"X": home})
+    terms = [term for term in CONTROL(machine).basis(errors_of(EXX=1e-5, EZX=-2e-5)) if term.axis == 0]
+    assert len(terms) == 2
+    for term in terms:
+        assert term.zero_at_mm == pytest.approx(home)
+        assert np.interp(home, term.nodes_mm, term.start) == pytest.approx(0.0, abs=1e-15)
+
+
 def test_the_one_motor_that_is_free_takes_the_largest_function():
     machine = machine_with(tool=(0.0, 0.0, 0.0), motors_available=4)
     errors = errors_of(EZX=1e-5, EYX=4e-5, EXZ=1e-5, EXY=2e-5)  # over 800, 800, 500 and 800 mm
