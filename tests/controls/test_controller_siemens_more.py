@@ -454,7 +454,7 @@ def test_what_has_no_room_is_named_with_its_rms_the_largest_first(shape, steps):
     own = {"sign": "error", "mult_mode": "S1", "tables_available": 1, **({"step_mm": steps} if steps else {})}
     machine = machine_with("WFYXZT", {"siemens-cec": own})
     unknown = np.full(len(shape), np.nan)
-    sizes = {"EXY": 12e-3, "EZY": 5e-3, "EYX": 10e-3, "EZX": 15e-6}
+    sizes = {"EXY": 12e-3, "EXZ": 5e-3, "EYX": 10e-3, "EZX": 15e-6}
     curves = {
         name: Curve(
             np.linspace(*machine.axes["XYZ".index(name[2])].range_mm, len(shape)), size * np.array(shape), unknown
@@ -465,11 +465,31 @@ def test_what_has_no_room_is_named_with_its_rms_the_largest_first(shape, steps):
         text for text in export(machine, ErrorTable(curves), "siemens-cec").warnings if "not corrected are" in text
     ]
     found = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
-    assert [name for name, _ in found] == ["Y(x)", "Z(y)"]
+    assert [name for name, _ in found] == ["Y(x)", "X(z)"]
     together = re.search(r"together they leave ([\d.]+) um rms over the volume", note).group(1)
     due = [10.0, 5.0, np.hypot(10.0, 5.0)] / np.sqrt(3.0)
     # the figures are taken at a thinned sample of the volume, which is right to half a percent here
     assert [float(text) for text in (*(text for _, text in found), together)] == pytest.approx(due, rel=0.01)
+
+
+def test_what_encoder_tables_hold_is_not_missed_by_a_cross_table_that_has_no_room():
+    """A pitch error of 30 um from end to end has a mean; X(z) could take it up, but the encoder table of X has it."""
+    own = {"sign": "error", "mult_mode": "S1", "products": False, "tables_available": 1}
+    machine = machine_with("WFYXZT", {"siemens-cec-eec": own})
+    x, _, z = (axis.nodes_mm for axis in machine.axes)
+    unknown, shape = np.full(7, np.nan), np.array([0.0, *[1.0, -1.0, 0.0] * 2])
+    pitch = np.interp(x, [-350.0, -50.0, 450.0], [-0.002, 0.0, 0.03])
+    errors = ErrorTable(
+        {
+            "EXX": Curve(x, pitch, unknown),
+            "EYX": Curve(x, 10e-3 * shape, unknown),
+            "EXZ": Curve(z, 5e-3 * shape, unknown),
+        }
+    )
+    (note,) = [text for text in export(machine, errors, "siemens-cec-eec").warnings if "not corrected are" in text]
+    ((name, size),) = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
+    assert name == "X(z)"
+    assert float(size) == pytest.approx(5.0 / np.sqrt(3.0), rel=0.1)
 
 
 def test_more_tables_never_leave_more():
