@@ -489,7 +489,7 @@ def test_what_encoder_tables_hold_is_not_missed_by_a_cross_table_that_has_no_roo
     (note,) = [text for text in export(machine, errors, "siemens-cec-eec").warnings if "not corrected are" in text]
     ((name, size),) = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
     assert name == "X(z)"
-    assert float(size) == pytest.approx(5.0 / np.sqrt(3.0), rel=0.1)
+    assert float(size) == pytest.approx(5.0 / np.sqrt(3.0), rel=0.1)  # 9.5 with the mean of 9 um
 
 
 def test_more_tables_never_leave_more():
