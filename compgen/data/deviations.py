@@ -1,4 +1,4 @@
-"""Measured against commanded positions: deviations, and features of parts."""
+"""Positions measured against commanded ones: deviations, features of parts, and of artefacts under the machine's own probe."""
 
 from __future__ import annotations
 
@@ -30,12 +30,14 @@ from compgen.data.records import (
 from compgen.errors import InputError
 
 __all__ = [
+    "Artefact",
     "DEVIATION_COLUMNS",
     "PART",
     "Deviations",
     "RoughPose",
     "aligned",
     "format_deviations",
+    "read_artefacts",
     "read_deviations",
     "read_parts",
     "setups_of",
@@ -244,6 +246,112 @@ def _origin(table: CsvTable) -> FloatArray:
     if values.shape != (3,) or not np.isfinite(values).all():
         raise InputError(f"the comment origin_mm = {text!r} is not three numbers X, Y, Z in mm", file=table.path)
     return values
+
+
+# An artefact (plate, ring, step gauge) measured by the machine's own probe: ``*.artefact.csv``.
+
+
+@dataclass(frozen=True, repr=False)
+class Artefact(Displayed):
+    """Features of artefacts as the machine's own probe measured them, n rows.
+
+    Parameters
+    ----------
+    feature : name of the feature of each row; the same name in several set-ups is the same feature.
+    nominal_mm : its place in the artefact, (n, 3); that of a calibration where ``calibrated``.
+    u_nominal_mm : standard uncertainty of the calibrated place (n, 3); nan or zero: exact.
+    measured_mm : machine coordinates at which the probe found it, (n, 3); nan for a component that was not measured.
+    setup : number of the set-up, (n,); the artefact lies anew in each.
+    calibrated : whether the nominal places are calibrated, (n,); else every feature's own place is unknown.
+    tool_mm : offset of the probe, (n, 3), or None for the machine's tool.
+    metadata, origin : comments ``key = value`` of the file; file and line of each row.
+    """
+
+    feature: Sequence[str]
+    nominal_mm: FloatArray
+    u_nominal_mm: FloatArray
+    measured_mm: FloatArray
+    setup: NDArray[np.int64]
+    calibrated: NDArray[np.bool_]
+    tool_mm: FloatArray | None = None
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.feature)
+
+    def overview(self) -> Overview:
+        """Numbers of features and set-ups, and the box of the machine that they cover."""
+        kind = (
+            "calibrated" if self.calibrated.all() else "uncalibrated" if not self.calibrated.any() else "both kinds of"
+        )
+        title = f"{len(set(self.feature))} {kind} features in {len(np.unique(self.setup))} set-ups"
+        known = np.where(np.isnan(self.measured_mm).all(axis=0), self.nominal_mm, self.measured_mm)
+        return Overview(title, ("axis", "from (mm)", "to (mm)"), ranges_of(known))
+
+
+_ARTEFACTS = Schema(
+    (
+        Field("feature", ("feature",), CsvTable.names),
+        Field("xy_mm", POSITION_COLUMNS[:2]),
+        Field("z_mm", POSITION_COLUMNS[2:], presence="filled", fill=0.0),
+        Field("u_nominal_mm", ("u_x_um", "u_y_um", "u_z_um"), unit=MM_PER_UM, presence="filled"),
+        Field("measured_mm", MEASURED_COLUMNS, presence="filled"),
+        Field("setup", ("setup",), CsvTable.labels, presence="filled", fill=0),
+        TOOL,
+    )
+)
+
+
+def read_artefacts(files: str | Path | Sequence[str | Path]) -> Artefact:
+    """Read one or more ``*.artefact.csv`` files into one :class:`Artefact`; each file has set-ups of its own.
+
+    The comment ``# calibrated = false`` says that the nominal places are only nominal. Without ``z_mm`` all features lie in one
+    plane. A component of the machine that was not measured counts as the nominal one plus the comment ``# origin_mm = X, Y, Z``.
+
+    Raises
+    ------
+    InputError
+        for a feature that is twice in a set-up, or a file without a measured coordinate.
+    """
+    parts, first = [], 0
+    for table in _ARTEFACTS.read_tables(files):
+        values = _ARTEFACTS.values(table)
+        flag = table.metadata.get("calibrated", "true").lower()
+        if flag not in ("true", "false"):
+            raise InputError(f"the comment calibrated = {flag!r} is neither true nor false", file=table.path)
+        nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
+        if np.isnan(values["measured_mm"]).all():
+            raise InputError(f"has none of {', '.join(MEASURED_COLUMNS)}; at least one is needed", file=table.path)
+        keys = list(zip(values["feature"], values["setup"].tolist(), strict=True))
+        for row, key in enumerate(keys):
+            if keys.index(key) < row:
+                text = f"feature {key[0]!r} of set-up {int(key[1])} is already in line {table.lines[keys.index(key)]}"
+                raise table.fail(row, "feature", f"{text}; number the set-ups, or take the mean of repeats")
+        _, setup = np.unique(values.pop("setup"), return_inverse=True)
+        known = np.full(len(table), flag == "true")
+        found = Artefact(
+            nominal_mm=nominal_mm, setup=setup.ravel().astype(np.int64) + first, calibrated=known, **values
+        )
+        missing = np.isnan(found.measured_mm).all(axis=0)
+        shifted = np.where(missing, found.nominal_mm + _origin(table), found.nominal_mm)
+        parts.append(replace(found, nominal_mm=shifted))
+        first = int(found.setup.max()) + 1
+    tools = [part.tool_mm for part in parts]
+    if any(tool is None for tool in tools) and any(tool is not None for tool in tools):
+        raise InputError("some files have tool_x_mm, tool_y_mm, tool_z_mm, others not; give them in every file")
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("nominal_mm", "u_nominal_mm", "measured_mm", "setup", "calibrated")
+    }
+    return Artefact(
+        feature=[name for part in parts for name in part.feature],
+        tool_mm=None if tools[0] is None else np.concatenate([tool for tool in tools if tool is not None]),
+        metadata={key: value for part in parts for key, value in part.metadata.items()},
+        origin=[place for part in parts for place in part.origin],
+        **joined,
+    )
 
 
 def setups_of(deviations: Deviations) -> NDArray[np.int64]:

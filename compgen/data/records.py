@@ -324,8 +324,19 @@ def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
 def detect_format(source: str | Path) -> str | None:
     """Return the kind of a measurement file from its columns.
 
-    ``lengths``, ``deviations``, ``part``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
+    ``lengths``, ``deviations``, ``part``, ``artefact``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
     """
     if str(source).lower().endswith(ARCHIVE):
         return "lengths"
-    return format_of_columns(names_in_header(read_text(source)))
+    text = read_text(source)
+    kind = format_of_columns(names_in_header(text))
+    return "artefact" if kind == "part" and is_artefact(source, text) else kind
+
+
+def is_artefact(source: str | Path, text: str) -> bool:
+    """Whether a file of features was measured by the machine itself, by its name or the comment ``calibrated``.
+
+    Both have the same columns, but opposite signs: a part has the errors of the machine, its probe sees their opposite.
+    """
+    comment = any(line.lstrip("# ").startswith("calibrated") for line in text.splitlines()[:50] if line.startswith("#"))
+    return str(source).lower().endswith(".artefact.csv") or comment

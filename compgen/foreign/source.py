@@ -14,7 +14,7 @@ from typing import Literal
 from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_bytes
-from compgen.data.records import ARCHIVE, format_of_columns
+from compgen.data.records import ARCHIVE, format_of_columns, is_artefact
 from compgen.errors import InputError
 from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
@@ -385,7 +385,15 @@ def header_date(text: str, chosen: Order | None = None) -> tuple[str | None, str
 # :func:`open_measurement` and :func:`open_errors` take any file; a foreign one with open questions is refused with what
 # ``volcomp import`` needs. The converters are imported when a foreign file is read.
 
-_NATIVE_SUFFIXES = (".lengths.csv", ".deviations.csv", ".axis.csv", ".sixdof.csv", ".part.csv", ".circle.csv")
+_NATIVE_SUFFIXES = (
+    ".lengths.csv",
+    ".deviations.csv",
+    ".axis.csv",
+    ".sixdof.csv",
+    ".part.csv",
+    ".artefact.csv",
+    ".circle.csv",
+)
 
 
 def native_format(path: Path) -> str | None:
@@ -396,7 +404,10 @@ def native_format(path: Path) -> str | None:
     head = read_head(path)
     if head.startswith((b"PK\x03\x04", b"HEADER::", b"\xff\xfe", b"\xfe\xff")):
         return None
-    kind = format_of_columns(names_in_header(decode_head(head).lstrip("\ufeff")), complete=True)
+    text = decode_head(head).lstrip("\ufeff")
+    kind = format_of_columns(names_in_header(text), complete=True)
+    if kind == "part" and is_artefact(path, text):
+        return "artefact"
     if kind not in (None, "sixdof", "part"):
         check_size(path, MOST_OWN_BYTES)
     return kind

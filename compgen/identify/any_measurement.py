@@ -28,7 +28,7 @@ from compgen.identify.tracer_lengths import identify
 if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
-    from compgen.data.deviations import Deviations
+    from compgen.data.deviations import Artefact, Deviations
     from compgen.data.length_archive import LengthArchive
     from compgen.identify.six_dof import SixDofMeasurement
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 SMALLEST_UM = 0.1
 
 
-OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | Circles | SixDofMeasurement"
+OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | Circles | Artefact | SixDofMeasurement"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,10 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     for path in paths:
         found = detect_format(path)  # of a file that is no measurement, the reader of lengths says best what is missing
         kinds.setdefault(
-            found if found in ("part", "axis", "circle", "deviations", "sixdof", "diagonals") else "lengths", []
+            found
+            if found in ("part", "artefact", "axis", "circle", "deviations", "sixdof", "diagonals")
+            else "lengths",
+            [],
         ).append(path)
     if "diagonals" in kinds:
         text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
@@ -111,9 +114,10 @@ def _read_kind(kind: str, files: Sequence[str | Path], instrument: str | Path | 
         return SixDofMeasurement(read_sixdof(files), read_instrument(str(instrument)))
     from compgen.data.axis_runs import read_axis_runs
     from compgen.data.circles import read_circles
-    from compgen.data.deviations import read_deviations, read_parts
+    from compgen.data.deviations import read_artefacts, read_deviations, read_parts
 
-    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns | Circles]] = {
+    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns | Circles | Artefact]] = {
+        "artefact": read_artefacts,
         "circle": read_circles,
         "part": read_parts,
         "axis": read_axis_runs,
@@ -132,7 +136,7 @@ def describe(measurement: Measurement | ErrorTable) -> str:
         return ", ".join(describe(part) for _, part in measurement.parts)
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
-    from compgen.data.deviations import PART, Deviations
+    from compgen.data.deviations import PART, Artefact, Deviations
     from compgen.data.length_archive import LengthArchive
 
     if isinstance(measurement, LengthArchive):
@@ -140,6 +144,8 @@ def describe(measurement: Measurement | ErrorTable) -> str:
     if isinstance(measurement, Deviations):
         what = "features of parts" if measurement.metadata.get("measured") == PART else "measured positions"
         return f"{len(measurement)} {what}"
+    if isinstance(measurement, Artefact):
+        return f"{len(measurement)} features of artefacts in {len(np.unique(measurement.setup))} set-ups"
     if isinstance(measurement, Circles):
         return f"{len(measurement)} readings along circles in {', '.join(measurement.planes)}"
     if isinstance(measurement, AxisRuns):
@@ -164,9 +170,9 @@ def identify_measurement(
         return identify_archive(machine, measurement, chosen)
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
-    from compgen.data.deviations import Deviations
+    from compgen.data.deviations import Artefact, Deviations
     from compgen.identify.axis_tests import identify_axis_runs
-    from compgen.identify.positions import identify_deviations
+    from compgen.identify.positions import identify_artefact, identify_deviations
     from compgen.identify.six_dof import identify_sixdof
 
     if isinstance(measurement, MixedMeasurement):
@@ -192,6 +198,13 @@ def identify_measurement(
                 "deviations, for which use --u-deviation-um"
             )
         return identify_deviations(machine, measurement, chosen)
+    if isinstance(measurement, Artefact):
+        if other:
+            raise InputError(
+                "--method, --stations, --u-length-... apply to tracer lengths; the files contain an artefact, which takes "
+                "--u-deviation-um"
+            )
+        return identify_artefact(machine, measurement, chosen)
     if isinstance(measurement, AxisRuns | Circles):
         if other or chosen.u_deviation_um is not None:
             what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
@@ -220,7 +233,7 @@ def identify_mixed(
     ``known`` are the errors that are known otherwise, by the name of their part.
     """
     from compgen.data.axis_runs import AxisRuns
-    from compgen.data.deviations import Deviations
+    from compgen.data.deviations import Artefact, Deviations
     from compgen.identify.merging import merge
     from compgen.identify.six_dof import SixDofMeasurement
     from compgen.identify.together import Source, identify_together
@@ -236,7 +249,7 @@ def identify_mixed(
                     warnings.simplefilter("ignore", CompgenWarning)
                 alone = identify_measurement(machine, part, _applicable(part, options))
         except UndeterminedError:
-            if not isinstance(part, Deviations):
+            if not isinstance(part, Deviations | Artefact):
                 raise
             alone = None
         parts.append(Source(name, part, alone))
@@ -260,7 +273,7 @@ def _applicable(part: OneKind, options: IdentifyOptions) -> IdentifyOptions:
         method=plain.method,
         stations=None,
         systematic=plain.systematic,
-        u_deviation_um=options.u_deviation_um if type(part).__name__ == "Deviations" else None,
+        u_deviation_um=options.u_deviation_um if type(part).__name__ in ("Deviations", "Artefact") else None,
     )
 
 

@@ -74,7 +74,7 @@ class Identification(Drawable):
     systematic : contributions of systematic inputs, included in the standard uncertainties; None if there are none.
     method : "joint", "two-step", "sixdof" for readings of the six-DOF instrument (the residuals are translations about
         the mean of their position), "merged" for those and others, "axis-runs" for
-        runs along single axes, "circles" for circular tests, "together" for a mixture of these, "given" for errors of
+        runs along single axes, "circles" for circular tests, "artefact","together" for a mixture of these, "given" for errors of
         another program (no residuals), or "deviations" where measured positions were given instead of lengths; then the
         residuals are those of the components dx, dy, dz, and ``u_length_um`` is their standard uncertainty.
     steps : figures of the single steps of the two-step method.
@@ -175,7 +175,15 @@ class Identification(Drawable):
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``identify.json``."""
-        of_lengths = self.method not in ("deviations", "sixdof", "axis-runs", "circles", "given", "together")
+        of_lengths = self.method not in (
+            "deviations",
+            "artefact",
+            "sixdof",
+            "axis-runs",
+            "circles",
+            "given",
+            "together",
+        )
         return {
             "method": self.method,
             "residual_rms_um": self.rms_um,

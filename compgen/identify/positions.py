@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import PART, Deviations, aligned, setups_of
+from compgen.data.deviations import PART, Artefact, Deviations, aligned, setups_of
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
@@ -38,7 +38,7 @@ from compgen.identify.identification import (
     judged,
     not_among,
 )
-from compgen.identify.options import IdentifyOptions, deviation_sigma
+from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions, deviation_sigma
 from compgen.identify.reference_conditions import without_effects
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
@@ -340,6 +340,145 @@ def _poses(
             )
         )
     return found
+
+
+# Errors from artefacts that the machine's own probe measured.
+#
+# The probe finds a feature at the coordinates m, where the tool is at m + E(m): that is the place of the feature,
+#
+#     m + E(m) = shift_s + R_s (q + dq)
+#
+# with its place q in the artefact, and the unknown pose of the set-up. So what the probe reads has the errors of the machine with
+# the opposite sign of those in a part. dq is zero for a calibrated artefact, known to the uncertainty of its calibration, or
+# unknown: then the same plate in several set-ups, turned and shifted, tells its own errors from those of the machine
+# (self-calibration; a common scale is not among what it tells).
+
+
+def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOptions) -> Identification:
+    """Identify what an artefact under the machine's own probe determines of the errors.
+
+    Parameters
+    ----------
+    machine : chain, nodes, reference point and the errors that its model contains.
+    artefact : calibrated or not, in one or more set-ups.
+    options : ``u_deviation_um``, the standard uncertainty of a probed coordinate, and ``reject``.
+
+    Raises
+    ------
+    InputError
+        for features outside the travel, or that do not lie where they should.
+    UndeterminedError
+        where no error at all is determined.
+    """
+    layout = error_parameters(machine, modelled_errors(machine))
+    around = np.zeros(layout.size)
+    for _ in range(2):  # once more about the first result, so that terms of second order stay out
+        observations, count, source = artefact_observations(machine, layout, artefact, options, around)
+        solution, accepted = _robust(layout, observations, count, reject=options.reject)
+        around = solution.on(layout)
+    standardised = solution.residual / observations.sigma
+    adjusted = AdjustedReadings(
+        -solution.residual[:count], observations.sigma[:count], accepted, source, solution.rank, solution.freedom,
+        known_square_sum=float(np.sum(standardised[count:] ** 2)), too_few="{} coordinates for {} unknowns and the poses",
+    )  # fmt: skip
+    errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
+    u_um = float(np.median(adjusted.sigma_mm)) / MM_PER_UM
+    return replace(
+        adjusted.identification(errors, solution.layout, artefact.metadata, u_um),
+        unobservable=(
+            *not_among(errors, "no reading shows it"),
+            *(
+                f"{name}: a part of it is not told apart from the pose, the artefact or other errors"
+                for name in solution.partly
+            ),
+        ),
+        condition=solution.condition,
+        method="artefact",
+        values_factor=values_factor,
+        details={
+            "features": len(set(artefact.feature)),
+            "setups": len(np.unique(artefact.setup)),
+            "calibrated": bool(artefact.calibrated.all()),
+            "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
+        },
+    )
+
+
+def _robust(
+    layout: ErrorParameters, observations: Observations, count: int, *, reject: bool
+) -> tuple[Determined, NDArray[np.bool_]]:
+    """The adjustment without the probed coordinates, the first ``count`` readings, that do not fit; and which of them do."""
+
+    def fit(accepted: NDArray[np.bool_], _: Determined | None) -> Determined:
+        return least_squares(
+            layout, observations, np.concatenate([accepted, np.ones(len(observations) - count, dtype=bool)])
+        )
+
+    return fit_accepted(
+        fit,
+        lambda found: (found.residual / observations.sigma)[:count],
+        count,
+        "probed coordinates do not fit the model; check which feature is which, the set-ups, axes, signs and units,",
+        reject=reject,
+    )
+
+
+def artefact_observations(
+    machine: Machine, layout: ErrorParameters, artefact: Artefact, options: IdentifyOptions, around: FloatArray
+) -> tuple[Observations, int, str]:
+    """Return probed coordinates as readings of the errors of a layout, and behind them what the calibration says.
+
+    Also their number, and whether their uncertainty is "stated" or "assumed". ``around`` are errors of the layout (size,) that
+    are nearly right; poses and errors count from there.
+    """
+    tool_mm = np.broadcast_to(tool_of(machine, artefact.tool_mm), artefact.measured_mm.shape)
+    position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
+    check_travel(machine, position_mm, artefact.origin)
+    expected_mm = layout.tips(around, position_mm, tool_mm) - tool_mm - position_mm
+    found_mm = artefact.measured_mm + expected_mm
+    lying = aligned(Deviations(artefact.nominal_mm, found_mm - artefact.nominal_mm, labels={"setup": artefact.setup}))
+    poses = [lying.poses[setup] for setup in artefact.setup.tolist()]
+    rotation = np.array([pose.rotation for pose in poses])
+    arm_mm = np.einsum("nij,nj->ni", rotation, artefact.nominal_mm - np.array([pose.nominal_mm for pose in poses]))
+    there_mm = arm_mm + np.array([pose.measured_mm for pose in poses])
+    row, component = np.nonzero(np.isfinite(artefact.measured_mm))
+    # where the rough pose has the features: there a common scale of the machine and of the plate are exactly the same
+    at_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, there_mm)
+    design = layout.design(c_matrix(machine, at_mm, tool_mm), layout.bases(at_mm))[row, component]
+    unit = np.eye(3)[component]
+    pose = np.hstack([unit, np.cross(arm_mm[row], unit)])
+    setups = np.unique(artefact.setup)
+    features = {name: k for k, name in enumerate(dict.fromkeys(artefact.feature))}
+    number = np.array([features[name] for name in artefact.feature])
+    own = np.zeros((len(row), len(features), 3))
+    own[np.arange(len(row)), number[row]] = rotation[row, component]
+    # features with an uncertainty are free and known at once; exact ones are not free
+    first = np.array([artefact.feature.index(name) for name in features])
+    u_mm = np.where(artefact.calibrated[first, None], np.nan_to_num(artefact.u_nominal_mm[first]), np.inf)
+    free = (u_mm > 0).ravel()
+    known = np.flatnonzero(free & np.isfinite(u_mm).ravel())
+    others = np.hstack(
+        [*(pose * (artefact.setup[row] == setup)[:, None] for setup in setups), own.reshape(len(row), -1)[:, free]]
+    )
+    sigma_um = options.u_deviation_um
+    if sigma_um is None and "u_probe_um" in artefact.metadata:
+        sigma_um = float(artefact.metadata["u_probe_um"])
+    behind = np.zeros((len(known), others.shape[1]))
+    behind[np.arange(len(known)), others.shape[1] - int(free.sum()) + np.searchsorted(np.flatnonzero(free), known)] = (
+        1.0
+    )
+    value = (there_mm - found_mm)[row, component] + design @ around
+    sigma_mm = np.full(len(row), (ASSUMED_U_DEVIATION_UM if sigma_um is None else sigma_um) * MM_PER_UM)
+    nothing = len(known)
+    observations = Observations(
+        design=np.vstack([design, np.zeros((nothing, layout.size))]),
+        others=np.vstack([others, behind]),
+        value=np.concatenate([value, np.zeros(nothing)]),
+        sigma=np.concatenate([sigma_mm, u_mm.ravel()[known]]),
+        at_mm=np.vstack([at_mm[row], np.full((nothing, 3), np.nan)]),
+        shows=np.repeat([[True], [False]], [len(row), nothing], axis=0) & np.ones(len(layout.curves), dtype=bool),
+    )
+    return observations, len(row), "assumed" if sigma_um is None else "stated"
 
 
 # Errors from measured and commanded positions (``*.deviations.csv``): the separation step alone.

@@ -20,7 +20,7 @@ from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import Circles
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
+from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, error_named
@@ -32,7 +32,7 @@ from compgen.identify.covariance import joint_covariance, values_with_factor
 from compgen.identify.identification import Identification, not_among, uncertainty_scale, worst_uncertainty
 from compgen.identify.merging import FALSE_ALARM, MANY, projected
 from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions
-from compgen.identify.positions import position_observations
+from compgen.identify.positions import artefact_observations, position_observations
 from compgen.kinematics.first_order import modelled_errors
 
 #: No value is known better than this, um and urad.
@@ -98,7 +98,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
     layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
     around = None
-    for _ in range(2 if any(isinstance(part.measurement, Deviations) for part in parts) else 1):
+    for _ in range(2 if any(isinstance(part.measurement, Deviations | Artefact) for part in parts) else 1):
         found = [_observed(machine, layout, part, options, around) for part in parts]
         everything = stacked(found)
         solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
@@ -159,6 +159,10 @@ def _observed(
     """
     if isinstance(part.measurement, Deviations):
         found = position_observations(machine, layout, part.measurement, options, around)
+        return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
+    if isinstance(part.measurement, Artefact):
+        start = np.zeros(layout.size) if around is None else around
+        found, _, _ = artefact_observations(machine, layout, part.measurement, options, start)
         return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
     if part.alone is None:
         text = f"{part.name}: the readings do not determine the errors and what else is unknown of them"

@@ -1,0 +1,138 @@
+"""Plates under the machine's own probe: against machines with known errors, by an independent formula of what the probe finds."""
+
+import numpy as np
+import pytest
+
+import compgen
+from compgen.data.deviations import read_artefacts
+from compgen.data.error_table import Curve, ErrorTable
+from compgen.errors import InputError
+from compgen.foreign import open_measurement
+from compgen.identify import IdentifyOptions, identify_measurement
+from compgen.kinematics.exact_chain import tip_position
+from compgen.pipeline import identify_bare
+
+EC0Y, SLOPES, NOISE_MM = 120e-6, (30e-6, -20e-6), 3e-4
+
+
+@pytest.fixture(scope="module", params=["WFYXZT", "WXYFZT"])
+def machine(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("m") / "mill.toml"
+    axes = "".join(f"[axes.{a}]\nrange_mm = [-200.0, 200.0]\nnodes = 5\n" for a in "XYZ")
+    path.write_text(f'name = "mill"\nchain = "{request.param}"\n{axes}')
+    return compgen.load_machine(path)
+
+
+@pytest.fixture(scope="module")
+def errors():
+    at, zero = np.linspace(-200.0, 200.0, 5), np.zeros(5)
+    curves = {
+        "EXX": Curve(at, SLOPES[0] * at + 4e-3 * np.array([0, 1, 0, 1, 0]), zero),
+        "EYY": Curve(at, SLOPES[1] * at, zero),
+        "EYX": Curve(at, 5e-3 * np.array([0, 1, 1.5, 0.5, 0]), zero),
+        "EXY": Curve(at, -4e-3 * np.array([0, 0.5, 1.0, 1.2, 0]), zero),
+    }
+    return ErrorTable(curves, {"EC0Y": (EC0Y, 0.0)})
+
+
+def probed(machine, errors, poses, *, form_mm=0.0, seed=1):
+    """Rows of a plate of 6 x 6 holes in each pose (degrees, x, y): m with m + E(m) = the place of the hole, by iteration."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.linspace(-125, 125, 6), np.linspace(-125, 125, 6))
+    nominal = np.column_stack([x.ravel(), y.ravel(), np.zeros(36)])
+    actual = nominal + np.column_stack([*rng.normal(0.0, form_mm, (2, 36)), np.zeros(36)])
+    rows = []
+    for setup, (turn, dx, dy) in enumerate(poses):
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        place = actual @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [dx, dy, 0.0]
+        found = place.copy()
+        for _ in range(5):
+            found = place - (tip_position(machine, errors.at(found), found, np.zeros(3)) - found)
+        found = found + rng.normal(0.0, NOISE_MM, found.shape)
+        rows += [(f"H{k}", *nominal[k], *found[k, :2], setup) for k in range(36)]
+    return rows
+
+
+def written(path, rows, *comments):
+    head = "feature,x_mm,y_mm,z_mm,mx_mm,my_mm,setup"
+    lines = [",".join(str(v) if not isinstance(v, float) else f"{v:.7f}" for v in row) for row in rows]
+    path.write_text("\n".join([*(f"# {text}" for text in comments), head, *lines]) + "\n")
+    return path
+
+
+def test_a_calibrated_plate_gives_squareness_scale_and_straightness(tmp_path, machine, errors):
+    path = written(tmp_path / "plate.artefact.csv", probed(machine, errors, [(0.4, 3.0, -2.0)]), "u_probe_um = 0.3")
+    found = identify_bare(machine, open_measurement([path]))
+    assert found.method == "artefact"
+    assert 0.5 < found.reduced_chi_square < 1.6
+    position = np.array([[x, y, 0.0] for x in (-120.0, 0.0, 120.0) for y in (-120.0, 0.0, 120.0)])
+    left = compgen.volumetric_error(machine, found.errors, position) - compgen.volumetric_error(
+        machine, errors, position
+    )
+    left[:, 2] = 0.0
+    assert np.abs(compgen.without_rigid_motion(position, left)[:, :2]).max() < 4 * NOISE_MM
+
+
+def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, machine, errors):
+    """Holes are off by 20 um: one set-up is wrong by that, turned ones find squareness and straightness; scale stays open."""
+    rows = probed(
+        machine, errors, [(0.0, 0.0, 0.0), (90.2, 2.0, 1.0), (180.1, -3.0, 2.0), (0.1, 50.0, 30.0)], form_mm=0.02
+    )
+    path = written(tmp_path / "plate.artefact.csv", rows, "calibrated = false", "u_probe_um = 0.3")
+    found = identify_measurement(machine, open_measurement([path]))
+    assert 0.5 < found.reduced_chi_square < 1.6
+    position = np.array([[x, y, 0.0] for x in (-100.0, 0.0, 100.0) for y in (-100.0, 0.0, 100.0)])
+    left = compgen.volumetric_error(machine, found.errors, position) - compgen.volumetric_error(
+        machine, errors, position
+    )
+    left[:, 2] = 0.0
+    scale = np.sum(left * position) / np.sum(position[:, :2] ** 2)  # the common scale is not among what turning tells
+    rest = compgen.without_rigid_motion(position, left - scale * position)
+    assert np.abs(rest[:, :2]).max() < 8 * NOISE_MM
+    assert any(name in text for text in found.unobservable for name in ("EXX: a part", "EYY: a part"))
+    wrong = written(tmp_path / "once.artefact.csv", rows[:36], "u_probe_um = 0.3")  # taken as calibrated
+    assert identify_measurement(machine, open_measurement([wrong]), IdentifyOptions(reject=False)).rms_um > 5.0
+
+
+def test_one_length_gives_a_turned_plate_its_scale(tmp_path, machine, errors):
+    rows = probed(
+        machine, errors, [(0.0, 0.0, 0.0), (90.2, 2.0, 1.0), (180.1, -3.0, 2.0), (0.1, 50.0, 30.0)], form_mm=0.02
+    )
+    path = written(tmp_path / "plate.artefact.csv", rows, "calibrated = false", "u_probe_um = 0.3")
+    runs = tmp_path / "x.axis.csv"
+    at = np.linspace(-200.0, 200.0, 5)
+    lines = [f"X,{x},{way},{run},{1e3 * errors.curves['EXX'].at(np.array([x]))[0] + 0.1 * way:.4f}"
+             for run in (1, 2) for way in (1, -1) for x in at]  # fmt: skip
+    runs.write_text("axis,position_mm,direction,run,deviation_um\n" + "\n".join(lines) + "\n")
+    found = identify_bare(machine, open_measurement([path, runs]))
+    assert found.objections == ()
+    slope = np.polyfit(found.errors.curves["EYY"].position_mm[1:-1], found.errors.curves["EYY"].value[1:-1], 1)[0]
+    assert slope == pytest.approx(SLOPES[1], abs=4e-6)
+    assert found.errors.squareness["EC0Y"][0] == pytest.approx(EC0Y, abs=8e-6)
+
+
+def test_the_sign_is_the_opposite_of_that_of_a_part(tmp_path, machine, errors):
+    """A machine that travels too far makes holes too far apart, and finds true holes too near."""
+    rows = probed(machine, errors, [(0.0, 0.0, 0.0)])
+    path = written(tmp_path / "plate.artefact.csv", rows, "u_probe_um = 0.3")
+    as_part = tmp_path / "same.part.csv"
+    as_part.write_text(path.read_text().replace("feature,", "temp_feature_c,").replace("H", ""))
+    probe, part = (identify_measurement(machine, open_measurement([item])) for item in (path, as_part))
+    slopes = [
+        np.polyfit(item.errors.curves["EXX"].position_mm, item.errors.curves["EXX"].value, 1)[0]
+        for item in (probe, part)
+    ]
+    assert slopes[0] == pytest.approx(SLOPES[0], abs=3e-6)
+    assert slopes[1] == pytest.approx(-SLOPES[0], abs=3e-6)
+
+
+def test_files_say_what_is_wrong_with_them(tmp_path, machine, errors):
+    rows = probed(machine, errors, [(0.0, 0.0, 0.0)])
+    path = written(tmp_path / "plate.artefact.csv", [*rows, rows[3]])
+    with pytest.raises(InputError, match="feature 'H3' of set-up 0 is already in line 5"):
+        read_artefacts(path)
+    with pytest.raises(InputError, match="neither true nor false"):
+        read_artefacts(written(tmp_path / "a.artefact.csv", rows, "calibrated = perhaps"))
+    mirrored = [(name, x, y, z, -mx, my, setup) for name, x, y, z, mx, my, setup in rows]
+    with pytest.raises(InputError, match="mirrored"):
+        identify_measurement(machine, open_measurement([written(tmp_path / "b.artefact.csv", mirrored)]))
