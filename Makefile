@@ -15,6 +15,9 @@ PIP := $(BIN)/python $(PIP_INSTALL)
 PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
 
+# the tests start some hundred processes: each would compile all modules again
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test lint system bench coverage docs docs-links pins clean
 .DELETE_ON_ERROR:
 
@@ -22,12 +25,13 @@ demo: .venv/ready
 	$(BIN)/volcomp run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
 	$(BIN)/python examples/against_truth.py demo-out
 
+# the tests of a file go to one process, which then prepares once what they share
 test: lint system
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -ra
+	$(BIN)/python -m pytest -n 2 --dist loadfile -ra
 
 # as the tests of `make test`; the figures are those of all processes together
 coverage: .venv/ready-dev system
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -q --cov=compgen --cov-branch --cov-report=term
+	$(BIN)/python -m pytest -n 2 --dist loadfile -q --cov=compgen --cov-branch --cov-report=term
 
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
 system:

@@ -47,6 +47,8 @@ ONCE = "7 if __import__('os').path.exists({0!r}) else open({0!r}, 'w').close() o
 NOT_COMPARED = ("id", "at", "received_at", "owner", "seconds", "until")
 #: A few seconds for everything that waits for processes, on a computer that has other things to do.
 PATIENCE_S = 120.0
+#: Dask's processes do not look every 10 ms at what they are doing.
+ENVIRONMENT = {**os.environ, "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False"}
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +78,7 @@ def address(tmp_path_factory):
     script = tmp_path_factory.mktemp("dask") / "serve.py"
     script.write_text(SERVE)
     options = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "cwd": script.parent}
+    options["env"] = ENVIRONMENT
     with subprocess.Popen([sys.executable, str(script)], **options) as process:
         yield process.stdout.readline().strip()
         process.stdin.close()
@@ -220,7 +223,7 @@ class Apart:
 
     def started(self, command, folder):
         options = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
-        return subprocess.Popen(command, cwd=folder, **options)
+        return subprocess.Popen(command, cwd=folder, env=ENVIRONMENT, **options)
 
     def close(self):
         for process in reversed(self.processes):

@@ -33,9 +33,6 @@ MODULES = ("factory", "plant", "people", "checks", "clocks")
 #: Rms of the true error over the volume that is left right after new tables, um; readings are good to some 0.3 um.
 LEFT_UM = 0.5
 
-#: The year is simulated once: all tests go to one worker.
-pytestmark = pytest.mark.xdist_group("factory")
-
 
 @pytest.fixture(scope="module")
 def example():

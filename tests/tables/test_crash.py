@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -15,6 +16,12 @@ from compgen.tables.judge import Judge
 from compgen.tables.signs import crash_test, exported_tables, permutation_name, signed_permutations
 
 ALL = sorted(CONTROLLERS)
+
+
+@pytest.fixture(scope="module")
+def crashed(small_machine, small_errors):
+    """The crash test of a control, by its name; each is made once."""
+    return cache(partial(crash_test, small_machine, small_errors))
 
 
 def test_the_48_signed_permutations_are_those_of_a_brute_force_search():
@@ -32,8 +39,8 @@ def test_the_name_says_where_each_axis_takes_its_value_from():
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_wrong_table_of_every_control_is_rejected(name, small_machine, small_errors):
-    result = crash_test(small_machine, small_errors, name)
+def test_every_wrong_table_of_every_control_is_rejected(name, crashed):
+    result = crashed(name)
     assert result.baseline == ()
     assert [trial for trial in result.trials if trial.outcome == "ACCEPTED"] == []
     assert result.passed
@@ -44,8 +51,8 @@ def test_every_wrong_table_of_every_control_is_rejected(name, small_machine, sma
 
 
 @pytest.mark.parametrize("name", ["isg-csv", "siemens-cec"])
-def test_a_slip_of_degrees_is_visible_where_angles_are_held(name, small_machine, small_errors):
-    slips = {trial.name: trial for trial in crash_test(small_machine, small_errors, name).trials}
+def test_a_slip_of_degrees_is_visible_where_angles_are_held(name, crashed):
+    slips = {trial.name: trial for trial in crashed(name).trials}
     for slip in ("deg for rad (angles 57 times too large)", "rad for deg (angles 57 times too small)"):
         assert slips[slip].outcome == "rejected"
         assert slips[slip].difference_um > 5.0
