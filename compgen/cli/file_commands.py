@@ -153,7 +153,11 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         if known is None and present and not named:
             listing.append({"file": str(path), "kind": None, "problems": [], "warnings": [], "unsure": False})
             continue
-        found = toml_files.problems_of(path, _of_no_kind if known is None else KINDS[known].read, _APART)
+        if known is None and present:
+            none = InputError(f"is none of {', '.join(KINDS)}: no key tells its kind; say it by --kind", file=path)
+            found = toml_files.FileProblems((none,))
+        else:  # where nothing tells the kind, the file is no TOML, which any reader says
+            found = toml_files.problems_of(path, KINDS[known or "machine"].read, _APART)
         problems = [
             {
                 "file": str(item.file or path),
@@ -189,10 +193,6 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
             say("  what depends on these keys is looked over once they are right")
         say(*(f"  {'question' if '?' in text else 'warning'}: {text}" for text in item["warnings"]), style="yellow")
     return 2 if count else 0
-
-
-def _of_no_kind(root: toml_files.Section) -> None:
-    raise InputError(f"is none of {', '.join(KINDS)}: no key tells its kind; say it by --kind", file=root.path)
 
 
 def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:

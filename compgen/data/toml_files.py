@@ -571,7 +571,7 @@ def example_of(schema: Schema) -> Any:
 
 
 @dataclass(frozen=True)
-class Findings:
+class FileProblems:
     """What speaks against a file: what its reader refuses, in the order of the file, and what it warns of.
 
     ``unsure`` says that more may be wrong with what depends on the keys that are.
@@ -582,7 +582,7 @@ class Findings:
     unsure: bool = False
 
 
-def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequence[str] = ()) -> Findings:
+def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequence[str] = ()) -> FileProblems:
     """Return everything in a TOML file that ``read`` refuses: it reads again and again, each time without what was wrong.
 
     A key that is unknown or wrong is left out for the next time, one that must be there gets a value that its check
@@ -592,7 +592,7 @@ def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequ
     try:
         root = read_toml(path)
     except InputError as error:
-        return Findings((error,))
+        return FileProblems((error,))
     attempt = _Attempt(deepcopy(root.data), tuple(apart))
     while True:
         try:
@@ -606,7 +606,7 @@ def problems_of(path: str | Path, read: Callable[[Section], object], apart: Sequ
                 break
     ordered = sorted(attempt.found, key=lambda error: (error.file != root.path, error.line or 0))
     said = [str(item.message) for item in heard if issubclass(item.category, CompgenWarning)]
-    return Findings(tuple(ordered), tuple(dict.fromkeys(said)), attempt.unsure)
+    return FileProblems(tuple(ordered), tuple(dict.fromkeys(said)), attempt.unsure)
 
 
 class _Attempt:

@@ -152,8 +152,8 @@ def _file_name(value: Any) -> str:
     return value
 
 
-def _instruments_schema() -> dict[str, Any]:
-    """The instruments by their ``type``; the class that a reader says it returns declares the keys."""
+def instruments_schema() -> dict[str, Any]:
+    """Return the JSON schema of ``[instrument]``, by its ``type``; the class that a reader says it returns declares the keys."""
     found = []
     for name, reader in INSTRUMENTS.items():
         made, kind = typing.get_type_hints(reader).get("return"), {"const": name, "required": True}
@@ -172,7 +172,7 @@ def _instruments_schema() -> dict[str, Any]:
 class Scenario(Displayed):
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: AnyInstrument = part_setting(lambda: _instruments_schema(), required=True, meaning="what measures")
+    instrument: AnyInstrument = part_setting(lambda: instruments_schema(), required=True, meaning="what measures")
     seed: int = setting(toml_files.whole(0), meaning="starts every random number")
     name: str = setting(_file_name, "simulated", meaning="begins the names of the files")
     errors: TruthPlan = part_setting(

@@ -3,6 +3,7 @@
 import json
 import os
 import pty
+import random
 import subprocess
 import sys
 import tomllib
@@ -311,6 +312,30 @@ def test_what_is_not_there_cannot_be_checked(words, message, call, tmp_path):
     (tmp_path / "empty").mkdir()
     code, stdout, stderr = call("check", *words)
     assert code == 2 and message in stdout + stderr
+
+
+@pytest.mark.parametrize(("kind", "path"), FILES, ids=lambda item: getattr(item, "name", item))
+def test_a_file_damaged_anywhere_is_looked_over_to_its_end(kind, path, schemas):
+    """Problems are listed exactly if the reader refuses the file, and what it takes its schema takes."""
+    chance, data = random.Random(7), tomllib.loads(path.read_text())
+    for _ in range(25):
+        damaged = data
+        for _ in range(chance.randint(1, 4)):
+            place, probe = chance.choice(list(places(damaged))), deepcopy(chance.choice(PROBES))
+            name = place[-1] if chance.random() < 0.6 or isinstance(place[-1], int) else "no_such_key"
+            damaged = changed(damaged, place, lambda table, key, name=name, probe=probe: table.__setitem__(name, probe))
+        found = problems_in(kind, damaged, path)
+        assert bool(found.problems) == refused(kind, damaged, path)
+        assert found.problems or Draft202012Validator(schemas[kind]).is_valid(damaged)
+
+
+def problems_in(kind, data, path):
+    """What ``problems_of`` finds in data as the file ``path`` would have them."""
+    whole = toml_files.read_toml
+    with pytest.MonkeyPatch.context() as patch:
+        section = toml_files.Section(deepcopy(data), path=path, text=path.read_text())
+        patch.setattr(toml_files, "read_toml", lambda other: section if Path(other) == path else whole(other))
+        return toml_files.problems_of(path, KINDS[kind].read, ("controllers", "effects", "machines"))
 
 
 # --- settings that a command does not use --------------------------------------------------------------------------
