@@ -761,29 +761,32 @@ def _store_url(store: str | None, job: Path | None) -> str:
     return url
 
 
-def _users(users: Path | None, store: str | None) -> Users:
-    try:
-        from compgen.fleet.dashboard.users import Users
+def users_option(command: Command) -> Command:
+    """Add --users and --store; the command receives ``users``, the file of users that either names."""
 
-        file = users if users is not None else default_users(store) if store else None
-    except ImportError as error:
-        raise _missing(error) from error
-    if file is None:
-        raise click.UsageError("give --users FILE, or --store FILE of an SQLite store")
-    return Users(file)
+    @functools.wraps(command)
+    def wrapper(*args: Any, users: Path | None, store: str | None, **options: Any) -> Any:
+        try:
+            from compgen.fleet.dashboard.users import Users
 
+            file = users if users is not None else default_users(store) if store else None
+        except ImportError as error:
+            raise _missing(error) from error
+        if file is None:
+            raise click.UsageError("give --users FILE, or --store FILE of an SQLite store")
+        return command(*args, users=Users(file), **options)
 
-_users_option = options_of(DashboardSettings, "users", only=("users",), build=lambda users: users)
-_store_option = click.option("--store", metavar="URL", help="SQLite store; the file of its users is next to it.")
+    text = "SQLite store; the file of its users is next to it."
+    decorated: Any = click.option("--store", metavar="URL", help=text)(wrapper)
+    return options_of(DashboardSettings, "users", only=("users",), build=lambda users: users)(decorated)  # type: ignore[no-any-return]
 
 
 @serve_command.command("add-user")
 @click.argument("name")
-@_users_option
-@_store_option
+@users_option
 @click.option("--password-stdin", is_flag=True, help="Read the password from the first line of stdin.")
 @click.option("--reader", is_flag=True, help="The user may read what --private shows, but not decide.")
-def add_user(name: str, users: Path | None, store: str | None, password_stdin: bool, reader: bool) -> int:
+def add_user(name: str, users: Users, password_stdin: bool, reader: bool) -> int:
     """Add a user, or change password and rights; a change ends the user's sessions.
 
     The password is prompted for twice and stored only as an Argon2id hash.
@@ -792,7 +795,6 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
     Example:
       volcomp serve add-user meyer --users users.json
     """
-    file = _users(users, store)
     from compgen.fleet.dashboard.users import check_name
 
     check_name(name)
@@ -800,39 +802,36 @@ def add_user(name: str, users: Path | None, store: str | None, password_stdin: b
         password = sys.stdin.readline().rstrip("\r\n")
     else:
         password = click.prompt("Password", hide_input=True, confirmation_prompt=True, err=True)
-    new = file.add(name, password, reader=reader)
-    say(f"{name} {'is added' if new else 'has a new password'}: {file.path}")
+    new = users.add(name, password, reader=reader)
+    say(f"{name} {'is added' if new else 'has a new password'}: {users.path}")
     return 0
 
 
 @serve_command.command("remove-user")
 @click.argument("name")
-@_users_option
-@_store_option
-def remove_user(name: str, users: Path | None, store: str | None) -> int:
+@users_option
+def remove_user(name: str, users: Users) -> int:
     """Remove a user; the user's sessions end at once.
 
     \b
     Example:
       volcomp serve remove-user meyer --users users.json
     """
-    file = _users(users, store)
-    file.remove(name)
-    say(f"{name} is removed: {file.path}")
+    users.remove(name)
+    say(f"{name} is removed: {users.path}")
     return 0
 
 
 @serve_command.command("users")
-@_users_option
-@_store_option
+@users_option
 @json_option
-def list_users(users: Path | None, store: str | None, as_json: bool) -> int:
+def list_users(users: Users, as_json: bool) -> int:
     """List who may log in.
 
     \b
     Example:
       volcomp serve users --users users.json
     """
-    names = _users(users, store).names()
+    names = users.names()
     answer(as_json, {"users": names}, "\n".join(names) or "no users yet: nobody can log in")
     return 0
