@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln
 
 from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.field import Figure
@@ -220,6 +219,8 @@ def figure(statistics: RunStatistics, item: Combination, meaning: str, budget: S
     The scatter gives s^2 / n for a mean and s^2 (1 - c4^2) for an estimator s (normal readings); the rest comes from
     the budget. A single reading has no scatter: u is then nan.
     """
+    from scipy.special import gammaln  # imported here: slow to load
+
     counts, scatter = statistics.count, statistics.values[2:]
     # variance of s over sigma^2 for n normal readings: 1 - c4(n)^2, c4^2 = 2 / (n - 1) (G(n/2) / G((n-1)/2))^2
     n = np.maximum(counts, 2.0)

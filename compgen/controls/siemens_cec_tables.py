@@ -11,7 +11,6 @@ from itertools import combinations, count
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lstsq
 
 from compgen.controls.shared.base import SourceFile, Term, parameter_row
 from compgen.controls.shared.grids import equidistant_grid
@@ -562,7 +561,7 @@ class _Gains:
         if not held:
             return 0.0
         where = np.concatenate([self.columns[term.name] for term in held])
-        solution = lstsq(self.normal[np.ix_(where, where)], self.right[where], cond=_UNDETERMINED)[0]
+        solution = np.linalg.lstsq(self.normal[np.ix_(where, where)], self.right[where], rcond=_UNDETERMINED)[0]
         return float(self.right[where] @ solution)
 
     def missed(self, kept: Sequence[Term]) -> list[tuple[str, float]]:

@@ -8,7 +8,6 @@ components of the points one after another, F F^T. Nothing here knows a machine.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
@@ -33,11 +32,11 @@ def best_rotation(moment: FloatArray) -> FloatArray:
     The points enter by their ``moment`` (3, 3) alone, the sum of w target point^T, both counted from where they are brought
     together (Kabsch 1976, Acta Crystallographica A32). If they lie on one line, the turn about it is arbitrary.
     """
-    from scipy.spatial.transform import Rotation  # imported here: slow to load (0.07 s)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of points on one line
-        return np.asarray(Rotation.align_vectors(moment.T, np.eye(3))[0].as_matrix())
+    left, _, right = np.linalg.svd(moment)
+    left[:, 2] *= np.sign(
+        np.linalg.det(left) * np.linalg.det(right)
+    )  # as scipy's Rotation.align_vectors, which is slow to load
+    return np.asarray(left @ right)
 
 
 def without_rigid_motion(position_mm: FloatArray, error_mm: FloatArray) -> FloatArray:

@@ -536,10 +536,19 @@ def spline_matrix(nodes_mm: FloatArray, position_mm: FloatArray) -> FloatArray:
 
 
 def free_basis(constraints: FloatArray, size: int) -> FloatArray:
-    """Basis (size, free) of all x with ``constraints`` (k, size) x = 0, by elimination.
+    """Basis (size, free) of all x with ``constraints`` (k, size) x = 0, see :func:`eliminated`: mostly zeros and ones."""
+    free, bound, rows = eliminated(constraints, size)
+    basis = np.zeros((size, len(free)))
+    basis[free, np.arange(len(free))] = 1.0
+    basis[bound] = rows
+    return basis
+
+
+def eliminated(constraints: FloatArray, size: int) -> tuple[NDArray[np.intp], list[int], FloatArray]:
+    """Solve ``constraints`` (k, size) x = 0 for as many unknowns: which stay free, which are bound, x[bound] = rows x[free].
 
     Each row eliminates the unknown with its largest factor; the others keep their meaning: a row with a single entry
-    gives an exact zero, and the basis stays sparse.
+    gives an exact zero.
     """
     rows = np.atleast_2d(constraints).astype(np.float64) if np.size(constraints) else np.zeros((0, size))
     pivots: list[int] = []
@@ -553,11 +562,8 @@ def free_basis(constraints: FloatArray, size: int) -> FloatArray:
         pivots.append(pivot)
     keep = np.ones(size, dtype=bool)
     keep[pivots] = False
-    basis = np.zeros((size, int(keep.sum())))
-    basis[np.flatnonzero(keep), np.arange(basis.shape[1])] = 1.0
     used = np.flatnonzero(np.abs(rows).max(axis=1, initial=0.0) > 1e-12).tolist()
-    basis[pivots] = -rows[used][:, keep]
-    return basis
+    return np.flatnonzero(keep), pivots, -rows[used][:, keep]
 
 
 # Reference lines through straightness readings (ISO 230-1): least squares, minimum zone, or through the end points.

@@ -18,13 +18,15 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequenc
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from compgen.data.messages import one_line
 from compgen.errors import CompgenWarning, InputError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 #: What the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
@@ -166,6 +168,8 @@ def _import_error(error: BaseException, origin: str, file: Path | None) -> Input
 
 def load_entry_points(kinds: Sequence[Kind]) -> None:
     """Register the entry points of installed distributions; a broken one gives a warning, and its name is unavailable."""
+    from importlib.metadata import entry_points  # imported here: slow to load, and few installations have plug-ins
+
     installed = entry_points()
     for kind in kinds:
         for entry in installed.select(group=kind.group):

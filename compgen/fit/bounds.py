@@ -7,10 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Drawable, Overview, Panel, shortened
@@ -21,6 +20,9 @@ from compgen.data.toml_files import option
 from compgen.errors import ConvergenceError, InputError
 from compgen.fit.smoother import Method, Smoother
 from compgen.fit.zeroing import FrameChange
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
 
 # What the fit returns: the fitted table, a report per curve, and what was moved out of the curves.
 
@@ -204,6 +206,8 @@ class Rows:
     @cached_property
     def matrix(self) -> sp.csr_array:
         """The rows as the general solvers want them: sparse."""
+        import scipy.sparse as sp  # imported here and below: slow to load, and general solvers alone want it
+
         return sp.csr_array(self.dense)
 
     def excess(self, curve: FloatArray) -> FloatArray:
@@ -527,7 +531,7 @@ def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
 
 #: Solves min x^T P x / 2 + q^T x, lower <= A x <= upper for (P, q, A, lower, upper): x and multipliers, None if it fails.
 _Solver = Callable[
-    [sp.csc_array, FloatArray, sp.csc_array, FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None
+    ["sp.csc_array", FloatArray, "sp.csc_array", FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None
 ]
 
 
@@ -535,6 +539,8 @@ def _general(
     smoother: Smoother, mu: float, y: FloatArray, rows: Rows, call: _Solver
 ) -> tuple[FloatArray, FloatArray] | None:
     """Curve (n,) of a general solver, made to keep its bounds, and multipliers (m,), positive at upper limits."""
+    import scipy.sparse as sp
+
     # unknowns scaled to 1 on the diagonal of A, and only the rows that have a limit
     quadratic = smoother.matrix(mu)
     scale = 1 / np.sqrt(quadratic.diagonal())
@@ -558,6 +564,8 @@ def _general(
 def _clarabel(
     quadratic: sp.csc_array, linear: FloatArray, matrix: sp.csc_array, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
+    import scipy.sparse as sp
+
     clarabel: Any = import_module("clarabel")
     high, low = np.isfinite(upper), np.isfinite(lower)
     one_sided = sp.csc_matrix(sp.vstack([matrix[high], -matrix[low]]))
@@ -579,6 +587,8 @@ def _clarabel(
 def _osqp(
     quadratic: sp.csc_array, linear: FloatArray, matrix: sp.csc_array, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, FloatArray] | None:
+    import scipy.sparse as sp
+
     osqp: Any = import_module("osqp")
     solver = osqp.OSQP()
     settings = {"eps_abs": 1e-8, "eps_rel": 1e-8, "max_iter": 20000, "verbose": False}

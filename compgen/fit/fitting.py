@@ -10,9 +10,7 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dpbsv, dpbtrs
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
@@ -42,7 +40,7 @@ from compgen.fit.smoother import (
 )
 from compgen.fit.zeroing import FixedCurve, zero_ends
 from compgen.identify.covariance import Covariance
-from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.kernel_switch import lapack, one_thread
 
 # Many curves in one banded system: their nodes follow one another, and nothing couples one curve with the next.
 #
@@ -145,15 +143,15 @@ class Stack:
         band = self.mu * self.laid.penalty
         band[0] += self.laid.free_weight
         load = self._free(self.laid.load(y[:, None]))
-        factor, x, info = dpbsv(band, load, lower=1)
+        factor, x, info = lapack().dpbsv(band, load, lower=1)
         if info:
             return None
-        rough = np.ones(len(self.sizes), dtype=bool)
+        rough, solved = np.ones(len(self.sizes), dtype=bool), lapack().dpbtrs
         weight, mu = self.laid.weight[:, None], self.mu[:, None]
         for _ in range(REFINEMENTS):
             # A x without forming the product of the second differences
             applied = self._free(weight * x + mu * self.laid.bend_transposed(self.laid.bend(x)))
-            step = dpbtrs(factor, load - applied, lower=1)[0]
+            step = solved(factor, load - applied, lower=1)[0]
             x = x + (step if rough.all() else step * rough.repeat(self.sizes)[:, None])
             rough &= ~(self.largest(step[:, 0]) <= SETTLED * self.largest(x[:, 0]))
             if not rough.any():
@@ -444,6 +442,8 @@ def solve_constrained(
     ConvergenceError
         if the solver fails.
     """
+    import scipy.sparse as sp  # as cvxpy, imported here: slow to load, and few fits have constraints of their own
+
     cp: Any = import_module("cvxpy")
     inner = {item.name: cp.Variable(len(item.y), name=item.name) for item in prepared}
     shown = {item.name: cp.Variable(len(item.y), name=item.name) for item in prepared}
@@ -479,7 +479,9 @@ def solve_constrained(
 
 def _rules(item: Prepared, x: Any, shown: Any) -> list[Any]:
     """Zeros and bounds: ``x`` are the smoother's unknowns (eliminated ones zero), ``shown`` the node values."""
-    turn = sp.csr_array(item.smoother.expand(np.eye(len(item.y))))
+    from scipy.sparse import csr_array
+
+    turn = csr_array(item.smoother.expand(np.eye(len(item.y))))
     rows = constraint_rows(item.fixed.position_mm, item.smoother, *item.bounds.limits, item.bounds.direction)
     high, low = np.flatnonzero(np.isfinite(rows.upper)), np.flatnonzero(np.isfinite(rows.lower))
     rules = [shown == turn @ x]

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import scipy.sparse as sp
+from numpy.linalg import LinAlgError
 from numpy.typing import NDArray
-from scipy.linalg import (
-    cho_factor,
-    cho_solve,
-    cho_solve_banded,
-    cholesky_banded,
-    eigvals_banded,
-    solve_banded,
-    solve_triangular,
-    svd,
-)
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
@@ -28,6 +19,10 @@ from compgen.data.names import CURVE_NAMES
 from compgen.errors import InputError
 from compgen.fit.zeroing import SAME_POSITION_MM, FixedCurve, Row
 from compgen.identify.covariance import Covariance
+from compgen.kinematics.kernel_switch import lapack
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_array
 
 # The smoother: minimise sum(w (c - y)^2) + mu |D2 c|^2 with the curve fixed at zero, in banded form.
 #
@@ -157,7 +152,7 @@ class Smoother:
         scaled = np.zeros_like(self.penalty)
         for d in range(min(_BAND + 1, len(root))):
             scaled[d, : len(root) - d] = self.penalty[d, : len(root) - d] * root[d:] * root[: len(root) - d]
-        values = eigvals_banded(scaled[: len(root)], lower=True)
+        values = lapack().dsbevd(scaled[: len(root)], compute_v=0, lower=1)[0]
         found: FloatArray = np.zeros(self.unknowns)
         if self.rank:
             found[-self.rank :] = np.maximum(values[-self.rank :], 0.0)
@@ -206,19 +201,22 @@ class Smoother:
         return self.gather(self.weight[:, None] * c + mu * self.bend_transposed(self.bend(c)))
 
     def factor(self, mu: float) -> FloatArray:
-        """Banded Cholesky factor of A."""
+        """Banded Cholesky factor of A; LinAlgError if rounding left A not positive definite."""
         width = 1 + (2 if all(other is None for _, other, _ in self.steps) else _BAND)
         band = mu * self.penalty[: min(width, len(self.weight))]
         band[0] += self.free_weight
-        return np.asarray(cholesky_banded(band, lower=True, check_finite=False))
+        found, failed = lapack().dpbtrf(band, lower=1)
+        if failed:
+            raise LinAlgError("not positive definite")
+        return np.asarray(found)
 
     def inverse(self, mu: float, gathered: FloatArray) -> FloatArray:
         """Z A^-1 g for gathered right-hand sides (n, k): curves (n, k), refined against the product form of A."""
-        factor = (self.factor(mu), True)
-        x = cho_solve_banded(factor, gathered, check_finite=False)
+        factor, solved = self.factor(mu), lapack().dpbtrs
+        x = solved(factor, gathered, lower=1)[0]
         for _ in range(REFINEMENTS):
             rest = gathered - self.apply(mu, self.expand(x))
-            step = cho_solve_banded(factor, rest, check_finite=False)
+            step = solved(factor, rest, lower=1)[0]
             x = x + step
             if np.abs(step).max(initial=0.0) <= SETTLED * np.abs(x).max(initial=0.0):
                 break
@@ -254,11 +252,13 @@ class Smoother:
         upper = np.zeros_like(lower)  # L^T in the order of banded matrices
         for d in range(len(lower)):
             upper[len(lower) - 1 - d, d:] = lower[d, : n - d]
-        turned = solve_banded((0, len(lower) - 1), upper, np.eye(n), check_finite=False)
+        turned = lapack().dgbsv(0, len(lower) - 1, upper, np.eye(n))[2]
         return np.delete(self.expand(turned), [node for node, _, _ in self.steps], axis=1)
 
-    def matrix(self, mu: float) -> sp.csc_array:
+    def matrix(self, mu: float) -> csc_array:
         """A (n, n) with 1 on the diagonal of eliminated unknowns."""
+        import scipy.sparse as sp  # imported here: slow to load, and the general solvers alone want it
+
         n = len(self.weight)
         band = mu * self.penalty
         band[0] += self.free_weight
@@ -301,6 +301,8 @@ Method = Literal["REML", "GCV", "given"]
 #: Cross-validation needs this many curvatures; with fewer it does not determine a weight and the data are kept.
 _GCV_LEAST = 3
 _STRAIGHT_TO_ROUNDING = 1e-12
+#: Smaller part of a golden section; steps of Brent's method, which never needs as many.
+_GOLDEN, _MOST_STEPS = 0.5 * (3.0 - math.sqrt(5.0)), 500
 
 
 def reml_criterion(smoother: Smoother, y: FloatArray, u0: float) -> Callable[[float], float]:
@@ -342,15 +344,59 @@ def choose(smoother: Smoother, y: FloatArray, u0: float | None) -> float:
 
 
 def _minimise(function: Callable[[float], float], low: float, high: float) -> float:
-    """Lowest point of a function on an interval: a grid of about one decade, then Brent's method around its best."""
-    from scipy.optimize import minimize_scalar  # imported here: slow to load
+    """Lowest point of a function on an interval: a grid of about one decade, then Brent's method around its best.
 
+    Brent (1973), Algorithms for Minimization without Derivatives, chapter 5; step by step as ``minimize_scalar`` of
+    scipy does it ("bounded"), whose module takes as long to load as all curves take to be fitted.
+    """
     grid = np.linspace(low, high, max(3, int(np.ceil(high - low)) + 1))
     values = [function(point) for point in grid]
     best = int(np.argmin(values))
     around = (grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    found = minimize_scalar(function, bounds=around, method="bounded", options={"xatol": 1e-3})
-    return float(found.x) if found.fun < values[best] else float(grid[best])
+    x, least = _brent(function, float(around[0]), float(around[1]), 1e-3)
+    return x if least < values[best] else float(grid[best])
+
+
+def _brent(function: Callable[[float], float], a: float, b: float, tolerance: float) -> tuple[float, float]:
+    """Lowest point of a function between ``a`` and ``b``, and its value there.
+
+    ``x``, ``w``, ``v`` are the best, second and third point; the parabola through them gives the next one, the golden
+    section where it leaves the interval or does not halve the last step but one.
+    """
+    x = w = v = a + _GOLDEN * (b - a)
+    fx = fw = fv = function(x)
+    step = before = 0.0
+    for _ in range(_MOST_STEPS):
+        middle = 0.5 * (a + b)
+        near = math.sqrt(2.2e-16) * abs(x) + tolerance / 3.0
+        if abs(x - middle) <= 2.0 * near - 0.5 * (b - a):
+            break
+        golden = True
+        if abs(before) > near:
+            r, q = (x - w) * (fx - fv), (x - v) * (fx - fw)
+            p, q = (x - v) * q - (x - w) * r, 2.0 * (q - r)
+            p, q = -p if q > 0.0 else p, abs(q)
+            golden = not (abs(p) < abs(0.5 * q * before) and q * (a - x) < p < q * (b - x))
+            before = step
+            if not golden:
+                step = p / q
+                if x + step - a < 2.0 * near or b - (x + step) < 2.0 * near:
+                    step = near if middle >= x else -near
+        if golden:
+            before = a - x if x >= middle else b - x
+            step = _GOLDEN * before
+        u = x + max(abs(step), near) * (1.0 if step >= 0.0 else -1.0)
+        fu = function(u)
+        if fu <= fx:
+            a, b = (x, b) if u >= x else (a, x)
+            v, w, x, fv, fw, fx = w, x, u, fw, fx, fu
+        else:
+            a, b = (u, b) if u < x else (a, u)
+            if fu <= fw or w == x:
+                v, w, fv, fw = w, u, fw, fu
+            elif fu <= fv or v in (x, w):
+                v, fv = u, fu
+    return x, fx
 
 
 # Curves whose nodes are correlated: the covariance of the identification in place of independent uncertainties.
@@ -386,7 +432,7 @@ class CorrelatedSmoother(Smoother):
         nodes = np.setdiff1d(np.arange(len(simple.weight)), [node for node, _, _ in simple.steps])
         turn = simple.expand(np.eye(len(simple.weight)))[:, nodes]
         root = np.linalg.cholesky(covariance[np.ix_(nodes, nodes)])
-        _, values, across = svd(simple.bend(turn) @ root, full_matrices=True)
+        _, values, across = np.linalg.svd(simple.bend(turn) @ root, full_matrices=True)
         strength = np.zeros(len(nodes))
         strength[: len(values)] = values**2
         strength[simple.rank :] = 0.0
@@ -410,7 +456,7 @@ class CorrelatedSmoother(Smoother):
         return self.strength
 
     def _weighted(self, x: FloatArray) -> FloatArray:
-        return np.asarray(cho_solve((self.root, True), x))
+        return np.asarray(lapack().dpotrs(self.root, x, lower=1)[0])
 
     def _scattered(self, x: FloatArray) -> FloatArray:
         out = np.zeros((len(self.weight), x.shape[1]))
@@ -433,7 +479,7 @@ class CorrelatedSmoother(Smoother):
 
     def solve(self, mu: float, y: FloatArray) -> FloatArray:
         """Fitted curves (n, k) for data (n, k)."""
-        white = solve_triangular(self.root, y[self.nodes], lower=True)
+        white = lapack().dtrtrs(self.root, y[self.nodes], lower=1)[0]
         return self._curves(self.basis.T @ white, mu)
 
     def load(self, y: FloatArray) -> FloatArray:
@@ -442,7 +488,7 @@ class CorrelatedSmoother(Smoother):
 
     def misfit(self, residual: FloatArray) -> float:
         """r^T W r for residuals (n,)."""
-        white = solve_triangular(self.root, residual[self.nodes], lower=True)
+        white = lapack().dtrtrs(self.root, residual[self.nodes], lower=1)[0]
         return float(white @ white)
 
     def costs(self, y: FloatArray) -> Callable[[float], tuple[float, float]]:
@@ -450,7 +496,7 @@ class CorrelatedSmoother(Smoother):
 
         With t = Q^T L^-1 y the fitted curve has the components t/(1 + mu s^2), for zeroed data.
         """
-        power = (self.basis.T @ solve_triangular(self.root, y[self.nodes], lower=True)) ** 2
+        power = (self.basis.T @ lapack().dtrtrs(self.root, y[self.nodes], lower=1)[0]) ** 2
 
         def at(mu: float) -> tuple[float, float]:
             damping = 1 / (1 + mu * self.strength)
@@ -463,13 +509,15 @@ class CorrelatedSmoother(Smoother):
         """F (n, m) with F F^T = Z A^-1 Z^T: L Q (1 + mu s^2)^-1/2."""
         return np.asarray(self.turn @ (self.root @ (self.basis / np.sqrt(1 + mu * self.strength))))
 
-    def matrix(self, mu: float) -> sp.csc_array:
+    def matrix(self, mu: float) -> csc_array:
         """A (n, n) with 1 on the diagonal of eliminated unknowns."""
+        from scipy.sparse import csc_array  # imported here, as above
+
         full = np.eye(len(self.weight))
         bent = self.bend(self.turn)
-        inner = cho_solve(cho_factor(self.root @ self.root.T), np.eye(len(self.nodes))) + mu * bent.T @ bent
+        inner = self._weighted(np.eye(len(self.nodes))) + mu * bent.T @ bent
         full[np.ix_(self.nodes, self.nodes)] = 0.5 * (inner + inner.T)
-        return sp.csc_array(full)
+        return csc_array(full)
 
 
 def propagated(smoother: Smoother, mu: float, fixed: FixedCurve, covariance: FloatArray) -> FloatArray:

@@ -16,6 +16,7 @@ from compgen.data.names import COVERAGE
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
 from compgen.report.html.pictures import describe_error
 from compgen.resources import data_folder
+from compgen.tables.render import KeptTemplates
 
 
 def history_page(drift: Drift) -> str:
@@ -26,6 +27,8 @@ def history_page(drift: Drift) -> str:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        optimized=False,
+        bytecode_cache=KeptTemplates("history"),
     )
     environment.filters |= {"number": number_text, "probability": probability, "moment": moment_of, "zip": zip}
     style, _, policy = page_assets()

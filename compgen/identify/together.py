@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
-from scipy.special import stdtrit
 
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import Circles
@@ -240,6 +239,8 @@ def _agreement(
 
     The coverage factor is chosen so that the probability of a false alarm holds for all values of a part together.
     """
+    from scipy.special import stdtrit  # imported here: slow to load
+
     result: dict[str, dict[str, float]] = {}
     for k in range(len(parts)) if len(parts) > 2 else range(1):
         others = stacked([item for j, item in enumerate(found) if j != k])

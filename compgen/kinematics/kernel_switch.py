@@ -86,13 +86,13 @@ def load_kernels() -> bool:
     return True
 
 
-def cache_folder() -> Path:
-    """Folder for compiled code, below the user's cache folder; nothing is written next to the program."""
+def cache_folder(kind: str) -> Path:
+    """Folder for compiled code of a kind, below the user's cache folder; nothing is written next to the program."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
     else:
         base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "compgen" / "numba"
+    return Path(base) / "compgen" / kind
 
 
 @contextmanager
@@ -102,7 +102,7 @@ def _settings() -> Iterator[None]:
 
     before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
     numba.config.SLP_VECTORIZE = 1
-    numba.config.CACHE_DIR = before[1] or str(cache_folder())
+    numba.config.CACHE_DIR = before[1] or str(cache_folder("numba"))
     try:
         yield
     finally:

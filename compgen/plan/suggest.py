@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.linalg import LinAlgError
-from scipy.linalg.lapack import dtrtri
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
@@ -17,7 +16,7 @@ from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
 from compgen.identify.adjust.solver import factorise
 from compgen.identify.options import ReadingNoise
-from compgen.kinematics.kernel_switch import one_thread
+from compgen.kinematics.kernel_switch import lapack, one_thread
 from compgen.kinematics.many_points import volume_grid
 from compgen.plan.prediction import NEAREST_MM, Plan, Planned, plan_of, planned
 from compgen.plan.stations import PlannedStations, Region
@@ -104,7 +103,7 @@ class _Search:
             return np.inf
         if factor.rcond < LEAST_RCOND:
             return np.inf
-        inverse, _ = dtrtri(factor.lower, lower=1)
+        inverse, _ = lapack().dtrtri(factor.lower, lower=1)
         size = found.problem.parameters.size
         spread = self.rows @ (factor.scale[:size, None] * np.tril(inverse).T[:size])
         square = np.einsum("nij,nij->n", spread, spread)

@@ -6,13 +6,21 @@ import ctypes
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any
 
-from jinja2 import ChoiceLoader, FileSystemLoader, StrictUndefined, TemplateError, TemplateSyntaxError
+from jinja2 import (
+    ChoiceLoader,
+    FileSystemBytecodeCache,
+    FileSystemLoader,
+    StrictUndefined,
+    TemplateError,
+    TemplateSyntaxError,
+)
+from jinja2.bccache import Bucket
 from jinja2.runtime import Context
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 
@@ -24,6 +32,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, ERRORS
 from compgen.errors import InputError
+from compgen.kinematics.kernel_switch import cache_folder
 from compgen.resources import data_folder
 
 # Controller files through Jinja2: strict about missing values, sandboxed; text of a user is never executed.
@@ -207,6 +216,31 @@ class _Bounded(ImmutableSandboxedEnvironment):
         return super().call_binop(context, operator, left, right)
 
 
+class KeptTemplates(FileSystemBytecodeCache):
+    """Compiled templates of an environment in the user's cache folder; compiling them takes as long as a verification.
+
+    Jinja compares the text of a template with that of the compiled one. Environments have a ``kind`` each, because options
+    are part of what is compiled; constants are not evaluated before (``optimized = False``), because filters may change.
+    Where nothing can be written, templates are compiled every time.
+    """
+
+    def __init__(self, kind: str) -> None:
+        with suppress(OSError, RuntimeError):  # no permission; no home
+            folder = cache_folder("templates")
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            super().__init__(str(folder), f"{kind}-%s.cache")
+
+    def load_bytecode(self, bucket: Bucket) -> None:
+        """Take what is kept."""
+        with suppress(OSError, AttributeError):  # no folder: no attribute
+            super().load_bytecode(bucket)
+
+    def dump_bytecode(self, bucket: Bucket) -> None:
+        """Keep what was compiled."""
+        with suppress(OSError, AttributeError):
+            super().dump_bytecode(bucket)
+
+
 @lru_cache(maxsize=32)
 def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
     """Return the environment of some folders; it is cached with its compiled templates, and changed ones are read again."""
@@ -217,6 +251,10 @@ def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
         keep_trailing_newline=True,
         trim_blocks=True,
         lstrip_blocks=True,
+        optimized=False,
+        bytecode_cache=KeptTemplates("tables")
+        if folders == (data_folder("templates"),)
+        else None,  # not those of users
     )
     environment.filters["fixed"] = lambda value, digits: fixed(float(value), digits)
     environment.filters["plain"] = lambda value: one_line(value)

@@ -12,17 +12,18 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import block_diag, coo_array, csr_array, hstack
+from numpy.linalg import LinAlgError
+from numpy.typing import NDArray
 
 from compgen.controls.shared.base import Term
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, free_basis, hat_entries, hat_matrix
+from compgen.data.error_table import ErrorTable, eliminated, hat_entries, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import ConvergenceError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.kernel_switch import lapack
 from compgen.kinematics.many_points import volume_sample
 
 #: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
@@ -33,6 +34,8 @@ RIDGE = 1e-11
 LEAST_SHARE = 0.5
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
+#: Up to so many fields are summed one by one, more by a matrix product unless the matrix has more entries than that.
+_FEW, _LARGEST_HAT = 3, 4_000_000
 
 #: What a control adds to the commands: values by term, points -> (n, 3), mm.
 Applied = Callable[[Mapping[str, FloatArray], Points], FloatArray]
@@ -53,13 +56,92 @@ def wanted_correction(
 
 
 @dataclass(frozen=True)
+class FreeValues:
+    """All table values (parameters,) as linear functions of the free ones x: x at ``free``, ``rows`` x at ``bound``."""
+
+    free: NDArray[np.intp]
+    bound: NDArray[np.intp]
+    rows: FloatArray
+
+    def expand(self, x: FloatArray) -> FloatArray:
+        """T x for free values (free, k): all values (parameters, k)."""
+        values = np.empty((len(self.free) + len(self.bound), x.shape[1]))
+        values[self.free], values[self.bound] = x, self.rows @ x
+        return values
+
+    def gather(self, g: FloatArray) -> FloatArray:
+        """T^T g for quantities (parameters, k) of all values: (free, k)."""
+        return np.asarray(g[self.free] + self.rows.T @ g[self.bound])
+
+
+@dataclass(frozen=True)
+class SampledTerm:
+    """A term at n sample points: two values count at each, those at ``node`` (2, n) with the shares ``share`` (2, n).
+
+    ``place`` is that of the term in the vector of all values, ``carrier`` (n, 3) its carrier, zero but for ``outputs``;
+    ``hat`` says which terms have the same nodes.
+    """
+
+    place: slice
+    hat: tuple[int | None, bytes]
+    node: NDArray[np.int64]
+    share: FloatArray
+    outputs: tuple[int, ...]
+    carrier: FloatArray
+
+    @classmethod
+    def of(cls, term: Term, place: slice, position_mm: FloatArray, tool_mm: FloatArray) -> SampledTerm:
+        """Evaluate a term at points (n, 3) with tool offsets (3,) or (n, 3)."""
+        if term.axis is None or len(term.nodes_mm) == 1:
+            left, share = np.zeros(len(position_mm), dtype=np.int64), np.zeros(len(position_mm))
+        else:
+            left, share = hat_entries(term.nodes_mm, position_mm[:, term.axis])
+        node = np.stack([left, np.minimum(left + 1, len(term.nodes_mm) - 1)])
+        hat = term.axis, np.asarray(term.nodes_mm, dtype=np.float64).tobytes()
+        outputs = tuple(sorted({part.output for part in term.carrier}))
+        return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, term.carrier_field(position_mm, tool_mm))
+
+    def gather(self, fields_mm: FloatArray) -> FloatArray:
+        """Products of the values' fields with k fields (n, 3) in a row, (values, k)."""
+        along = np.zeros(fields_mm.shape[:2])
+        for output in self.outputs:
+            along += self.carrier[:, output] * fields_mm[:, :, output]
+        hat = self._hat(len(fields_mm))
+        if hat is not None:
+            return np.asarray(hat @ along.T)
+        size = self.place.stop - self.place.start
+        return np.stack([np.bincount(self.node.ravel(), (self.share * one).ravel(), size) for one in along], axis=1)
+
+    def take(self, values: FloatArray, fields_mm: FloatArray) -> None:
+        """Subtract the fields of k sets of values (values, k) from k fields (k, n, 3)."""
+        hat = self._hat(len(fields_mm))
+        if hat is not None:
+            along = values.T @ hat
+        else:
+            along = (self.share[0] * values.T[:, self.node[0]]) + (self.share[1] * values.T[:, self.node[1]])
+        for output in self.outputs:
+            fields_mm[:, :, output] -= self.carrier[:, output] * along
+
+    def _hat(self, fields: int) -> FloatArray | None:
+        """Matrix (values, n) of the shares, where it serves several fields and is not too large."""
+        size, points = self.place.stop - self.place.start, np.arange(len(self.carrier))
+        if fields <= _FEW or size * len(points) > _LARGEST_HAT:
+            return None
+        hat = np.zeros((size, len(points)))
+        hat[self.node[0], points] = self.share[0]
+        hat[self.node[1], points] += self.share[1]
+        return hat
+
+
+@dataclass(frozen=True)
 class Projector:
     """Least squares of a basis over sample points, with the normal matrix factorised once.
 
     ``position_mm`` (n, 3) with ``weight`` (n,) and ``sample_tool_mm`` (3,) or (n, 3) are the sample; elsewhere the tool
-    is ``tool_mm``. ``transform`` (parameters, free) builds in the zeros at the reference point; ``offsets`` is 3 if a
-    constant per axis is fitted together with the tables because the control cannot express it. ``design`` (3 n, free +
-    offsets) is sparse.
+    is ``tool_mm``. ``terms`` are the basis at the sample. ``freedom`` builds in the zeros at the reference point;
+    ``offsets`` is 3 if a constant per axis is fitted together with the tables because the control cannot express it.
+    ``factor`` (free + offsets, free + offsets) is the Cholesky factor of the normal matrix with
+    unit diagonal, ``scale`` what gave it that.
     """
 
     basis: tuple[Term, ...]
@@ -67,10 +149,10 @@ class Projector:
     weight: FloatArray
     tool_mm: FloatArray
     sample_tool_mm: FloatArray
-    transform: csr_array
+    terms: tuple[SampledTerm, ...]
+    freedom: FreeValues
     offsets: int
-    design: csr_array
-    factor: tuple[FloatArray, bool]
+    factor: FloatArray
     scale: FloatArray
 
     def project(self, wanted_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
@@ -81,19 +163,23 @@ class Projector:
 
     def project_all(self, wanted_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
-        return np.asarray((self.transform @ self._solved(wanted_mm)[: self.transform.shape[1]]).T)
+        return self._solved(wanted_mm).T
 
     def left_of(self, wanted_mm: FloatArray) -> FloatArray:
         """Return what the closest tables leave of k wanted fields (k, n, 3) at the sample points, (k, n, 3)."""
-        solution = self._solved(wanted_mm)
-        solution[self.transform.shape[1] :] = 0.0  # a constant per axis is left to whoever asks
-        return np.asarray(wanted_mm - (self.design @ solution).T.reshape(wanted_mm.shape))
+        left, values = wanted_mm.copy(), self._solved(wanted_mm)  # a constant per axis is left to whoever asks
+        for term in self.terms:
+            term.take(values[term.place], left)
+        return left
 
     def _solved(self, wanted_mm: FloatArray) -> FloatArray:
-        """Free values and offsets (free + offsets, k) for k wanted fields (k, n, 3)."""
-        weighted = wanted_mm * self.weight[:, None]
-        right = self.design.T @ weighted.reshape(len(wanted_mm), -1).T
-        return np.asarray(self.scale[:, None] * np.asarray(cho_solve(self.factor, right * self.scale[:, None])))
+        """All table values (parameters, k) for k wanted fields (k, n, 3)."""
+        counting = wanted_mm * self.weight[:, None]
+        right = self.freedom.gather(np.concatenate([term.gather(counting) for term in self.terms]))
+        if self.offsets:
+            right = np.concatenate([right, counting.sum(axis=1).T])
+        solution = self.scale[:, None] * lapack().dpotrs(self.factor, right * self.scale[:, None], lower=1)[0]
+        return self.freedom.expand(solution[: len(self.freedom.free)])
 
     def field(self, values: FloatArray, position_mm: FloatArray | None = None) -> FloatArray:
         """Return the correction field of table values at the sample points or at others, see :func:`basis_field`."""
@@ -128,25 +214,31 @@ def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArr
     return fields if values.ndim == 2 else np.asarray(fields[0])
 
 
-def _design(basis: Sequence[Term], position_mm: FloatArray, tool_mm: FloatArray) -> csr_array:
-    """Design matrix (3 n, parameters) at points (n, 3), sparse: each table has two values at a point."""
-    rows, columns, entries = [], [], []
-    points = np.arange(len(position_mm))
-    for term, place in placed_terms(basis):
-        carrier = term.carrier_field(position_mm, tool_mm)
-        if term.axis is None or len(term.nodes_mm) == 1:
-            left, share = np.zeros(len(points), dtype=np.int64), np.zeros(len(points))
-        else:
-            left, share = hat_entries(term.nodes_mm, position_mm[:, term.axis])
-        right = np.minimum(left + 1, len(term.nodes_mm) - 1)
-        for output in sorted({part.output for part in term.carrier}):
-            for node, weight in ((left, 1.0 - share), (right, share)):
-                rows.append(3 * points + output)
-                columns.append(place.start + node)
-                entries.append(carrier[:, output] * weight)
-    where = (np.concatenate(rows), np.concatenate(columns))
-    size = sum(len(term.nodes_mm) for term in basis)
-    return coo_array((np.concatenate(entries), where), shape=(3 * len(points), size)).tocsr()
+def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArray:
+    """Sums of the weighted products of the values' fields at points (n,), (parameters, parameters).
+
+    Two nodes count for each term at a point, so four entries for two terms; terms with the same nodes share them.
+    """
+    size = terms[-1].place.stop
+    normal = np.zeros((size, size))
+    entries: dict[tuple[object, object], tuple[NDArray[np.int64], FloatArray]] = {}
+    for k, one in enumerate(terms):
+        counting = weight[:, None] * one.carrier
+        for other in terms[k:]:
+            common = [output for output in one.outputs if output in other.outputs]
+            if not common:
+                continue
+            width = other.place.stop - other.place.start
+            if (one.hat, other.hat) not in entries:
+                where = one.node[:, None] * width + other.node[None]
+                entries[one.hat, other.hat] = where.ravel(), one.share[:, None] * other.share[None]
+            where, share = entries[one.hat, other.hat]
+            product = np.einsum("nc,nc->n", counting[:, common], other.carrier[:, common])
+            height = one.place.stop - one.place.start
+            block = np.bincount(where, (share * product).ravel(), height * width).reshape(height, width)
+            normal[one.place, other.place] = block
+            normal[other.place, one.place] = block.T
+    return normal
 
 
 def projector(
@@ -194,37 +286,42 @@ def _factorised(problem: _Problem) -> Projector:
     if tools_mm:
         tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)
         position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
-    transform = _transform(machine, basis)
-    offsets = 3 if problem.anchored else 0
-    design = _design(basis, position_mm, tool_mm) @ transform
+    terms = tuple(SampledTerm.of(term, place, position_mm, tool_mm) for term, place in placed_terms(basis))
+    freedom = _freedom(machine, basis)
+    free, offsets = len(freedom.free), 3 if problem.anchored else 0
+    normal = np.zeros((free + offsets, free + offsets))
+    normal[:free, :free] = freedom.gather(freedom.gather(_normal_matrix(terms, weight)).T)
     if offsets:
-        constants = coo_array(np.tile(np.eye(3), (len(position_mm), 1)))
-        design = hstack([design, constants], format="csr")
-    normal = (design.T @ (design.multiply(np.repeat(weight, 3)[:, None])).tocsr()).toarray()
+        constant = weight[:, None] * np.eye(3)[:, None]
+        across = freedom.gather(np.concatenate([term.gather(constant) for term in terms]))
+        normal[:free, free:], normal[free:, :free] = across, across.T
+        normal[free:, free:] = weight.sum() * np.eye(3)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     # rows whose product with the values gives them at the positions keep_mm of every term
     blocks = []
     for term, place in placed_terms(basis):
-        kept = np.zeros((len(term.keep_mm) if term.axis is not None else 0, transform.shape[0]))
+        kept = np.zeros((len(term.keep_mm) if term.axis is not None else 0, terms[-1].place.stop))
         if len(kept):
             kept[:, place] = hat_matrix(term.nodes_mm, np.array(term.keep_mm))
         blocks.append(kept)
-    rows = np.asarray(np.vstack(blocks) @ transform)
-    rows *= scale[: transform.shape[1]]
+    rows = freedom.gather(np.vstack(blocks).T).T
+    rows *= scale[:free]
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
     regular = KEEP * rows.T @ rows
     regular[np.diag_indices_from(regular)] += RIDGE
     normal *= scale[:, None]  # in place: for tables of thousands of nodes these matrices are large
     normal *= scale
-    normal[: transform.shape[1], : transform.shape[1]] += regular
-    factor = cho_factor(normal, lower=True, overwrite_a=True)
-    sampled = (position_mm, weight, own_tool_mm, tool_mm)
-    return Projector(basis, *sampled, transform, offsets, design, factor, scale)
+    normal[:free, :free] += regular
+    factor, failed = lapack().dpotrf(normal.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
+    if failed:
+        raise LinAlgError("the normal matrix of the tables is not positive definite")
+    sampled = (position_mm, weight, own_tool_mm, tool_mm, terms)
+    return Projector(basis, *sampled, freedom, offsets, factor, scale)
 
 
-def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
-    blocks = []
-    for term in basis:
+def _freedom(machine: Machine, basis: Sequence[Term]) -> FreeValues:
+    parts = []
+    for term, place in placed_terms(basis):
         rows = []
         if term.axis is not None:
             if term.zero_at_mm is not None:
@@ -240,9 +337,15 @@ def _transform(machine: Machine, basis: Sequence[Term]) -> csr_array:
                     row = np.zeros(len(nodes_mm))
                     row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
                     rows.append(row)
-        # sparse before they are joined: block_diag would keep every zero of a dense block as an entry
-        blocks.append(csr_array(free_basis(np.array(rows), len(term.nodes_mm))))
-    return csr_array(block_diag(blocks))
+        parts.append((place.start, *eliminated(np.array(rows), len(term.nodes_mm))))
+    free = np.concatenate([first + own for first, own, _, _ in parts])
+    bound = np.concatenate([np.array(own, dtype=np.intp) + first for first, _, own, _ in parts])
+    combined, down, across = np.zeros((len(bound), len(free))), 0, 0
+    for *_, own_rows in parts:
+        height, width = own_rows.shape
+        combined[down : down + height, across : across + width] = own_rows
+        down, across = down + height, across + width
+    return FreeValues(free, bound, combined)
 
 
 def synthesize(

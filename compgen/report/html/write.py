@@ -41,6 +41,7 @@ from compgen.report.html.pictures import (
 )
 from compgen.resources import data_folder
 from compgen.tables import REPORT_FILES, program_version
+from compgen.tables.render import KeptTemplates
 from compgen.tables.verification import coverage_of
 
 # Figures of ISO 230 in the report: those in the folder, otherwise those of the identified errors.
@@ -503,6 +504,8 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        optimized=False,
+        bytecode_cache=KeptTemplates("report"),
     )
     environment.filters |= {
         "um": um,
