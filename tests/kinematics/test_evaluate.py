@@ -294,6 +294,15 @@ def test_wrong_shapes_are_refused_with_what_is_due(call, message):
         call(machine_of(), errors_of())
 
 
+@pytest.mark.parametrize("count", [2, 3, 9, 1001])
+def test_even_nodes_are_seen_to_be_even_and_no_others(count):
+    nodes = np.linspace(-300.1, 500.0, count)
+    assert NodeIndex(nodes).even
+    if count > 2:
+        nodes[-2] += 1e-6
+        assert not NodeIndex(nodes).even
+
+
 @settings(max_examples=200, deadline=None)
 @given(
     gaps=st.lists(st.floats(1e-6, 500.0), min_size=1, max_size=30),
