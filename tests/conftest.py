@@ -147,6 +147,20 @@ def example():
 
 
 @pytest.fixture
+def call(capsys):
+    """Run the command line as the console script does: (exit code, stdout, stderr)."""
+    from compgen.cli import cli
+    from compgen.cli.common import run_command
+
+    def run(*words):
+        code = run_command(cli, [str(word) for word in words])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
 def listing():
     """A function that returns every path below a folder with its contents, hidden ones too."""
 

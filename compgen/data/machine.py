@@ -35,13 +35,9 @@ ZONE_WEIGHT = 10.0
 MOST_ZONE_WEIGHT = 1e3
 
 
-@toml_files.accepts({"type": "number", "minimum": 1.0, "maximum": MOST_ZONE_WEIGHT})
-def _weight(value: Any) -> float:
-    """Return a weight from 1 to 1000."""
-    result = toml_files.number(value)
-    if not 1.0 <= result <= MOST_ZONE_WEIGHT:
-        raise ValueError(f"expected a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (almost only the zone)")
-    return result
+_weight = toml_files.bounded(
+    f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (almost only the zone)", minimum=1.0, maximum=MOST_ZONE_WEIGHT
+)
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import Field, dataclass, field, fields, is_dataclass, replace
 from decimal import Decimal
+from operator import ge, gt, le, lt
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, overload
 
@@ -801,6 +802,20 @@ def word_for(values: Mapping[str, T]) -> Callable[[Any], T]:
     """One of the given words, converted to its value."""
     check = choice(*values)
     return accepts(accepted(check))(lambda value: values[check(value)])
+
+
+def bounded(expected: str, **limits: float) -> Callable[[Any], float]:
+    """A number within limits, which have their names in a JSON schema (``minimum``, ``exclusiveMaximum``, ...)."""
+    holds = {"minimum": ge, "exclusiveMinimum": gt, "maximum": le, "exclusiveMaximum": lt}
+
+    @accepts({"type": "number", **limits})
+    def check(value: Any) -> float:
+        result = number(value)
+        if not all(holds[name](result, limit) for name, limit in limits.items()):
+            raise ValueError(f"expected {expected}")
+        return result
+
+    return check
 
 
 def share(most: float, whole: str) -> Callable[[Any], float]:

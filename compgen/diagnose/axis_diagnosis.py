@@ -231,7 +231,16 @@ def _findings(
     effects, unknown = _changes_found(changes, most)
     if repeated and not unknown:
         unknown = _restless(changes)
-    effects, unknown = _beside_each_other(effects, unknown, reversal.found(names, add, source))
+    static, irregular = reversal.found(names, add, source)
+    # a reversal is doubtful where it changes with time, and a small one where anything else has no name
+    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
+        static = [_doubted(item, "the reversal changes with time") for item in static]
+    elif unknown:
+        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
+        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
+    effects, unknown = [*effects, *static], [*unknown, *irregular]
+    if unknown:
+        effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
     if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
         first = effects[0]
         unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
@@ -269,25 +278,6 @@ def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list
         covariates = ("run", *_one_way(changes.session, effects))
         unknown.append(AxisUnknown(text, covariates, np.nan, of_runs[0].name))
     return sorted(effects, key=lambda item: -item.gain), unknown
-
-
-def _beside_each_other(
-    effects: Sequence[AxisEffect], unknown: Sequence[AxisUnknown], reversal: tuple[list[AxisEffect], list[AxisUnknown]]
-) -> tuple[list[AxisEffect], list[AxisUnknown]]:
-    """Changes with time and the reversal, each graded by what has no name.
-
-    A reversal is doubtful where it changes with time, and a small one where anything else has no name.
-    """
-    static, irregular = reversal
-    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
-        static = [_doubted(item, "the reversal changes with time") for item in static]
-    elif unknown:
-        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
-        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
-    graded, nameless = [*effects, *static], [*unknown, *irregular]
-    if nameless:
-        graded = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in graded]
-    return graded, nameless
 
 
 def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, ...]:

@@ -289,7 +289,22 @@ def engine_of(url: str) -> sa.Engine:
             f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or create it first"
         )
     path = folder / Path(parsed.database).name
-    _refuse_empty(path, url)
+    for pause in (
+        *WAITS_S,
+        None,
+    ):  # a file without contents: a store lost them; one that is being made has some in a moment
+        try:
+            if path.stat().st_size > 0:
+                break
+        except OSError:  # not there yet, or the database says what is wrong
+            break
+        if pause is not None:
+            time.sleep(pause)
+    else:
+        raise StoreError(
+            f"the store {shown(url)} is damaged: the file is empty (0 bytes); restore a backup, or remove the file if there "
+            "never was anything in it"
+        )
     return _sqlite(parsed.set(database=str(path)), os.getpid())
 
 
@@ -302,22 +317,6 @@ def sqlite_path(url: str) -> str | None:
     except sa.exc.ArgumentError:
         return None
     return parsed.database or None if parsed.get_backend_name() == "sqlite" else None
-
-
-def _refuse_empty(path: Path, url: str) -> None:
-    """Raise StoreError for a file without contents: a store lost them; one that is being made has some in a moment."""
-    for pause in (*WAITS_S, None):
-        try:
-            if path.stat().st_size > 0:
-                return
-        except OSError:
-            return  # not there yet, or the database says what is wrong
-        if pause is not None:
-            time.sleep(pause)
-    raise StoreError(
-        f"the store {shown(url)} is damaged: the file is empty (0 bytes); restore a backup, or remove the file if there "
-        "never was anything in it"
-    )
 
 
 @lru_cache(maxsize=8)

@@ -163,12 +163,9 @@ WATCH_POLL_S = 2.0
 MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-@accepts({"type": "number", "minimum": 0.5, "exclusiveMaximum": 1.0})
-def _confidence(value: Any) -> float:
-    result = toml_files.number(value)
-    if not 0.5 <= result < 1.0:
-        raise ValueError("expected a confidence from 0.5 to below 1, for example 0.95")
-    return result
+_confidence = toml_files.bounded(
+    "a confidence from 0.5 to below 1, for example 0.95", minimum=0.5, exclusiveMaximum=1.0
+)
 
 
 @accepts(

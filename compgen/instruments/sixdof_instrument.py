@@ -52,12 +52,7 @@ def _separation(value: Any) -> float:
     return result
 
 
-@toml_files.accepts({"type": "number", "exclusiveMinimum": 1.0, "exclusiveMaximum": 4.0, "examples": [1.5]})
-def _glass(value: Any) -> float:
-    result = toml_files.number(value)
-    if not 1.0 < result < 4.0:
-        raise ValueError("expected a refractive index between 1 and 4")
-    return result
+_glass = toml_files.bounded("a refractive index between 1 and 4", exclusiveMinimum=1.0, exclusiveMaximum=4.0)
 
 
 @dataclass(frozen=True)

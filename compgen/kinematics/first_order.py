@@ -133,26 +133,24 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
     (17, False)
     """
     tools = np.zeros((1, 3)) if tools_mm is None else np.atleast_2d(tools_mm)
-    idle = [_idle_rotations(machine, axis, tools) for axis in range(3)]
-    return tuple(error.name for error in ERRORS if error.kind != "angular" or error.direction not in idle[error.axis])
-
-
-def _idle_rotations(machine: Machine, axis: int, tools_mm: FloatArray) -> set[int]:
-    """Directions (0, 1, 2) of the angular errors of ``axis`` that its lever arms do not show."""
-    others = [other for other in machine.chain.lever_axes(axis) if other != axis]
-    if len(others) > 1:
-        return set()
-    travel = np.eye(3)[others]
-    spread = tools_mm - tools_mm.mean(axis=0)
+    spread = tools - tools.mean(axis=0)
     longest = np.linalg.norm(spread, axis=1).max()
-    if longest <= _SAME_TOOL_MM:
-        return set(others) if others else {0, 1, 2}
-    levers = np.vstack([travel, spread / longest])
-    _, lengths, directions = np.linalg.svd(levers)
-    if len(lengths) > 1 and lengths[1] > _PARALLEL:
-        return set()
-    components = np.abs(directions[0])
-    return {int(np.flatnonzero(components > _PARALLEL)[-1])}
+    idle: list[set[int]] = [
+        set(),
+        set(),
+        set(),
+    ]  # directions of the angular errors that the lever arms of an axis do not show
+    for axis in range(3):
+        others = [other for other in machine.chain.lever_axes(axis) if other != axis]
+        if len(others) > 1:
+            continue
+        if longest <= _SAME_TOOL_MM:
+            idle[axis] = set(others or range(3))
+            continue
+        _, lengths, directions = np.linalg.svd(np.vstack([np.eye(3)[others], spread / longest]))
+        if len(lengths) == 1 or lengths[1] <= _PARALLEL:
+            idle[axis] = {int(np.flatnonzero(np.abs(directions[0]) > _PARALLEL)[-1])}
+    return tuple(error.name for error in ERRORS if error.kind != "angular" or error.direction not in idle[error.axis])
 
 
 def modelled_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:

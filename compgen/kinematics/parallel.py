@@ -257,7 +257,15 @@ class Processes:
                 if stop() or self._stop.value:
                     raise StoppedError("not begun: stopped")
                 try:
-                    return self._waited(lane, lane.perform(function, item), stop).value()
+                    future = lane.perform(function, item)
+                    while True:
+                        try:
+                            return future.result(POLL_S).value()
+                        except NotYet:
+                            if stop():
+                                self._stop.value = 1
+                            if lane.overdue():
+                                lane.kill()
                 except BrokenExecutor:
                     late = lane.overdue()
                     lane.close()
@@ -267,16 +275,6 @@ class Processes:
         finally:
             self._idle.put(lane)
         raise LostError("the process that worked on it was killed, twice (out of memory?)")
-
-    def _waited(self, lane: _Lane, future: Future[Answer], stop: Stop) -> Answer:
-        while True:
-            try:
-                return future.result(POLL_S)
-            except NotYet:
-                if stop():
-                    self._stop.value = 1
-                if lane.overdue():
-                    lane.kill()
 
     def close(self) -> None:
         """Begin nothing more, wait for what runs, end the processes."""

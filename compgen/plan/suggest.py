@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -130,11 +131,23 @@ def suggest(
     seed : of the spread places; the same seed gives the same result.
     progress : called with the progress of the search.
     """
+    from scipy.optimize import minimize  # imported here: slow to load
+
     with one_thread():
         search = _Search(start, regions, criterion, evaluations)
         start_um = search.at(start.stations.position_mm)
         _spread(search, seed, progress)
-        _improve(search, progress)
+        # Powell's method from the best so far, until the limit; the best is kept
+        start_unit = np.concatenate([r.unit(place) for r, place in zip(search.regions, search.best_mm, strict=True)])
+
+        def cost(unit: FloatArray) -> float:
+            value = search.at_units(np.clip(unit, 0.0, 1.0))
+            progress(f"searching places: {search.count} of {search.limit}, best {search.best_um:.3g} um")
+            return float(np.log(value)) if np.isfinite(value) else 50.0
+
+        with suppress(StopIteration):
+            limits = [(0.0, 1.0)] * len(start_unit)
+            minimize(cost, start_unit, method="Powell", bounds=limits, options={"xtol": 0.02, "ftol": 1e-4})
         better = search.best_um < start_um
         found = plan_of(_moved(start, search.best_mm)) if better else plan_of(start)
     return Suggestion(found, criterion, start_um, search.best_um, search.count, better)
@@ -150,23 +163,6 @@ def _spread(search: _Search, seed: int, progress: Progress) -> None:
             return
         search.at_units(unit)
         progress(f"searching places: {k + 1} of {search.limit}, best {search.best_um:.3g} um")
-
-
-def _improve(search: _Search, progress: Progress) -> None:
-    """Apply Powell's method to the best so far, until the limit; the best is kept."""
-    from scipy.optimize import minimize  # imported here: slow to load
-
-    start = np.concatenate([r.unit(place) for r, place in zip(search.regions, search.best_mm, strict=True)])
-
-    def cost(unit: FloatArray) -> float:
-        value = search.at_units(np.clip(unit, 0.0, 1.0))
-        progress(f"searching places: {search.count} of {search.limit}, best {search.best_um:.3g} um")
-        return float(np.log(value)) if np.isfinite(value) else 50.0
-
-    try:
-        minimize(cost, start, method="Powell", bounds=[(0.0, 1.0)] * len(start), options={"xtol": 0.02, "ftol": 1e-4})
-    except StopIteration:
-        return
 
 
 def _moved(start: Planned, stations_mm: FloatArray) -> Planned:

@@ -32,18 +32,12 @@ EXTREMES = "x_mm,y_mm,z_mm\n-300,-100,-240\n200,300,0\n-50,100,-40\n12.5,-37.25,
 
 
 @pytest.fixture
-def call(capsys, monkeypatch, tmp_path):
-    """Run the command line as the console script does: (exit code, stdout, stderr); the working folder is empty."""
+def call(call, monkeypatch, tmp_path):
+    """The command line, with an empty working folder."""
     work = tmp_path / "work"
     work.mkdir()
     monkeypatch.chdir(work)
-
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
+    return call
 
 
 @pytest.fixture

@@ -11,8 +11,6 @@ import numpy as np
 import pytest
 
 import compgen
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.registry import Kind, load_entry_points, restored
 from compgen.plugins import KINDS
@@ -42,18 +40,6 @@ def tutorial(tmp_path, monkeypatch):
             commands += text.splitlines()
     monkeypatch.chdir(tmp_path)
     return commands
-
-
-@pytest.fixture
-def call(capsys):
-    """Run the command line: (exit code, stdout, stderr)."""
-
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
 
 
 # --- the tutorial ----------------------------------------------------------------------------------------------------

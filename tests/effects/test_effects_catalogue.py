@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.data.axis_runs import read_axis_runs
 from compgen.data.lengths import Points
 from compgen.data.machine import load_machine
@@ -52,18 +50,6 @@ p1_urad = 10.0
 def registries_as_before():
     with restored(KINDS):
         yield
-
-
-@pytest.fixture
-def call(capsys):
-    """Run the command line: (exit code, stdout, stderr)."""
-
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture

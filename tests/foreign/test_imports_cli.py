@@ -9,8 +9,6 @@ import numpy as np
 import openpyxl
 import pytest
 
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.data.error_table import read_errors
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -39,15 +37,9 @@ def machine(tmp_path):
     return str(path)
 
 
-def call(capsys, *words):
-    code = run_command(cli, [str(word) for word in words])
-    shown = capsys.readouterr()
-    return code, shown.out, shown.err
-
-
-def test_import_shows_what_it_understood_and_writes_nothing_without_out(capsys, tmp_path, listing):
+def test_import_shows_what_it_understood_and_writes_nothing_without_out(call, tmp_path, listing):
     before = listing(tmp_path)
-    code, out, err = call(capsys, "import", GOLDEN / "linear.rtl")
+    code, out, err = call("import", GOLDEN / "linear.rtl")
     assert code == 0
     for line in ("axis: X", "targets: 5", "runs: 5", "directions: both", "unit: um", "sign: measured minus target"):
         assert line in out
@@ -55,10 +47,8 @@ def test_import_shows_what_it_understood_and_writes_nothing_without_out(capsys, 
     assert listing(tmp_path) == before
 
 
-def test_import_as_json_is_one_object_and_writes_the_contract_file(capsys, tmp_path, machine):
-    code, out, _ = call(
-        capsys, "import", GOLDEN / "german.csv", "--machine", machine, "--out", tmp_path / "o", "--json"
-    )
+def test_import_as_json_is_one_object_and_writes_the_contract_file(call, tmp_path, machine):
+    code, out, _ = call("import", GOLDEN / "german.csv", "--machine", machine, "--out", tmp_path / "o", "--json")
     facts = json.loads(out)
     assert code == 0
     assert facts["kind"] == "axis"
@@ -67,20 +57,20 @@ def test_import_as_json_is_one_object_and_writes_the_contract_file(capsys, tmp_p
     assert facts["files"] == [str(tmp_path / "o" / "german.axis.csv")]
 
 
-def test_import_writes_nothing_while_something_is_open(capsys, tmp_path):
-    code, out, _ = call(capsys, "import", GOLDEN / "ecmc_ISO230.dat", "--out", tmp_path / "o")
+def test_import_writes_nothing_while_something_is_open(call, tmp_path):
+    code, out, _ = call("import", GOLDEN / "ecmc_ISO230.dat", "--out", tmp_path / "o")
     assert code == 2
     assert "give --axis" in out
     assert not (tmp_path / "o").exists()
-    code, _, _ = call(capsys, "import", GOLDEN / "ecmc_ISO230.dat", "--axis", "y", "--out", tmp_path / "o")
+    code, _, _ = call("import", GOLDEN / "ecmc_ISO230.dat", "--axis", "y", "--out", tmp_path / "o")
     assert code == 0
     assert (tmp_path / "o" / "ecmc_ISO230.axis.csv").exists()
 
 
-def test_positions_beyond_the_travel_are_named(capsys, tmp_path, machine):
+def test_positions_beyond_the_travel_are_named(call, tmp_path, machine):
     path = tmp_path / "x.csv"
     path.write_text("position [mm],deviation [um],axis\n0,1,X\n4000,2,X\n")
-    code, out, _ = call(capsys, "import", path, "--machine", machine, "--out", tmp_path / "o")
+    code, out, _ = call("import", path, "--machine", machine, "--out", tmp_path / "o")
     assert code == 2
     assert "0 to 4000 mm, but imported travels from 0 to 400 mm" in out
     assert not (tmp_path / "o").exists()
@@ -98,12 +88,12 @@ OWN = {
 
 
 @pytest.mark.parametrize("kind", OWN)
-def test_files_of_the_own_format_are_shown_and_copied(capsys, tmp_path, kind):
+def test_files_of_the_own_format_are_shown_and_copied(call, tmp_path, kind):
     path = OWN[kind]
     if isinstance(path, str):
         path = tmp_path / f"a.{kind}.csv"
         path.write_text(OWN[kind])
-    code, out, err = call(capsys, "import", path, "--out", tmp_path / "o", "--json")
+    code, out, err = call("import", path, "--out", tmp_path / "o", "--json")
     assert code == 0, err
     facts = json.loads(out)
     assert (facts["format"], facts["kind"]) == ("compgen", kind)
@@ -111,38 +101,38 @@ def test_files_of_the_own_format_are_shown_and_copied(capsys, tmp_path, kind):
     assert list(facts["understood"]["columns"]) == names
     assert facts["files"] == [str(tmp_path / "o" / path.name)]
     assert (tmp_path / "o" / path.name).read_text() == path.read_text()
-    code, out, _ = call(capsys, "import", path)
+    code, out, _ = call("import", path)
     assert code == 0
     assert f"compgen, {kind}" in out
     assert "the other commands read it directly" in out
 
 
-def test_damaged_own_files_options_that_convert_and_unknown_sheets_are_usage_errors(capsys, tmp_path):
+def test_damaged_own_files_options_that_convert_and_unknown_sheets_are_usage_errors(call, tmp_path):
     path = tmp_path / "a.axis.csv"
     path.write_text(OWN["axis"].replace("2.5", "x"))
-    code, _, err = call(capsys, "import", path, "--out", tmp_path / "o")
+    code, _, err = call("import", path, "--out", tmp_path / "o")
     assert code == 2
     assert "a.axis.csv:2: column deviation_um: 'x' is not a number" in err
     assert not (tmp_path / "o").exists()
-    code, _, err = call(capsys, "import", OWN["lengths"], "--sign", "correction")
+    code, _, err = call("import", OWN["lengths"], "--sign", "correction")
     assert code == 2
     assert "--sign: is already in the native format (lengths)" in err
-    code, _, err = call(capsys, "import", OWN["lengths"], "--machine", "jia-xytz", "--out", tmp_path / "o")
+    code, _, err = call("import", OWN["lengths"], "--machine", "jia-xytz", "--out", tmp_path / "o")
     assert code == 2
-    code, _, err = call(capsys, "import", GOLDEN / "wide.xlsx", "--sheet", "Q", "--json")
+    code, _, err = call("import", GOLDEN / "wide.xlsx", "--sheet", "Q", "--json")
     assert code == 2
     assert "no sheet 'Q'" in err
 
 
 @pytest.mark.parametrize("name", ["linear.rtl", "wide.xlsx", "german.csv"])
-def test_from_a_foreign_measurement_to_accepted_tables_in_one_command(capsys, tmp_path, machine, name):
+def test_from_a_foreign_measurement_to_accepted_tables_in_one_command(call, tmp_path, machine, name):
     words = ["run", machine, GOLDEN / name, "--controller", "isg-csv", "--smoothness", "0", "--json", "--out"]
-    code, out, _ = call(capsys, *words, tmp_path / "refused")  # the runs of the golden example scatter widely
+    code, out, _ = call(*words, tmp_path / "refused")  # the runs of the golden example scatter widely
     assert (code, [item["code"] for item in json.loads(out)["objections"] if item["blocking"]]) == (
         1,
         ["residual_too_large"],
     )
-    code, out, err = call(capsys, *words, tmp_path / "o", "--allow-misfit")
+    code, out, err = call(*words, tmp_path / "o", "--allow-misfit")
     assert code == 0, err
     facts = json.loads(out)
     assert facts["accepted"] is True
@@ -154,27 +144,25 @@ def test_from_a_foreign_measurement_to_accepted_tables_in_one_command(capsys, tm
     assert [round(1e3 * value, 9) for value in errors.curves["EXX"].value] == [0.0, 3.5, -2.0, -4.5, 3.0]
 
 
-def test_from_an_exchange_file_and_from_a_sheet_of_errors_to_tables_in_one_command(capsys, tmp_path, machine):
-    code, _, err = call(capsys, "export", machine, VENDOR, "--controller", "isg-csv", "--out", tmp_path / "a")
+def test_from_an_exchange_file_and_from_a_sheet_of_errors_to_tables_in_one_command(call, tmp_path, machine):
+    code, _, err = call("export", machine, VENDOR, "--controller", "isg-csv", "--out", tmp_path / "a")
     assert code == 0, err
     book = openpyxl.Workbook()
     for row in (["Position", "EXX"], ["mm", "um"], [0, 0], [200, 5], [400, -3]):
         book.active.append(row)
     book.save(tmp_path / "errors.xlsx")
-    code, _, err = call(
-        capsys, "export", machine, tmp_path / "errors.xlsx", "--controller", "isg-csv", "--out", tmp_path / "b"
-    )
+    code, _, err = call("export", machine, tmp_path / "errors.xlsx", "--controller", "isg-csv", "--out", tmp_path / "b")
     assert code == 0, err
     assert (tmp_path / "b" / "volcomp0.csv").exists()
 
 
-def test_an_exchange_file_runs_through_the_whole_chain(capsys, tmp_path, machine):
+def test_an_exchange_file_runs_through_the_whole_chain(call, tmp_path, machine):
     path = tmp_path / "tracer.txt"
     path.write_text(
         "// constructed\n[C0Y]\nVALUE = 0.00002\n[EXX]\nGridpoints = {\n0 0.003\n100 0.007\n200 0.002\n400 0.005\n}\n"
         "[EYX]\nGridpoints = {\n0 0.001\n200 0.006\n400 0.003\n}\n"
     )
-    code, out, err = call(capsys, "run", machine, path, "--controller", "isg-csv", "--out", tmp_path / "o", "--json")
+    code, out, err = call("run", machine, path, "--controller", "isg-csv", "--out", tmp_path / "o", "--json")
     assert code == 0, err
     facts = json.loads(out)
     assert facts["identify"]["method"] == "given"
@@ -185,10 +173,8 @@ def test_an_exchange_file_runs_through_the_whole_chain(capsys, tmp_path, machine
     assert 1e6 * errors.squareness["EC0Y"][0] == pytest.approx(15, abs=1e-6)
 
 
-def test_a_file_that_leaves_something_open_is_not_computed_with(capsys, tmp_path, machine):
-    code, _, err = call(
-        capsys, "run", machine, GOLDEN / "ecmc_ISO230.dat", "--controller", "isg-csv", "--out", tmp_path / "o"
-    )
+def test_a_file_that_leaves_something_open_is_not_computed_with(call, tmp_path, machine):
+    code, _, err = call("run", machine, GOLDEN / "ecmc_ISO230.dat", "--controller", "isg-csv", "--out", tmp_path / "o")
     assert code == 2
     assert "leaves open" in err
     assert "give --axis" in err
@@ -196,7 +182,7 @@ def test_a_file_that_leaves_something_open_is_not_computed_with(capsys, tmp_path
 
 
 @pytest.mark.parametrize("command", ["import", "identify", "run", "fit"])
-def test_a_file_of_500_megabytes_is_answered_within_a_second(capsys, tmp_path, machine, command):
+def test_a_file_of_500_megabytes_is_answered_within_a_second(call, tmp_path, machine, command):
     path = tmp_path / "huge.rtl"
     with path.open("wb") as stream:
         stream.write(b"HEADER::\r\n")
@@ -208,7 +194,7 @@ def test_a_file_of_500_megabytes_is_answered_within_a_second(capsys, tmp_path, m
         "fit": [machine, path, "--out", tmp_path / "o"],
     }[command]
     started = time.monotonic()
-    code, _, err = call(capsys, command, *words)
+    code, _, err = call(command, *words)
     assert time.monotonic() - started < 1.0
     assert code == 2
     assert "500 MB" in err
@@ -217,7 +203,7 @@ def test_a_file_of_500_megabytes_is_answered_within_a_second(capsys, tmp_path, m
 @pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT"])
 @pytest.mark.parametrize("source", ["laser", "exchange", "workbook"])
 def test_an_axis_that_goes_too_far_is_told_to_go_less_far_whatever_the_file_and_the_machine(
-    capsys, tmp_path, chain, source
+    call, tmp_path, chain, source
 ):
     """EXX = +10 um at 400 mm, zero at the reference point 100 mm: the trims of joint 0 are minus that, EEC has it as error."""
     targets, per_mm = [0, 100, 200, 300, 400], 0.025
@@ -225,7 +211,7 @@ def test_an_axis_that_goes_too_far_is_told_to_go_less_far_whatever_the_file_and_
     text = MACHINE.replace('"WFYXZT"', f'"{chain}"\nreference_point_mm = [100.0, -100.0, -40.0]')
     machine.write_text(text)
     measured = {"laser": _laser, "exchange": _exchange, "workbook": _workbook}[source](tmp_path, targets, per_mm)
-    code, _, err = call(capsys, "run", machine, measured, "--controller", "linuxcnc-comp", "--controller", "siemens-eec",
+    code, _, err = call("run", machine, measured, "--controller", "linuxcnc-comp", "--controller", "siemens-eec",
                         "--out", tmp_path / "o")  # fmt: skip
     assert code == 0, err
     assert (tmp_path / "o" / "report.html").stat().st_size > 10_000
@@ -274,20 +260,20 @@ def _workbook(folder, targets, per_mm):
     return folder / "p.xlsx"
 
 
-def test_import_shows_what_is_not_used_and_carries_the_date_over(capsys, tmp_path):
+def test_import_shows_what_is_not_used_and_carries_the_date_over(call, tmp_path):
     path = tmp_path / "x.csv"
     path.write_text(
         "Date: 04/03/2025\nTarget [mm],Deviation [um],Dead path [mm],Air temp [degC]\n0,1,5,20\n100,2,5,20.5\n"
     )
     words = ("import", path, "--axis", "X", "--out", tmp_path / "o")
-    code, out, _ = call(capsys, *words, "--dates", "dmy")
+    code, out, _ = call(*words, "--dates", "dmy")
     assert code == 0
     assert "not_used:" in out
     assert "Dead path [mm]: the native format has no column for it" in out
     text = (tmp_path / "o" / "x.axis.csv").read_text()
     assert "# measured_at = 2025-03-04\n" in text
     assert "temp_ambient_c" in text
-    code, out, _ = call(capsys, *words)
+    code, out, _ = call(*words)
     assert code == 0
     assert "may be 2025-03-04 or 2025-04-03" in out
     assert "measured_at" not in (tmp_path / "o" / "x.axis.csv").read_text()

@@ -9,8 +9,6 @@ import pytest
 from scipy.stats import chi2
 
 import machines
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.files import sha256_of
 from compgen.data.lengths import Lengths, Points, format_lengths, read_lengths
@@ -448,32 +446,22 @@ def test_a_file_of_another_kind_is_refused(written):
 
 
 @pytest.fixture
-def command(capsys):
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
-
-
-@pytest.fixture
-def files(tmp_path, small_machine, small_machine_file, small_lengths_file, command):
+def files(tmp_path, small_machine, small_machine_file, small_lengths_file, call):
     out = tmp_path / "i"
     words = ("--out", out, "--u-wavelength-ppm", "0.5", "--json")
-    code, stdout, _ = command("identify", small_machine_file, small_lengths_file, *words)
+    code, stdout, _ = call("identify", small_machine_file, small_lengths_file, *words)
     assert code == 0
     points = tmp_path / "p.points.csv"
     points.write_text("x_mm,y_mm,z_mm\n-300,-100,-240\n200,300,0\n-50,100,-40\n")
     return out, points, json.loads(stdout)
 
 
-def test_predict_adds_three_columns(command, files, small_machine, small_machine_file, tmp_path):
+def test_predict_adds_three_columns(call, files, small_machine, small_machine_file, tmp_path):
     out, points, summary = files
     result = tmp_path / "predicted.csv"
     errors = out / "identified.errors.csv"
     words = ("--points", points, "--out", result, "--json", "--uncertainty")
-    code, stdout, _ = command("predict", small_machine_file, errors, *words)
+    code, stdout, _ = call("predict", small_machine_file, errors, *words)
     assert code == 0
     header, *rows = [line for line in result.read_text().splitlines() if not line.startswith("#")]
     assert header.split(",")[-6:] == ["ex_um", "ey_um", "ez_um", "u_x_um", "u_y_um", "u_z_um"]
@@ -486,26 +474,26 @@ def test_predict_adds_three_columns(command, files, small_machine, small_machine
     assert summary["systematic"]["wavelength_ppm"]["u"] == 0.5
     named = tmp_path / "named.csv"
     words = ("--points", points, "--out", named, "--uncertainty", out / FILE_NAME)
-    assert command("predict", small_machine_file, errors, *words)[0] == 0
+    assert call("predict", small_machine_file, errors, *words)[0] == 0
     assert named.read_text() == result.read_text()
 
 
-def test_predict_refuses_a_covariance_of_other_errors(command, files, small_machine_file, tmp_path):
+def test_predict_refuses_a_covariance_of_other_errors(call, files, small_machine_file, tmp_path):
     out, points, _ = files
-    assert command("fit", small_machine_file, out / "identified.errors.csv", "--out", out)[0] == 0
+    assert call("fit", small_machine_file, out / "identified.errors.csv", "--out", out)[0] == 0
     target = tmp_path / "never.csv"
     words = ("--points", points, "--out", target)
-    code, _, stderr = command("predict", small_machine_file, out / "fitted.errors.csv", *words, "--uncertainty")
+    code, _, stderr = call("predict", small_machine_file, out / "fitted.errors.csv", *words, "--uncertainty")
     assert (code, "refers to no covariance file" in stderr) == (2, True)
     words = (*words, "--uncertainty", out / FILE_NAME)
-    code, _, stderr = command("predict", small_machine_file, out / "fitted.errors.csv", *words)
+    code, _, stderr = call("predict", small_machine_file, out / "fitted.errors.csv", *words)
     assert (code, "belongs to another errors file" in stderr) == (2, True)
     assert not target.exists()
 
 
-def test_identify_refuses_a_negative_input(command, small_machine_file, small_lengths_file, tmp_path):
+def test_identify_refuses_a_negative_input(call, small_machine_file, small_lengths_file, tmp_path):
     words = ("--out", tmp_path / "no", "--u-drift-um", "-1")
-    code, _, stderr = command("identify", small_machine_file, small_lengths_file, *words)
+    code, _, stderr = call("identify", small_machine_file, small_lengths_file, *words)
     assert (code, "drift_um" in stderr) == (2, True)
     assert not (tmp_path / "no").exists()
 

@@ -6,8 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.data.error_table import read_errors
 from compgen.data.lengths import Lengths, Points, read_points
 from compgen.data.machine import Axis, load_machine
@@ -430,30 +428,20 @@ def test_boxes_are_read_strictly(tmp_path):
 
 
 @pytest.fixture
-def command(capsys):
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
-
-
-@pytest.fixture
-def stations_file(command, small_machine_file, small_lengths_file, tmp_path):
+def stations_file(call, small_machine_file, small_lengths_file, tmp_path):
     """What identify wrote about the stations."""
     out = tmp_path / "identified"
-    assert command("identify", small_machine_file, small_lengths_file, "--out", out)[0] == 0
+    assert call("identify", small_machine_file, small_lengths_file, "--out", out)[0] == 0
     return out / "stations.csv"
 
 
 def test_plan_reads_the_stations_of_identify_and_predicts_its_uncertainties(
-    command, small_machine_file, stations_file, tmp_path
+    call, small_machine_file, stations_file, tmp_path
 ):
     out = tmp_path / "plan"
     noise = ("--u-length-um", "0.1", "--u-length-um-per-m", "0.15")
     words = ("plan", small_machine_file, "--stations", stations_file, "--grid", "--out", out, *noise)
-    code, stdout, stderr = command(*words, "--json")
+    code, stdout, stderr = call(*words, "--json")
     assert (code, stderr) == (0, "")
     assert sorted(path.name for path in out.iterdir()) == ["plan.errors.csv", "plan.json"]
     report = json.loads((out / "plan.json").read_text())
@@ -466,32 +454,32 @@ def test_plan_reads_the_stations_of_identify_and_predicts_its_uncertainties(
         expected = found.curves[name].u * np.sqrt(2) / scaled
         assert np.allclose(curve.u, expected, rtol=2e-3, atol=1e-9), name
         assert not curve.value.any()
-    code, stdout, _ = command(*words)
+    code, stdout, _ = call(*words)
     assert code == 0
     assert "u of E, max / rms" in stdout
     assert all(len(line.rstrip()) <= 130 for line in stdout.splitlines())
 
 
-def test_plan_says_by_its_exit_code_what_is_not_determined(command, small_machine_file, stations_file, tmp_path):
+def test_plan_says_by_its_exit_code_what_is_not_determined(call, small_machine_file, stations_file, tmp_path):
     lines_kept = stations_file.read_text().splitlines()
     two = tmp_path / "two.csv"
     header, *rows = [line for line in lines_kept if not line.startswith("#")]
     two.write_text("\n".join([header, *rows[:2]]) + "\n")
     out = tmp_path / "plan"
-    code, stdout, _ = command("plan", small_machine_file, "--stations", two, "--grid", "--out", out, "--json")
+    code, stdout, _ = call("plan", small_machine_file, "--stations", two, "--grid", "--out", out, "--json")
     report = json.loads(stdout)
     assert (code, report["determined"]) == (1, False)
     assert report["undetermined_directions"] > 0
     assert any("cannot be distinguished" in reason for reason in report["reasons"])
     assert (out / "plan.json").exists()
-    assert "not determined" in command("plan", small_machine_file, "--stations", two, "--grid", "--out", out)[1]
+    assert "not determined" in call("plan", small_machine_file, "--stations", two, "--grid", "--out", out)[1]
 
 
-def test_plan_suggests_and_proposes(command, small_machine_file, stations_file, tmp_path):
+def test_plan_suggests_and_proposes(call, small_machine_file, stations_file, tmp_path):
     out = tmp_path / "plan"
     words = ("plan", small_machine_file, "--stations", stations_file, "--grid", "--out", out)
     search = ("--suggest", "--evaluations", "40", "--box", "S1:-600,-420,-300,-210,-420,-100", "--target-um", "1.0")
-    code, stdout, _ = command(*words, *search, "--json")
+    code, stdout, _ = call(*words, *search, "--json")
     report = json.loads(stdout)
     assert code == 0
     assert report["suggestion"]["criterion_after_um"] < report["suggestion"]["criterion_before_um"]
@@ -502,9 +490,9 @@ def test_plan_suggests_and_proposes(command, small_machine_file, stations_file, 
     assert report["proposed"] == names[-1]
     assert report["trajectories"][-1]["u_max_um"] <= 1.0
     assert len(read_points(out / "proposed.points.csv")) == report["trajectories"][-1]["points"]
-    code, stdout, _ = command(*words, "--target-um", "0.0001", "--json")
+    code, stdout, _ = call(*words, "--target-um", "0.0001", "--json")
     assert (code, json.loads(stdout)["proposed"]) == (1, None)
-    assert "suggested places" in command(*words, *search)[1]
+    assert "suggested places" in call(*words, *search)[1]
 
 
 @pytest.mark.parametrize(
@@ -518,9 +506,9 @@ def test_plan_suggests_and_proposes(command, small_machine_file, stations_file, 
         (("--grid", "--target-um", "-1"), "the target is -1"),
     ],
 )
-def test_wrong_usage_writes_nothing(command, small_machine_file, stations_file, tmp_path, extra, message):
+def test_wrong_usage_writes_nothing(call, small_machine_file, stations_file, tmp_path, extra, message):
     out = tmp_path / "plan"
-    code, _, stderr = command("plan", small_machine_file, "--stations", stations_file, "--out", out, *extra)
+    code, _, stderr = call("plan", small_machine_file, "--stations", stations_file, "--out", out, *extra)
     assert code == 2
     assert message in stderr
     assert not out.exists()

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 import compgen
-from compgen.cli import cli
-from compgen.cli.common import run_command
 from compgen.controls import SourceFile, controller_named
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves, format_errors, format_reversal, read_reversal
@@ -62,15 +60,10 @@ def single(machine, name, value):
 
 
 @pytest.fixture
-def call(capsys, monkeypatch, tmp_path):
+def call(call, monkeypatch, tmp_path):
+    """The command line, with ``tmp_path`` as the working folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        code = run_command(cli, [str(word) for word in words])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return run
+    return call
 
 
 @pytest.fixture

@@ -25,7 +25,7 @@ from compgen.data.charts import (
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.messages import um_text
-from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
+from compgen.data.names import AXES, COVERAGE, error_named
 from compgen.kinematics.many_points import full_grid
 from compgen.report.html.folder import ReadingResiduals, TableCurve, Volume
 
@@ -62,14 +62,7 @@ def describe_error(name: str) -> str:
     return f"Roll of {axis}" if error.direction == error.axis else f"Rotation of {axis} about {AXES[error.direction]}"
 
 
-def draw_curves(
-    identified: ErrorTable, fitted: ErrorTable | None, tables: Mapping[str, Sequence[TableCurve]]
-) -> list[Picture]:
-    """Return one picture for each identified error curve."""
-    return [_draw_curve(name, identified, fitted, tables) for name in CURVE_NAMES if name in identified.curves]
-
-
-def _draw_curve(
+def draw_curve(
     name: str, identified: ErrorTable, fitted: ErrorTable | None, tables: Mapping[str, Sequence[TableCurve]]
 ) -> Picture:
     """One error in its file's unit: identified with its band, smoothed, and in each control that has a table of it."""

@@ -24,12 +24,12 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, json_text, json_values
 from compgen.data.machine import Machine
 from compgen.data.messages import number_text, one_line, um_text
-from compgen.data.names import COVERAGE, error_named
+from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError
 from compgen.report.html.folder import ControlFolder, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
     describe_error,
-    draw_curves,
+    draw_curve,
     draw_residuals,
     draw_slices,
     draw_space,
@@ -845,7 +845,11 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
     tables: dict[str, tuple[TableCurve, ...]] = {item.name: table_curves(errors, item) for item in source.controls}
     found: dict[str, list[Picture]] = {"curves": [], "squareness": [], "measurement": []}
     if source.identified is not None:
-        found["curves"] = draw_curves(source.identified, source.fitted, tables)
+        found["curves"] = [
+            draw_curve(name, source.identified, source.fitted, tables)
+            for name in CURVE_NAMES
+            if name in source.identified.curves
+        ]
         found["squareness"] = draw_squareness(source.identified)
     if source.residuals is not None:
         found["measurement"] = draw_residuals(source.residuals)
