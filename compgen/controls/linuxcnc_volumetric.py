@@ -10,6 +10,7 @@ from itertools import chain, product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.controls.linuxcnc_comp import (
     MM_PER_UNIT,
@@ -66,13 +67,28 @@ class VolCurve:
 
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Value at positions (m,)."""
+        return self.within(self.cells(position_mm))
+
+    @property
+    def grid(self) -> tuple[int, float, float, int]:
+        """Axis, first position, step and count: curves of the same grid have the same :meth:`cells`."""
+        return self.axis, self.first_mm, self.step_mm, len(self.values)
+
+    def cells(
+        self, position_mm: FloatArray
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.bool_]]:
+        """Values before and after positions (m,), the share of the one after, and whether a position is at the end."""
         last = len(self.values) - 1
         ratio = np.clip((position_mm - self.first_mm) / self.step_mm, 0.0, float(last))
         left = np.minimum(ratio.astype(np.int64), max(last - 1, 0))
-        right = np.minimum(left + 1, last)
+        return left, np.minimum(left + 1, last), ratio - left, ratio >= last
+
+    def within(self, cells: tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.bool_]]) -> FloatArray:
+        """Value in the cells of :meth:`cells`, shape (m,)."""
+        left, right, share, at_end = cells
         below = self.values[left]
-        between = below + (ratio - left) * (self.values[right] - below)
-        return np.asarray(np.where(ratio >= last, self.values[last], between))
+        between = below + share * (self.values[right] - below)
+        return np.asarray(np.where(at_end, self.values[-1], between))
 
 
 @dataclass(frozen=True)
@@ -143,7 +159,10 @@ class VolTable:
             )
         tool = np.broadcast_to(tool_mm, position_mm.shape)
         levers = dict(zip(LEVERS, [np.ones(len(position_mm)), *position_mm.T, *tool.T], strict=True))
-        values = {curve.name: curve.at(position_mm[:, curve.axis]) for curve in self.curves}
+        # usually all curves over an axis have the same nodes: what depends on these alone is worked out once
+        grids = {curve.grid: curve for curve in self.curves}
+        cells = {grid: curve.cells(position_mm[:, curve.axis]) for grid, curve in grids.items()}
+        values = {curve.name: curve.within(cells[curve.grid]) for curve in self.curves}
         error = np.zeros((len(position_mm), 3))
         for term in self.terms:
             error[:, term.output] += term.coefficient * levers[term.lever] * values[term.curve]
