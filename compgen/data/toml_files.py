@@ -167,12 +167,14 @@ class Section:
         full = f"{self.name}.{key}" if self.name else key
         # the line of the key, or of its table's header if the file does not have the key
         inside, count, own = not self.name, -1, None
+        parent, _, last = self.name.rpartition(".")
+        around, inline = bool(self.name) and not parent, None  # a table may be the value of a key: last = { key = ... }
         for number, line in enumerate(self.text.split("\n"), start=1):
             header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
             if header:
                 table = re.sub(r"[\"' ]", "", header.group(1))
                 count += table == self.name
-                inside = table == self.name and count == self._nth
+                inside, around = table == self.name and count == self._nth, table == parent
                 own = number if inside else own
                 if table == full and max(count, 0) == self._nth:
                     own = number
@@ -180,8 +182,10 @@ class Section:
             elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
                 own = number
                 break
+            elif around and inline is None and re.match(rf"\s*[\"']?{re.escape(last)}[\"']?\s*[=.]", line):
+                inline = number
         place = f"[{self.name}] {key}" if self.name else key
-        error = SettingError(message, file=self.path, line=own, field=visible_line(place))
+        error = SettingError(message, file=self.path, line=own or inline, field=visible_line(place))
         error.place, error.kind, error.instead = (*self.place, key), kind, instead
         return error
 

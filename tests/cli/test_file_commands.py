@@ -306,7 +306,7 @@ def test_a_file_that_a_scenario_names_is_checked_with_it_and_the_rest_all_the_sa
 
 @pytest.mark.parametrize(
     ("words", "message"),
-    [(["no-such-machine"], "no machine is named"), (["none.toml"], "none.toml"), (["empty"], "has no *.toml file")],
+    [(["no-such-machine"], "no-such-machine"), (["none.toml"], "none.toml"), (["empty"], "has no *.toml file")],
 )
 def test_what_is_not_there_cannot_be_checked(words, message, call, tmp_path):
     (tmp_path / "empty").mkdir()

@@ -1,5 +1,7 @@
 """Strict TOML: every refusal names the file, the line and the key, and says what is expected."""
 
+from pathlib import Path
+
 import pytest
 
 from compgen.data import toml_files
@@ -184,3 +186,18 @@ def test_each_check_returns_the_clean_value():
     assert toml_files.text("a b") == "a b" and toml_files.choice("X", "Y")("Y") == "Y"
     assert toml_files.numbers([]) == () and toml_files.vector3([1, 2, 3]) == (1.0, 2.0, 3.0)
     assert toml_files.interval([-1, 0]) == (-1.0, 0.0) and toml_files.ascending([0, 1, 4]) == (0.0, 1.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    "text", ["a = 1\nlow = { X = 1,\n Y = 2 }\n", "a = 1\nlow.X = 1\n", "a = 1\n[low]\nX = 1\n[b]\n"]
+)
+def test_a_key_of_a_table_that_is_a_value_has_the_line_of_the_table(text):
+    section = toml_files.parse_toml(text, Path("m.toml")).section("low")
+    assert section.fail("X", "is wrong").line == (2 if "[low]" not in text else 3)
+
+
+def test_a_table_that_is_a_value_is_looked_for_in_its_own_table_alone():
+    text = "[one]\nends = { X = 1 }\n[two]\nb = 2\nends = { X = 2 }\n"
+    root = toml_files.parse_toml(text, Path("m.toml"))
+    lines = [root.section(name).section("ends").fail("X", "is wrong").line for name in ("one", "two")]
+    assert lines == [2, 5]
