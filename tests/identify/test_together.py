@@ -240,3 +240,25 @@ def test_a_command_takes_numbers_without_any_file(tmp_path, small_machine, capsy
     assert "EC0Y,,25.000000000,3.000000000" in (out / "identified.errors.csv").read_text()
     assert run_command(cli, ["identify", str(small_machine.source), "--out", str(tmp_path / "p")]) == 2
     assert "no measurement file was given" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_formula_of_the_granite_square_on_the_page_of_instruments(small_machine, seed):
+    """EC0Y = -b/B - a/A + s, by the geometry of arms that lie somewhere and a gauge that travels with the tool."""
+    rng = np.random.default_rng(seed)
+    truth, lean, own = rng.uniform(-1e-4, 1e-4, 3)
+    errors = StatedNumbers(squareness={"EC0Y": f"{truth * 1e6}"}).errors(small_machine)
+    length, start = 150.0, np.array([axis.range_mm[0] for axis in small_machine.axes]) + 10.0
+    ends = np.array([start, start + [length, 0, 0], start + [0, length, 0]])
+    at, along_x, along_y = ends + compgen.volumetric_error(small_machine, errors, ends) - start
+
+    def drift(tool, angle):
+        """How far the tool goes to the left of an arm at an angle, over its way."""
+        return (tool - at)[1] * np.cos(angle) - (tool - at)[0] * np.sin(angle)
+
+    a = drift(along_x, lean)  # plunger to +Y: the reading grows to the left of the X arm
+    found = []
+    for turned in (1, -1):  # the second time turned over about the X arm, read along the same line towards +Y
+        b = -drift(along_y, np.pi / 2 + lean + turned * own)  # plunger to +X: it grows to the right of the Y arm
+        found.append(-b / length - a / length + turned * own)
+    assert found == pytest.approx([truth, truth], abs=1e-8)
