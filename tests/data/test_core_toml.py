@@ -189,7 +189,7 @@ def test_each_check_returns_the_clean_value():
 
 
 @pytest.mark.parametrize(
-    "text", ["a = 1\nlow = { X = 1,\n Y = 2 }\n", "a = 1\nlow.X = 1\n", "a = 1\n[low]\nX = 1\n[b]\n"]
+    "text", ["a = 1\nlow = { X = 1, Y = 2 }\n", "a = 1\nlow.X = 1\n", "a = 1\n[low]\nX = 1\n[b]\n"]
 )
 def test_a_key_of_a_table_that_is_a_value_has_the_line_of_the_table(text):
     section = toml_files.parse_toml(text, Path("m.toml")).section("low")
