@@ -270,7 +270,7 @@ CROSS, PLANE = golden("crosscomp_z.lis"), golden("crosscomp2_x.lis")
         (LIST.replace("X\n", "X /* open\n", 1), 2, "ends on its line"),
         (LIST + "garbage\n", 11, "is not an entry"),
         (LIST + "\N{MICRO SIGN}\n", 11, "ASCII"),
-        ("# entries: 11\n" + LIST, None, "declares 11 entries but holds 10"),
+        ("# entries: 11\n" + LIST, None, "declares 11 entries but contains 10"),
         (CROSS.replace("11523", "10735"), 13, "not above the position before it"),
         (PLANE.replace("interval                           100000", "interval 0"), 3, "70430"),
         (re.sub(r"master2_ax_nr +3", "master2_ax_nr 2", PLANE), 11, "two axes"),

@@ -363,7 +363,7 @@ def test_the_largest_step_has_its_place_and_a_limit_of_the_user():
 def test_a_correction_at_the_reference_point_is_warned_of_beyond_20_um_and_the_rounding(offset_um, warned):
     safety = safety_with(np.full(11, offset_um))
     assert safety.reference_um == pytest.approx((offset_um, 0.0, 0.0))
-    assert [f"at the reference point the correction is X {offset_um:+.1f} um" in text for text in safety.warnings] == [
+    assert [f"the correction at the reference point is X {offset_um:+.1f} um" in text for text in safety.warnings] == [
         True
     ] * warned
 
