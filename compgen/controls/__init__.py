@@ -88,7 +88,7 @@ NOT_PUBLIC = {
 def controller_named(name: str) -> type[AnyController]:
     """Return the class of the control ``name``, to be called with a machine, or raise an InputError that lists what there is."""
     if name in NOT_PUBLIC and name not in CONTROLLERS:
-        raise InputError(f"no controller is named {name!r}: {NOT_PUBLIC[name]}")
+        raise InputError(f"there is no controller {name!r}: {NOT_PUBLIC[name]}")
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
@@ -102,7 +102,7 @@ def controller_named(name: str) -> type[AnyController]:
         }
         hint = nearest(name, CONTROLLERS, titles, alike=0.7)
         hint = hint if "did you mean" in hint else nearest(name, CONTROLLERS, texts)
-        raise InputError(f"no controller is named {name!r}; {hint}{why_missing(CONTROLLERS.broken, name)}")
+        raise InputError(f"there is no controller {name!r}; {hint}{why_missing(CONTROLLERS.broken, name)}")
     return CONTROLLERS[name]
 
 

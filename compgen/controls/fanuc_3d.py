@@ -112,7 +112,7 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
     notes = (
         f"records of the form {FORMS[form]}, the first is N{data[0].number}, {len(data)} of them",
         f"parameters {'are' if parameters else 'are not'} in the same file",
-        "the order of the points cannot be told from the sample; `order` in the machine file says it",
+        "the order of the points cannot be determined from the sample; `order` in the machine file states it",
     )
     return VolumeStyle(style, form, data[0].number, bool(parameters), notes)
 
@@ -433,7 +433,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             table = read
         if table is None:
             raise InputError(
-                "no table is given; VOLUME.csv (or a punched file with parameters 10800 to 10814) is needed"
+                "no table is given; expected VOLUME.csv (or a punched file with parameters 10800 to 10814)"
             )
         return table
 

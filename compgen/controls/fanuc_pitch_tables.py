@@ -206,7 +206,7 @@ def _kept(settings: PitchSettings) -> tuple[PointGrid | None, ...]:
 
 def _check_together(section: toml_files.Section, settings: PitchSettings) -> None:
     if settings.last_number < settings.first_number:
-        raise section.fail("last_number", f"lies below first_number = {settings.first_number}")
+        raise section.fail("last_number", f"is below first_number = {settings.first_number}")
     if settings.bidirectional:
         # no public document settles how 3627 counts with total values, and with a magnification
         if settings.total:
@@ -369,7 +369,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
-        raise InputError("no FANUC text file is given; PITCH.TXT (or a file punched from the control) is needed")
+        raise InputError("no FANUC text file is given; expected PITCH.TXT (or a file punched from the control)")
     found, points = PunchedRecords(settings.sample.style.path or 1), PointRecords()
     base, known = settings.number_base, (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
     for record in (record for file in texts for record in read_records(file)):

@@ -479,7 +479,7 @@ def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
         notes = (
             *kept,
             *(n for n in point_notes if "compensation point" in n),
-            "parameters and points in files of their own",
+            "parameters and points in separate files",
         )
     straightness = [record for number, (_, record) in sorted_in.common.items() if number in STRAIGHTNESS_PARAMETERS]
     if any("L" in dict(record.words()) for record in straightness):
@@ -585,7 +585,7 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
         if not interval and not factor and not any((reference, first, last)):
             continue
         if last < first:
-            raise record.fail(f"axis A{axis} has the points {first} to {last}; the first must not lie behind the last")
+            raise record.fail(f"axis A{axis} has the points {first} to {last}; the first must not be after the last")
         both = parameters.get((3605, axis), ("0", record))[0].endswith("1")
         start = parameters.get((3626, axis)) if both else None
         negative = None if start is None else start[1].whole(start[0], 0, MOST_NUMBER)

@@ -417,7 +417,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         """
         texts = [file for file in files if file.path.suffix.lower() != ".json"]
         if not texts:
-            raise InputError("no FANUC text file is given; STRAIGHT.TXT (or a punched parameter file) is needed")
+            raise InputError("no FANUC text file is given; expected STRAIGHT.TXT (or a punched parameter file)")
         found = PunchedRecords(self.settings.path)
         for file in texts:
             for record in read_records(file):
@@ -560,9 +560,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         points = [whole(number, 0, 9999) for number in numbers[2:6]]
         for number, before, point in zip(numbers[3:6], points, points[1:], strict=False):
             if point <= before:
-                raise found.common[number][1].fail(
-                    f"point {point} does not lie behind {before}; expected a < b < c < d"
-                )
+                raise found.common[number][1].fail(f"point {point} is not after {before}; expected a < b < c < d")
         if not grid.first <= points[0] <= points[-1] <= grid.last:
             raise found.common[numbers[2]][1].fail(
                 f"points {points[0]} to {points[-1]} are not within those of {AXES[moving]}, {grid.first} to {grid.last}"

@@ -229,7 +229,7 @@ def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) 
 
 #: Places for nodes between those of the curves: angular errors with a lever of their own travel are bent there.
 MOST_CANDIDATES, MOST_PARTS = 200, 4
-#: Free tables go on by this much beyond both ends with the end value, so that what lies outside does not matter.
+#: Free tables go on by this much beyond both ends with the end value, so that what is outside does not matter.
 MARGIN_MM = Decimal(10)
 #: Neighbours of the oldest tables may differ by this share of their distance at most (TNC 407 manual, p. 156).
 GRADIENT_SHARE = 1.0 / 64.0
@@ -666,7 +666,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         if not marked:
             raise table.file.fail(f"no line is marked with '*' in column {ACTIVE}", table.header_line)
         if not lines[marked[0]]:
-            raise table.file.fail("the active line names no .COM file", table.rows[marked[0]].line)
+            raise table.file.fail("the active line contains no .COM file", table.rows[marked[0]].line)
         return lines[marked[0]]
 
     def _axis(self, table: TextTable, column: str, line: int) -> int:
@@ -708,7 +708,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             found = [table.number(row, POSITION) for row in table.rows]
             for k in range(1, len(found)):
                 if found[k] <= found[k - 1]:
-                    message = f"{POSITION} {found[k]} does not lie above {found[k - 1]}; positions ascend"
+                    message = f"{POSITION} {found[k]} is not above {found[k - 1]}; positions ascend"
                     raise table.file.fail(message, table.rows[k].line)
             return tuple(found)
         datum, exponent = self.settings.datum_mm[axis], self.settings.exponent[axis]

@@ -52,7 +52,7 @@ class DraftSettings:
         AXES,
         key="comptab_prefix",
         differ="{}: expected three different names",
-        meaning="what stands before ..C1 in COMPTAB for the .COM file of each axis",
+        meaning="text before ..C1 in COMPTAB for the .COM file of each axis",
     )
     decimals: int = setting(whole(3, 6), 4, meaning="decimals of C1 to C3 in mm")
     angle_decimals: int = setting(whole(5, 9), 7, meaning="decimals of C4 to C6 (default 7 for deg, 9 for rad)")
@@ -129,7 +129,7 @@ def _positions(table: TextTable) -> tuple[Decimal, ...]:
     found = _entries(table, POSITION)
     for k in range(1, len(found)):
         if found[k] <= found[k - 1]:
-            raise table.file.fail(f"{POSITION} {found[k]} does not lie above {found[k - 1]}", table.rows[k].line)
+            raise table.file.fail(f"{POSITION} {found[k]} is not above {found[k - 1]}", table.rows[k].line)
     if len(found) < 2:
         raise table.file.fail(f"contains {len(found)} entries; expected at least 2", table.header_line)
     return found
@@ -214,7 +214,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
             "warnings": [
                 "DRAFT: the maker of the machine must integrate these rows into the kinematics description and check them.",
                 f"Whether angles are degrees or rad is not documented; {'degrees' if settings.degrees else 'rad'} are written.",
-                "What stands before '..C1' in COMPTAB is not documented; set comptab_prefix.",
+                "The text before '..C1' in COMPTAB is not documented; set comptab_prefix.",
             ],
             "com": com,
             "chain_rows": {

@@ -215,7 +215,7 @@ def parse_list(source: SourceFile) -> ListFile:
     files = {int(key[5:-1]): value for key, (value, _) in entries.items() if key.startswith("file[")}
     formats = {int(key[12:-1]): value.upper() for key, (value, _) in entries.items() if key.startswith("file_format[")}
     if not files:
-        raise source.fail("names no parameter file: file[0] is missing; is the list truncated?")
+        raise source.fail("refers to no parameter file: file[0] is missing; is the list truncated?")
     known = choice("GRID", "AUTO")  # other modes interpolate in a way that is not documented in public
     axes = tuple(_take(source, entries, letter, _whole(1, 65535), None) for letter in "xyz")
     return ListFile(

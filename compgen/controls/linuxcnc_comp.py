@@ -58,7 +58,7 @@ def units_setting(meaning: str) -> Any:
 def check_size(source: SourceFile, most: int) -> None:
     """Raise InputError for a text that is longer than any file of its kind."""
     if len(source.text) > most:
-        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}: it is no table", 1)
+        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}: it is not a table", 1)
 
 
 def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
@@ -230,7 +230,7 @@ def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]
         raise source.fail(message, line)
     row = tuple(number_in(source, line, word, what) for word, what in zip(words, _COLUMNS, strict=False))
     if above and row[0] <= above[-1][0]:
-        message = f"{row[0]:g} does not lie above {above[-1][0]:g} of the row before; LinuxCNC drops such a row"
+        message = f"{row[0]:g} is not above {above[-1][0]:g} of the row before; LinuxCNC drops such a row"
         raise source.fail(message, line)
     if len(above) == MOST_ROWS:
         raise source.fail(f"is row {MOST_ROWS + 1}; LinuxCNC takes {MOST_ROWS} rows and drops the rest", line)

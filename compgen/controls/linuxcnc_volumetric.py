@@ -186,7 +186,7 @@ class VolTable:
                 if np.all(ended):
                     return axes
         raise InputError(
-            "the errors of the table change too fast with position: no position puts the tool where it belongs"
+            "the errors of the table change too fast with position: no position puts the tool at the commanded point"
         )
 
     def slope(self, lower_mm: FloatArray, upper_mm: FloatArray, tool_mm: FloatArray) -> float:
@@ -312,7 +312,7 @@ def parse_volcomp(source: SourceFile) -> VolTable:
                 raise source.fail(f"is term {len(terms) + 1}; {MOST_TERMS} are allowed", words.line)
             output, name = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2), words.take("the name of a curve")
             if name not in curves:
-                raise source.fail(f"no curve above is named {name[:SHOWN]!r}", words.line)
+                raise source.fail(f"there is no curve above with the name {name[:SHOWN]!r}", words.line)
             coefficient, lever = words.number("a coefficient"), words.take("a lever")
             if lever not in LEVERS:
                 raise source.fail(f"{lever[:SHOWN]!r} is not a lever; {', '.join(LEVERS)} are", words.line)
@@ -370,7 +370,7 @@ def _check_trailer(source: SourceFile, words: _WordReader) -> None:
             raise source.fail(f"{message}: it was changed or damaged; export it again", line)
         found = True
     if not found:
-        raise source.fail("there is no 'crc32 XXXXXXXX' behind 'end': the file is truncated", words.line)
+        raise source.fail("there is no 'crc32 XXXXXXXX' after 'end': the file is truncated", words.line)
 
 
 # How the numbers of a ``volkins`` table are written, their checksum, and the files that stand beside a table.

@@ -525,7 +525,7 @@ def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> M
     entries, passed_over = file_entries(own[0])
     found = _sets_of(settings, own[0], by_number(entries), passed_over)
     if sheets and parse_tables(settings, sheets).sets != found.sets:
-        raise own[0].fail(f"does not hold the same tables as {sheets[0].path.name}")
+        raise own[0].fail(f"does not contain the same tables as {sheets[0].path.name}")
     return found
 
 
@@ -652,7 +652,7 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
             if table.first <= last and table.last >= first:
                 found.append(f"the numbers of {set_name(table)} overwrite those of {name}, {first} to {last}")
     missing = [AXES[axis] for axis in range(3) if not any(t.base == t.output == axis for t in tables.sets)]
-    found += [f"{letter} has no table of its own position" for letter in missing]
+    found += [f"{letter} has no table over its own travel" for letter in missing]
     return found + [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > 1.0]
 
 

@@ -377,7 +377,7 @@ def _complete(reader: _DownloadReader, line: int) -> _DownloadReader:
 
 
 _COUNTS_MISSING = (
-    "is missing: tables are in counts of the motors, and nothing but the machine says how many make a mm; write e.g. "
+    "is missing: tables are in counts of the motors, and only the machine builder's data say how many make a mm; write e.g. "
     "counts_per_mm = { X = 1000.0, Y = 1000.0, Z = 2000.0 } (negative where the motor counts against the axis)"
 )
 
@@ -414,7 +414,7 @@ class PmacSettings:
         toml_files.number, (0.0, 0.0, 0.0), meaning="machine coordinates of the motors' zero"
     )
     counts_per_mm: tuple[float, float, float] = setting(
-        _scales, meaning="counts of a motor per mm, negative where it counts against its axis"
+        _scales, meaning="counts of a motor per mm, negative if it counts against its axis"
     )
     two_dimensional: bool = setting(toml_files.flag, False, meaning="write angular errors as two-dimensional tables")
     desired: bool = setting(

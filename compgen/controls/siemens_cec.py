@@ -88,7 +88,7 @@ VARIABLES = {
     "SN_CEC_TABLE_WEIGHT": 1,
 }
 MODE_OF_A_FILE = (
-    "the file multiplies tables, and the machine file does not say what the control makes of that: state "
+    "the file multiplies tables, and the machine file does not state how the control combines them: state "
     'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
 )
 #: (output, axis) of every table without products.

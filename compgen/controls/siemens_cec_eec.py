@@ -154,7 +154,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         )
         for part, array, what in ((cec_part, "AN_CEC", "cross"), (eec_part, "AA_ENC_COMP", "encoder")):
             if not any(item.variable == array for item in part.items):
-                raise files[-1].fail(f"the files contain no {what} tables (${array}); give all that the control holds")
+                raise files[-1].fail(f"the files contain no {what} tables (${array}); give all files of the control")
         cec = foreign_cec_tables(cec_part, self.machine, self.settings, findings)
         eec = foreign_eec_tables(eec_part, self.machine, self.settings.eec, findings)
         return CecEecTables(cec, eec), findings.statements()

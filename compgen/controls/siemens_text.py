@@ -515,7 +515,7 @@ def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], 
     writing = [f"{part.name}.{part.kind}" for part in others if part.writes_tables]
     few = ", ".join(writing[:3]) + (f" and {len(writing) - 3} more" if len(writing) > 3 else "")
     if writing and not any(part.writes_tables for part in chosen):
-        raise source.fail(f"only programs hold tables ({few}): give such a program as a file of its own")
+        raise source.fail(f"only programs hold tables ({few}): give such a program as a separate file")
     if others := [part for part in others if part.name]:
         named = f" (programs that write tables, not run here: {few})" if writing else ""
         findings.count(f"other files of the archive{named}", len(others))
@@ -591,7 +591,7 @@ def _item(
     elif "CEC" in variable or "ENC_COMP" in variable:
         raise item.fail("is not known here, and it could change a table")
     elif variable.startswith("MA_BACKLASH"):
-        what = "lines of $MA_BACKLASH, which is not a table and is not taken out"
+        what = "lines of $MA_BACKLASH, which is not a table and is not removed"
     else:
         what = "other machine data"
     findings.count(what)

@@ -241,7 +241,7 @@ def analyse(
     design = design_of(fit, [*groups, *(item.group for item in wider)], whitener(fit.observed.layout, noise))
     taken = needed(design, wider) if wider else []
     if taken:
-        show("fitting the wider curves that the readings ask for")
+        show("fitting the wider curves that the readings require")
         fit = widened(fit, taken)
         groups, missing, fixed = _groups_of(fit, only)
         noise = noise_of(fit, fixed if repeats else [], sigma_mm=sigma_mm)

@@ -179,15 +179,15 @@ def _generic(session: AxisSession) -> list[Candidate]:
         add("each target drifts in its own way", ("time", "x"), shape[:, None] * own, 3)
     cycles, legs = _indicators(session.cycle), _indicators(session.leg)
     if cycles.shape[1] > 2 and session.in_runs:
-        add("every run has a level of its own", ("run",), cycles[:, 1:])
-        add("every run has a slope of its own", ("run", "x"), cycles * s[:, None])
+        add("every run has a separate level", ("run",), cycles[:, 1:])
+        add("every run has a separate slope", ("run", "x"), cycles * s[:, None])
         curve = np.polynomial.legendre.legvander(s, min(CURVE, len(session.targets_mm) - 1))[:, 1:]
-        add("every run has a curve of its own", ("run", "x"), _products(cycles, np.asarray(curve, dtype=np.float64)))
+        add("every run has a separate curve", ("run", "x"), _products(cycles, np.asarray(curve, dtype=np.float64)))
         if cycles.shape[1] * len(session.targets_mm) <= MOST_OF_RUNS:
             text = "both ways of a run agree, and differ from the other runs"
             add(text, ("run", "x"), _products(cycles, _indicators(session.target)))
     if legs.shape[1] > cycles.shape[1] and session.in_runs:
-        add("every way of every run has a level of its own", ("run", "approach"), legs[:, 1:])
+        add("every way of every run has a separate level", ("run", "approach"), legs[:, 1:])
     inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
     for k in inside:
         way_text = f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"

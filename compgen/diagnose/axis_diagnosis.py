@@ -36,7 +36,7 @@ Show = Callable[[str], None]
 
 #: What statistics cannot tell.
 WARM_UP_NOTE = (
-    "a warm-up of the machine and one of the sensor look alike: only a stationary drift test tells them apart"
+    "a warm-up of the machine and one of the sensor look alike: only a stationary drift test distinguishes them"
 )
 NO_REPEATS = "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
 #: Figures that are shown: reversal, its mean, systematic deviations, repeatability and accuracy, um.
@@ -564,9 +564,7 @@ def _text(
             "machine or sensor"
         )
     if item.name == "linear_drift":
-        return (
-            f"the readings drift by {size:+.3g} um from the first to the last; machine or sensor cannot be told apart"
-        )
+        return f"the readings drift by {size:+.3g} um from the first to the last; machine and sensor cannot be distinguished"
     if item.name == "step_between_runs":
         return (
             f"all readings from {item.text.removeprefix('step before ')} on are {size:+.3g} um off against those before"
@@ -947,7 +945,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
                 if others and item.effect.card.breaker:
                     found.append(f"{item.effect.card.breaker}: separates {item.name} from {', '.join(others)}")
             if part.noise_source != "repeats":
-                found.append("measure at least three runs in each direction: only repeats tell noise from effects")
+                found.append("measure at least three runs in each direction: only repeats separate noise from effects")
             if any(item.covariates for item in part.unknown):
                 depends = ", ".join(part.unknown[0].covariates)
                 found.append(

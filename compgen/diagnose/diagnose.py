@@ -70,7 +70,7 @@ class DiagnoseOptions:
         (), "Look for these effects only; default: the whole catalogue.", metavar="NAME,..."
     )
     add: tuple[str, ...] = option((), "Add this effect whether it was found or not.", metavar="NAME")
-    u_um: float | None = option(None, "Standard uncertainty of a reading, um; used where no line was repeated.")
+    u_um: float | None = option(None, "Standard uncertainty of a reading, um; used if no line was repeated.")
     against: ErrorTable | None = option(
         None,
         "Errors (*.errors.csv) that the measurement is compared with: which have changed?",
@@ -254,7 +254,7 @@ def _completed(
 
 
 NOTE = (
-    "an optical error that depends on the distance alone equals a geometric error: no statistics can tell the two apart"
+    "an optical error that depends only on the distance equals a geometric error: no statistics can distinguish the two"
 )
 #: What separates instrument and machine.
 ADVICE = (

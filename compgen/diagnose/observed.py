@@ -240,11 +240,11 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
 def _kind(path: str | Path) -> str:
     kind = detect_format(path)
     if kind == "sixdof":
-        message = "holds six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        message = (
+            "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
+        )
         raise InputError(message, file=path)
     if kind == "part":
-        message = (
-            "holds features of a part, which identify and accuracy take; diagnose takes lengths, deviations, axis runs"
-        )
+        message = "contains features of a part, which identify and accuracy read; diagnose reads lengths, deviations, axis runs"
         raise InputError(message, file=path)
     return {"axis": "axis runs", "deviations": "deviations"}.get(str(kind), "lengths")

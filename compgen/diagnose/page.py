@@ -238,7 +238,7 @@ def _effects(data: dict[str, Any]) -> str:
         )
         others = ", ".join(f"{o['name']} {o['weight']:.2f}" for o in item["alias_set"] if o["name"] != item["name"])
         text = f"<b>{escape(item['name'])}</b> <span class=note>{escape(item['grade'].replace('_', ' '))}</span> "
-        text += escape(values) + (f"; cannot be told from {escape(others)}" if others else "")
+        text += escape(values) + (f"; cannot be distinguished from {escape(others)}" if others else "")
         text += escape("".join(f"; {reason}" for reason in item.get("reasons", [])))
         if item.get("text"):
             text += f"<br>{escape(item['text'])}"
@@ -375,7 +375,7 @@ def _effect_lines(item: Mapping[str, Any], *, markdown: bool, several: bool) -> 
         lines.append(f"  * {key} = {entry['value']:.4g}{u}")
     others = [f"{o['name']} {o['weight']:.2f}" for o in item["alias_set"] if o["name"] != item["name"]]
     if others:
-        lines.append(f"  * cannot be told from: {', '.join(others)}")
+        lines.append(f"  * cannot be distinguished from: {', '.join(others)}")
     lines += [f"  * {reason}" for reason in item.get("reasons", [])]
     if item.get("what_to_do"):
         lines.append(f"  * what to do: {item['what_to_do']}")

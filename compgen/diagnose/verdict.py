@@ -335,7 +335,7 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
             if breaker:
                 found.append(f"{breaker}: separates {item.name} from {other}")
     if analysis.noise.source != "repeats":
-        found.append("measure every line at least twice, in random order: only repeats tell noise from effects")
+        found.append("measure every line at least twice, in random order: only repeats separate noise from effects")
     if verdict.unknown and verdict.unknown[0].covariates:
         depends = ", ".join(verdict.unknown[0].covariates)
         found.append(f"vary {depends} by themselves, each line twice: shows the law of what has no name")

@@ -218,7 +218,7 @@ ADVICE = {
     "table positions at a fraction of the pitch; tables with wide positions do not change it",
     "spindle_growth": "the tool grows with the temperature of the spindle: warm the spindle up, or use the control's "
     "spindle growth compensation",
-    "servo_lag": "the axis lags by a time: adapt loop gain or feed-forward; tables cannot hold it",
+    "servo_lag": "the axis lags by a time: adapt loop gain or feed-forward; tables cannot correct it",
 }
 
 
@@ -284,6 +284,6 @@ def advice_of_effects(machine: Machine) -> list[str]:
         if isinstance(active.effect, Backlash | LostMotion):
             continue
         figures = ", ".join(f"{key} = {value:g}" for key, value in active.summary().items())
-        advice = ADVICE.get(active.name.rpartition("_")[0], "no table of this control holds it")
+        advice = ADVICE.get(active.name.rpartition("_")[0], "no table of this control corrects it")
         found.append(f"{active.effect.card.title} ({active.name}: {figures}): {advice}")
     return found

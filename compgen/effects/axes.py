@@ -79,7 +79,7 @@ class SpindleGrowth(SingleAxisEffect):
         covariates=("temp_spindle_c",),
         parameters=(Parameter("c_um_per_k", MM_PER_UM, "growth for each K of the spindle", 30.0),),
         aliases=("dead_path", "station_drift", "thermal_scale_{A}"),
-        breaker="switch the spindle on and off in cycles while measuring, in place of one warm-up",
+        breaker="switch the spindle on and off in cycles while measuring, instead of one warm-up",
         settings=(reference_of("temp_spindle_c"),),
         slow=True,
     )
@@ -329,7 +329,7 @@ class LinearDrift(Effect):
             covariates=("time_s or order",),
             parameters=(Parameter("c_um", MM_PER_UM, "drift over the span", 500.0),),
             aliases=("warmup_drift", "drift of the sensor"),
-            breaker="a longer session: a warm-up levels off, a drift of sensor or room goes on",
+            breaker="a longer session: a warm-up levels off, a drift of sensor or room continues",
             kinds=("axis",),
             settings=(
                 Setting("start", "time (or number of the reading) at which the drift begins; default: the first"),

@@ -157,11 +157,11 @@ WHAT_TO_DO = {
     "difference of two temperatures of the column if the control can",
     "backlash": "enter the reversal value (twice c) as the control's backlash compensation of this axis, or export tables "
     "with reversal; look at nut, preload, coupling and thrust bearing if it has grown",
-    "lost_motion": "a single backlash value cannot hold it: export tables for each direction; look for a worn stretch of the "
+    "lost_motion": "a single backlash value cannot correct it: export tables for each direction; look for a worn stretch of the "
     "screw, wind-up of a long screw and sticking guides, and measure again after lubrication",
     "periodic": "use table positions at a fraction of the pitch, or the control's periodic compensation; look at screw run-out, "
     "coupling and scale mounting, and measure one pitch in steps of a tenth",
-    "servo_lag": "adapt loop gain (KV) or velocity feed-forward, or dwell before each reading; tables cannot hold it",
+    "servo_lag": "adapt loop gain (KV) or velocity feed-forward, or dwell before each reading; tables cannot correct it",
     "lever": "let the model of the machine file contain this angular error, measure with a second tool offset, and export it",
     "squareness": "let the model of the machine file contain this squareness and export it; check the alignment of the guides "
     "if it is new",

@@ -92,7 +92,7 @@ class Lever(CurveEffect):
         covariates=("tool_x_mm", "tool_y_mm", "tool_z_mm"),
         parameters=(),
         aliases=("lever_ECX", "lever_EAZ", "lever_EBZ", "lever_ECZ", "tool_offset_error"),
-        breaker="measure with three or more tool offsets that do not lie in one plane",
+        breaker="measure with three or more tool offsets that are not in one plane",
         kinds=("lengths", "deviations"),
         settings=(Setting("degree", "degree of the curve, 1 ... 6"),),
         scan="degree",

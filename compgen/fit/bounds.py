@@ -339,7 +339,7 @@ class FitOptions:
     )
     monotone: Mapping[str, str] = option(
         factory=dict,
-        text="NAME=increasing or NAME=decreasing: the fitted curve goes one way only. NAME is an error, but not a "
+        text="NAME=increasing or NAME=decreasing: the fitted curve is monotone. NAME is an error, but not a "
         "straightness.",
         metavar="NAME=WAY",
     )
@@ -355,9 +355,7 @@ class FitOptions:
             for key, limit in getattr(self, bound).items():
                 _check_key(bound, key)
                 if not limit > 0:
-                    message = (
-                        f"{limit!r} for {key} leaves no curve; a bound is a positive number, leave it out for none"
-                    )
+                    message = f"{limit!r} for {key} leaves no curve; a bound must be a positive number, or omit it"
                     raise InputError(message, field=bound)
         for key, direction in self.monotone.items():
             if key not in CURVE_NAMES:

@@ -294,7 +294,7 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
     told_apart = [name for name in curves if name not in one_tool]
     if told_apart and np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad)).max() > NOTHING:
         warnings.warn(
-            f"a rotation is taken out of the curves; E stays the same for the machine's tool offset "
+            f"a rotation is removed from the curves; E stays the same for the machine's tool offset "
             f"{machine.tool_offset_mm} mm and changes by a constant for the other tools that "
             f"{', '.join(told_apart)} refer to",
             CompgenWarning,

@@ -186,7 +186,7 @@ def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | 
     machine_job = job.machine(name)
     if request.active_table is not None and not re.fullmatch(r"(?i)none|v?[0-9]{1,9}", request.active_table):
         raise InputError(
-            f"{request.active_table!r} does not name tables; give a version (v3) or none", field="--active-table"
+            f"{request.active_table!r} is not a name of tables; give a version (v3) or none", field="--active-table"
         )
     if not request.reason.strip() or not request.actor.strip():
         raise InputError("processing a measurement again needs a reason and a name", field="--reason")
@@ -207,7 +207,7 @@ def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> Meas
     known = store.measurements(machine)
     if not known:
         raise InputError(
-            f"the store holds no measurement of {machine.name}; `volcomp recal run` reads them from the inbox"
+            f"the store has no measurement of {machine.name}; `volcomp recal run` reads them from the inbox"
         )
     if requested is None:
         return known[-1]

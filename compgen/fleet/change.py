@@ -316,9 +316,7 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
             found.append(Calibration(record.measured_at, errors, covariance, means))
             ids.append(record.id)
     if not found:
-        raise InputError(
-            f"the store holds no identified errors of {machine.name!r} with uncertainties; measure it first"
-        )
+        raise InputError(f"the store has no identified errors of {machine.name!r} with uncertainties; measure it first")
     newest = next(item for item in records if item.id == ids[-1])
     return found, ids, store.machine_of(newest)
 

@@ -285,9 +285,7 @@ def engine_of(url: str) -> sa.Engine:
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
     folder = Path(parsed.database).absolute().parent
     if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
-        raise StoreError(
-            f"the store {shown(url)} cannot be used: there is no folder {folder}; mount or create it first"
-        )
+        raise StoreError(f"the store {shown(url)} cannot be used: no such folder: {folder}; mount or create it first")
     path = folder / Path(parsed.database).name
     for pause in (
         *WAITS_S,

@@ -766,7 +766,7 @@ def drift_report(
     last, notes = len(history) - 1, []
     temperature = _temperature(history, data)
     if temperature is None and any(item.temperatures_c for item in history):
-        notes.append("temperatures are too few or too even to tell their effect from the drift")
+        notes.append("there are too few temperatures, or they vary too little, to separate their effect from the drift")
     if last < 2:
         notes.append("a trend needs three calibrations")
     figures = _figures(data, chosen, temperature)

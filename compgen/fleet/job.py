@@ -251,7 +251,7 @@ class Policy:
     max_reference_um: float | None = setting(
         toml_files.positive,
         None,
-        meaning="The correction changes by more than this at the reference point; for first tables against none.",
+        meaning="The correction changes by more than this at the reference point; for first tables: compared with none.",
     )
     max_step_um: float | None = setting(
         toml_files.positive,
@@ -328,7 +328,7 @@ class MachineJob:
         toml_files.flag, False, meaning="Export formats that no public document fully describes."
     )
     notify: tuple[str, ...] = setting(
-        command_words, (), meaning="Command, as a list of words, that is told of decisions and failures."
+        command_words, (), meaning="Command, as a list of words, that is notified of decisions and failures."
     )
     settle_s: float = setting(
         toml_files.not_negative,
@@ -399,7 +399,7 @@ class Job:
     def machine(self, name: str) -> MachineJob:
         """Return one machine; InputError names the nearest if there is none of that name."""
         if name not in self.machines:
-            raise InputError(f"no machine is named {name!r}; {nearest(name, self.machines)}", file=self.path)
+            raise InputError(f"there is no machine {name!r}; {nearest(name, self.machines)}", file=self.path)
         return self.machines[name]
 
 
@@ -430,7 +430,7 @@ def job_schema() -> dict[str, Any]:
         "propertyNames": {"pattern": f"^{MACHINE_NAME.pattern}$"},
         "additionalProperties": keys,
     }
-    defaults = {**keys, "description": "Keys of every machine that does not say otherwise."}
+    defaults = {**keys, "description": "Default keys of all machines."}
     # what a machine needs may also be among the defaults
     needed = [
         {

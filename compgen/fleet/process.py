@@ -205,7 +205,7 @@ def judge_assumption(judgement: Judgement, case: Case) -> None:
         return
     doubts = []
     if measurement.measured_at_source == "file time":
-        doubts.append("the file does not say when it was measured, and the time of a file changes when it is copied")
+        doubts.append("the file does not state when it was measured, and the time of a file changes when it is copied")
     elif measurement.measured_at_source == "file, no zone":
         doubts.append("the time of the measurement has no zone")
     for before, swap in zip([None, *swaps], swaps, strict=False):
@@ -283,7 +283,7 @@ def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
     active = None if on is None else on.version
     if taken in adds:  # the clock may be late: a later version was on already
         later = order[order.index(taken) + 1 :]
-        added |= {f"version {version} in place of version {taken}": adds[version] - adds[taken] for version in later}
+        added |= {f"version {version} instead of version {taken}": adds[version] - adds[taken] for version in later}
     missing = {f"version {version}": adds[version] for version in order if version in (taken, active)}
     old = (old_errors, case.store.covariance_of(last))
     found = likeness(machine, _identified(result), old, added, missing)
@@ -528,7 +528,7 @@ def process(
         warnings.simplefilter("always", CompgenWarning)
         was_active = None if taken is None else _tables_read(store, machine, taken, job.controllers[0])
         if taken is not None and was_active is None:
-            holds = f"version {taken.version} was active, but holds no tables of {job.controllers[0]}"
+            holds = f"version {taken.version} was active, but contains no tables of {job.controllers[0]}"
             raise InputError(f"{holds}; is the control right?")
         outcome = run(
             machine,

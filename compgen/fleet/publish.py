@@ -245,7 +245,7 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     known = {version_name(table): table for table in tables if table.state in ("active", "retired")}
     then = (
         f"give the right store (`store` in the job file) or a newer backup; if this store is right, `volcomp recal adopt "
-        f"{machine.name} --reason TEXT` sets aside what the folder holds"
+        f"{machine.name} --reason TEXT` sets aside the contents of the folder"
     )
     if seen.pointer is not None and seen.pointer not in known:
         raise InputError(

@@ -171,7 +171,7 @@ def _prior(layout: ErrorParameters, covariance: Covariance) -> FloatArray:
         found = np.flatnonzero(names == name)
         if len(found) != len(position_mm):
             where = "" if name in SQUARENESS_NAMES else f" on the nodes of {AXES[error_named(name).axis]}"
-            raise InputError(f"the last calibration does not hold {name}{where} of the machine file; measure again")
+            raise InputError(f"the last calibration does not contain {name}{where} of the machine file; measure again")
         rows.append(found)
         spread = np.zeros((len(found), layout.size))
         spread[:, columns] = matrix

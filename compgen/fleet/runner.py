@@ -217,7 +217,7 @@ class _Pass:
         known = self.store.newest_entry(self.machine)
         if known is not None and known > self.store.now():
             behind = known.isoformat(timespec="seconds")
-            text = f"the clock went backwards: the store holds an entry of {behind}"
+            text = f"the clock went backwards: the store has an entry of {behind}"
             self._problem("clock", "clock", text, fail=False)
         for problem in problems:
             self._problem("inbox", *problem)

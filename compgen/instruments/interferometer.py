@@ -86,7 +86,7 @@ def compensated(readings: SixDof, instrument: SixDofInstrument) -> tuple[SixDof,
         return readings, {}
     temperature = readings.covariates.get("temp_ambient_c")
     if temperature is None:
-        message = "is missing; a phase, or wavelength_compensated = false, asks for the air temperature of each row"
+        message = "is missing; a phase, or wavelength_compensated = false, requires the air temperature of each row"
         raise InputError(message, file=_file(readings), field="column temp_ambient_c")
     _check_complete(readings, "temp_ambient_c", temperature, np.ones(len(readings), dtype=bool))
     pressure = _air(readings, "pressure_hpa", STANDARD_PRESSURE_HPA, (500.0, 1200.0))

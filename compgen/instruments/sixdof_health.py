@@ -140,7 +140,7 @@ def _contradiction(machine: Machine, instrument: SixDofInstrument, runs: Sequenc
     wrong = [run.run for run in runs if run.away != expected]
     if wrong:
         text = (
-            "the displacement goes the other way than chain, mode and beam_direction have it: one of them is wrong, or "
+            "the displacement is opposite to chain, mode and beam_direction: one of them is wrong, or "
             "the axis is commanded the other way"
         )
         yield Suspicion("mode", _letter(runs), text, {"expected": float(expected), "runs": float(len(wrong))})

@@ -453,7 +453,7 @@ def test_a_broken_installed_plug_in_is_a_warning_and_only_its_name_is_missing(in
     Path("e.errors.csv").write_text("error,position_mm,value,u_value\nEXX,0,1,\n")
     code, _, stderr = call(*words)
     assert code == 2
-    assert "no controller is named 'shop-csv'" in stderr
+    assert "there is no controller 'shop-csv'" in stderr
     assert "ShopCsv has no parse" in stderr.split("error: ")[1]
 
 

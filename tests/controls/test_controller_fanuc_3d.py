@@ -236,7 +236,7 @@ def test_records_follow_the_sample_and_hold_what_the_csv_holds(name, order, smal
     cut = text.replace(data[-1], "")
     with pytest.raises(InputError, match="truncated|missing"):
         CONTROL(machine, chosen).parse([files[0], SourceFile(Path("VOLUME.TXT"), cut)])
-    assert "cannot be told from the sample" in made.preflight
+    assert "cannot be determined from the sample" in made.preflight
 
 
 @pytest.mark.parametrize(

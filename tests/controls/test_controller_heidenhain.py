@@ -462,7 +462,7 @@ def test_a_malformed_table_is_refused_with_its_line(tmp_path, before, after, lin
         ("ACTIVE", "AKTIV ", 2, "no column ACTIVE"),
         ("Y            Z", "B            Z", 3, "is not an axis of the machine file"),
         ("\n[END]", "\n1    *                     AXIS_Y.COM\n[END]", 4, "second line"),
-        ("AXIS_Y.COM", "", 3, "names no .COM file"),
+        ("AXIS_Y.COM", "", 3, "contains no .COM file"),
         ("[END]\n", "", 4, "truncated"),
     ],
 )

@@ -555,7 +555,7 @@ def test_file_and_sheet_that_differ_are_refused(tmp_path, backup_file, make_erro
     row = next(row for row in text.split("\r\n") if row.startswith("N4105P"))
     damaged = {**made.files, "ALL-NEW.PRM": text.replace(row, "N4105P77")}
     sources = [SourceFile(Path(name), text) for name, text in damaged.items()]
-    with pytest.raises(InputError, match="does not hold the same tables as SETSHEET.CSV"):
+    with pytest.raises(InputError, match="does not contain the same tables as SETSHEET.CSV"):
         CONTROL(machine).parse(sources)
 
 

@@ -385,7 +385,7 @@ def test_a_negative_backlash_is_said_to_be_one(value, warned):
 def test_counts_per_mm_are_mandatory_and_say_why():
     machine = machine_with()
     bare = Machine("m", machine.chain, machine.axes)
-    with pytest.raises(InputError, match="nothing but the machine says"):
+    with pytest.raises(InputError, match="only the machine builder"):
         CONTROL.read_settings(bare)
     with pytest.raises(InputError, match="other than zero"):
         CONTROL.read_settings(machine_with(counts_per_mm={"X": 1.0, "Y": 0.0, "Z": 1.0}))

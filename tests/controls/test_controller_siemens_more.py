@@ -705,12 +705,12 @@ def test_a_switch_or_a_step_is_no_table():
         ):
             parsed(machine, "siemens-cec-eec", {file: made[file], "other": f"{other}\nM17\n"})
         with pytest.raises(
-            InputError, match=f"{file}: the files contain no {missing} tables .* give all that the control"
+            InputError, match=f"{file}: the files contain no {missing} tables .* give all files of the control"
         ):
             of_control.parse_foreign([SourceFile(Path(file), made[file])])
         both = [SourceFile(Path(file), made[file]), SourceFile(Path("other"), f"{other}\nM17\n")]
         with pytest.raises(
-            InputError, match=f"other: the files contain no {missing} tables .* give all that the control"
+            InputError, match=f"other: the files contain no {missing} tables .* give all files of the control"
         ):
             of_control.parse_foreign(both)
 
@@ -873,7 +873,7 @@ def test_wrong_templates_of_a_user_are_errors(tmp_path, name, text, message):
 
 
 def test_the_control_without_public_format_is_refused_with_the_way_round():
-    with pytest.raises(InputError, match="no controller is named 'siemens-vcs': the file format .* is not public"):
+    with pytest.raises(InputError, match="there is no controller 'siemens-vcs': the file format .* is not public"):
         export(machine_with(), errors_of(machine_with()), "siemens-vcs")
 
 

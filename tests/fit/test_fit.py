@@ -81,7 +81,7 @@ def cubic_bump(position):
 @pytest.mark.parametrize("reference", ["X", "Y"])
 @pytest.mark.parametrize("tool", [(0.0, 0.0, 0.0), (30.0, -70.0, -210.0)])
 @pytest.mark.parametrize("chain", CHAINS)
-@pytest.mark.filterwarnings("ignore:a rotation is taken out")
+@pytest.mark.filterwarnings("ignore:a rotation is removed")
 def test_zeroing_leaves_e_unchanged_but_for_the_reported_rigid_motion(chain, tool, reference):
     machine = machine_of(
         chain, tool_offset_mm=tool, squareness_reference=reference, reference_point_mm=(-120.0, -1000.0, -33.0)
@@ -95,7 +95,7 @@ def test_zeroing_leaves_e_unchanged_but_for_the_reported_rigid_motion(chain, too
     assert np.abs(difference - zeroed.change.field(points)).max() < SAME_ERROR_MM
 
 
-@pytest.mark.filterwarnings("ignore:a rotation is taken out")
+@pytest.mark.filterwarnings("ignore:a rotation is removed")
 def test_a_fit_without_smoothing_changes_e_by_the_reported_rigid_motion_only():
     machine = machine_of("WXFYZT", tool_offset_mm=(0.0, 0.0, -150.0), reference_point_mm=(-300.0, -250.0, -100.0))
     errors = random_table(machine, seed=5)

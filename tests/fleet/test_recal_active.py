@@ -171,7 +171,7 @@ def test_readings_with_the_new_tables_by_a_clock_that_is_a_day_late_are_held(run
     running.measure("late", moved, on=running.on(), seed=3, at=running.now - timedelta(days=1, hours=2))
     outcome = running.run()
     assert (outcome.state, outcome.active) == ("held", 2)
-    assert "by what version 2 in place of version 1 adds" in " ".join(running.tables()[-1].reasons)
+    assert "by what version 2 instead of version 1 adds" in " ".join(running.tables()[-1].reasons)
 
 
 def test_after_a_rollback_to_none_the_tables_that_are_still_on_are_found(running):

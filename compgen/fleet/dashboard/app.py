@@ -310,7 +310,7 @@ def health() -> tuple[Response, int]:
         store.version()
     except CompgenError as error:
         logs.error("store", problem=str(error))
-        return Response("store not available; the log says why\n", mimetype="text/plain"), 503
+        return Response("store not available; see the log\n", mimetype="text/plain"), 503
     return Response("ok\n", mimetype="text/plain"), 200
 
 
@@ -421,7 +421,7 @@ def _decision_request() -> dict[str, Any]:
     reason = " ".join("".join(char if char.isprintable() else " " for char in text).split())
     if len(reason) > LONGEST_REASON:
         raise InputError(f"a reason has at most {LONGEST_REASON} characters; this one has {len(reason)}")
-    seen = _whole("seen", "open the page again: the form does not say what was active")
+    seen = _whole("seen", "open the page again: the form does not state what was active")
     return {"actor": g.session.user, "reason": reason, "seen": seen}
 
 
@@ -600,7 +600,7 @@ def _program_error(error: CompgenError) -> tuple[str, int]:
     """Show what the program itself says: a decision that cannot be made, a store that cannot be reached."""
     if isinstance(error, StoreError):
         logs.error("store", problem=str(error))
-        text = "The store cannot be used at the moment; the log says why."
+        text = "The store is not available at the moment; see the log."
         return render_template("error.html", code=503, title="Store not available", text=text), 503
     return render_template("error.html", code=409, title="Not done", text=str(error)), 409
 
@@ -609,7 +609,7 @@ def _unexpected(error: Exception) -> tuple[str, int]:
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     logs.error("internal error", problem=f"{type(error).__name__}: {error}", where=where, path=request.path[:200])
-    text = "This is a fault of the program; its log says more."
+    text = "This is an error of the program; see its log."
     return render_template("error.html", code=500, title="Internal error", text=text), 500
 
 

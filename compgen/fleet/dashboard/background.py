@@ -394,7 +394,7 @@ def basis(store: Store, machine: MachineRecord) -> Basis:
         if stations is not None and errors and item.covariance_sha256 is not None:
             order = sorted(errors, key=lambda name: (name not in SQUARENESS_NAMES, name))
             return Basis(item, stations, order)
-    raise InputError("no calibration of this machine says where its tracers were, so a re-check cannot be planned")
+    raise InputError("no calibration of this machine states where its tracers were, so a re-check cannot be planned")
 
 
 def stations_of(summary: Mapping[str, Any]) -> PlannedStations | None:

@@ -38,7 +38,7 @@ class DashboardSettings:
     users: Path | None = option(None, "File of the users; default: next to the SQLite store.", metavar="FILE")
     metrics_token: str | None = option(
         None,
-        "File with the token that /metrics asks for; with --private there is no /metrics without one.",
+        "File with the token that /metrics requires; with --private there is no /metrics without one.",
         name="--metrics-token-file",
         metavar="FILE",
     )
