@@ -262,7 +262,7 @@ class Policy:
     clock_minutes: float = setting(
         toml_files.not_negative,
         30.0,
-        meaning="It was measured within this time of a decision that changed the active tables, and does not say which "
+        meaning="It was measured within this time of a decision that changed the active tables, and does not state which "
         "were active.",
     )
 

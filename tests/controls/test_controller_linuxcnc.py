@@ -561,7 +561,7 @@ def test_malformed_tables_are_refused_with_their_line(body, line, words):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (BODY, "cut"),
+        (BODY, "truncated"),
         (signed(BODY).replace("0.2", "0.3"), "checksum"),
         (signed(BODY).replace("crc32 ", "crc32 0"), "checksum"),
         (signed(BODY) + "term 0 A 1 x\n", "may follow"),

@@ -216,7 +216,7 @@ def test_captures_are_read_to_the_last_sample(tmp_path, trailer):
     "content", [capture()[:-600], capture(declared=999), capture(trailer=b""), capture(declared=10**12)]
 )
 def test_cut_captures_are_refused_and_not_padded(tmp_path, content):
-    with pytest.raises(InputError, match="cut"):
+    with pytest.raises(InputError, match="truncated"):
         import_file(written(tmp_path, content, "a.rtx"))
 
 
