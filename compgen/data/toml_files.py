@@ -494,7 +494,11 @@ def section_schema(*kinds: type, **more: Schema) -> dict[str, Any]:
     properties: dict[str, Any] = {}
     required = [key for key, schema in more.items() if schema.get("required") is True]
     for kind in kinds:
-        described = _described_fields(kind)
+        # the section "Parameters" of the docstrings of the dataclass and its bases, each field on one line
+        described: dict[str, str] = {}
+        for doc in (inspect.cleandoc(base.__doc__ or "") for base in reversed(kind.__mro__)):
+            for names, text in re.findall(r"^(\w+(?:, \w+)*) : (.+(?:\n {4}.*)*)", doc, re.M):
+                described |= dict.fromkeys(names.split(", "), " ".join(text.replace("``", "").split()))
         for item in fields(cast(Any, kind)):
             data = item.metadata
             key, said = data.get("key") or item.name, data.get("meaning") or described.get(item.name, "")
@@ -537,17 +541,6 @@ def _property(item: Field[Any], meaning: str) -> dict[str, Any]:
     shown = DeclaredKey(item.name, data["required"], data["stated"], data["check"]).shown
     default = {} if data["required"] or shown is None else {"default": shown}
     return {**accepted(data["check"]), **described, **default}
-
-
-def _described_fields(kind: type) -> dict[str, str]:
-    """What the section "Parameters" of the docstrings of a dataclass and its bases say of each field, on one line."""
-    found: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
-        for names, text in re.findall(
-            r"^(\w+(?:, \w+)*) : (.+(?:\n {4}.*)*)", inspect.cleandoc(base.__doc__ or ""), re.M
-        ):
-            found |= dict.fromkeys(names.split(", "), " ".join(text.replace("``", "").split()))
-    return found
 
 
 def example_of(schema: Schema) -> Any:
@@ -638,7 +631,16 @@ class _Attempt:
             self.unsure = True
         elif not follows:
             self.found.append(error)
-        return (key_error is not None and self._mended(key_error)) or self._smaller(place)
+        if key_error is not None and self._mended(key_error):
+            return True
+        # leave out the key at the place, or the smallest table around it
+        for length in range(len(place), 0, -1):
+            table, key = self._table(place[: length - 1]), place[length - 1]
+            if table is not None and key in table:
+                del table[key]
+                self.left_out.add(place[:length])
+                return True
+        return False
 
     def _mended(self, error: SettingError) -> bool:
         """Take an unknown key away, put a key under its right name, or give it a value that would do."""
@@ -655,16 +657,6 @@ class _Attempt:
         else:
             return False
         return True
-
-    def _smaller(self, place: Place) -> bool:
-        """Leave out the key at a place, or the smallest table around it; False if nothing of it is left."""
-        for length in range(len(place), 0, -1):
-            table, key = self._table(place[: length - 1]), place[length - 1]
-            if table is not None and key in table:
-                del table[key]
-                self.left_out.add(place[:length])
-                return True
-        return False
 
     def _table(self, place: Place) -> dict[Any, Any] | None:
         """The table at a place, None if there is none."""
