@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 
-from compgen.data.arrays import distinct
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import SQUARENESS_NAMES
@@ -196,7 +195,8 @@ def levels_of(position_mm: FloatArray, *, compiled: bool = False) -> tuple[Float
         if len(levels):
             return levels, index
     position_mm = np.ascontiguousarray(position_mm)
-    sample = distinct(position_mm[:: max(1, len(position_mm) // 1999) | 1])  # tried first, because sorting all is slow
+    sample = position_mm[:: max(1, len(position_mm) // 1999) | 1]  # tried first, because sorting all is slow
+    sample, _ = np.unique(sample, return_index=True)  # without the index it would load numpy.ma, which is slow too
     found = np.minimum(np.searchsorted(sample, position_mm), len(sample) - 1)
     if np.array_equal(sample[found], position_mm):
         return sample, found

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.arrays import median
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths
@@ -21,7 +20,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM
 from compgen.errors import CompgenWarning
 from compgen.identify.adjust.grid_problem import levels_of
-from compgen.identify.adjust.robust import time_order
+from compgen.identify.adjust.robust import median, time_order
 from compgen.identify.adjust.unknowns import IntArray
 from compgen.kinematics.first_order import c_matrix
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.arrays import median
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
@@ -337,6 +336,17 @@ def standardised_spread(standardised: FloatArray) -> float:
     At least ``LEAST_SPREAD``, so that rounding in noise-free data rejects nothing.
     """
     return max(1.4826 * median(np.abs(standardised - median(standardised))), LEAST_SPREAD)
+
+
+def median(values: FloatArray) -> float:
+    """Return the median of values (n,), nan if one of them is; numpy's own loads ``numpy.ma``, a third of numpy's time.
+
+    >>> median(np.array([4.0, 1.0, 2.0]))
+    2.0
+    """
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, [low, high, len(values) - 1])
+    return float(ordered[-1] if np.isnan(ordered[-1]) else 0.5 * (ordered[low] + ordered[high]))
 
 
 def accepted_readings(standardised: FloatArray) -> NDArray[np.bool_]:
