@@ -199,7 +199,7 @@ def options_of(
     ----------
     only, without : the fields that become options (default: all), and those that do not.
     read : by field, what makes the value from the text on the command line, where one is given.
-    build : makes the object from the values by field, in place of ``kind``.
+    build : makes the object from the values by field, instead of ``kind``.
     """
     hints = get_type_hints(kind)
     chosen = [item for item in fields(kind) if item.name not in without and (not only or item.name in only)]

@@ -258,7 +258,7 @@ MOST_NUMBER, MOST_VALUE = 9999, 10_000_000
 #: Line ends of controls; LF CR CR is the end of block in ISO code.
 LINE_ENDS = {"\n\r\r": "LF CR CR", "\r\n": "CR LF", "\n": "LF", "\r": "CR"}
 
-#: Comments may be in any language; they are followed with ? in place of what is not ASCII.
+#: Comments may be in any language; they are followed with ? for characters that are not ASCII.
 _COMMENT_BYTES, _NOT_ASCII = re.compile(rb"\([^()\r\n]*\)"), re.compile(rb"[\x80-\xff]+")
 
 Span = tuple[int, int]

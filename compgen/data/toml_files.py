@@ -489,7 +489,7 @@ def section_schema(*kinds: type, **more: Schema) -> dict[str, Any]:
     """Return the JSON schema of a section with the keys that dataclasses declare, and ``more`` properties by key.
 
     The description of a key is its declared meaning, else what the docstring of its dataclass says of the field. A
-    property of ``more`` with ``"required": True`` in place of its list of keys is a key that the section must have.
+    property of ``more`` with ``"required": True`` instead of its list of keys is a key that the section must have.
     """
     properties: dict[str, Any] = {}
     required = [key for key, schema in more.items() if schema.get("required") is True]

@@ -497,7 +497,7 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
 
 
 def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str, float], ...]:
-    """Names that explain the readings nearly as well in place of a member, with their weights."""
+    """Names that explain the readings nearly as well instead of a member, with their weights."""
     best: dict[str, float] = {}
     for k, candidate in enumerate(search.candidates):
         if candidate.tier == "named" and criteria[member] - criteria[k] < ALIAS:

@@ -317,7 +317,7 @@ def next_steps(files: Container[str], machine: str, measurement: str, out: str) 
     return (
         f"{out}/extended.toml is the machine file with these effects; it takes them off the next measurement, for example\n"
         f"  volcomp run {out}/extended.toml {measurement} --controller NAME --out tables/\n"
-        f"in place of\n  volcomp run {machine} {measurement} --controller NAME --out tables/"
+        f"instead of\n  volcomp run {machine} {measurement} --controller NAME --out tables/"
     )
 
 

@@ -501,7 +501,7 @@ SAME_LAW = 0.93
 
 
 def with_names(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
-    """Put names in place of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
+    """Put names instead of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
     for generic in [g for g in chosen.members if design.groups[g].tier == "generic"]:
         rest = [g for g in chosen.members if g != generic]
         group, related = design.groups[generic], []
@@ -559,7 +559,7 @@ def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
 
 @dataclass(frozen=True)
 class Alternative:
-    """A name that explains the readings almost as well in place of a member, with its weight and correlation."""
+    """A name that explains the readings almost as well instead of a member, with its weight and correlation."""
 
     name: str
     weight: float

@@ -90,7 +90,7 @@ class Card:
     slow: bool = False
 
     def named(self, **words: str) -> Card:
-        """Return the card with ``words`` in place of their names in braces, in all of its texts."""
+        """Return the card with ``words`` for their names in braces, in all of its texts."""
 
         def said(value: Any) -> Any:
             if isinstance(value, str):

@@ -399,7 +399,7 @@ def _brent(function: Callable[[float], float], a: float, b: float, tolerance: fl
     return x, fx
 
 
-# Curves whose nodes are correlated: the covariance of the identification in place of independent uncertainties.
+# Curves whose nodes are correlated: the covariance of the identification instead of independent uncertainties.
 #
 #     (y - c)^T W (y - c) + mu |D2 c|^2,   W = u0^2 V^-1
 #

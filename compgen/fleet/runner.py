@@ -181,7 +181,7 @@ def _passed(
 
 
 class _Pass:
-    """One pass over one machine; collects messages as it goes. ``elsewhere`` processes in place of this process."""
+    """One pass over one machine; collects messages as it goes. ``elsewhere`` processes instead of this process."""
 
     def __init__(
         self,

@@ -50,7 +50,7 @@ def _listed(numbers: tuple[int, ...]) -> str:
 class Watch:
     """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once.
 
-    ``notify`` is a command in place of those of the job file.
+    ``notify`` is a command instead of those of the job file.
     """
 
     def __init__(

@@ -164,7 +164,7 @@ def _as_curve(position_mm: FloatArray, value: FloatArray) -> Curve:
 def axis_runs(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[AxisRun]:
     """Errors of the moved axis over every run; a CompgenWarning where chain and readings contradict each other.
 
-    ``as_printed`` of the instrument takes the paper's own equations in place of the traced ones.
+    ``as_printed`` of the instrument takes the paper's own equations instead of the traced ones.
     """
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     grown = {axis: growth_mm(machine, readings, axis) for axis in {run.axis for run in reduced}}

@@ -29,7 +29,7 @@ class SixDof:
     distance_mm : absolute optical distance L of each row, nan where it is not given, (n,).
     direction : sign of travel, 0 where it is not given, (n,).
     covariates : ``time_s``, air and temperatures by column name, each (n,); ``phase_rad`` where the interferometer's
-        phase was given in place of its displacement, which then is nan until :func:`compensated` has made it.
+        phase was given instead of its displacement, which then is nan until :func:`compensated` has made it.
     metadata : comments ``key = value``.
     origin : (file, line) of each row.
     """

@@ -307,7 +307,7 @@ def predict(machine: Machine, errors: ErrorTable, points: Points, *, exact: bool
     Parameters
     ----------
     machine, errors, points : what moves, how wrong, and where to.
-    exact : finite rotations along the chain in place of E = C P.
+    exact : finite rotations along the chain instead of E = C P.
 
     Examples
     --------

@@ -145,7 +145,7 @@ def align(
 
 
 def _completed(errors: ErrorTable, reference: ErrorTable) -> ErrorTable:
-    """Return ``errors`` with zero in place of the errors that only the reference has."""
+    """Return ``errors`` with zero instead of the errors that only the reference has."""
     curves = dict(errors.curves)
     for name, curve in reference.curves.items():
         zero = np.zeros(len(curve.value))

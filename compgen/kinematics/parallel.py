@@ -385,7 +385,7 @@ def facts(*, host: bool) -> WorkerFacts:
 def objection(required: WorkerFacts, found: WorkerFacts, who: str) -> str:
     """Say why a scheduler or worker cannot be used, empty if it can."""
     here, there = dict(required.versions), dict(found.versions)
-    other = [f"{name} {there.get(name, 'none')} in place of {here[name]}" for name in here if here[name] != there[name]]
+    other = [f"{name} {there.get(name, 'none')} instead of {here[name]}" for name in here if here[name] != there[name]]
     if other:
         return f"{who} has {', '.join(other)}; the same versions belong everywhere, so that results are the same"
     if required.host and required.host != found.host:

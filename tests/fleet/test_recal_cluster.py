@@ -540,13 +540,13 @@ def test_without_dask_the_extra_is_named(monkeypatch):
 def test_other_versions_are_refused_before_anything_is_sent(address, monkeypatch):
     mine = cluster.facts(host=False).versions
     monkeypatch.setattr(cluster, "facts", lambda *, host: cluster.WorkerFacts((("compgen", "99.0"), *mine[1:])))
-    with pytest.raises(cluster.ClusterError, match=f"the scheduler has compgen {mine[0][1]} in place of 99.0"):
+    with pytest.raises(cluster.ClusterError, match=f"the scheduler has compgen {mine[0][1]} instead of 99.0"):
         cluster.Cluster(address)
 
 
 def test_a_worker_of_another_version_that_comes_later_is_refused_too(there, monkeypatch):
     monkeypatch.setattr(there, "_required", cluster.WorkerFacts((("compgen", "99.0"), ("numpy", np.__version__))))
-    with pytest.raises(cluster.ClusterError, match=r"a worker has compgen .* in place of 99.0"):
+    with pytest.raises(cluster.ClusterError, match=r"a worker has compgen .* instead of 99.0"):
         list(spread(there, eval, ["1"]))
 
 

@@ -136,7 +136,7 @@ def test_the_uncertainty_of_e_is_that_of_the_full_dense_covariance(curves):
     size = result.layout.size
     expected = np.sqrt(np.einsum("nij,jk,nik->ni", design, dense[:size, :size], design))
     found = predict_uncertainty(machine, joint_covariance(result), points)
-    # the normal matrix takes C in place of the exact derivative; without errors the two agree
+    # the normal matrix takes C instead of the exact derivative; without errors the two agree
     assert np.allclose(found, expected, rtol=1e-5, atol=0)
     stations = joint_covariance(result).stations_covariance
     assert np.allclose(stations, dense[size : size + 12, size : size + 12], rtol=1e-4, atol=1e-4 * stations.max())

@@ -455,7 +455,7 @@ class PathProblem:
         return found.cost + (self.known.add_gradient(state, found.gradient) if self.known else 0.0), found.gradient
 
     def normal_matrix(self, state: State) -> FloatArray:
-        """J^T W J (size, size) with C in place of the exact derivative."""
+        """J^T W J (size, size) with C instead of the exact derivative."""
         matrix = self._sums(state, np.empty(len(self.weight)), matrix=True).matrix
         assert matrix is not None
         if self.known:
