@@ -115,8 +115,10 @@ def _may_have_plugins() -> bool:
         if hasattr(finder, "find_distributions") and getattr(finder, "__name__", "") != "PathFinder":
             return True
     for folder in map(Path, dict.fromkeys(sys.path)):
-        if folder.is_file():
+        if os.path.isfile(folder):
             return True
+        if not os.path.isdir(folder):  # also where this user may not look
+            continue
         for file in (*folder.glob("*-info/entry_points.txt"), *folder.glob("EGG-INFO/entry_points.txt")):
             try:
                 if b"[compgen." in file.read_bytes():
