@@ -22,7 +22,6 @@ from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
@@ -34,6 +33,7 @@ from compgen.identify.any_measurement import (
     identify_measurement,
     identify_mixed,
 )
+from compgen.identify.options import StatedNumbers
 from compgen.identify.reversal_errors import SIGNIFICANT
 
 if TYPE_CHECKING:

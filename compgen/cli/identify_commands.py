@@ -21,11 +21,11 @@ from compgen.cli.terminal import progress, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.stated import StatedNumbers
 from compgen.errors import InputError
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
+from compgen.identify.options import StatedNumbers
 from compgen.pipeline import (
     add_identification,
     failure_reported,

@@ -29,10 +29,10 @@ from compgen.cli.shared_options import (
 from compgen.cli.terminal import progress, say, say_paths, stdout
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
-from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
+from compgen.identify.options import StatedNumbers
 from compgen.pipeline import run
 from compgen.report.terminal import identification_table, verification_table
 from compgen.tables.judge import SafetyLimits

@@ -19,9 +19,9 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.data.messages import nearest
-from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
+from compgen.identify.options import StatedNumbers
 from compgen.resources import data_folder
 
 if TYPE_CHECKING:

@@ -12,10 +12,10 @@ from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.error_table import format_errors
 from compgen.data.names import error_named
-from compgen.data.stated import StatedNumbers
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_measurement
 from compgen.identify import joint_covariance
+from compgen.identify.options import StatedNumbers
 from compgen.kinematics.exact_chain import tip_position
 from compgen.pipeline import identify_bare, with_reversal
 
