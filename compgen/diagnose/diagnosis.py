@@ -349,7 +349,17 @@ class Diagnosis(DisplayedDiagnosis):
         verdict, analysis, against = self.verdict, self.analysis, self.against_rms_mm
         cards = self._cards
         effects = [self._named(item) for item in verdict.named] + [
-            {**_classed(item), "what_to_do": what_to_do(cards[item.name])} for item in self.classed
+            {
+                "name": item.name,
+                "alias_set": [{"name": item.name, "weight": 1.0}],
+                "parameters": {key: {"value": value, "u": None} for key, value in item.parameters.items()},
+                "confidence": item.confidence,
+                "grade": "confirmed",
+                "visible_fraction": 1.0,
+                "text": item.text,
+                "what_to_do": what_to_do(cards[item.name]),
+            }
+            for item in self.classed
         ]
         word = "named" if verdict.word == "none" and self.classed else verdict.word
         gap: dict[str, Any] = {"train": self.gap.train.to_dict()}
@@ -440,16 +450,4 @@ def _unknown(item: Unknown) -> dict[str, Any]:
         "rms_um": item.rms_mm / MM_PER_UM if np.isfinite(item.rms_mm) else None,
         "text": item.text,
         "resembles": item.resembles or None,
-    }
-
-
-def _classed(item: Classed) -> dict[str, Any]:
-    return {
-        "name": item.name,
-        "alias_set": [{"name": item.name, "weight": 1.0}],
-        "parameters": {key: {"value": value, "u": None} for key, value in item.parameters.items()},
-        "confidence": item.confidence,
-        "grade": "confirmed",
-        "visible_fraction": 1.0,
-        "text": item.text,
     }

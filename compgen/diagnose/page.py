@@ -336,7 +336,17 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
         if item.get("resembles"):
             lines.append(f"  * resembles {item['resembles']}, without being certain")
     lines += [f"* possible secondary effect: {item['name']}" for item in data["secondary"]]
-    lines += _gap_lines(data, markdown=markdown)
+    gap = [
+        (key.replace("_", " "), pair["before_rms_um"], pair["after_rms_um"])
+        for key in ("train", "heldout_lines", "heldout_stations", "heldout_times")
+        if (pair := data["gap"][key])
+    ]
+    if markdown:
+        lines += ["", "| | before (um rms) | after |", "|---|---|---|"]
+        lines += [f"| {name} | {before:.3f} | {after:.3f} |" for name, before, after in gap]
+    else:
+        lines += ["", f"{'residual, um rms':20s} {'before':>10s} {'after':>10s}"]
+        lines += [f"{name:20s} {before:10.3f} {after:10.3f}" for name, before, after in gap]
     if "against" in data:
         lines += ["", f"Against the given errors: {data['against']['rms_um']:.3f} um rms. Errors that have changed:"]
         for item in data["against"]["changes"]:
@@ -380,16 +390,3 @@ def _effect_lines(item: Mapping[str, Any], *, markdown: bool, several: bool) -> 
     if item.get("what_to_do"):
         lines.append(f"  * what to do: {item['what_to_do']}")
     return lines
-
-
-def _gap_lines(data: Mapping[str, Any], *, markdown: bool) -> list[str]:
-    rows = [
-        (key.replace("_", " "), pair["before_rms_um"], pair["after_rms_um"])
-        for key in ("train", "heldout_lines", "heldout_stations", "heldout_times")
-        if (pair := data["gap"][key])
-    ]
-    if markdown:
-        head = ["", "| | before (um rms) | after |", "|---|---|---|"]
-        return head + [f"| {name} | {before:.3f} | {after:.3f} |" for name, before, after in rows]
-    head = ["", f"{'residual, um rms':20s} {'before':>10s} {'after':>10s}"]
-    return head + [f"{name:20s} {before:10.3f} {after:10.3f}" for name, before, after in rows]

@@ -238,16 +238,30 @@ def identify_mixed(
     from compgen.identify.six_dof import SixDofMeasurement
     from compgen.identify.together import Source, identify_together
 
-    parts = []
+    parts, plain = [], IdentifyOptions()
+    unless_lengths = replace(
+        options,
+        u_length_um=None,
+        u_length_um_per_m=None,
+        method=plain.method,
+        stations=None,
+        systematic=plain.systematic,
+    )
     for name, part in measurement.parts:
         if isinstance(part, ErrorTable):
             parts.append(Source(name, None, known[name]))
             continue
+        # of the options, those that apply to this kind
+        probed = isinstance(part, Deviations | Artefact)
+        applicable = replace(
+            options if isinstance(part, Lengths) else unless_lengths,
+            u_deviation_um=options.u_deviation_um if probed else None,
+        )
         try:
             with warnings.catch_warnings():
                 if isinstance(part, AxisRuns):  # they warn of what others may have measured
                     warnings.simplefilter("ignore", CompgenWarning)
-                alone = identify_measurement(machine, part, _applicable(part, options))
+                alone = identify_measurement(machine, part, applicable)
         except UndeterminedError:
             if not isinstance(part, Deviations | Artefact):
                 raise
@@ -259,22 +273,6 @@ def identify_mixed(
     if len(parts) == 2 and posed and posed[0] is not None and others and others[0] is not None:
         return merge(machine, others[0], posed[0])
     return identify_together(machine, parts, options)
-
-
-def _applicable(part: OneKind, options: IdentifyOptions) -> IdentifyOptions:
-    """The options that apply to one kind of several."""
-    plain = IdentifyOptions()
-    if isinstance(part, Lengths):
-        return replace(options, u_deviation_um=None)
-    return replace(
-        options,
-        u_length_um=None,
-        u_length_um_per_m=None,
-        method=plain.method,
-        stations=None,
-        systematic=plain.systematic,
-        u_deviation_um=options.u_deviation_um if type(part).__name__ in ("Deviations", "Artefact") else None,
-    )
 
 
 # What a later report needs in addition to the results of an identification: the machine file, and the residuals.

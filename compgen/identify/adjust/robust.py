@@ -451,7 +451,12 @@ def explain_rejected(
         return ()
     expected = _expected(lengths, layout, state, group, residual_mm, sigma_mm)
     rows = rejected.tolist()
-    broken = _rows_of(lengths, segments, set(rows))
+    broken: dict[int, str] = {}  # rows of rejected segments, with the reason
+    for segment in segments:
+        if not segment.kept:
+            where = f"lines {segment.line} to {segment.last_line}" if segment.line else "a run of readings"
+            text = f"one of {segment.readings} readings off by {segment.offset_mm:+.3f} mm ({where}): beam break"
+            broken.update({row: text for row in segment.rows if row in set(rows)})
     exchanged = _exchanges(lengths, expected, [row for row in rows if row not in broken], residual_mm)
     found = []
     for row in rows:
@@ -501,17 +506,6 @@ def _expected(
         group=group,
         close_mm=CLOSE * sigma_mm * max(standardised_spread(residual_mm / sigma_mm), 0.1),
     )
-
-
-def _rows_of(lengths: Lengths, segments: Sequence[Segment], rejected: set[int]) -> dict[int, str]:
-    """Rejected rows that are part of a rejected segment, with the reason."""
-    found = {}
-    for segment in segments:
-        if not segment.kept:
-            where = f"lines {segment.line} to {segment.last_line}" if segment.line else "a run of readings"
-            text = f"one of {segment.readings} readings off by {segment.offset_mm:+.3f} mm ({where}): beam break"
-            found.update({row: text for row in segment.rows if row in rejected})
-    return found
 
 
 def _exchanges(lengths: Lengths, expected: _Expected, rows: Sequence[int], residual_mm: FloatArray) -> dict[int, str]:

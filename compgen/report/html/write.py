@@ -622,9 +622,20 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
         verified += [f"- Remains: {row['error']} {um(row['um'])} um; {row['why']}" for row in item["uncorrected"]]
         verified += [*(f"- {plain_markdown(text)}" for text in (*item["reasons"], *item["notes"])), ""]
     lines += _section("5. Verification", verified)
+    compare = dossier["comparison"]
+    compared = [
+        [
+            row["key"],
+            *(_figure(row[side], row[f"{side}_U"]) for side in ("before", "after")),
+            row["unit"],
+            row["verdict"] or "",
+        ]
+        for group in compare.get("groups", [])
+        for row in group["rows"]
+    ]
+    table = _table(["figure", "before", "after", "unit", "verdict"], compared)
     lines += _section(
-        "6. Accuracy figures and comparison",
-        [*_accuracy(dossier["accuracy"]), *_comparison_lines(dossier["comparison"])],
+        "6. Accuracy figures and comparison", [*_accuracy(dossier["accuracy"]), *table, *_statements(compare)]
     )
     lines += _section("7. Limits", [f"- {plain_markdown(text)}" for text in dossier["limits"]])
     lines += _section("8. Provenance", _pairs(dossier["provenance"]))
@@ -677,21 +688,6 @@ def _accuracy(accuracy: Mapping[str, Any]) -> list[str]:
         for row in group["rows"]
     ]
     return [*_table(["figure", "value", "unit", "meaning"], rows), *_statements(accuracy)]
-
-
-def _comparison_lines(compare: Mapping[str, Any]) -> list[str]:
-    rows = [
-        [
-            row["key"],
-            _figure(row["before"], row["before_U"]),
-            _figure(row["after"], row["after_U"]),
-            row["unit"],
-            row["verdict"] or "",
-        ]
-        for group in compare.get("groups", [])
-        for row in group["rows"]
-    ]
-    return [*_table(["figure", "before", "after", "unit", "verdict"], rows), *_statements(compare)]
 
 
 def _statements(data: Mapping[str, Any]) -> list[str]:
