@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.display import Displayed, Overview
-from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, uncertainties, within
+from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, one_of, uncertainties, within
 from compgen.errors import InputError
 
 #: First and second axis of each plane; angles count from the first to the second.
@@ -95,19 +95,9 @@ class Circles(Displayed):
         )
 
 
-def _planes(table: CsvTable, column: str) -> NDArray[np.int64]:
-    """Read names of planes; the axes in the other order are refused, because the sense of the angle would turn."""
-    names = [name.upper() for name in table.text(column)]
-    for row, name in enumerate(names):
-        if name not in PLANES:
-            turned = f"; angles count from {name[1]} to {name[0]} in {name[::-1]}" if name[::-1] in PLANES else ""
-            raise table.fail(row, column, f"{name!r} is not a plane; expected {', '.join(PLANES)}{turned}")
-    return np.array([list(PLANES).index(name) for name in names], dtype=np.int64)
-
-
 _CIRCLES = Schema(
     (
-        Field("plane", ("plane",), _planes, encode=lambda planes: [list(PLANES)[k] for k in planes]),
+        Field("plane", ("plane",), one_of(PLANES, "a plane"), encode=lambda planes: [list(PLANES)[k] for k in planes]),
         Field("angle_rad", ("angle_deg",), unit=float(np.pi / 180.0), digits=6),
         Field("radius_mm", ("radius_mm",), within(LARGEST_RADIUS_MM, "mm", "more than 10 m; is the unit mm?")),
         RUN_DEVIATION,
@@ -127,7 +117,8 @@ def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
     Raises
     ------
     InputError
-        for a plane that is not XY, YZ or ZX, a direction that is not 1 or -1, a centre of which a coordinate is missing.
+        for a plane other than XY, YZ and ZX (angles would turn the other way), a direction that is not 1 or -1, a centre of
+        which a coordinate is missing.
     """
     parts, first = [], 0
     for table in _CIRCLES.read_tables(files):

@@ -67,15 +67,6 @@ def chains_of(words: str) -> tuple[Chain, ...]:
     code = re.sub(r"[\s-]", "", words).upper()
     if code in CHAINS:
         return (Chain(code),)
-    carried = _carried(words)
-    if not carried:
-        raise InputError(f"{words!r} names no axes that move; write for example {EXAMPLES}", field="--chain")
-    fits = [Chain(name) for name in CHAINS if _allows(Chain(name), carried)]
-    return tuple(sorted(fits, key=lambda chain: _turned(chain, carried)))
-
-
-def _carried(words: str) -> dict[str, Carried]:
-    """What carries each axis that the words name, in their order."""
     found: dict[str, Carried] = {}
     for letter, carrier in _pairs(words):
         _, side, level = next(kind for k, kind in enumerate(_CARRIERS) if carrier.group(f"c{k}"))
@@ -88,12 +79,16 @@ def _carried(words: str) -> dict[str, Carried]:
     table = any(item.tool_side is False for item in found.values())
     column = any(item.tool_side and item.level < 2 for item in found.values())
     gantry = re.search(_CARRIERS[2][0], words.lower().translate(_UMLAUTS)) is not None
-    return {
+    carried = {
         letter: replace(item, tool_side=gantry or column)
         if item.tool_side is None and (gantry or table != column)
         else item
         for letter, item in found.items()
     }
+    if not carried:
+        raise InputError(f"{words!r} names no axes that move; write for example {EXAMPLES}", field="--chain")
+    fits = [Chain(name) for name in CHAINS if _allows(Chain(name), carried)]
+    return tuple(sorted(fits, key=lambda chain: _turned(chain, carried)))
 
 
 def _pairs(words: str) -> list[tuple[str, re.Match[str]]]:

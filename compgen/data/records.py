@@ -101,13 +101,23 @@ class Field:
         return {name: one for name, one in found.items() if self.presence == "required" or not np.isnan(one).all()}
 
 
-def axes_of(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]:
-    """Read a column of axis letters as 0, 1, 2 for X, Y, Z."""
-    letters = table.text(column)
-    for row, letter in enumerate(letters):
-        if letter not in AXES:
-            raise table.fail(row, column, f"{letter!r} is not an axis; expected X, Y or Z")
-    return np.array([AXES.index(letter) for letter in letters], dtype=np.int64)
+def one_of(allowed: Iterable[str], what: str) -> Callable[[CsvTable, str], np.ndarray[Any, np.dtype[np.int64]]]:
+    """Read a column of words as their numbers among the allowed ones; another word is refused as not being ``what``."""
+    known = tuple(allowed)
+
+    def read(table: CsvTable, column: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+        words = table.text(column)
+        for row, word in enumerate(words):
+            if word not in known:
+                listed = f"{', '.join(known[:-1])} or {known[-1]}"
+                raise table.fail(row, column, f"{word!r} is not {what}; expected {listed}")
+        return np.array([known.index(word) for word in words], dtype=np.int64)
+
+    return read
+
+
+#: Reads a column of axis letters as 0, 1, 2 for X, Y, Z.
+axes_of = one_of(AXES, "an axis")
 
 
 def within(most: float, unit: str, doubt: str) -> ReadColumn:

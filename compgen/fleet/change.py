@@ -346,7 +346,11 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     if not kept:
         raise InputError("the calibrations have no error in common; keep the same errors in the machine file")
     error, position = tuple(newest.error[k] for k in kept), newest.position_mm[kept]
-    keep = _gauge_projector(machine, error, position)
+    # takes the gauge directions out so that the curves, not squareness, become small
+    told = [name for name in dict.fromkeys(error) if name in SQUARENESS_NAMES or error.count(name) > 1]
+    weight = np.where(np.isin(error, SQUARENESS_NAMES), 0.0, curve_weights(error))
+    changes = gauge_changes(gauge_directions(machine, told), error, position)
+    keep = np.asarray(np.eye(len(error)) - gauge_part(changes, np.diag(weight)))
     names, maps = np.array(error), []
     for item in history:  # each with a matrix (k, k_i) that takes its values to the common nodes, linear in between
         given = np.array(item.covariance.error)
@@ -367,14 +371,6 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     figures, weights = _figures(error, position, keep)
     days = np.array(seconds) / 86400.0
     return Aligned(machine, error, position, days, np.array(values), tuple(factors), figures, weights)
-
-
-def _gauge_projector(machine: Machine, error: Sequence[str], position_mm: FloatArray) -> FloatArray:
-    """Matrix (k, k) that takes the gauge directions out so that the curves, not squareness, become small."""
-    names = [name for name in dict.fromkeys(error) if name in SQUARENESS_NAMES or error.count(name) > 1]
-    weight = np.where(np.isin(error, SQUARENESS_NAMES), 0.0, curve_weights(error))
-    changes = gauge_changes(gauge_directions(machine, names), error, position_mm)
-    return np.asarray(np.eye(len(error)) - gauge_part(changes, np.diag(weight)))
 
 
 def _figures(

@@ -590,7 +590,13 @@ def backup(url: str, path: Path) -> dict[str, int]:
         path.parent.mkdir(parents=True, exist_ok=True)
         with closing(open_store(url)) as source, closing(open_store(f"sqlite:///{temporary}")) as target:
             counts = _copy(source, target)
-            retried(lambda: _end_log(target), target.url)
+
+            def end_log() -> None:  # nothing is left in the write-ahead log
+                with target.engine.connect() as connection:
+                    connection.exec_driver_sql("COMMIT")
+                    connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
+
+            retried(end_log, target.url)
         try:  # never over another file that came meanwhile, where the file system can promise that
             os.link(temporary, path)
         except OSError as error:
@@ -603,13 +609,6 @@ def backup(url: str, path: Path) -> dict[str, int]:
     finally:
         for left in (temporary, *(temporary.with_name(temporary.name + end) for end in ("-wal", "-shm", "-journal"))):
             left.unlink(missing_ok=True)
-
-
-def _end_log(store: Store) -> None:
-    """Leave nothing in the write-ahead log."""
-    with store.engine.connect() as connection:
-        connection.exec_driver_sql("COMMIT")
-        connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
 
 
 def restore(path: Path, url: str) -> dict[str, int]:

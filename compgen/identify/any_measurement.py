@@ -94,36 +94,34 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
             f"--instrument {instrument} was given, but no file contains six-DOF readings (*.sixdof.csv with axis, "
             "position_mm, y_qd1_mm, ...)"
         )
-    parts = [(_names(files), _read_kind(kind, files, instrument)) for kind, files in (kinds or {"lengths": []}).items()]
+    if not kinds or set(kinds) == {"lengths"}:
+        return read_lengths(paths)
+    from compgen.data.axis_runs import read_axis_runs
+    from compgen.data.circles import read_circles
+    from compgen.data.deviations import read_artefacts, read_deviations, read_parts
+
+    readers: dict[str, Callable[[Sequence[str | Path]], OneKind]] = {
+        "lengths": read_lengths,
+        "artefact": read_artefacts,
+        "axis": read_axis_runs,
+        "circle": read_circles,
+        "deviations": read_deviations,
+        "part": read_parts,
+    }
+    if instrument is not None:
+        from compgen.identify.six_dof import SixDofMeasurement
+        from compgen.instruments.sixdof_instrument import read_instrument
+        from compgen.instruments.sixdof_readings import read_sixdof
+
+        constants = read_instrument(str(instrument))
+        readers["sixdof"] = lambda files: SixDofMeasurement(read_sixdof(files), constants)
+    parts = [(_names(files), readers[kind](files)) for kind, files in kinds.items()]
     return parts[0][1] if len(parts) == 1 else MixedMeasurement(tuple(parts))
 
 
 def _names(files: Sequence[str | Path]) -> str:
     names = [Path(file).name for file in files]
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-
-
-def _read_kind(kind: str, files: Sequence[str | Path], instrument: str | Path | None) -> OneKind:
-    if kind == "lengths":
-        return read_lengths(files)
-    if kind == "sixdof":
-        from compgen.identify.six_dof import SixDofMeasurement
-        from compgen.instruments.sixdof_instrument import read_instrument
-        from compgen.instruments.sixdof_readings import read_sixdof
-
-        return SixDofMeasurement(read_sixdof(files), read_instrument(str(instrument)))
-    from compgen.data.axis_runs import read_axis_runs
-    from compgen.data.circles import read_circles
-    from compgen.data.deviations import read_artefacts, read_deviations, read_parts
-
-    readers: Mapping[str, Callable[[Sequence[str | Path]], Deviations | AxisRuns | Circles | Artefact]] = {
-        "artefact": read_artefacts,
-        "circle": read_circles,
-        "part": read_parts,
-        "axis": read_axis_runs,
-        "deviations": read_deviations,
-    }
-    return readers[kind](files)
 
 
 def describe(measurement: Measurement | ErrorTable) -> str:

@@ -22,7 +22,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
-from compgen.data.names import MM_PER_UM, error_named
+from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenWarning, UndeterminedError
 from compgen.identify.adjust.determined import Observations, determined_values, least_squares, stacked
 from compgen.identify.adjust.residual_tests import misfit_of
@@ -30,12 +30,9 @@ from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.identify.covariance import joint_covariance, values_with_factor
 from compgen.identify.identification import Identification, not_among, uncertainty_scale, worst_uncertainty
 from compgen.identify.merging import FALSE_ALARM, MANY, projected
-from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions
+from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import artefact_observations, position_observations
 from compgen.kinematics.first_order import modelled_errors
-
-#: No value is known better than this, um and urad.
-FINEST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -45,6 +42,48 @@ class Source:
     name: str
     measurement: object
     alone: Identification | None
+
+    def observed(
+        self, machine: Machine, layout: ErrorParameters, options: IdentifyOptions, around: FloatArray | None
+    ) -> Observations:
+        """Return what it says about the errors of a layout; ``around`` are errors (size,) that are nearly right.
+
+        Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with the joint
+        covariance of these: stations, dead lengths and rejected readings are settled then. Axis runs and known errors enter value
+        by value.
+        """
+        if isinstance(self.measurement, Deviations):
+            found = position_observations(machine, layout, self.measurement, options, around)
+            return found if self.alone is None else replace(found, sigma=found.sigma * self.alone.u_scale)
+        if isinstance(self.measurement, Artefact):
+            start = np.zeros(layout.size) if around is None else around
+            found, _, _ = artefact_observations(machine, layout, self.measurement, options, start)
+            return found if self.alone is None else replace(found, sigma=found.sigma * self.alone.u_scale)
+        if self.alone is None:
+            text = f"{self.name}: the readings do not determine the errors and what else is unknown of them"
+            raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
+        if self.alone.method == "sixdof":
+            names, positions, values, factor, _ = projected(machine, layout, self.alone)
+            return Observations.of_values(layout, names, positions, values, factor @ factor.T)
+        if self.alone.has_covariance and self.alone.method not in ("deviations", "axis-runs", "circles", "given"):
+            known = joint_covariance(self.alone)
+            return Observations.of_values(
+                layout, known.error, known.position_mm, self.alone.errors.values(), known.errors_covariance
+            )
+        return Observations.of_curves(layout, self.alone.errors)
+
+    def summary(self) -> dict[str, object]:
+        """Return the entry of the part in ``identify.json``."""
+        if self.alone is None:
+            return {"name": self.name, "method": "", "errors": [], "readings": 0}
+        return {
+            "name": self.name,
+            "method": self.alone.method,
+            "errors": list(self.alone.errors.names),
+            "readings": self.alone.readings if self.measurement is not None else 0,
+            "residual_rms_um": self.alone.rms_um,
+            "reduced_chi_square": self.alone.reduced_chi_square,
+        }
 
 
 def identify_together(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
@@ -88,7 +127,7 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
         worst_u=worst_uncertainty(errors) if whole else {},
         layout=error_parameters(machine, errors.names),
         values_factor=np.diag(u) if whole else None,
-        details={"parts": [_described(part) for part in parts]},
+        details={"parts": [part.summary() for part in parts]},
     )
 
 
@@ -98,7 +137,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
     around = None
     for _ in range(2 if any(isinstance(part.measurement, Deviations | Artefact) for part in parts) else 1):
-        found = [_observed(machine, layout, part, options, around) for part in parts]
+        found = [part.observed(machine, layout, options, around) for part in parts]
         everything = stacked(found)
         solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
         around = solution.on(layout)
@@ -140,95 +179,10 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         adjustment=None,
         values_factor=factor,
         details={
-            "parts": [_described(part) for part in parts],
+            "parts": [part.summary() for part in parts],
             "en": agreement,
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
-    )
-
-
-def _observed(
-    machine: Machine, layout: ErrorParameters, part: Source, options: IdentifyOptions, around: FloatArray | None
-) -> Observations:
-    """What a part says about the errors of a layout; ``around`` are errors (size,) that are nearly right.
-
-    Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with the joint
-    covariance of these: stations, dead lengths and rejected readings are settled then. Axis runs and known errors enter value
-    by value.
-    """
-    if isinstance(part.measurement, Deviations):
-        found = position_observations(machine, layout, part.measurement, options, around)
-        return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
-    if isinstance(part.measurement, Artefact):
-        start = np.zeros(layout.size) if around is None else around
-        found, _, _ = artefact_observations(machine, layout, part.measurement, options, start)
-        return found if part.alone is None else replace(found, sigma=found.sigma * part.alone.u_scale)
-    if part.alone is None:
-        text = f"{part.name}: the readings do not determine the errors and what else is unknown of them"
-        raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
-    if part.alone.method == "sixdof":
-        names, positions, values, factor, _ = projected(machine, layout, part.alone)
-        return _of_values(layout, names, positions, values, factor @ factor.T)
-    if part.alone.has_covariance and part.alone.method not in ("deviations", "axis-runs", "circles", "given"):
-        known = joint_covariance(part.alone)
-        return _of_values(layout, known.error, known.position_mm, part.alone.errors.values(), known.errors_covariance)
-    return _of_curves(layout, part.alone.errors)
-
-
-def _of_values(
-    layout: ErrorParameters,
-    names: Sequence[str],
-    position_mm: FloatArray,
-    value: FloatArray,
-    covariance: FloatArray,
-) -> Observations:
-    """Error values with a covariance, as independent readings of unit variance: nothing is seen where it has no extent.
-
-    Values without uncertainty (a curve where it is zero by definition) say nothing. Every curve counts as read everywhere.
-    """
-    design = layout.value_rows(names, position_mm)
-    size, direction = np.linalg.eigh(covariance)
-    seen = size > 1e-12 * size[-1]
-    whiten = (direction[:, seen] / np.sqrt(size[seen])).T
-    count = int(np.count_nonzero(seen))
-    return Observations(
-        design=whiten @ design,
-        others=np.zeros((count, 0)),
-        value=whiten @ value,
-        sigma=np.ones(count),
-        at_mm=np.full((count, 3), np.nan),
-        shows=np.zeros((count, len(layout.curves)), dtype=bool),
-        covered=frozenset(names),
-    )
-
-
-def _of_curves(layout: ErrorParameters, errors: ErrorTable) -> Observations:
-    """Values of errors as independent readings, each curve with a constant of its own, straightness with a line.
-
-    An uncertainty that is not known is taken as usual.
-    """
-    names = [name for name, rows in errors.rows().items() for _ in range(rows.stop - rows.start)]
-    position_mm = np.concatenate(
-        [errors.curves[name].position_mm if name in errors.curves else [np.nan] for name in errors.names]
-    )
-    label, axis = np.array(names), np.array([error_named(name).axis for name in names])
-    unit = np.array([error_named(name).si_per_unit for name in names])
-    u = errors.uncertainties()
-    at_mm = np.full((len(names), 3), np.nan)
-    at_mm[np.arange(len(names)), axis] = position_mm
-    free = []
-    for name, curve in errors.curves.items():
-        own = (label == name).astype(np.float64)
-        free.append(own)
-        if error_named(name).is_straightness:
-            free.append(own * np.nan_to_num(position_mm - curve.position_mm.mean()))
-    return Observations(
-        design=layout.value_rows(names, position_mm),
-        others=np.column_stack(free) if free else np.zeros((len(names), 0)),
-        value=errors.values(),
-        sigma=np.where(np.isfinite(u), np.maximum(u, FINEST * unit), ASSUMED_U_DEVIATION_UM * unit),
-        at_mm=at_mm,
-        shows=label[:, None] == np.array([curve.error.name for curve in layout.curves], dtype=object)[None, :],
     )
 
 
@@ -292,17 +246,3 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
         objections=tuple(dict.fromkeys(chain.from_iterable(result.objections for result in known))),
         misfit=next((result.misfit for result in known if result.misfit is not None and result.misfit.beyond), None),
     )
-
-
-def _described(part: Source) -> dict[str, object]:
-    """The entry of a part in ``identify.json``."""
-    if part.alone is None:
-        return {"name": part.name, "method": "", "errors": [], "readings": 0}
-    return {
-        "name": part.name,
-        "method": part.alone.method,
-        "errors": list(part.alone.errors.names),
-        "readings": part.alone.readings if part.measurement is not None else 0,
-        "residual_rms_um": part.alone.rms_um,
-        "reduced_chi_square": part.alone.reduced_chi_square,
-    }

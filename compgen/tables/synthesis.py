@@ -63,6 +63,36 @@ class FreeValues:
     bound: NDArray[np.intp]
     rows: FloatArray
 
+    @classmethod
+    def of(cls, machine: Machine, basis: Sequence[Term]) -> FreeValues:
+        """Return the values that are free in the tables of a basis: not those that must be zero, or continue a line."""
+        parts = []
+        for term, place in placed_terms(basis):
+            rows = []
+            if term.axis is not None:
+                if term.zero_at_mm is not None:
+                    rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
+                rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
+                # nodes outside the travel that few points determine continue the line of the two inside
+                nodes_mm, (low_mm, high_mm) = term.nodes_mm, machine.axes[term.axis].range_mm
+                ends = ((0, 1, 2, low_mm), (-1, -2, -3, high_mm)) if len(nodes_mm) >= 3 else ()
+                for node, next_node, third, end_mm in ends:
+                    step = nodes_mm[next_node] - nodes_mm[node]
+                    if (nodes_mm[next_node] - end_mm) / step < LEAST_SHARE:
+                        ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
+                        row = np.zeros(len(nodes_mm))
+                        row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
+                        rows.append(row)
+            parts.append((place.start, *eliminated(np.array(rows), len(term.nodes_mm))))
+        free = np.concatenate([first + own for first, own, _, _ in parts])
+        bound = np.concatenate([np.array(own, dtype=np.intp) + first for first, _, own, _ in parts])
+        combined, down, across = np.zeros((len(bound), len(free))), 0, 0
+        for *_, own_rows in parts:
+            height, width = own_rows.shape
+            combined[down : down + height, across : across + width] = own_rows
+            down, across = down + height, across + width
+        return cls(free, bound, combined)
+
     def expand(self, x: FloatArray) -> FloatArray:
         """T x for free values (free, k): all values (parameters, k)."""
         values = np.empty((len(self.free) + len(self.bound), x.shape[1]))
@@ -287,7 +317,7 @@ def _factorised(problem: _Problem) -> Projector:
         tool_mm = np.repeat(np.array(tools_mm, dtype=np.float64), len(position_mm), axis=0)
         position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
     terms = tuple(SampledTerm.of(term, place, position_mm, tool_mm) for term, place in placed_terms(basis))
-    freedom = _freedom(machine, basis)
+    freedom = FreeValues.of(machine, basis)
     free, offsets = len(freedom.free), 3 if problem.anchored else 0
     normal = np.zeros((free + offsets, free + offsets))
     normal[:free, :free] = freedom.gather(freedom.gather(_normal_matrix(terms, weight)).T)
@@ -317,35 +347,6 @@ def _factorised(problem: _Problem) -> Projector:
         raise LinAlgError("the normal matrix of the tables is not positive definite")
     sampled = (position_mm, weight, own_tool_mm, tool_mm, terms)
     return Projector(basis, *sampled, freedom, offsets, factor, scale)
-
-
-def _freedom(machine: Machine, basis: Sequence[Term]) -> FreeValues:
-    parts = []
-    for term, place in placed_terms(basis):
-        rows = []
-        if term.axis is not None:
-            if term.zero_at_mm is not None:
-                rows.append(hat_matrix(term.nodes_mm, np.array([term.zero_at_mm]))[0])
-            rows += [row for row in hat_matrix(term.nodes_mm, np.array(term.zeros_mm)) if len(term.zeros_mm)]
-            # nodes outside the travel that few points determine continue the line of the two inside
-            nodes_mm, (low_mm, high_mm) = term.nodes_mm, machine.axes[term.axis].range_mm
-            ends = ((0, 1, 2, low_mm), (-1, -2, -3, high_mm)) if len(nodes_mm) >= 3 else ()
-            for node, next_node, third, end_mm in ends:
-                step = nodes_mm[next_node] - nodes_mm[node]
-                if (nodes_mm[next_node] - end_mm) / step < LEAST_SHARE:
-                    ratio = (nodes_mm[node] - nodes_mm[next_node]) / (nodes_mm[next_node] - nodes_mm[third])
-                    row = np.zeros(len(nodes_mm))
-                    row[node], row[next_node], row[third] = 1.0, -(1.0 + ratio), ratio
-                    rows.append(row)
-        parts.append((place.start, *eliminated(np.array(rows), len(term.nodes_mm))))
-    free = np.concatenate([first + own for first, own, _, _ in parts])
-    bound = np.concatenate([np.array(own, dtype=np.intp) + first for first, _, own, _ in parts])
-    combined, down, across = np.zeros((len(bound), len(free))), 0, 0
-    for *_, own_rows in parts:
-        height, width = own_rows.shape
-        combined[down : down + height, across : across + width] = own_rows
-        down, across = down + height, across + width
-    return FreeValues(free, bound, combined)
 
 
 def synthesize(

@@ -167,7 +167,7 @@ def test_a_laser_and_circles_make_tables_in_one_command(tmp_path, machine, capsy
 def test_files_say_what_is_wrong_with_them(tmp_path, machine):
     good = format_circles(readings(machine, errors_of(machine), "XY"))
     for text, message in (
-        (good.replace("XY,", "YX,", 1), "'YX' is not a plane; expected XY, YZ, ZX; angles count from X to Y in XY"),
+        (good.replace("XY,", "YX,", 1), "'YX' is not a plane; expected XY, YZ or ZX"),
         (good.replace(",100.000000,", ",0.000000,", 1), "0 is not a radius"),
         (good.replace("centre_z_mm", "temp_z_c"), "give centre_x_mm, centre_y_mm and centre_z_mm"),
     ):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import hat_matrix
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import UndeterminedError
 from compgen.identify.adjust.unknowns import CurveParameters, ErrorParameters, error_parameters
@@ -30,6 +30,8 @@ WEAK = 0.25
 SEEN = 1e-6
 #: A part of an error is not determined if the readings show less than this share of one of its unknowns.
 WHOLLY = 1.0 - 1e-4
+#: Standard uncertainty of values that state none, and the least of all, um and urad.
+USUAL_U, FINEST = 1.0, 1e-3
 #: So many positions of each error stand for all at which it was read.
 MOST_SHOWN = 50
 #: A value is determined if less than this share of it lies beside the determined directions.
@@ -63,6 +65,64 @@ class Observations:
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.value)
+
+    @classmethod
+    def of_values(
+        cls,
+        layout: ErrorParameters,
+        names: Sequence[str],
+        position_mm: FloatArray,
+        value: FloatArray,
+        covariance: FloatArray,
+    ) -> Observations:
+        """Return error values with a covariance as independent readings of unit variance; directions without extent stay out.
+
+        Values without uncertainty (a curve where it is zero by definition) say nothing. Every curve counts as read everywhere.
+        """
+        design = layout.value_rows(names, position_mm)
+        size, direction = np.linalg.eigh(covariance)
+        seen = size > 1e-12 * size[-1]
+        whiten = (direction[:, seen] / np.sqrt(size[seen])).T
+        count = int(np.count_nonzero(seen))
+        return cls(
+            design=whiten @ design,
+            others=np.zeros((count, 0)),
+            value=whiten @ value,
+            sigma=np.ones(count),
+            at_mm=np.full((count, 3), np.nan),
+            shows=np.zeros((count, len(layout.curves)), dtype=bool),
+            covered=frozenset(names),
+        )
+
+    @classmethod
+    def of_curves(cls, layout: ErrorParameters, errors: ErrorTable) -> Observations:
+        """Return values of errors as independent readings, each curve with a constant of its own, straightness with a line.
+
+        An uncertainty that is not known is taken as usual.
+        """
+        names = [name for name, rows in errors.rows().items() for _ in range(rows.stop - rows.start)]
+        position_mm = np.concatenate(
+            [errors.curves[name].position_mm if name in errors.curves else [np.nan] for name in errors.names]
+        )
+        label, axis = np.array(names), np.array([error_named(name).axis for name in names])
+        unit = np.array([error_named(name).si_per_unit for name in names])
+        u = errors.uncertainties()
+        at_mm = np.full((len(names), 3), np.nan)
+        at_mm[np.arange(len(names)), axis] = position_mm
+        free = []
+        for name, curve in errors.curves.items():
+            own = (label == name).astype(np.float64)
+            free.append(own)
+            if error_named(name).is_straightness:
+                free.append(own * np.nan_to_num(position_mm - curve.position_mm.mean()))
+        return cls(
+            design=layout.value_rows(names, position_mm),
+            others=np.column_stack(free) if free else np.zeros((len(names), 0)),
+            value=errors.values(),
+            sigma=np.where(np.isfinite(u), np.maximum(u, FINEST * unit), USUAL_U * unit),
+            at_mm=at_mm,
+            shows=label[:, None] == np.array([curve.error.name for curve in layout.curves], dtype=object)[None, :],
+        )
 
     def positions(self, layout: ErrorParameters) -> dict[str, FloatArray]:
         """Where readings say something about each error: at most ``MOST_SHOWN`` of their positions, else the nodes."""
