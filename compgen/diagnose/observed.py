@@ -244,7 +244,8 @@ def _kind(path: str | Path) -> str:
             "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
         )
         raise InputError(message, file=path)
-    if kind == "part":
-        message = "contains features of a part, which identify and accuracy read; diagnose reads lengths, deviations, axis runs"
+    others = {"part": "features of a part", "artefact": "an artefact", "circle": "circles", "errors": "errors"}
+    if kind in others:
+        message = f"contains {others[kind]}, which identify reads; diagnose reads lengths, deviations, axis runs"
         raise InputError(message, file=path)
     return {"axis": "axis runs", "deviations": "deviations"}.get(str(kind), "lengths")

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, join_axis_runs, read_axis_runs, read_diagonals
+from compgen.data.circles import read_circles
 from compgen.data.csv_files import CsvTable, read_csv
-from compgen.data.deviations import Deviations, join_deviations, read_deviations, read_parts
+from compgen.data.deviations import Deviations, join_deviations, read_artefacts, read_deviations, read_parts
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
@@ -78,7 +79,8 @@ def describe_native(path: Path, kind: str) -> tuple[dict[str, Any], object]:
         for a file that its reader refuses.
     """
     readers: dict[str, Callable[[Path], object]] = {
-        "errors": read_errors, "diagonals": read_diagonals, "sixdof": read_sixdof,
+        "errors": read_errors, "diagonals": read_diagonals, "sixdof": read_sixdof, "circle": read_circles,
+        "artefact": read_artefacts,
         **{name: read for name, read in _NATIVE_READERS.items() if name},
     }  # fmt: skip
     data = readers[kind](path)

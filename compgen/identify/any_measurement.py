@@ -257,7 +257,7 @@ def identify_mixed(
         )
         try:
             with warnings.catch_warnings():
-                if isinstance(part, AxisRuns):  # they warn of what others may have measured
+                if isinstance(part, AxisRuns | Artefact):  # they warn of what others may have measured
                     warnings.simplefilter("ignore", CompgenWarning)
                 alone = identify_measurement(machine, part, applicable)
         except UndeterminedError:

@@ -382,6 +382,13 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
         known_square_sum=float(np.sum(standardised[count:] ** 2)), too_few="{} coordinates for {} unknowns and the poses",
     )  # fmt: skip
     errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
+    if not artefact.calibrated.all() and {"EXX", "EYY", "EZZ"} & set(solution.partly):
+        warnings.warn(
+            "an artefact that is not calibrated does not show a common scale of the axes: it is taken as zero; give a length "
+            "as well, for example an axis run (*.axis.csv)",
+            CompgenWarning,
+            stacklevel=3,
+        )
     u_um = float(np.median(adjusted.sigma_mm)) / MM_PER_UM
     return replace(
         adjusted.identification(errors, solution.layout, artefact.metadata, u_um),

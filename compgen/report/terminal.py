@@ -63,13 +63,14 @@ def identification_table(result: Identification) -> Group:
         disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
                     for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
         return Group(Text("\n".join([*listed, quality, *disagree])), _errors_table(result))
-    lengths = result.method != "deviations"
-    used = f"{result.readings_used} of {result.readings} "
-    used += (
-        f"lengths used, {len({item.station for item in result.stations})} stations"
-        if lengths
-        else "components of measured positions used"
-    )
+    counted = {
+        "deviations": "components of measured positions used",
+        "artefact": "probed coordinates used",
+        "circles": "readings of circles used",
+    }
+    lengths = result.method not in counted
+    stations = f"lengths used, {len({item.station for item in result.stations})} stations"
+    used = f"{result.readings_used} of {result.readings} {counted.get(result.method, stations)}"
     stated = f"{result.u_length_um:g} um" + (f" + {result.u_length_um_per_m:g} um/m" if lengths else "")
     lines = [
         f"{used}, rank {result.rank} of {result.unknowns} unknowns, method {result.method}",
@@ -83,6 +84,11 @@ def identification_table(result: Identification) -> Group:
     ]
     if len(result.rejected) > MOST_VERDICT_REASONS:
         lines.append(f"... and {len(result.rejected) - MOST_VERDICT_REASONS} more in identify.json")
+    lines += [
+        f"{item['what']} {item['of']}: {item['value']:+.2f} {item['unit']}, u {item['u']:.2f}"
+        for item in result.details.get("unknowns", ())
+        if item["what"] in ("reversal", "scales", "servo mismatch")
+    ]
     if result.method == "merged":
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
