@@ -352,7 +352,7 @@ class StatedNumbers:
     >>> stated = StatedNumbers(squareness={"EC0Y": "25±3"}, scale={"Y": "-12um/m"})
     >>> errors = stated.errors(compgen.load_machine("zha-gantry"))
     >>> errors
-    <ErrorTable: 2 errors: EYY, EC0Y>
+    <ErrorTable: 2 errors of zha-gantry: EYY, EC0Y>
     """
 
     squareness: Mapping[str, str] = option(

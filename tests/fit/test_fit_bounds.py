@@ -685,7 +685,7 @@ def test_the_command_takes_bounds_in_file_units(tmp_path, small_machine, small_m
 @pytest.mark.parametrize(
     ("option", "value", "message"),
     [
-        ("--max-abs", "EXX", "--max-abs: 'EXX' does not have the form NAME=LIMIT"),
+        ("--max-abs", "EXX", "--max-abs: 'EXX' is not of the form NAME=LIMIT"),
         ("--max-slope", "EXX=steep", "--max-slope: 'steep' for EXX is not a number"),
         ("--max-abs", "EXX=-3", "max_abs: -0.003 for EXX leaves no curve"),
         ("--monotone", "EXX=up", "'up' for EXX is not allowed"),

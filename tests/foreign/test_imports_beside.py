@@ -200,7 +200,7 @@ def test_several_files_with_dates_share_one_clock(tmp_path):
     head = "Station,Point,X [mm],Y [mm],Z [mm],Length [mm],Time\n"
     rows = "{s},1,0,0,0,5,2025-04-13 {t}:00:00\n{s},2,50,0,0,55,2025-04-13 {t}:00:10\n"
     paths = [written(tmp_path, head + rows.format(s=s, t=t), f"{s}.csv") for s, t in (("A", 10), ("B", 9))]
-    with pytest.warns(CompgenWarning, match="taken as"):
+    with pytest.warns(CompgenWarning, match="was read as: table, lengths"):
         both = open_measurement(paths)
     assert both.covariates["time_s"].tolist() == [3600, 3610, 0, 10]
 

@@ -6,7 +6,7 @@ import pytest
 import compgen
 from compgen.data.deviations import read_artefacts
 from compgen.data.error_table import Curve, ErrorTable
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_measurement
 from compgen.identify import IdentifyOptions, identify_measurement
 from compgen.kinematics.exact_chain import tip_position
@@ -79,7 +79,8 @@ def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, mach
         machine, errors, [(0.0, 0.0, 0.0), (90.2, 2.0, 1.0), (180.1, -3.0, 2.0), (0.1, 50.0, 30.0)], form_mm=0.02
     )
     path = written(tmp_path / "plate.artefact.csv", rows, "calibrated = false", "u_probe_um = 0.3")
-    found = identify_measurement(machine, open_measurement([path]))
+    with pytest.warns(CompgenWarning, match="does not show a common scale of the axes"):
+        found = identify_measurement(machine, open_measurement([path]))
     assert 0.5 < found.reduced_chi_square < 1.6
     position = np.array([[x, y, 0.0] for x in (-100.0, 0.0, 100.0) for y in (-100.0, 0.0, 100.0)])
     left = compgen.volumetric_error(machine, found.errors, position) - compgen.volumetric_error(

@@ -331,7 +331,7 @@ def test_two_axes_alone_give_their_errors_and_one_squareness(tmp_path):
         (
             "[axes.X]\nmode = 2\nbeam_direction = 1",
             "[axes.X]\nmode = 2\nbeam_direction = 0",
-            "expected 1 (beam along",
+            "expected 1 \\(beam along",
         ),
         ("eps_PEy_arcsec = 4.0", "eps_PEy_deg = 4.0", "is not a systematic parameter"),
         ("eps_PEy_arcsec = 4.0", "eps_PEy_arcsec = 4.0\neps_PEy_urad = 4.0", "twice, in two units"),

@@ -133,7 +133,7 @@ def test_controls_without_settings_are_left_out_by_name_and_refused_when_asked_f
     monkeypatch.setattr("compgen.cli.table_commands.CONTROLLERS", two)
     assert run_command(cli, ["crash-test", str(machine), str(errors_file), "--json"]) == 0
     printed = capsys.readouterr()
-    assert "pmac is left out" in printed.err
+    assert "pmac is skipped" in printed.err
     assert list(json.loads(printed.out)["controllers"]) == ["siemens-eec"]
     two.pop("siemens-eec")
     assert run_command(cli, ["crash-test", str(machine), str(errors_file)]) == 2
