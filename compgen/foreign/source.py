@@ -459,7 +459,12 @@ def open_measurement(
             if isinstance(found, MixedMeasurement)
             else [(", ".join(Path(path).name for path in plain), found)]
         )
-    parts += [(Path(paths[k]).name, read_errors(paths[k])) for k, kind in enumerate(kinds) if kind == "errors"]
+    tables = [Path(paths[k]) for k, kind in enumerate(kinds) if kind == "errors"]
+    for k, path in enumerate(tables):
+        if path.resolve() in [other.resolve() for other in tables[:k]]:
+            raise InputError("is given twice; give it once", file=path)
+        same = [other.name for other in tables].count(path.name) > 1
+        parts.append((str(path) if same else path.name, read_errors(path)))
     if stated is not None:
         parts.append(("command line", stated))
     return parts[0][1] if len(parts) == 1 else MixedMeasurement(tuple(parts))

@@ -101,6 +101,8 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
         where no error at all is determined, or a kind that is not linear does not determine its own unknowns.
     """
     known = [part.alone for part in parts if part.alone is not None]
+    if not known:
+        raise UndeterminedError("none of the measurements alone determines any of the machine's errors", [])
     listed = list(chain.from_iterable(result.errors.names for result in known))
     direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns | Circles) for part in parts)
     if direct and len(listed) == len(set(listed)):

@@ -158,6 +158,25 @@ def test_errors_of_several_files_are_one_set(tmp_path, small_machine, truth):
         assert found.errors.curves[name].value == pytest.approx(truth.curves[name].at(at), abs=1e-9)
 
 
+def test_files_of_one_name_and_errors_that_the_model_lacks_do_not_disturb(tmp_path, small_machine, truth):
+    """Two folders with a file of one name; one of them holds ECX, which this machine does not show."""
+    at = small_machine.axes[0].nodes_mm
+    yaw = compgen.Curve(at, 50e-6 * np.sin(at), np.full(len(at), 1e-6))
+    paths = []
+    both = truth.only("EXX").replace(curves={"EXX": truth.curves["EXX"], "ECX": yaw})
+    for folder, table in (("a", truth.only("EXX")), ("b", both)):
+        (tmp_path / folder).mkdir()
+        paths += written(tmp_path / folder, x_errors_csv=format_errors(table))
+    with pytest.warns(CompgenWarning, match="a rotation is removed"):
+        found = identify_bare(small_machine, open_measurement(paths))
+    assert found.errors.names == ("EXX",)
+    assert found.objections == ()
+    assert found.reduced_chi_square < 1.5
+    assert [part["name"] for part in found.details["parts"]] == [str(path) for path in paths]
+    with pytest.raises(InputError, match="is given twice"):
+        open_measurement([paths[0], paths[0]])
+
+
 def test_how_a_straightedge_lay_makes_no_squareness(tmp_path, small_machine, truth):
     """A line in the straightness of a file without squareness is the set-up of the straightedge."""
     curve = truth.curves["EYX"]

@@ -98,8 +98,9 @@ class Observations:
     def of_curves(cls, layout: ErrorParameters, errors: ErrorTable) -> Observations:
         """Return values of errors as independent readings, each curve with a constant of its own, straightness with a line.
 
-        An uncertainty that is not known is taken as usual.
+        An uncertainty that is not known is taken as usual. Errors that the layout does not contain stay out.
         """
+        errors = errors.only(*(name for name, _ in layout.columns()))
         names = [name for name, rows in errors.rows().items() for _ in range(rows.stop - rows.start)]
         position_mm = np.concatenate(
             [errors.curves[name].position_mm if name in errors.curves else [np.nan] for name in errors.names]
