@@ -1,7 +1,7 @@
 """What a person does: approve, reject, roll back, adopt tables, process a stored measurement again.
 
-Each is kept in the store first; then the files of the machine follow, and the notification. ``clock`` tells the time of a
-simulated factory; None: that of the computer or the database.
+Each action is stored first; then the machine's files are updated and the notification is sent. ``clock`` gives the time of
+a simulated factory; None: the time of the computer or the database.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def approve(
 ) -> DecisionRecord:
     """Approve a version and make its files the active ones.
 
-    Errors as :func:`compgen.fleet.decisions.approve` has them, and NotPublishedError if the folder cannot be written.
+    Errors as for :func:`compgen.fleet.decisions.approve`, and NotPublishedError if the folder cannot be written.
     ``seen`` is the version that the person saw as the active one.
     """
 
@@ -71,7 +71,7 @@ def reject(
     seen: int | None = None,
     clock: Clock | None = None,
 ) -> DecisionRecord:
-    """Reject a version (None: the only one that is open)."""
+    """Reject a version (None: the only open one)."""
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
         chosen = decisions.only_pending(store, machine).version if version is None else version
@@ -90,7 +90,7 @@ def rollback(
     seen: int | None = None,
     clock: Clock | None = None,
 ) -> DecisionRecord:
-    """Make an earlier version active again, byte for byte; ``to`` = 0 leaves none active."""
+    """Make an earlier version active again, byte for byte; with ``to`` = 0 none is active."""
 
     def decide(store: Store, machine: MachineRecord) -> DecisionRecord:
         return decisions.rollback(store, machine, actor, reason, to=to, seen=seen)
@@ -99,13 +99,13 @@ def rollback(
 
 
 def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None = None) -> Path | None:
-    """Give the folder of a machine to this store: what it holds is set aside, and the store publishes its own.
+    """Give a machine's folder to this store: its contents are set aside, and the store publishes its own files.
 
-    From now on the store does not know which tables are on until one is approved or a measurement says it.
+    From then on the store does not know which tables are on until one is approved or a measurement states it.
 
     Returns
     -------
-    The folder into which what was there was moved, None if there was nothing.
+    The folder that the old contents were moved to, None if there were none.
 
     Raises
     ------
@@ -130,7 +130,7 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
 def carried_out(
     job: Job, name: str, decide: Callable[[Store, MachineRecord], DecisionRecord], clock: Clock | None = None
 ) -> DecisionRecord:
-    """Make a decision about a machine, given as a function of :mod:`compgen.fleet.decisions`; its files follow."""
+    """Make a decision about a machine, a function of :mod:`compgen.fleet.decisions`, then update the machine's files."""
     machine_job = job.machine(name)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)
@@ -141,7 +141,7 @@ def carried_out(
 
 
 def _follow(store: Store, job: MachineJob, machine: MachineRecord, done: str) -> None:
-    """Publish and notify; NotPublishedError says what was done all the same."""
+    """Publish and notify; NotPublishedError says what was done nevertheless."""
     try:
         publish(store, machine, job.out)
         notify(store, machine, job.notify)
@@ -151,8 +151,8 @@ def _follow(store: Store, job: MachineJob, machine: MachineRecord, done: str) ->
 
 # --- process a stored measurement again ----------------------------------------------------------------------------
 #
-# After machine file, instrument, policy or program changed: nothing old is replaced, there is one more identification of
-# the measurement and one more version of the tables, judged as any other. The history says who requested it and why.
+# For a changed machine file, instrument, policy or program. Nothing old is replaced: the measurement gets another
+# identification and the tables another version, judged like any other. The history says who requested it and why.
 
 SHORTEST_HASH = 8
 #: Kind of the events that say why a measurement could not be processed again.
@@ -161,7 +161,7 @@ REPROCESS_FAILED = "reprocess"
 
 @dataclass(frozen=True)
 class Reprocessed:
-    """The measurement, how often it was identified by now, and the new version of the tables."""
+    """The measurement, how often it has been identified, and the new version of the tables."""
 
     measurement: MeasurementRecord
     revision: int
@@ -174,14 +174,14 @@ class Reprocessed:
 
 
 def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | None = None) -> Reprocessed:
-    """Process a stored measurement of a machine again, as the job says now, and publish what comes of it.
+    """Process a stored measurement of a machine again by the present job, and publish the result.
 
     Raises
     ------
     InputError
         without a reason, for an unknown machine or measurement.
     CompgenError
-        if the measurement cannot be used now, which is kept as an event, or another runner works on it.
+        if the measurement cannot be used now (stored as an event), or another runner is working on it.
     """
     machine_job = job.machine(name)
     if request.active_table is not None and not re.fullmatch(r"(?i)none|v?[0-9]{1,9}", request.active_table):
@@ -203,7 +203,7 @@ def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | 
 
 
 def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> MeasurementRecord:
-    """Return the measurement with this number, or SHA-256 that begins like this; without either the newest."""
+    """Return the measurement with this number, or whose SHA-256 begins with this text; None: the newest."""
     known = store.measurements(machine)
     if not known:
         raise InputError(

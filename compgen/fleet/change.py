@@ -1,4 +1,4 @@
-"""Whether a machine has changed between calibrations, against the uncertainty of both."""
+"""Whether a machine has changed between calibrations, given the uncertainty of both."""
 
 from __future__ import annotations
 
@@ -29,30 +29,30 @@ from compgen.identify.covariance import (
 from compgen.kinematics.gauge import curve_weights, gauge_changes, gauge_directions, gauge_part
 from compgen.kinematics.many_points import full_grid, volumetric_error
 
-# Whether a machine has changed between two measurements, against the uncertainty of both.
+# Whether a machine has changed between two measurements, given the uncertainty of both.
 #
-# The change is E = C P of the new errors minus that of the old ones at points of the volume, with the best-fit rigid
-# motion taken out: so the gauge directions, which no measurement shows, do not count. If nothing changed, its covariance
-# is the sum of both, which says how probable its sum of squares over the points is (:mod:`compgen.data.comparison`).
+# The change is E = C P of the new errors minus E of the old errors at points of the volume, with the best-fit rigid
+# motion removed: the gauge directions, which no measurement shows, do not count. If nothing changed, its covariance is
+# the sum of both covariances, which gives the probability of its sum of squares (:mod:`compgen.data.comparison`).
 
 
-#: Identified errors and, where it is known, their covariance.
+#: Identified errors and their covariance, if known.
 Known = tuple[ErrorTable, Covariance | None]
-#: Points along each axis of the grid on which the change is looked at.
+#: Points along each axis of the grid on which the change is evaluated.
 POINTS = 6
-#: A change is like a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
-#: most the second one where it holds the field just once, give or take the third: then a drift of another shape came on top.
+#: A change equals a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
+#: most the second share if it contains the field once, within the third: then a drift of another shape was added.
 ALIKE, DRIFTED, ONCE = 0.25, 0.5, 0.1
-#: Probabilities below this are said as that: the number of independent directions is hardly known.
+#: Lower probabilities are reported as this one: the number of independent directions is known only roughly.
 LEAST_P = 1e-9
 
 
 @dataclass(frozen=True)
 class Change:
-    """Change of the machine over its volume, rigid motion taken out, um.
+    """Change of the machine over its volume, rigid motion removed, um.
 
-    ``expected_rms_um`` is the rms that the uncertainties alone make; ``p_value`` the probability of at least this change
-    if there was none.
+    ``expected_rms_um`` is the rms due to the uncertainties alone; ``p_value`` the probability of at least this change if
+    the machine had not changed.
     """
 
     rms_um: float
@@ -75,9 +75,9 @@ class Change:
 class Likeness:
     """A change that equals plus or minus a known field, both over the volume without rigid motion.
 
-    ``field`` is the key of that field, ``sign`` +1 or -1, ``correlation`` that of the two, ``size`` the factor by which
-    the field fits the change best. ``p_value``: the probability that a change drawn evenly from all those of at most
-    twice the size of the field comes as close to any of the fields that were looked at, each with its sign.
+    ``field`` is the key of the field, ``sign`` +1 or -1, ``correlation`` the correlation of the two, ``size`` the factor
+    with which the field fits the change best. ``p_value``: the probability that a change drawn uniformly from all changes
+    of at most twice the size of the field comes as close to any of the fields that were tried, each with its sign.
     """
 
     field: str
@@ -87,7 +87,10 @@ class Likeness:
     p_value: float
 
     def words(self) -> str:
-        """Say the figures, e.g. ``correlation +0.990, size 1.02; an arbitrary change comes as close with probability 1e-07``."""
+        """State the figures.
+
+        E.g. ``correlation +0.990, size 1.02; an arbitrary change comes as close with probability 1e-07``.
+        """
         by_chance = f"{self.p_value:.1g}" if self.p_value >= LEAST_P else f"below {LEAST_P:g}"
         return (
             f"correlation {self.correlation:+.3f}, size {abs(self.size):.2f}; an arbitrary change comes as close with "
@@ -106,15 +109,15 @@ def likeness(
     added: Mapping[str, FloatArray],
     missing: Mapping[str, FloatArray],
 ) -> Likeness | None:
-    """Return the field that the change equals, with its sign; None if it equals none.
+    """Return the field that the change equals, with its sign; None if there is none.
 
-    Readings of a machine whose tables were on, but are not taken out, change by what the tables add; readings of the
-    bare machine from which tables are taken out change by the opposite. That looks like a drift, and tables made of it
-    undo the compensation.
+    If the tables were on but are not removed from the readings, the readings change by what the tables add; if tables
+    are removed from readings of the bare machine, by the opposite. Both look like a drift, and tables made from it undo
+    the compensation.
 
     Parameters
     ----------
-    new, old : identified errors and, where it is known, their covariance.
+    new, old : identified errors and their covariance, if known.
     added : fields that may have acted without being counted, at the points of :func:`volume_points`, (n, 3), mm.
     missing : fields that may have been counted without acting.
     """
@@ -133,7 +136,7 @@ def likeness(
         known = motion.taken_out(error_field).ravel()
         square, product = float(known @ known), float(known @ moved)
         if square <= 4.0 * noise or sign * product <= 0.0:
-            continue  # too small to be told from nothing, or the other way round
+            continue  # too small to be detected, or of the opposite sign
         apart = float(np.sum((moved - sign * known) ** 2))
         share = float(np.sqrt(max(apart - noise, 0.0) / square))
         once = abs(sign * product / square - 1.0) <= ONCE
@@ -148,8 +151,8 @@ def likeness(
 def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, motion: SmallMotion) -> float:
     """Number of independent directions that low-order changes of the errors span over the volume.
 
-    Each error may change by its value (squareness), or by a line and a bow; fields that nearly coincide count once: n^2
-    over the sum of squares of the eigenvalues of their correlation matrix (participation ratio), at least 1.
+    Each error may change by its value (squareness), or by a line and a bow; nearly equal fields count once: n^2 over the
+    sum of the squared eigenvalues of their correlation matrix (participation ratio), at least 1.
     """
     layout = covariance_of_values(errors, np.diag(errors.uncertainties()))
     design = error_design(machine, layout, position_mm).reshape(3 * len(position_mm), -1)
@@ -179,7 +182,7 @@ def change_between(
     old: tuple[ErrorTable, Covariance],
     confidence: float,
 ) -> Change:
-    """Compare two identifications (errors with covariance) of one machine over its volume."""
+    """Compare two identifications (errors with covariance) of the same machine over its volume."""
     found = _compared(machine, new, old, volume_points(machine))
     sizes = sizes_of(found.size / MM_PER_UM)
     count = len(found.size)
@@ -193,7 +196,7 @@ def change_between(
 
 
 def _compared(machine: Machine, new: Known, old: Known, position_mm: FloatArray) -> Difference:
-    """Difference of the fields at points (n, 3) without rigid motion; what has no covariance counts as exact."""
+    """Difference of the fields at points (n, 3) without rigid motion; errors without covariance count as exact."""
     fields: list[Uncertain] = []
     for errors, covariance in (new, old):
         factor = np.zeros((position_mm.size, 0))
@@ -205,22 +208,22 @@ def _compared(machine: Machine, new: Known, old: Known, position_mm: FloatArray)
 
 
 def volume_points(machine: Machine) -> FloatArray:
-    """Return the points at which changes are looked at, (n, 3), mm."""
+    """Return the points at which changes are evaluated, (n, 3), mm."""
     levels = [np.linspace(*axis.range_mm, POINTS) for axis in machine.axes]
     return full_grid(levels).reshape(-1, 3)
 
 
-# The calibrations of one machine on common figures: gauge-aligned, each with its joint covariance.
+# The calibrations of one machine in common figures: gauge-aligned, each with its joint covariance.
 #
-# Two tables of errors may describe the same machine (:mod:`compgen.kinematics.gauge`). Every calibration is therefore brought
-# into one gauge first: along the gauge directions the curves are made as small as possible, so that constants vanish and
-# slopes that a squareness error can express as well become part of it. That map is linear, so covariances follow it.
+# Two different error tables may describe the same machine (:mod:`compgen.kinematics.gauge`). Every calibration is
+# therefore brought into one gauge first: along the gauge directions the curves are made as small as possible. Constants
+# vanish, and slopes that a squareness error can also express become part of it. The map is linear, also for covariances.
 #
-# A curve is watched by two figures of its best-fit parabola: ``line``, what its straight part adds from the first to the
-# last node, and ``bow``, by how much the middle lies above the ends. A squareness error is its own ``value``.
+# A curve is monitored by two figures of its best-fit parabola: ``line``, the change of its straight part from the first
+# to the last node, and ``bow``, the height of the middle above the ends. A squareness error has one figure, ``value``.
 
 
-#: A figure whose weights keep less than this share of their size in the common gauge is not observable.
+#: A figure is not observable if its weights keep less than this share of their size in the common gauge.
 NOTHING_LEFT = 1e-6
 #: A calibration that shows less than this share of the errors of the richest one is left out.
 LEAST_SHARE = 0.5
@@ -228,7 +231,7 @@ LEAST_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Calibration:
-    """One identification: when it was measured, errors (mm, rad) with covariance, mean temperature by channel, degC."""
+    """One identification: time of measurement, errors (mm, rad) with covariance, mean temperature by channel, degC."""
 
     at: datetime
     errors: ErrorTable
@@ -238,7 +241,7 @@ class Calibration:
 
 @dataclass(frozen=True)
 class MonitoredFigure:
-    """One watched quantity of one error: ``part`` is "value", "line" or "bow"; mm or rad inside."""
+    """One monitored figure of one error: ``part`` is "value", "line" or "bow"; in mm or rad internally."""
 
     error: str
     part: str
@@ -265,11 +268,11 @@ class Aligned:
 
     Parameters
     ----------
-    machine : chain, travel and tool offset that the gauge is that of.
+    machine : its chain, travel and tool offset define the gauge.
     error, position_mm : name and position (k,) of each value; nan for squareness.
     days : times in days since the first calibration, (n,).
     value : (n, k), mm and rad. ``factor``: n factors (k, r_i) of the covariance of each.
-    figures, weights : f watched figures and what each takes of the values, (f, k).
+    figures, weights : f monitored figures and their weights of the values, (f, k).
     """
 
     machine: Machine
@@ -302,7 +305,7 @@ class Aligned:
 def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibration], list[int], Machine]:
     """Return the calibrations of a machine with known uncertainty, their identification ids, and the newest machine file.
 
-    Those that a person excluded are left out. InputError if there is none.
+    Calibrations that a person excluded are left out. InputError if there are none.
     """
     left_out, records = excluded(store, machine), counting(store, machine)
     measured = {item.id: item for item in store.measurements(machine)}
@@ -326,7 +329,7 @@ def with_all_errors(
 ) -> tuple[list[Calibration], list[int], list[str]]:
     """Keep the calibrations that show at least half of the errors of the richest one; return a note about the others.
 
-    What a laser along one axis saw has another gauge, and would leave nothing but that axis to compare.
+    A laser measurement along one axis has another gauge, and would leave only that axis to compare.
     """
     names = [{*item.covariance.error} for item in history]
     richest = max(names, key=len)
@@ -346,13 +349,13 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     if not kept:
         raise InputError("the calibrations have no error in common; keep the same errors in the machine file")
     error, position = tuple(newest.error[k] for k in kept), newest.position_mm[kept]
-    # takes the gauge directions out so that the curves, not squareness, become small
+    # removes the gauge directions; the curves, not the squareness errors, become small
     told = [name for name in dict.fromkeys(error) if name in SQUARENESS_NAMES or error.count(name) > 1]
     weight = np.where(np.isin(error, SQUARENESS_NAMES), 0.0, curve_weights(error))
     changes = gauge_changes(gauge_directions(machine, told), error, position)
     keep = np.asarray(np.eye(len(error)) - gauge_part(changes, np.diag(weight)))
     names, maps = np.array(error), []
-    for item in history:  # each with a matrix (k, k_i) that takes its values to the common nodes, linear in between
+    for item in history:  # each with a matrix (k, k_i) that interpolates its values linearly at the common nodes
         given = np.array(item.covariance.error)
         matrix = np.zeros((len(names), len(given)))
         for name in dict.fromkeys(error):
@@ -376,7 +379,7 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
 def _figures(
     error: Sequence[str], position_mm: FloatArray, keep: FloatArray
 ) -> tuple[tuple[MonitoredFigure, ...], FloatArray]:
-    """Figures that the common gauge leaves, and their weights (f, k)."""
+    """Figures that are observable in the common gauge, and their weights (f, k)."""
     figures, rows = [], []
     for name in dict.fromkeys(error):
         columns = np.flatnonzero(np.array(error) == name)
@@ -409,8 +412,8 @@ class ErrorChange:
     """Change of one error in the common gauge.
 
     ``largest`` is the change of the value that changed most (mm or rad, with its sign), ``u`` its standard uncertainty,
-    ``p_value`` the probability of at least this change of the whole curve if there was none, ``adjusted`` the same when
-    all errors that are looked at count (Holm 1979, Scandinavian Journal of Statistics 6).
+    ``p_value`` the probability of at least this change of the whole curve if there was none, ``adjusted`` the same
+    corrected for all errors that are tested (Holm 1979, Scandinavian Journal of Statistics 6).
     """
 
     error: str
@@ -427,7 +430,7 @@ class ErrorChange:
 
 
 def changes(data: Aligned, new: int, old: int) -> tuple[ErrorChange, ...]:
-    """Return the change of every error from calibration ``old`` to ``new``; both are taken as independent."""
+    """Return the change of every error from calibration ``old`` to ``new``, which are taken as independent."""
     whole = compare((data.value[new], data.factor[new]), (data.value[old], data.factor[old]))
     names = list(dict.fromkeys(data.error))
     found = []
@@ -440,7 +443,7 @@ def changes(data: Aligned, new: int, old: int) -> tuple[ErrorChange, ...]:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Return the error probabilities that count all that were looked at.
+    """Return the error probabilities corrected for the number of tests.
 
     >>> holm([0.01, 0.5, 0.02])
     [0.03, 0.5, 0.04]

@@ -1,9 +1,8 @@
 """Leases on measurements, and the results that are stored when a lease ends.
 
 A lease (claim) says who works on a measurement. The claims of a measurement are a chain of rows, and only one runner can
-add the next row. A lease of a process of this host that no longer runs is free at once; every other one when its time is
-over, unless it is renewed, which :func:`renewal` does during the work. What the work adds to the store is kept in one
-transaction together with the release of the claim.
+add the next row. A lease ends at once if its process on this host no longer runs; otherwise it expires, unless
+:func:`renewal` renews it during the work. The results are stored and the claim is released in the same transaction.
 """
 
 from __future__ import annotations
@@ -41,16 +40,16 @@ from compgen.fleet.store import Store
 
 Result = TypeVar("Result")
 
-#: How long a claim counts without being renewed, s.
+#: How long a claim is valid without renewal, s.
 LEASE_S = 900.0
-#: A claim is renewed when this share of its time is over.
+#: A claim is renewed after this share of its time.
 RENEWED_AT = 1.0 / 3.0
 #: How often a measurement is judged again because other tables became active meanwhile.
 JUDGED_AT_MOST = 5
 
 
 class ClaimLostError(CompgenError):
-    """Another runner took over; whatever was worked out must not be kept."""
+    """Another runner took over; the results must not be stored."""
 
     exit_code = 1
 
@@ -65,9 +64,9 @@ class Claim:
 
 
 class _InHand:
-    """What this process works on in one store, by owner and measurement: two of its threads have the same owner.
+    """What this process works on in one store, by owner and measurement: its threads share one owner.
 
-    A claim of this process that is not here was left behind, so that it may take it again.
+    A claim of this process that is not listed here was left behind, and the process may take it again.
     """
 
     def __init__(self) -> None:
@@ -88,7 +87,7 @@ class _InHand:
 
 @cache
 def _in_hand(_store_url: str, _process: int) -> _InHand:
-    """Return the one object for a store and this process; as engines are, see :func:`compgen.fleet.database.engine_of`."""
+    """Return the only object for a store and this process, as for engines (:func:`compgen.fleet.database.engine_of`)."""
     return _InHand()
 
 
@@ -103,7 +102,7 @@ def take(
 ) -> Claim | None:
     """Claim a measurement for ``lease_s`` (None: :data:`LEASE_S`); None if somebody works on it or it is done.
 
-    With ``again`` one that is done may be claimed too.
+    With ``again`` a measurement that is done may also be claimed.
     """
     results = database.identifications
 
@@ -114,7 +113,7 @@ def take(
         done = not again and connection.execute(identified).first() is not None
         counts = last is not None and last.owner != owner and last.kind != "release"
         if last is not None and counts and _alive(str(last.owner)) is not False:
-            # until its time is over; a clock that went back prolongs it at most by its own length
+            # until its time is over; a clock that was set back extends it by at most its length
             done = done or bool(now < last.until and last.at - now < last.until - last.at)
         if done:
             return None
@@ -137,15 +136,15 @@ def take(
 def work_on(
     store: Store, measurement: MeasurementRecord, work: Callable[[Claim], Result], *, again: bool = False
 ) -> Result:
-    """Do ``work`` on a measurement with a claim, which ends when the work keeps what came of it.
+    """Do ``work`` on a measurement with a claim, which ends when the work stores its result.
 
-    Where other tables became active meanwhile (ChangedMeanwhileError) the work is done again. Any other error ends it and
-    gives the claim back. With ``again`` a measurement that is done may be worked on too.
+    If other tables became active meanwhile (ChangedMeanwhileError), the work is repeated. Any other error ends it and
+    releases the claim. With ``again`` a measurement that is done may also be worked on.
 
     Raises
     ------
     ClaimLostError
-        if nothing was kept, because of another runner or of tables that change again and again; it says which.
+        if nothing was stored, because of another runner or of tables that keep changing; the message says which.
     """
     for _ in range(JUDGED_AT_MOST):
         claim = take(store, measurement, owner_name(), again=again)
@@ -161,14 +160,14 @@ def work_on(
         except BaseException:
             try:
                 give_back(store, claim)
-            except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the error on its way
+            except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the original error
                 logs.error("claim not given back", problem=str(error))
             raise
     raise ClaimLostError("other tables became active again and again")
 
 
 def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
-    """Prolong a claim; ClaimLostError if somebody else has taken over. The claim as it was stays valid too."""
+    """Extend a claim; ClaimLostError if somebody else has taken over. The old claim object stays valid too."""
 
     def action(connection: sa.Connection) -> Claim:
         last = check(connection, claim)
@@ -183,9 +182,9 @@ def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
 
 @contextmanager
 def renewal(store: Store, claim: Claim, lease_s: float | None = None) -> Iterator[None]:
-    """Prolong a claim from a thread of its own for as long as the ``with`` block takes.
+    """Extend a claim from a separate thread until the ``with`` block ends.
 
-    A store that is away is tried again; if somebody else took over meanwhile, whoever keeps the result notices it.
+    If the store cannot be reached, it is tried again; a claim lost meanwhile is noticed when the result is stored.
     """
     lease_s, over = LEASE_S if lease_s is None else lease_s, threading.Event()
 
@@ -216,13 +215,13 @@ def check(connection: sa.Connection, claim: Claim) -> int:
 
 
 def release(store: Store, connection: sa.Connection, claim: Claim) -> None:
-    """Give a claim back in the transaction that keeps its result; ClaimLostError if it is somebody else's."""
+    """Release a claim in the transaction that stores its result; ClaimLostError if it belongs to somebody else."""
     last = check(connection, claim)
     _add(connection, claim.measurement_id, last + 1, "release", claim.owner, store.now(connection), 0.0)
 
 
 def give_back(store: Store, claim: Claim) -> None:
-    """Give a claim back without a result; one that is lost needs none."""
+    """Release a claim without a result; a lost claim needs no release."""
     try:
         with suppress(ClaimLostError, sa.exc.IntegrityError):
             store.write(lambda connection: release(store, connection, claim))
@@ -231,12 +230,12 @@ def give_back(store: Store, claim: Claim) -> None:
 
 
 def forget(store: Store, claim: Claim) -> None:
-    """Say that this process no longer works on a measurement, whatever the store says."""
+    """Note that this process no longer works on a measurement, whatever the store says."""
     _in_hand(store.url, os.getpid()).end(claim.owner, claim.measurement_id)
 
 
 def left_by(store: Store, machine: MachineRecord, pid: int) -> list[MeasurementRecord]:
-    """Return the machine's measurements that a process of this computer had claimed when it ended."""
+    """Return the machine's measurements that were still claimed by a process of this computer when it ended."""
     mark = f"{socket.gethostname()}/{_process_space()}/{pid}/"
     measured = {item.id: item for item in store.measurements(machine)}
     found = [
@@ -248,14 +247,14 @@ def left_by(store: Store, machine: MachineRecord, pid: int) -> list[MeasurementR
 
 
 def unfinished(store: Store) -> set[int]:
-    """Return the ids of the machines that have a measurement whose claim a process left that no longer runs."""
+    """Return the ids of the machines with a measurement claimed by a process that no longer runs."""
     left = [last for last in _last_claims(store) if last.kind != "release" and _alive(str(last.owner)) is False]
     machines = {item.id: item.machine_id for item in store.measurements()} if left else {}
     return {machines[last.measurement_id] for last in left}
 
 
 def _last_claims(store: Store) -> list[Any]:
-    """Return the last row of the chain of each measurement."""
+    """Return the last row of each measurement's chain."""
     table = database.claims
     last = sa.select(sa.func.max(table.c.id)).group_by(table.c.measurement_id)
     return store.read(lambda connection: list(connection.execute(sa.select(table).where(table.c.id.in_(last)))))
@@ -268,7 +267,7 @@ def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object
 
 
 def _alive(owner: str) -> bool | None:
-    """Whether the process runs; None if it belongs to another host or this system cannot tell."""
+    """Whether the process is running; None if it is on another host or this system cannot tell."""
     host, space, pid, start = owner.rsplit("/", 3)
     if host != socket.gethostname() or space != _process_space() or space == "-" or not pid.isdigit():
         return None
@@ -276,7 +275,7 @@ def _alive(owner: str) -> bool | None:
 
 
 def _process_space() -> str:
-    """Say which numbering of processes this one belongs to: boot and name space; "-" where the system does not tell."""
+    """Identify the process numbering that this process belongs to: boot and namespace; "-" if the system cannot tell."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot}:{os.readlink('/proc/self/ns/pid')}".replace("/", "_")
@@ -285,7 +284,7 @@ def _process_space() -> str:
 
 
 def _start_of(pid: int) -> str:
-    """Start time of a process in the system's ticks, "-" if there is none."""
+    """Start time of a process in clock ticks, "-" if it does not exist."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -319,13 +318,13 @@ class ChangedMeanwhileError(ClaimLostError):
 def keep_result(
     store: Store, machine: MachineRecord, claim: Claim, new: NewResult, judged_against: int | None
 ) -> TableRecord:
-    """Keep errors, tables and the automatic decisions about them.
+    """Store errors, tables and the automatic decisions about them.
 
     Parameters
     ----------
-    claim : it is released; whoever lost it keeps nothing.
-    new : what processing gave.
-    judged_against : id of the tables that were active when it was judged; ChangedMeanwhileError if others are now.
+    claim : it is released; nothing is stored if it was lost.
+    new : the results of processing.
+    judged_against : id of the tables that were active at the judgement; ChangedMeanwhileError if others are active now.
     """
 
     def action(connection: sa.Connection) -> int:
@@ -353,7 +352,7 @@ def keep_result(
     try:
         table_id = store.write(action)
     except ClaimLostError:
-        # the store may have kept the result and gone away before it said so
+        # the connection may have failed after the result was stored
         kept, tried = database.identifications, database.attempts
         query = (
             sa.select(database.tables.c.id)
@@ -425,7 +424,7 @@ def _insert_errors(
 def keep_failure(
     store: Store, machine: MachineRecord, claim: Claim, message: str, settings_sha256: str, seconds: float
 ) -> None:
-    """Keep that a measurement could not be processed, and why; it is tried again when settings or machine change."""
+    """Record that a measurement could not be processed, and why; it is retried when settings or machine change."""
 
     def action(connection: sa.Connection) -> None:
         release(store, connection, claim)
@@ -444,5 +443,5 @@ def _add_attempt(
 
 
 def clean(value: Any) -> Any:
-    """Return what JSON can hold: a number that is not finite becomes null."""
+    """Return the value in a form that JSON accepts: a number that is not finite becomes null."""
     return json.loads(json.dumps(json_values(value), default=str))

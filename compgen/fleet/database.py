@@ -1,7 +1,7 @@
 """The database below the store: schema, connections, upgrades, contents of files by SHA-256.
 
-Rows are only ever added (triggers refuse a change); the state follows from the last ones. Times are UTC. Contents of files
-are kept deflated in ``blobs`` by their SHA-256, each once. The store is an SQLite file, or PostgreSQL by URL; an old one is
+Rows are only added (triggers refuse a change); the state follows from the last rows. Times are UTC. File contents are kept
+compressed in ``blobs`` by their SHA-256, each once. The store is an SQLite file, or PostgreSQL by URL; an old store is
 upgraded when it is opened.
 """
 
@@ -31,13 +31,13 @@ INITIAL = "0004"
 
 
 class UtcTime(sa.types.TypeDecorator[datetime]):
-    """A time with zone UTC in the program, without a zone in the database."""
+    """A time with time zone UTC in the program, without a time zone in the database."""
 
     impl = sa.DateTime
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: sa.engine.Dialect) -> datetime | None:
-        """Turn into UTC; a time without a zone is an error of the program."""
+        """Convert to UTC; a time without a time zone is a programming error."""
         if value is None:
             return None
         if value.tzinfo is None:
@@ -45,18 +45,18 @@ class UtcTime(sa.types.TypeDecorator[datetime]):
         return value.astimezone(UTC).replace(tzinfo=None)
 
     def process_result_value(self, value: datetime | None, dialect: sa.engine.Dialect) -> datetime | None:
-        """Give the zone back."""
+        """Restore the time zone."""
         return None if value is None else value.replace(tzinfo=UTC)
 
 
 class PlainText(sa.types.TypeDecorator[str]):
-    """Text that every database takes: PostgreSQL refuses a NUL, and none takes the rest of a name that is not UTF-8."""
+    """Text that every database accepts: PostgreSQL refuses NUL, and none accepts the lone surrogates of non-UTF-8 names."""
 
     impl = sa.Text
     cache_ok = True
 
     def process_bind_param(self, value: str | None, dialect: sa.engine.Dialect) -> str | None:
-        """Escape what cannot be kept."""
+        """Escape what cannot be stored."""
         return None if value is None else plain(value)
 
 
@@ -165,16 +165,14 @@ identifications = sa.Table(
     _of("machines"),
     _of("measurements"),
     _of("machine_versions"),
-    sa.Column("active_table_id", sa.Integer, nullable=True),  # of tables, which refer to this table in turn
+    sa.Column("active_table_id", sa.Integer, nullable=True),  # id in tables, which in turn refers to this table
     sa.Column("errors_sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=False),
     sa.Column("covariance_sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=True),
     sa.Column("fitted_sha256", sa.String(64), sa.ForeignKey("blobs.sha256"), nullable=True),
     _json("summary"),
     _text("program"),
     _at(),
-    sa.Column(
-        "revision", sa.Integer, nullable=False, server_default=sa.text("1")
-    ),  # counts how often it was identified
+    sa.Column("revision", sa.Integer, nullable=False, server_default=sa.text("1")),  # number of its identification
     sa.UniqueConstraint("measurement_id", "revision"),
 )
 tables = sa.Table(
@@ -224,7 +222,7 @@ events = sa.Table(
     _at(),
 )
 
-#: Every table in an order in which none refers to a later one.
+#: Every table; none refers to a later one in this order.
 ALL = (
     blobs,
     machines,
@@ -247,9 +245,9 @@ Result = TypeVar("Result")
 
 #: Waits between attempts to reach the store, s.
 WAITS_S = (0.2, 0.5, 1.0, 2.0)
-#: How long a writer waits for another one, s; who waited that long for a lock does not try again.
+#: How long a writer waits for another one, s; after waiting that long for a lock it does not try again.
 BUSY_S = 60.0
-#: A server that does not answer is noticed: waits for a connection, and for an answer on one that broke, s.
+#: Time limits that detect a server that does not answer: for connecting, and for an answer on a broken connection, s.
 REACHABLE = {
     "connect_timeout": 10,
     "keepalives_idle": 30,
@@ -261,18 +259,18 @@ REACHABLE = {
 UPGRADE_LOCK = 7305211
 
 
-#: What waiting does not help with: a wrong name or password, a full disk, a damaged file.
+#: Errors that waiting does not cure: a wrong name or password, a full disk, a damaged file.
 LASTING = ("authentication", "does not exist", "no such table", "no such column", "disk is full", "readonly")
 
 
 class StoreError(CompgenError):
-    """The store cannot be reached, or is not one; nothing was changed."""
+    """The store cannot be reached or is not a store; nothing was changed."""
 
 
 def engine_of(url: str) -> sa.Engine:
-    """Return an engine for a URL or the path of an SQLite file; InputError for a kind that is not served.
+    """Return an engine for a URL or the path of an SQLite file; InputError for an unsupported kind.
 
-    A process has one for each store, which keeps its compiled statements when its connections are given back.
+    A process has one engine for each store; its compiled statements are kept after its connections are closed.
     """
     try:
         parsed = sa.make_url(url if "://" in url else f"sqlite:///{url}")
@@ -284,17 +282,17 @@ def engine_of(url: str) -> sa.Engine:
     if kind != "sqlite" or not parsed.database or parsed.database == ":memory:":
         raise InputError(f"{shown(url)} is not a store; give sqlite:///FILE or postgresql://HOST/NAME")
     folder = Path(parsed.database).absolute().parent
-    if not folder.is_dir():  # not made here: on a drive that is not mounted a new, empty store would begin
+    if not folder.is_dir():  # not created here: if a drive is not mounted, this would start a new, empty store
         raise StoreError(f"the store {shown(url)} cannot be used: no such folder: {folder}; mount or create it first")
     path = folder / Path(parsed.database).name
     for pause in (
         *WAITS_S,
         None,
-    ):  # a file without contents: a store lost them; one that is being made has some in a moment
+    ):  # an empty file: a store lost its contents; one that is being made has some in a moment
         try:
             if path.stat().st_size > 0:
                 break
-        except OSError:  # not there yet, or the database says what is wrong
+        except OSError:  # not there yet, or the database reports what is wrong
             break
         if pause is not None:
             time.sleep(pause)
@@ -329,7 +327,7 @@ def _sqlite(url: sa.URL, _process: int) -> sa.Engine:
 
     @event.listens_for(engine, "begin")
     def begin(connection: sa.Connection) -> None:
-        """Writers take the lock at once, so that none has to give up half way."""
+        """Writers take the lock at once; none has to give up half way."""
         reading = connection.get_execution_options().get("reading", False)
         connection.exec_driver_sql("BEGIN" if reading else "BEGIN IMMEDIATE")
 
@@ -338,14 +336,14 @@ def _sqlite(url: sa.URL, _process: int) -> sa.Engine:
 
 @lru_cache(maxsize=8)
 def _postgresql(url: sa.URL, _process: int) -> sa.Engine:
-    """One connection for the work and one for the renewal of leases; what the URL says itself counts."""
+    """One connection for the work and one for renewing leases; options in the URL take precedence."""
     arguments = {name: value for name, value in REACHABLE.items() if name not in url.query}
     url = url.set(drivername="postgresql+psycopg")
     engine = sa.create_engine(url, connect_args=arguments, pool_pre_ping=True, pool_size=2)
 
     @event.listens_for(engine, "connect")
     def configure(connection: Any, _record: object) -> None:
-        """Wait for a lock of somebody else as long as on SQLite, not for ever."""
+        """Wait for somebody else's lock as long as with SQLite, not for ever."""
         connection.execute(f"SET lock_timeout = {int(BUSY_S * 1000)}")
         connection.commit()
 
@@ -361,14 +359,14 @@ def shown(url: str) -> str:
 
 
 def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None] = time.sleep) -> Result:
-    """Do ``action`` again while the store cannot be reached, then raise StoreError."""
+    """Repeat ``action`` while the store cannot be reached, then raise StoreError."""
     for pause in (*WAITS_S, None):
         started = time.monotonic()
         try:
             return action()
         except sa.exc.IntegrityError:
             raise
-        except UnicodeDecodeError as error:  # SQLite shows a piece of the damage in its message
+        except UnicodeDecodeError as error:  # SQLite's message contains some of the damaged bytes
             raise StoreError(f"the store {shown(url)} is damaged: {error}; restore a backup") from error
         except (sa.exc.DBAPIError, sa.exc.TimeoutError) as error:
             waited = time.monotonic() - started >= BUSY_S
@@ -380,7 +378,7 @@ def retried(action: Callable[[], Result], url: str, wait: Callable[[float], None
 
 
 def first_line(error: Exception) -> str:
-    """Return what the database says, without the statement."""
+    """Return the database's message without the statement."""
     lines = str(getattr(error, "orig", error)).strip().splitlines()
     return lines[0] if lines else type(error).__name__
 
@@ -390,7 +388,7 @@ def upgrade(engine: sa.Engine) -> int:
 
     Returns
     -------
-    The number that the file of an SQLite store has alone, so that another file in its place is noticed; else 0.
+    The unique number of an SQLite store's file, by which a replaced file is noticed; 0 for other stores.
     """
     with engine.connect().execution_options(reading=True) as connection:
         number = _number(connection)
@@ -400,7 +398,7 @@ def upgrade(engine: sa.Engine) -> int:
         if connection.dialect.name == "postgresql":
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(UPGRADE_LOCK)))
         if _revision(connection) != HEAD:
-            from alembic import command  # late: only a store that is new or old needs it
+            from alembic import command  # imported late: needed only for a new or old store
             from alembic.config import Config
 
             config = Config()
@@ -415,7 +413,7 @@ def upgrade(engine: sa.Engine) -> int:
 
 
 def _number(connection: sa.Connection) -> int | None:
-    """Return the number of the file, None where it has none yet, 0 where the store is not a file."""
+    """Return the number of the file; None if it has none yet, 0 if the store is not a file."""
     if connection.dialect.name != "sqlite":
         return 0
     return int(connection.exec_driver_sql("PRAGMA user_version").scalar() or 0) or None
@@ -435,14 +433,14 @@ def _revision(connection: sa.Connection) -> str | None:
 
 
 def inserted(connection: sa.Connection, table: sa.Table, values: Mapping[str, Any]) -> int:
-    """Add a row to a table that numbers its rows, and return its number."""
+    """Add a row to a table with numbered rows, and return its number."""
     key = connection.execute(sa.insert(table).values(**values)).inserted_primary_key
     assert key is not None
     return int(key[0])
 
 
 def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]:
-    """Keep contents that are not there yet and return their SHA-256."""
+    """Store contents that are not there yet, and return the SHA-256 of each."""
     kind: Any = postgresql if connection.dialect.name == "postgresql" else sqlite
     digests = []
     for content in contents:
@@ -450,6 +448,6 @@ def put_blobs(connection: sa.Connection, contents: Iterable[bytes]) -> list[str]
         known = connection.execute(sa.select(blobs.c.size).where(blobs.c.sha256 == digest)).first()
         if known is None:
             row = {"sha256": digest, "size": len(content), "deflated": zlib.compress(content, 6)}
-            connection.execute(kind.insert(blobs).values(**row).on_conflict_do_nothing())  # another one may be faster
+            connection.execute(kind.insert(blobs).values(**row).on_conflict_do_nothing())  # another may be faster
         digests.append(digest)
     return digests

@@ -1,7 +1,7 @@
 """Decisions in the store: approve, reject, roll back a set of tables; exclude a measurement from the drift.
 
-Each adds one row with who, when and why; nothing else makes tables active. The files follow the store
-(:func:`compgen.fleet.publish.publish`), so a decision counts as soon as it is in the store.
+Each decision adds one row with who, when and why; nothing else makes tables active. The files are updated from the store
+(:func:`compgen.fleet.publish.publish`): a decision counts as soon as it is in the store.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class DecisionError(InputError):
 
 
 def pending(store: Store, machine: MachineRecord | None = None) -> list[TableRecord]:
-    """Return the sets of tables that wait for a person: proposed ones, and those that the policy holds back."""
+    """Return the sets of tables that wait for a person: proposed or held back by the policy."""
     return [table for table in store.tables(machine) if table.state in OPEN]
 
 
 def only_pending(store: Store, machine: MachineRecord) -> TableRecord:
-    """Return the only set of tables of a machine that waits for a person; DecisionError if none or several do."""
+    """Return the only set of a machine's tables that waits for a person; DecisionError if none or several wait."""
     waiting = pending(store, machine)
     if len(waiting) != 1:
         listed = ", ".join(f"{table.version} ({table.state})" for table in waiting)
@@ -53,7 +53,7 @@ def only_pending(store: Store, machine: MachineRecord) -> TableRecord:
 
 
 def active_table(store: Store, machine: MachineRecord) -> TableRecord | None:
-    """Return the set of tables that is active, None if none is."""
+    """Return the active set of tables, None if none is active."""
     return active_of(store.tables(machine))
 
 
@@ -72,15 +72,15 @@ def approve(
     Parameters
     ----------
     version : version of the machine's tables.
-    actor, reason : who, and why; both are kept.
-    override : also for tables that the policy holds back; then a reason is required. Files that the round trip did not
-        accept can never be approved.
-    seen : version that was active (0: none) when the person looked; DecisionError if another one is by now.
+    actor, reason : who, and why; both are stored.
+    override : also approve tables that the policy holds back; then a reason is required. Files that the round trip did
+        not accept can never be approved.
+    seen : version that was active (0: none) when the person looked; DecisionError if another one is active now.
 
     Raises
     ------
     DecisionError
-        for an unknown version, one that is not open, one that is held back without ``override``.
+        for an unknown version, one that is not open, or one that is held back if ``override`` is not given.
     StoreError
         if the contents of its files are missing or damaged in the store.
     """
@@ -100,7 +100,7 @@ def approve(
             raise DecisionError(
                 _place(machine, version) + " is held back by the policy; give the reason why it is right nevertheless"
             )
-        files_of(connection, table_id)  # nobody decides for files that nobody can write any more
+        files_of(connection, table_id)  # StoreError if the files can no longer be written
         return add_decision(store, connection, machine, "approve", table_id, actor, reason)
 
     return store.write(action)
@@ -109,7 +109,7 @@ def approve(
 def reject(
     store: Store, machine: MachineRecord, version: int, actor: str, reason: str, *, seen: int | None = None
 ) -> DecisionRecord:
-    """Refuse a proposed version or one that is held back; DecisionError where it is not open or no reason is given.
+    """Refuse a proposed version or one that is held back; DecisionError if it is not open or no reason is given.
 
     ``seen`` as for :func:`approve`.
     """
@@ -132,13 +132,13 @@ def rollback(
 
     Parameters
     ----------
-    to : version that was active before; 0 for no tables at all; None for the one that was active before this one.
+    to : version that was active before; 0 for no tables at all; None for the version active before the present one.
     seen : as for :func:`approve`.
 
     Raises
     ------
     DecisionError
-        where nothing is active, the version was never active, or no reason is given.
+        if nothing is active, the version was never active, or no reason is given.
     StoreError
         if the contents of its files are missing or damaged in the store.
     """
@@ -165,10 +165,10 @@ def rollback(
 
 
 def check_person(actor: str) -> None:
-    """Raise DecisionError unless this can be the name of a person: one line that shows all of itself, not "automatic"."""
+    """Raise DecisionError unless this can be a person's name: one line, all characters visible, not "automatic"."""
     if not actor.strip():
         raise DecisionError("a decision needs the name of who makes it")
-    plain = unicodedata.normalize("NFKC", actor)  # wide letters, ligatures and hard spaces as the usual ones
+    plain = unicodedata.normalize("NFKC", actor)  # wide letters, ligatures and hard spaces become plain ones
     if not plain.isprintable():
         shown = actor.encode("unicode_escape").decode("ascii")
         raise DecisionError(f"the name of who decides contains control characters or invisible ones: {shown}")
@@ -179,7 +179,7 @@ def check_person(actor: str) -> None:
 def _check_seen(
     connection: sa.Connection, machine: MachineRecord, decisions: list[DecisionRecord], seen: int | None
 ) -> None:
-    """Raise DecisionError unless the version that was seen as the active one still is, under the machine's lock."""
+    """Raise DecisionError unless the version seen as active is still active; under the machine's lock."""
     if seen is None:
         return
     active = active_id(decisions)
@@ -191,7 +191,7 @@ def _check_seen(
 
 
 def locked_decisions(connection: sa.Connection, machine: MachineRecord) -> list[DecisionRecord]:
-    """Return the decisions of a machine and keep others from deciding until this transaction ends."""
+    """Return the decisions of a machine; nobody else can decide until this transaction ends."""
     connection.execute(sa.select(database.machines.c.id).where(database.machines.c.id == machine.id).with_for_update())
     table = database.decisions
     query = sa.select(table).where(table.c.machine_id == machine.id).order_by(table.c.sequence)
@@ -207,7 +207,7 @@ def add_decision(
     actor: str,
     reason: str,
 ) -> DecisionRecord:
-    """Add one decision; its time is never before that of the one before it, whatever the clock says."""
+    """Add one decision; its time is never earlier than the previous decision's, whatever the clock says."""
     table = database.decisions
     own = table.c.machine_id == machine.id
     last = connection.execute(sa.select(table).where(own).order_by(table.c.sequence.desc()).limit(1)).first()
@@ -227,7 +227,7 @@ def add_decision(
 
 
 def _open(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[list[DecisionRecord], int, bool]:
-    """Return decisions, id and acceptance of a version that is open, under the machine's lock."""
+    """Return decisions, id and acceptance of an open version; under the machine's lock."""
     decisions = locked_decisions(connection, machine)
     table_id, accepted = _table_of(connection, machine, version)
     state = state_of(table_id, decisions)
@@ -253,9 +253,9 @@ def _place(machine: MachineRecord, version: int) -> str:
 
 # --- measurements that a person found to be wrong ------------------------------------------------------------------
 #
-# They are kept, but the drift of the machine leaves them out. An exclusion and its withdrawal are events of the store.
+# They are kept, but left out of the machine's drift. An exclusion and its withdrawal are events in the store.
 
-#: Kind of the events by which a measurement is excluded, or that is taken back.
+#: Kind of the events that exclude a measurement, or take the exclusion back.
 EXCLUSION = "exclusion"
 _SAID = re.compile(r"(excluded|taken back) by (.*?): (.*)", re.DOTALL)
 
@@ -263,12 +263,12 @@ _SAID = re.compile(r"(excluded|taken back) by (.*?): (.*)", re.DOTALL)
 def exclude(
     job: Job, name: str, version: int, actor: str, reason: str, *, undo: bool = False, clock: Clock | None = None
 ) -> None:
-    """Leave the measurement behind a version of tables out of the drift, or with ``undo`` take that back.
+    """Exclude the measurement behind a version of tables from the drift; with ``undo`` take the exclusion back.
 
     Raises
     ------
     InputError
-        for an unknown version, the active one (roll it back first), or without name or reason.
+        for an unknown version, the active version (roll it back first), or without name or reason.
     """
     check_person(actor)
     if ": " in actor or not reason.strip():
@@ -286,14 +286,14 @@ def exclude(
 
 
 def said_of(event: EventRecord) -> tuple[str, str, str]:
-    """Return what ("excluded", "taken back"), who and why of an event of this kind."""
+    """Return what ("excluded", "taken back"), who and why from an event of this kind."""
     found = _SAID.fullmatch(event.message)
     return (found[1], found[2], found[3]) if found else ("excluded", "", event.message)
 
 
 @at_one_moment
 def excluded(store: Store, machine: MachineRecord) -> dict[int, str]:
-    """Return who excluded what and why, in words, by the id of the measurement, whichever version was named."""
+    """Return in words who excluded what and why, by measurement id, whichever version was named."""
     measured = {item.id: item.measurement_id for item in store.identifications(machine)}
     tables = store.tables(machine, figures=False)
     behind = {f"version {table.version}": measured[table.identification_id] for table in tables}

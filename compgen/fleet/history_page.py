@@ -1,4 +1,4 @@
-"""A machine's history as one page without any other file: what changed, trends with their tolerance, forecasts."""
+"""A machine's history as one self-contained page: what changed, trends with their tolerance, forecasts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from compgen.tables.render import KeptTemplates
 
 
 def history_page(drift: Drift) -> str:
-    """Return the text of the page; nothing in it is fetched from elsewhere and no script runs."""
+    """Return the text of the page; it loads nothing from elsewhere and runs no script."""
     environment = Environment(
         loader=FileSystemLoader(data_folder("templates") / "_report"),
         autoescape=True,
@@ -44,14 +44,14 @@ def probability(value: float, level: float) -> Markup:
 
 
 def write_history_report(path: Path, drift: Drift) -> Path:
-    """Write the page to a file, whole or not at all."""
+    """Write the page to a file, completely or not at all."""
     folder = OutputFolder(path.parent)
     folder.add(path.name, history_page(drift))
     return next(iter(folder.commit().values()))
 
 
 def draw_history(drift: Drift) -> list[Picture]:
-    """Return the pictures: the volume, temperatures if they count, and every figure, those that matter first."""
+    """Return the pictures: the volume, temperatures if they are used, and every figure, the important ones first."""
     days = drift.figures[0].series.days if drift.figures else np.arange(float(len(drift.times)))
     rms, expected = (np.array(part) for part in zip(*drift.volume_um, strict=True))
     tolerance = drift.settings.tolerances.get("volume")
@@ -83,7 +83,7 @@ def _over_days(x: tuple[float, float], y: tuple[float, float], unit: str) -> Plo
 
 
 def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
-    """Values with their uncertainty, those at the mean temperature, trend, steps, tolerance and forecast."""
+    """Values with their uncertainty, values at the mean temperature, trend, steps, tolerance and forecast."""
     series, trend, unit = item.series, item.trend, LABEL[item.figure.unit]
     scale, days = item.figure.scale, np.asarray(series.days)
     value, spread = series.value * scale, COVERAGE * series.u * scale
@@ -94,7 +94,7 @@ def _figure(item: FigureDrift, warm: Collection[str]) -> Picture:
         if item.figure.name in warm and trend.per_kelvin is not None and series.temperature_k is not None:
             following = (series.value - trend.per_kelvin[0] * series.temperature_k) * scale
         if item.forecast is not None and item.forecast.low_days < (reach := max(end - float(days[0]), 1.0)):
-            # The interval of the forecast, as far as the picture should reach, and the trend up to there.
+            # The interval of the forecast within the range of the picture, and the trend up to there.
             reach = min(item.forecast.high_days, reach)
             state = sum(part.share * part.state[0] for part in trend.components)
             ahead = np.array([0.0, reach]), (state + trend.slope[0] * np.array([0.0, reach])) * scale

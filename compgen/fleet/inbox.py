@@ -1,4 +1,4 @@
-"""The inbox of a machine: each file that fits is one measurement, each sub-folder with such files another one."""
+"""The inbox of a machine: each file that matches is one measurement, each sub-folder with such files another one."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from compgen.errors import InputError
 from compgen.fleet.job import MachineJob, OtherInbox
 from compgen.fleet.records import NewMeasurement
 
-#: Comments of a measurement file that say when it was made, and with which tables (a version, or "none").
+#: Comments of a measurement file that give the time of measurement, and the tables that were on (a version, or "none").
 TIME_KEYS = ("measured_at", "date")
 ACTIVE_KEY = "active_table"
-#: Files of one measurement, and characters of a comment that says something about it.
+#: Largest number of files of one measurement, and of characters of a comment about it.
 MOST_FILES, LONGEST_COMMENT = 1000, 200
 
 
 @dataclass(frozen=True)
 class InboxProblem:
-    """Something in the inbox that cannot be taken now; it stays where it is and is looked at again."""
+    """Something in the inbox that cannot be used now; it stays there and is tried again."""
 
     subject: str
     message: str
@@ -36,14 +36,14 @@ class InboxProblem:
 
 @dataclass(frozen=True)
 class InboxContents:
-    """What an inbox contains: measurements by the paths of their files, and problems."""
+    """What an inbox contains: measurements (the paths of their files) and problems."""
 
     groups: tuple[tuple[Path, ...], ...]
     problems: tuple[InboxProblem, ...]
 
 
 def scan(job: MachineJob, now: datetime) -> InboxContents:
-    """List the measurements of an inbox by name; nothing is read yet. A folder that is missing is a problem."""
+    """List the measurements of an inbox in order of name without reading them. A missing folder is a problem."""
     try:
         entries = sorted(job.inbox.iterdir())
     except OSError as error:
@@ -61,9 +61,9 @@ def scan(job: MachineJob, now: datetime) -> InboxContents:
                 continue
             files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
             named = [path for path in files if not path.name.startswith(".") and _is_named(path, job.patterns)]
-            # a link, a pipe, a device is reported when it is read
+            # links, pipes and devices are reported when they are read
             group = tuple(path for path in named if path.is_symlink() or not path.is_dir())
-            # a file that is so new may still be written; one from the future (a clock that went back) is not
+            # a file this new may still be being written; one from the future (a clock set back) is not
             ages = [now.timestamp() - path.lstat().st_mtime for path in group]
             if group and not any(0.0 <= age < job.settle_s for age in ages):
                 groups.append(group)
@@ -82,7 +82,7 @@ def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str,
     Raises
     ------
     InputError
-        if one cannot be read, changes at this moment, is a link or no file, or all are larger than the job allows.
+        if a file cannot be read, is changing, is a link or not a file, or together they are larger than the job allows.
     """
     if len(group) > MOST_FILES:
         raise InputError(f"holds {len(group)} files; one measurement has at most {MOST_FILES}", file=group[0].parent)
@@ -98,16 +98,16 @@ def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str,
 
 
 def digest_of(contents: Mapping[str, bytes]) -> str:
-    """Return the hash by which a measurement is known; names of files do not count."""
+    """Return the hash that identifies a measurement; file names do not count."""
     digests = sorted(sha256_of(content) for content in contents.values())
     return digests[0] if len(digests) == 1 else sha256_of("\n".join(digests).encode())
 
 
 def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes, os.stat_result]:
-    """Return contents and state of a file that anybody may have put there: regular, at most ``most`` bytes, no link.
+    """Return contents and state of an untrusted file, which must be regular, at most ``most`` bytes and not a link.
 
-    Nothing is waited for (a pipe that nobody writes to) and nothing without end is read (a device). With
-    ``folder_is_real`` the folder of the file must not be a link either.
+    It neither waits (for a pipe that nobody writes to) nor reads without end (from a device). With ``folder_is_real``
+    the file's folder must not be a link either.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
         kind = path.lstat().st_mode
         if stat.S_ISLNK(kind) or (folder_is_real and path.parent.is_symlink()):
             raise InputError("cannot be read: it is a link; put the file itself there", file=path)
-        if not stat.S_ISREG(kind):  # not even opened: a device may do something then
+        if not stat.S_ISREG(kind):  # not even opened: opening a device may trigger an action
             raise InputError("cannot be read: it is a pipe or a device, not a file", file=path)
         with _opened_folder(path.parent, real=folder_is_real) as folder:
             handle = os.open(path if folder is None else path.name, flags, dir_fd=folder)
@@ -141,7 +141,7 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
 
 
 def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> list[MachineJob]:
-    """Return the jobs, each with the other machines whose inboxes hold one of its files as well as ``others``.
+    """Return the jobs, each with the machines whose inboxes contain one of its files added to ``others``.
 
     Only files of the same size are read. What cannot be read is reported by the pass over its machine.
     """
@@ -171,14 +171,14 @@ def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> lis
 
 
 def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
-    """Whether a file that fits, in another machine's inbox or a sub-folder, holds one of these contents, empty ones apart."""
+    """Whether a matching file in another machine's inbox or a sub-folder has one of these contents (except empty ones)."""
     searched = {(len(content), sha256_of(content)) for content in contents if content}
     held = found_in(other, {size for size, _ in searched}) if other.held is None else other.held
     return not searched.isdisjoint(held)
 
 
 def found_in(other: OtherInbox, sizes: Container[int]) -> frozenset[tuple[int, str]]:
-    """Return size and SHA-256 of the files that fit, in another machine's inbox or a sub-folder, of some sizes."""
+    """Return size and SHA-256 of matching files of these sizes in another machine's inbox or a sub-folder."""
     found = set()
     for path, size in _listed(other):
         if size in sizes:
@@ -189,7 +189,7 @@ def found_in(other: OtherInbox, sizes: Container[int]) -> frozenset[tuple[int, s
 
 
 def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
-    """Return path and size of the regular files that fit, in an inbox and its sub-folders; nothing where it is not read."""
+    """Return path and size of the matching regular files in an inbox and its sub-folders, as far as they can be read."""
     found = []
     with contextlib.suppress(OSError):
         entries = sorted(box.inbox.iterdir())
@@ -203,7 +203,7 @@ def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
 
 @contextlib.contextmanager
 def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
-    """Open a folder, so that nobody can put another one in its place; None on a system that cannot."""
+    """Open a folder by a handle, which nobody can redirect to another one; None on a system without this feature."""
     if os.open not in os.supports_dir_fd:
         yield None
         return
@@ -219,7 +219,7 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     comments: dict[str, str] = {}
     for (
         content
-    ) in contents.values():  # the comments `# key = value` that count, cut at a sensible length; the first file wins
+    ) in contents.values():  # the known comments `# key = value`, cut at a sensible length; the first file wins
         said: dict[str, str] = {}
         for line in content.splitlines():
             key, equals, value = line.strip().partition(b"=")
@@ -227,7 +227,7 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
             if equals and field in (*TIME_KEYS, ACTIVE_KEY):
                 said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
         comments = {**said, **comments}
-    times = []  # in ISO form, and how sure each is: one without a zone is taken as local time
+    times = []  # in ISO form, and how sure each is: a time without a time zone is taken as local
     for word in TIME_KEYS:
         with contextlib.suppress(ValueError, OverflowError, OSError):
             said_at = datetime.fromisoformat(comments.get(word, "").strip())
@@ -254,7 +254,7 @@ def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
     lines = [line for line in content.decode("utf-8-sig", "replace").splitlines() if line.strip() and line[0] != "#"]
     try:
         rows = list(csv.reader(lines))
-    except csv.Error:  # the reader of the measurement says what is wrong, and where
+    except csv.Error:  # the reader of the measurement reports what is wrong, and where
         return {}
     if not rows or len(rows[0]) > MOST_COLUMNS:
         return {}

@@ -14,7 +14,7 @@ _FORM: list[Format] = []
 
 
 class _Stderr:
-    """Writes to what stderr is at the moment."""
+    """Writes to the current stderr."""
 
     def msg(self, text: str) -> None:
         sys.stderr.write(text + "\n")
@@ -43,12 +43,12 @@ def configure(kind: Format = "auto") -> None:
 
 
 def _visible(_logger: object, _name: str, fields: Any) -> Any:
-    """Show control characters as escapes; JSON does so itself."""
+    """Show control characters as escapes; JSON already does."""
     return {key: visible(value, flat=True) if isinstance(value, str) else value for key, value in fields.items()}
 
 
 def form() -> Format:
-    """Return the form that was chosen, for a process that writes to the same place."""
+    """Return the chosen form, for a process that writes to the same place."""
     return _FORM[0] if _FORM else "auto"
 
 
@@ -64,7 +64,7 @@ def info(event: str, **fields: Any) -> None:
 
 
 def warning(event: str, **fields: Any) -> None:
-    """Log what somebody should look at."""
+    """Log what needs attention."""
     _logger().warning(event, **fields)
 
 
