@@ -1,4 +1,4 @@
-"""The controls: one or two files per control, what they share in ``shared``, one registry."""
+"""The controls: one or two files per control, shared code in ``shared``, one registry."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 
 class Controls(MutableMapping[str, "type[AnyController]"]):
-    """The class of every control by its name; the module of a built-in one is imported when its class is asked for."""
+    """The class of every control by name; the module of a built-in control is imported when its class is requested."""
 
     def __init__(self, built_in: Mapping[str, str]) -> None:
         self._classes: dict[str, str | type[AnyController]] = dict(built_in)
-        #: Why an entry point of an installed distribution is not available, by its name.
+        #: Name of each entry point of an installed distribution that is not available -> the reason.
         self.broken: dict[str, str] = {}
 
     def __getitem__(self, name: str) -> type[AnyController]:
@@ -47,7 +47,7 @@ class Controls(MutableMapping[str, "type[AnyController]"]):
         return len(self._classes)
 
     def templates(self, name: str) -> Path | None:
-        """Return the folder with the templates of a plug-in's control; None for a built-in one, which stays unloaded."""
+        """Return the template folder of a plug-in's control; None for a built-in control, which is not imported."""
         control = self._classes.get(name)
         return None if control is None or isinstance(control, str) else control.templates
 
@@ -55,7 +55,7 @@ class Controls(MutableMapping[str, "type[AnyController]"]):
         return f"<Controls: {', '.join(self)}>"
 
 
-#: The class of every control by its name on the command line; ``CONTROLLERS["pmac"](machine)`` is that of a machine.
+#: The class of every control by its name on the command line; ``CONTROLLERS["pmac"](machine)`` binds it to a machine.
 CONTROLLERS = Controls(
     {
         "isg-csv": "isg_kernel.IsgCsv",
@@ -78,7 +78,7 @@ CONTROLLERS = Controls(
 )
 
 
-#: Controls that are asked for and whose file format no public document describes: what there is instead.
+#: Controls that users request but whose file format is not published: what to use instead.
 NOT_PUBLIC = {
     "siemens-vcs": "the file format of the SINUMERIK volumetric compensation system is not public; export with another "
     "control and --templates FOLDER, where FOLDER/<control>/companion/<file name>.j2 is your own template with the 21 errors",
@@ -86,13 +86,13 @@ NOT_PUBLIC = {
 
 
 def controller_named(name: str) -> type[AnyController]:
-    """Return the class of the control ``name``, to be called with a machine, or raise an InputError that lists what there is."""
+    """Return the class of the control ``name``, to be called with a machine; InputError with suggestions if unknown."""
     if name in NOT_PUBLIC and name not in CONTROLLERS:
         raise InputError(f"there is no controller {name!r}: {NOT_PUBLIC[name]}")
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
-        # what was probably meant: the controls with it in their name, in the title of their card, anywhere in the card
+        # probable matches: controls with the word in their name, in the title of their card, or anywhere in the card
         folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}
         cards = {known: folder / known / "format.toml" for known, folder in folders.items()}
         texts = {known: read_text(path) for known, path in cards.items() if path.is_file()}

@@ -22,7 +22,7 @@ from compgen.data.toml_files import setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.many_points import full_grid, volumetric_error
 
-# The neutral formats as data: the correction field on a grid, and the 21 error curves that it comes from.
+# The neutral formats as data: the correction field on a grid, and the 21 error curves from which it is calculated.
 
 
 POSITION_DIGITS = 6
@@ -32,11 +32,11 @@ CURVE_DIGITS = 9
 
 @dataclass(frozen=True)
 class FieldGrid:
-    """What must be added to the command at the vertices of a grid, for one tool offset.
+    """Values to be added to the command at the vertices of a grid, for one tool offset.
 
     Parameters
     ----------
-    nodes_mm : ascending positions of X, Y, Z, any distances.
+    nodes_mm : ascending positions of X, Y, Z, any spacing.
     correction_um : shape (nx, ny, nz, 3).
     """
 
@@ -44,19 +44,19 @@ class FieldGrid:
     correction_um: FloatArray
 
     def at(self, position_mm: FloatArray) -> FloatArray:
-        """Trilinear correction at positions (n, 3), values of the surface held outside: shape (n, 3), mm."""
+        """Trilinear correction at positions (n, 3), boundary values held outside: shape (n, 3), mm."""
         parts = [ParameterGrid((0, 1, 2), self.nodes_mm, self.correction_um[..., k]).at(position_mm) for k in range(3)]
         return np.column_stack(parts) * MM_PER_UM
 
     def same_as(self, other: FieldGrid) -> bool:
-        """Whether another grid holds the same numbers at the same positions."""
+        """Whether another grid has the same numbers at the same positions."""
         pairs = [(self.correction_um, other.correction_um), *zip(self.nodes_mm, other.nodes_mm, strict=True)]
         return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
 
 @dataclass(frozen=True)
 class NeutralTables:
-    """The field, the curves (mm and rad, squareness reference X), or both; ``conflicts`` between files, in words."""
+    """The field, the curves (mm and rad, squareness reference X), or both; ``conflicts`` describes contradicting files."""
 
     field: FieldGrid | None
     curves: ErrorTable | None
@@ -64,7 +64,7 @@ class NeutralTables:
 
 
 def same_curves(one: ErrorTable, other: ErrorTable) -> bool:
-    """Whether two tables hold the same errors at the same positions."""
+    """Whether two tables contain the same errors at the same positions."""
     if one.names != other.names or any(one.squareness[name][0] != other.squareness[name][0] for name in one.squareness):
         return False
     pairs = [(one.curves[name], other.curves[name]) for name in one.curves]
@@ -72,7 +72,7 @@ def same_curves(one: ErrorTable, other: ErrorTable) -> bool:
 
 
 def curves_from(basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ErrorTable:
-    """Return the errors of all terms, rounded as they are written."""
+    """Return the errors of all terms, rounded as written to the file."""
     curves, squareness = {}, {}
     terms = {term.name: term for term in basis}
     for name in (name for name in ERROR_NAMES if name in terms):
@@ -86,9 +86,9 @@ def curves_from(basis: Sequence[Term], values: Mapping[str, FloatArray]) -> Erro
     return ErrorTable(curves, squareness)
 
 
-# Reading the neutral files strictly: CSV and JSON of the correction field and of the error curves.
+# Strict reader of the neutral files: CSV and JSON of the correction field and of the error curves.
 #
-# Schemas: see ``docs/files.md``, "Neutral formats". What a file holds is told from its contents, not from its name.
+# Schemas: see ``docs/files.md``, "Neutral formats". The kind of file is detected from its contents, not from its name.
 
 
 FIELD_SCHEMA, CURVE_SCHEMA = "compgen-correction-field", "compgen-error-curves"
@@ -98,7 +98,7 @@ _FIELD_KEYS = ("nodes_mm", "correction_um")
 
 
 def parse_neutral(files: Sequence[SourceFile]) -> NeutralTables:
-    """Return what the files hold; files that say the same twice must agree."""
+    """Return the contents of the files; the same data given twice must agree."""
     if not files:
         raise InputError("no file was given; neutral.field.csv is one")
     fields: list[tuple[SourceFile, FieldGrid]] = []
@@ -172,7 +172,7 @@ def _pairs(items: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _fail(source: SourceFile, key: str, message: str) -> InputError:
-    """Point at the first line that holds the last part of a key."""
+    """Return the error that points at the first line containing the last part of a key."""
     place = source.text.find(f'"{key.rpartition(".")[2]}"')
     return source.fail(f"{key}: {message}", source.text.count("\n", 0, max(place, 0)) + 1)
 
@@ -239,11 +239,11 @@ def _curves_json(source: SourceFile, data: Mapping[str, Any]) -> ErrorTable:
 
 # ``neutral``: the correction field on a grid and the 21 error curves, as CSV and JSON, for every other control.
 #
-# The formats are this program's own; ``docs/files.md`` has their schemas. The field is what must be ADDED to the command,
-# the curves are the ERRORS (ISO 230-1) that it takes out.
+# The formats are specific to this program; their schemas are in ``docs/files.md``. The field must be ADDED to the
+# command; the curves are the ERRORS (ISO 230-1) that it corrects.
 
 
-#: Field and curves may differ at the vertices by this much beside rounding, before it is reported.
+#: Difference between field and curves at the vertices, in addition to rounding, above which it is reported.
 AGREEMENT_MM = 1e-6
 _TOOL_DIFFERENCE_MM = 1e-6
 
@@ -271,7 +271,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         return error_terms(self.machine, errors, nodes)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> NeutralTables:
-        """Return the curves, and the field that they give with the machine's tool, rounded as written."""
+        """Return the curves, and the field that they give with the machine's tool offset, rounded as written."""
         curves = curves_from(basis, values)
         x, y, z = (self._nodes_mm(curves, axis) for axis in range(3))
         position_mm = full_grid((x, y, z))
@@ -280,7 +280,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         return NeutralTables(FieldGrid((x, y, z), flat.reshape(position_mm.shape)), curves)
 
     def context(self, tables: NeutralTables) -> dict[str, Any]:
-        """Return field and curves in the units of the files, and the signs with worked numbers."""
+        """Return field and curves in the units of the files, and the sign conventions with worked examples."""
         field, errors = None, []
         if tables.field is not None:
             lines = tables.field.nodes_mm
@@ -317,18 +317,18 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         return parse_neutral(files)
 
     def emulate(self, tables: NeutralTables, points: Points) -> FloatArray:
-        """Return the trilinear field; the curves (E = C P) without a field, or for points with another tool."""
+        """Return the trilinear field; use the curves (E = C P) if there is no field or the points have another tool."""
         position = np.asarray(points.position_mm, dtype=np.float64)
         other_tool = points.tool_mm is not None and bool(
             np.any(np.abs(points.tool_mm - np.array(self.machine.tool_offset_mm)) > _TOOL_DIFFERENCE_MM)
         )
         if tables.curves is not None and (tables.field is None or other_tool):
             return self._curve_correction(tables.curves, position, points.tool_mm)
-        assert tables.field is not None  # parse and build give one of the two at least
+        assert tables.field is not None  # parse and build give at least one of the two
         return tables.field.at(position)
 
     def violations(self, tables: NeutralTables) -> list[str]:
-        """Return files that contradict each other, and travel that the field or a curve does not cover."""
+        """Return contradictions between files, and travel that the field or a curve does not cover."""
         found = list(tables.conflicts)
         if tables.field is not None:
             for axis, nodes in enumerate(tables.field.nodes_mm):
@@ -375,7 +375,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         return -volumetric_error(replace(self.machine, squareness_reference="X"), curves, position_mm, tool_mm) + 0.0
 
     def _nodes_mm(self, curves: ErrorTable, axis: int) -> FloatArray:
-        """Nodes of the curves of an axis, divided where an angle acts at its own axis' travel (a parabola in between)."""
+        """Nodes of the curves of an axis, subdivided where an angle acts with its own travel as lever (parabola)."""
         own = [curve for name, curve in curves.curves.items() if error_named(name).axis == axis]
         nodes = np.unique(
             np.concatenate([np.array(self.machine.axes[axis].range_mm), *(curve.position_mm for curve in own)])

@@ -1,7 +1,7 @@
-"""SINUMERIK cross-error compensation (CEC, sag): any axis corrected as a function of any axis, and products of tables.
+"""SINUMERIK cross-error compensation (CEC, sag): any axis as a function of any axis, and products of tables.
 
 Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-252, 264; 802D sl, p. 215-222.
-The sign of the sum is not in the readable documents; it is inferred, see ``templates/siemens-cec/format.toml``.
+The available documents do not give the sign of the sum; it is inferred, see ``templates/siemens-cec/format.toml``.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ from compgen.data.names import AXES
 from compgen.data.toml_files import Section
 from compgen.errors import CompgenWarning
 
-#: Variables of the tables and their switches without ``$``, with the number of their indices (K3-2013, p. 245-249).
+#: Variables of the tables and their switches, without ``$``, and how many indices each has (K3-2013, p. 245-249).
 VARIABLES = {
     "AN_CEC": 2,
     "AN_CEC_INPUT_AXIS": 1,
@@ -94,15 +94,15 @@ MODE_OF_A_FILE = (
 #: (output, axis) of every table without products.
 ALL_PAIRS = [(output, axis) for output in range(3) for axis in range(3)]
 _AXIS_VALUE = re.compile(r'\(\s*([A-Z0-9_]{1,32})\s*\)|"([A-Z0-9_]{1,32})"')
-#: Every output axis has three ordinary tables and, on every chain, at most three products.
+#: Every output axis has three ordinary tables and, whatever the kinematic chain, at most three products.
 _ORDINARY_PER_AXIS = _PRODUCTS_PER_AXIS = 3
-#: Factors of a product have 9 decimals and stay below some mm: what their rounding may add up to on one axis.
+#: Largest total rounding error on one axis from the factors of products (9 decimals, values of a few mm at most).
 _FACTOR_ROUNDING_MM = 1e-8
 
 
 @dataclass(frozen=True)
 class CecTables:
-    """Tables by index, with the numbers as the file has them; ``others`` are the indices of tables of other axes."""
+    """Tables by index, with the numbers exactly as in the file; ``others`` are the indices of tables of other axes."""
 
     tables: CecMap
     others: tuple[int, ...] = field(default=(), compare=False)
@@ -121,20 +121,20 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return checked_cec_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return nine tables output over axis, and the products with levers that count from the reference point.
+        """Return nine tables (output over axis), and the products, with levers measured from the reference point.
 
-        If the control has fewer tables than that takes, those remain that leave the least error over the volume.
+        If the control has too few tables for all, return the set that leaves the smallest error over the volume.
         """
         return self._choice(errors).kept
 
     def basis_of(self, errors: ErrorTable, tables: CecTables) -> list[Term]:
-        """Return the terms that the tables hold, if no better set fits into the control."""
+        """Return the terms that the tables contain, unless a better set fits in the control."""
         choice = self._choice(errors)
         terms = self.terms(errors, ALL_PAIRS)
         return terms_of_tables(self.machine, errors, terms, self.settings.mult_mode, choice, term_names(tables.tables))
 
     def terms(self, errors: ErrorTable, pairs: Sequence[tuple[int, int]]) -> list[Term]:
-        """Return the terms of tables output over axis for the pairs, and of the products unless they are forbidden."""
+        """Return the terms of the tables for the pairs (output, axis), and of the products if they are allowed."""
         machine, settings = self.machine, self.settings
         nodes = [
             equidistant_grid(
@@ -156,18 +156,18 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def unwritten_products(
         self, errors: ErrorTable, pairs: Sequence[tuple[int, int]], given: Sequence[Term] = ()
     ) -> list[str]:
-        """Return what stays uncorrected because the settings allow no products, in words; nothing if they do."""
+        """Return, in words, what stays uncorrected because the settings allow no products; empty if they do."""
         if self.settings.products:
             return []
         everything = SiemensCec(self.machine, replace(self.settings, products=True)).terms(errors, pairs)
         return without_products(self.machine, errors, everything, given)
 
     def left_out(self, errors: ErrorTable) -> list[str]:
-        """Return which tables the control has no room for, which products are not written, and what stays for that."""
+        """Return which tables do not fit in the control, which products are not written, and the error that remains."""
         return self._choice(errors).statements() + self.unwritten_products(errors, ALL_PAIRS)
 
     def reservations(self, tables: CecTables) -> list[str]:
-        """Return what was inferred (sign), left out (products), or is not known (number of tables)."""
+        """Return what was inferred (sign), left out (products), or is unknown (number of tables)."""
         return cec_reservations(tables.tables, self.settings)
 
     def _choice(self, errors: ErrorTable) -> Choice:
@@ -182,7 +182,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return CecTables(around_kept(tables, settings.kept_tables))
 
     def with_reversal(self, tables: CecTables, reversal: ReversalCurves) -> CecTables:
-        """Return the tables with a pair DIRECTION 1 and -1 for each reversal."""
+        """Return the tables plus a pair with DIRECTION 1 and -1 for each reversal."""
         settings = self.settings
         found = with_reversal_tables(
             self.machine,
@@ -195,7 +195,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return CecTables(around_kept(found, settings.kept_tables))
 
     def context(self, tables: CecTables) -> dict[str, Any]:
-        """Return tables, machine data and the sign with a number from the file."""
+        """Return the tables, the machine data, and the sign convention with an example value from the file."""
         machine, settings = self.machine, self.settings
         sums = largest_sums(machine, tables.tables, settings.mult_mode)
         both = {index: entry for index, entry in tables.tables.items() if entry.direction == 0}
@@ -237,11 +237,11 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> CecTables:
-        """Read the tables; every variable of a table must be there, because the control keeps old values."""
+        """Read the tables; all variables of a table must be present, because the control keeps old values otherwise."""
         return cec_tables_from(read_assignments(files, VARIABLES), files, self.settings)
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecTables, list[str]]:
-        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        """Read an archive or a program from a real control: the active tables, and a list of what was skipped."""
         findings = Findings()
         given = foreign_assignments(files, VARIABLES, findings)
         return foreign_cec_tables(given, self.machine, self.settings, findings), findings.statements()
@@ -249,9 +249,9 @@ class SiemensCec(Controller[CecSettings, CecTables]):
     def emulate(self, tables: CecTables, points: Points) -> FloatArray:
         """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
 
-        A table with DIRECTION 1 or -1 acts where the last travel of its input axis (``points.approach``) has that
-        sign. Where that is unknown (0, or no approach at all) it does not act, and a CompgenWarning says so: what a
-        control does before the first motion is not documented.
+        A table with DIRECTION 1 or -1 acts where the last motion of its input axis (``points.approach``) has that
+        sign. Where the approach is unknown (0 or None) the table does not act, and a CompgenWarning is issued: the
+        documents do not say what a control does before the first motion.
         """
         settings = self.settings
         outputs = {}
@@ -275,7 +275,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return -total if settings.subtracts else total
 
     def violations(self, tables: CecTables) -> list[str]:
-        """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if the file states them."""
+        """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if those limits are stated."""
         settings = self.settings
         found = set_violations(self.machine, tables.tables, settings.max_points, settings.tables_available)
         found += [
@@ -285,14 +285,14 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return found + stated_limit_violations(self.machine, tables.tables, settings)
 
     def keeping_others(self, tables: CecTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
-        """Return ``kept_tables`` with the tables of other axes that an archive holds."""
+        """Return ``kept_tables`` extended by the tables of other axes that an archive contains."""
         kept = sorted({*self.settings.kept_tables, *tables.others})
         if kept == sorted(self.settings.kept_tables):
             return {}
         return {name: {"kept_tables": kept} for name in ("siemens-cec", "siemens-cec-eec")}
 
     def other_readings(self, tables: CecTables) -> dict[str, Self]:
-        """Return the three other modes of products, where there are any."""
+        """Return the control with each of the three other product modes; empty if there are no products."""
         if not any(entry.multiplier for entry in tables.tables.values()):
             return {}
         return {
@@ -306,11 +306,11 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return nodes_by_axis((entry.input_axis, entry.table.nodes_mm) for entry in tables.tables.values())
 
     def usage(self, tables: CecTables) -> list[Usage]:
-        """Return nodes, tables, sums and their change against the limits; those not stated against usual defaults."""
+        """Return nodes, tables, sums and their rate of change against the limits, or usual defaults if not stated."""
         return cec_usage(self.machine, tables.tables, self.settings)
 
     def resolution_mm(self) -> float:
-        """Half of the last decimal of every ordinary table and of every product that is too small to be written."""
+        """Half of the last decimal of every ordinary table, plus every product that is too small to be written."""
         ordinary = _ORDINARY_PER_AXIS * 0.5 * 10.0**-MM_DECIMALS
         return ordinary + self.settings.products * (_PRODUCTS_PER_AXIS * NEGLIGIBLE_PRODUCT_MM + _FACTOR_ROUNDING_MM)
 
@@ -320,7 +320,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
 
 
 def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], settings: CecSettings) -> CecTables:
-    """Return the tables that assignments make; ``files`` are looked at for the names of the tables in comments."""
+    """Return the tables that the assignments define; table names are taken from the comments in ``files``."""
     parts: dict[int, TableParts] = {}
     switches: dict[tuple[str, int], Assignment] = {}
     for item in items:
@@ -353,10 +353,11 @@ def cec_tables_from(items: Sequence[Assignment], files: Sequence[SourceFile], se
 def foreign_cec_tables(
     given: ArchiveAssignments, machine: Machine, settings: CecSettings, findings: Findings
 ) -> CecTables:
-    """Return the tables that act, from the files of a real control.
+    """Return the active tables from the files of a real control.
 
-    Tables without a step are not in use; those of axes that the machine file lacks are kept apart, and those that machine
-    data or setting data switch off are off. InputError with the line for what could change a table and is not known.
+    Tables with step 0 are not in use; tables of axes that the machine file lacks are listed separately; tables that
+    machine data or setting data switch off are off. InputError with the line for anything unknown that could change a
+    table.
     """
     parts: dict[int, TableParts] = {}
     for item in given.items:
@@ -384,7 +385,7 @@ def foreign_cec_tables(
             "new tables may not take their places: an export with --active keeps them, or one with kept_tables = "
             f"{missing} in the machine file"
         )
-    # products that cannot be worked out: with an axis that is not there, or without a stated mode
+    # products that cannot be evaluated: an axis is missing, or no mode is stated
     for index, part in parts.items():
         factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")
         number = 0 if factor is None else factor.whole(0, 1_000_000)
@@ -408,7 +409,7 @@ def foreign_cec_tables(
 def _switched(
     found: Mapping[int, CecTable], given: ArchiveAssignments, settings: CecSettings, findings: Findings
 ) -> dict[int, CecTable]:
-    """Return the tables with SD41300 and SD41310; those into an axis whose MD32710 is 0 in an archive are off."""
+    """Apply SD41300 and SD41310 to the tables; tables into an axis whose MD32710 is 0 in an archive are off."""
     result = dict(found)
     own = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
     for (variable, index), item in {**given.machine_data, **own}.items():
@@ -433,7 +434,7 @@ def _switched(
 def _cec_table(
     part: TableParts, table: LinearTable, axis_names: Sequence[str], farthest: int, label: str = ""
 ) -> CecTable:
-    """Return a table with its axes, its direction (up to ``farthest`` in size) and its multiplier (0 if not given)."""
+    """Return a table with its axes, direction (at most ``farthest`` in size) and multiplier (0 if not given)."""
     sides = (part.scalar(f"$AN_CEC_{side}_AXIS") for side in ("INPUT", "OUTPUT"))
     base, output = (axis_of(item, _axis_name_of(item), axis_names) for item in sides)
     factor = part.scalars.get("$AN_CEC_MULT_BY_TABLE")

@@ -1,9 +1,9 @@
-"""SINUMERIK with both kinds of tables: positioning in the encoder tables (EEC), everything else in the cross tables (CEC).
+"""SINUMERIK with both kinds of tables: positioning in the encoder tables (EEC), the rest in the cross tables (CEC).
 
 Sources as in :mod:`compgen.controls.siemens_eec` and :mod:`compgen.controls.siemens_cec`. The encoder tables act on
 the actual position and are zero at the reference point, the cross tables act on the setpoint; the axis makes both
-corrections. No CEC table may hold the positioning of an axis as well: what products fold into the table of an axis over
-itself cancels the direct term of their factor and nothing else.
+corrections. A CEC table must not contain the positioning error of an axis as well: the part that products fold into
+the table of an axis over itself only cancels the direct term of their factor.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.toml_files import Section
 
-#: Sections of the machine file that describe the same control: what its own section does not say is taken from them.
+#: Sections of the machine file that describe the same control: they supply the keys that its section does not state.
 OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
-#: Keys that both kinds of tables have with a meaning of their own: those of the encoder tables have this prefix.
+#: Keys that both kinds of tables have, with separate values: the keys of the encoder tables have this prefix.
 PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
-#: A CEC table of an axis over itself may leave this much of what it cancels (rounding), mm.
+#: Residual that a CEC table of an axis over itself may leave after cancelling (rounding), mm.
 ROUNDING_MM = 2e-6
 
 _CROSS = [(output, axis) for output in range(3) for axis in range(3) if output != axis]
@@ -48,7 +48,7 @@ _CROSS = [(output, axis) for output in range(3) for axis in range(3) if output !
 
 @dataclass(frozen=True)
 class CecEecTables:
-    """Tables of both kinds, with the numbers as the files have them."""
+    """Tables of both kinds, with the numbers exactly as in the files."""
 
     cec: CecTables
     eec: EecTables
@@ -67,7 +67,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
 
     @classmethod
     def settings_section(cls, machine: Machine) -> Section:
-        """Return the section with what it does not say from the sections of both kinds of tables."""
+        """Return the section; keys that it lacks come from the sections of both kinds of tables."""
         section = machine.controller_settings(cls.name)
         for other in OTHER_SECTIONS:
             for key, value in machine.controller_settings(other).data.items():
@@ -81,24 +81,24 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return checked_encoder_settings(checked_cec_settings(settings, section, machine), section, machine, PREFIX)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return positioning over the axis itself, the six tables over another axis, and the products."""
+        """Return positioning of each axis over itself, the six tables over another axis, and the products."""
         return self._pitch(errors) + self._choice(errors).kept
 
     def basis_of(self, errors: ErrorTable, tables: CecEecTables) -> list[Term]:
-        """Return positioning, and the terms that the cross tables hold if no better set fits into the control."""
+        """Return positioning, and the terms that the cross tables contain, unless a better set fits in the control."""
         choice, mode = self._choice(errors), self.settings.mult_mode
         terms = self._cec.terms(errors, _CROSS)
         held = terms_of_tables(self.machine, errors, terms, mode, choice, term_names(tables.cec.tables))
         return self._pitch(errors) + held
 
     def left_out(self, errors: ErrorTable) -> list[str]:
-        """Return which CEC tables the control has no room for, which products are not written, and what stays."""
+        """Return which CEC tables do not fit in the control, which products are not written, and what remains."""
         pitch = self._pitch(errors)
         products = self._cec.unwritten_products(errors, _CROSS, pitch)
         return self._choice(errors).statements() + products
 
     def reservations(self, tables: CecEecTables) -> list[str]:
-        """Return what the verdict must say of the cross tables."""
+        """Return what the verdict must say about the cross tables."""
         return self._cec.reservations(tables.cec)
 
     def _choice(self, errors: ErrorTable) -> Choice:
@@ -114,11 +114,11 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return CecEecTables(cec, self._eec.build(pitch, values))
 
     def with_reversal(self, tables: CecEecTables, reversal: ReversalCurves) -> CecEecTables:
-        """Return the tables with a pair of CEC tables, DIRECTION 1 and -1, for each reversal."""
+        """Return the tables plus a pair of CEC tables, DIRECTION 1 and -1, for each reversal."""
         return CecEecTables(self._cec.with_reversal(tables.cec, reversal), tables.eec)
 
     def context(self, tables: CecEecTables) -> dict[str, Any]:
-        """Return the contexts of both kinds under ``cec`` and ``eec``, and what they say together."""
+        """Return the contexts of both kinds under ``cec`` and ``eec``, and their combined texts."""
         cec = self._cec.context(tables.cec)
         eec = self._eec.context(tables.eec)
         return {
@@ -133,7 +133,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> CecEecTables:
-        """Read both kinds of tables from files of any order; both must be there."""
+        """Read both kinds of tables from files in any order; both must be present."""
         items = read_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES})
         eec_items = [item for item in items if item.variable in EEC_VARIABLES]
         cec_items = [item for item in items if item.variable in CEC_VARIABLES]
@@ -145,7 +145,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         )
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CecEecTables, list[str]]:
-        """Read an archive or programs of a real control: the tables of both kinds that act, and what was passed over."""
+        """Read an archive or programs from a real control: the active tables of both kinds, and what was skipped."""
         findings = Findings()
         given = foreign_assignments(files, {**EEC_VARIABLES, **CEC_VARIABLES}, findings)
         cec_part, eec_part = (
@@ -165,13 +165,13 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return cec + self._eec.emulate(tables.eec, points)
 
     def violations(self, tables: CecEecTables) -> list[str]:
-        """Return the broken rules of either kind, and positioning that is in both."""
+        """Return the broken rules of either kind, and positioning that is in both kinds."""
         settings = self.settings
         found = [*self._eec.violations(tables.eec), *self._cec.violations(tables.cec)]
         first_stays, multiplier_stays = MULT_MODES[settings.mult_mode]
         entries = tables.cec.tables
         multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
-        # axes whose CEC tables over themselves do not cancel (mean of both directions), in addition to an encoder table
+        # axes with an encoder table whose CEC tables over themselves do not cancel (mean of both directions)
         for axis in sorted({axis for axis, _ in tables.eec.tables}):
             own = {
                 index: entry
@@ -193,11 +193,11 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return found
 
     def keeping_others(self, tables: CecEecTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
-        """Return ``kept_tables`` with the cross tables of other axes that an archive holds."""
+        """Return ``kept_tables`` extended by the cross tables of other axes that an archive contains."""
         return self._cec.keeping_others(tables.cec, files)
 
     def other_readings(self, tables: CecEecTables) -> dict[str, Self]:
-        """Return the other modes of products of the cross tables."""
+        """Return the control with each of the other product modes of the cross tables."""
         others = self._cec.other_readings(tables.cec)
         return {
             words: type(self)(self.machine, replace(self.settings, mult_mode=cec.settings.mult_mode))
@@ -222,7 +222,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         return self._cec.resolution_mm() + self._eec.resolution_mm()
 
     def _pitch(self, errors: ErrorTable) -> list[Term]:
-        """Terms of the encoder tables; angles count in them with levers from where those of the products begin."""
+        """Terms of the encoder tables; their angles use the same lever origin as the products."""
         return eec_terms(
             self.machine,
             self.settings.eec,

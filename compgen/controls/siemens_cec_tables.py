@@ -1,4 +1,4 @@
-"""SINUMERIK CEC tables: what a set adds up to, products of tables, reversal as pairs, and which tables to keep."""
+"""SINUMERIK CEC tables: sum of a set, products of tables, reversal as pairs, and which tables to keep."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import volume_sample, volumetric_error
 
-# SINUMERIK CEC tables: what a set of them adds up to, and angular errors as products of two tables.
+# SINUMERIK CEC tables: the sum of a set, and angular errors as products of two tables.
 #
 # Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245, 248, 249, 252 (boring mill example).
-# A table whose MULT_BY_TABLE names another one adds the product of both interpolated numbers to its output axis. The
-# readable documents do not say whether the direct terms of the two tables stay; the four readings are the modes S1 to S4.
+# A table whose MULT_BY_TABLE names another table adds the product of both interpolated values to its output axis. The
+# available documents do not say whether the direct terms of both tables stay; the modes S1 to S4 are the four readings.
 #
 # Balanced folding, for e(x) z on one output axis: with a = sqrt(z_max / e_max) the tables A = a e(x) and B = z / a have
-# the product e(x) z and are both as small as they can be; the direct terms that the mode leaves are subtracted in the
-# ordinary tables over x and z, so that only the product remains.
+# the product e(x) z and are both as small as possible; the direct terms that the mode leaves are subtracted in the
+# ordinary tables over x and z, so only the product remains.
 
 
 IntArray = NDArray[np.int64]
 
-#: Whether (the table that is multiplied, its multiplier) also act directly, by mode.
+#: By mode: whether (the multiplied table, its multiplier) also act directly.
 MULT_MODES: dict[str, tuple[bool, bool]] = {
     "S1": (True, True),  # A + B + A B
     "S2": (False, False),  # A B
@@ -50,9 +50,9 @@ MODE_WORDS = {
     "S3": "the multiplier of a product does not act directly",
     "S4": "only the multiplier of a product acts directly",
 }
-#: Decimals of tables in mm, and of the factors of a product and the tables that hold their folds.
+#: Decimals of tables in mm; decimals of the factors of a product and of the tables that contain their folds.
 MM_DECIMALS, FACTOR_DECIMALS = 6, 9
-#: Angles below this count as zero, and so do products that stay below half of the last decimal in mm.
+#: Angles below this count as zero; so do products below half of the last decimal in mm.
 NEGLIGIBLE_RAD = 1e-12
 NEGLIGIBLE_PRODUCT_MM = 0.5 * 10.0**-MM_DECIMALS
 
@@ -65,7 +65,7 @@ _UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
 class CecTable:
     """One table: output over input axis (0..2); ``multiplier`` is the NUMBER (index + 1) of the other factor, or 0.
 
-    ``direction`` is 0 (both), 1 or -1: the travel of the input axis in which the table acts. ``enabled`` is SD41300,
+    ``direction`` is 0 (both), 1 or -1: the travel direction of the input axis in which the table acts. ``enabled`` is SD41300,
     ``weight`` SD41310. ``decimals`` and ``label`` are for writing only.
     """
 
@@ -90,7 +90,7 @@ CecMap = Mapping[int, CecTable]
 
 
 def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) -> list[FloatArray]:
-    """Return the total of each axis: direct terms as the mode leaves them, plus products.
+    """Return the total of each axis: the direct terms that the mode leaves, plus products.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) 
 
 
 def around_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
-    """Return the tables with other indices, so that none of the ``kept`` ones is used; multipliers follow."""
+    """Renumber the tables to avoid the ``kept`` indices; multipliers follow."""
     free = (index for index in count() if index not in kept)
     place = {old: next(free) for old in sorted(tables)}
     return {
@@ -124,7 +124,7 @@ def around_kept(tables: CecMap, kept: Collection[int]) -> dict[int, CecTable]:
 
 
 def term_names(tables: CecMap) -> set[str]:
-    """Return the names of the terms that a set of tables holds: ordinary ones by axes, products by angle and lever."""
+    """Return the names of the terms in a set of tables: ordinary terms by axes, products by angle and lever."""
     factors = {entry.multiplier - 1 for entry in tables.values() if entry.multiplier}
     names = set()
     for index, entry in tables.items():
@@ -145,7 +145,7 @@ class _Set:
     levers: dict[tuple[int, int], IntArray] = field(default_factory=dict)
 
     def fold(self, key: tuple[int, int], units: IntArray, what: str) -> None:
-        """Subtract the direct term of a factor in the ordinary table."""
+        """Subtract the direct term of a factor from the ordinary table."""
         self.ordinary[key] = self.ordinary.get(key, np.zeros(len(units), dtype=np.int64)) - units
         self.folds.setdefault(key, []).append(what)
 
@@ -158,18 +158,18 @@ def folded_tables(
     mode: str,
     travel_mm: Sequence[tuple[float, float]] = (),
 ) -> dict[int, CecTable]:
-    """Return the tables of a set of terms, numbered: ordinary ones, scaled angles, scaled levers.
+    """Return the tables of a set of terms, numbered: ordinary tables, scaled angles, scaled levers.
 
     Parameters
     ----------
-    terms : one-dimensional terms and products (function of one axis times lever); all of one axis share their nodes.
+    terms : one-dimensional terms and products (function of one axis times lever); terms over one axis share nodes.
     values : corrections by term name, mm and rad.
     flip : True if the control subtracts its total: the ordinary terms and the angles change sign, the levers do not.
     mode : which direct terms are folded away, a key of :data:`MULT_MODES`.
-    travel_mm : ends of the travel of X, Y, Z: the nodes of a lever over whose axis there is no term.
+    travel_mm : ends of the travel of X, Y, Z: the nodes of a lever whose axis has no term.
 
-    Ordinary tables that are zero in every decimal, and products that stay below half of the last decimal in mm, are
-    left out; if all are, the first ordinary table remains.
+    Ordinary tables that are zero in every decimal, and products below half of the last decimal in mm, are left out; if
+    all would be, the first ordinary table remains.
     """
     sign = -1 if flip else 1
     nodes = {axis: np.array(ends, dtype=np.float64) for axis, ends in enumerate(travel_mm)}
@@ -259,13 +259,13 @@ def _numbered(work: _Set, nodes: Mapping[int, FloatArray]) -> dict[int, CecTable
 
 
 def written_decimals(table: LinearTable) -> int:
-    """Return how many decimals the values of a table have in its text, at least those of a table in mm."""
+    """Return how many decimals the values of a table have in its text, at least as many as a table in mm."""
     places = [len(f"{value:f}".partition(".")[2]) for value in table.values]
     return min(max([MM_DECIMALS, *places]), FACTOR_DECIMALS)
 
 
 def labels_in(files: Sequence[SourceFile]) -> dict[int, str]:
-    """Return what the comments of an exported file call its tables, by index; they matter for nothing but writing."""
+    """Return the table labels in the comments of an exported file, by index; they are used only for writing."""
     found = {}
     for source in files:
         for line in source.text.splitlines():
@@ -275,11 +275,11 @@ def labels_in(files: Sequence[SourceFile]) -> dict[int, str]:
     return found
 
 
-# Reversal as pairs of SINUMERIK CEC tables: one acts after positive travel of its base axis, one after negative.
+# Reversal as pairs of SINUMERIK CEC tables: one acts after positive travel of its base axis, the other after negative.
 #
 # Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 249 (DIRECTION), 264 (example of a pair).
-# With the reversal B (position reached in positive minus in negative direction) the tool is at +B/2 after positive
-# travel, so the correction is -B/2 in the table with DIRECTION 1 and +B/2 in the one with DIRECTION -1.
+# With reversal B (position reached in the positive minus in the negative direction) the tool is at +B/2 after positive
+# travel, so the correction is -B/2 in the table with DIRECTION 1 and +B/2 in the table with DIRECTION -1.
 
 
 def with_reversal_tables(
@@ -291,15 +291,15 @@ def with_reversal_tables(
     max_points: int,
     step_mm: tuple[float | None, ...],
 ) -> dict[int, CecTable]:
-    """Return the tables with a pair behind them for each reversal that is worth one.
+    """Return the tables followed by a pair for each reversal large enough to need one.
 
     Parameters
     ----------
-    machine, tables : what is there already; its indices stay.
+    machine, tables : the machine and the existing tables, which keep their indices.
     reversal : values in mm.
     subtracts : whether the control subtracts the sum of the tables.
-    max_points : nodes that the control takes per table.
-    step_mm : node distances that the user asks for, or None.
+    max_points : most nodes per table.
+    step_mm : requested node spacings, or None.
     """
     found = dict(tables)
     for (axis, component), curve in sorted(reversal.curves.items()):
@@ -325,7 +325,7 @@ def _nodes_mm(machine: Machine, axis: int, curve: Curve, max_points: int, step_m
 
 
 def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
-    """Return what the tables of one direction do, with a number from the file; empty if there are none."""
+    """Say what the unidirectional tables do, with an example value from the file; empty if there are none."""
     for index, entry in sorted(tables.items()):
         if entry.direction == 1:
             value = float(max(entry.table.values, key=abs))
@@ -338,28 +338,28 @@ def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
 
 
 def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]]:
-    """Return the machine data that must be zero because tables of one direction hold the same effect."""
+    """Return the machine data that must be zero because unidirectional tables contain the same effect."""
     meaning = "the tables with DIRECTION 1 and -1 hold the reversal; with both it would be corrected twice"
     axes = sorted({entry.input_axis for entry in tables.values() if entry.direction})
     return [parameter_row(f"MD32450 $MA_BACKLASH[{names[axis]}]", "0", meaning) for axis in axes]
 
 
-# Which CEC tables to keep where a control has too few: those that leave the least error over the volume.
+# Which CEC tables to keep when a control has too few: those that leave the smallest error over the volume.
 #
-# Every table moves one axis only, so that the axes can be looked at one by one: for each set of terms of an axis the number
-# of tables that it takes and the squares that it takes out of the required correction (least squares over the volume). The
-# best sets of the three axes together within the number of tables are found exactly.
+# Every table moves one axis only, so each axis can be treated separately: each set of terms of an axis has a number of
+# tables and a sum of squares that it removes from the required correction (least squares over the volume). The best
+# combination of sets for the three axes within the number of tables is found exactly.
 
 
 #: Points over the volume at which sets of tables are compared.
 _MOST_POINTS = 6000
 #: Directions of the normal matrix (unit diagonal) below this are not determined.
 _UNDETERMINED = 1e-9
-#: Terms whose natural values move the tool by less than this need no table.
+#: Terms whose natural values move the tool by less than this do not need a table.
 _NOTHING_MM = 0.5e-6
-#: Tables of another set than the best one are as good if no more than this share above its error stays.
+#: A set of tables is as good as the best one if its remaining error is at most this factor times that of the best.
 _AS_GOOD = 1.1
-#: What stays uncorrected by less than this is not worth a word.
+#: Uncorrected errors below this are not reported.
 _NAMED_FROM_MM = 0.01 * MM_PER_UM
 
 
@@ -370,11 +370,11 @@ class Choice:
     Parameters
     ----------
     kept : terms in their order.
-    dropped : (name, mm): for each term that has no room what it would take out (rms over the volume) in addition.
-    allowed : tables that there are (None: not limited).
+    dropped : (name, mm): for each term that does not fit, the additional rms over the volume that it would remove.
+    allowed : number of tables available (None: not limited).
     needed : tables that all terms would take.
-    left_mm : rms over the volume that all terms would take out and the kept ones do not.
-    given : terms of tables of another kind, which are there in any case.
+    left_mm : rms over the volume that all terms would remove and the kept ones do not.
+    given : terms of tables of another kind, which are always present.
     """
 
     kept: list[Term]
@@ -396,7 +396,7 @@ class Choice:
 
 
 def table_count(terms: Sequence[Term], mode: str) -> int:
-    """Return how many tables a set of terms takes: ordinary ones, those that only hold folds, angles, levers."""
+    """Return how many tables a set of terms takes: ordinary tables, tables that only contain folds, angles, levers."""
     first_stays, multiplier_stays = MULT_MODES[mode]
     ordinary, levers, angles = set(), set(), 0
     for term in terms:
@@ -419,21 +419,21 @@ def chosen_terms(
     allowed: int | None,
     given: Sequence[Term] = (),
 ) -> Choice:
-    """Return the terms that ``allowed`` tables can hold and that leave the least error.
+    """Return the terms that fit in ``allowed`` tables and leave the smallest error.
 
     Parameters
     ----------
-    machine, errors : what is to be corrected; its work zone counts more.
-    terms : everything that the control could hold.
+    machine, errors : what to correct; the work zone has more weight.
+    terms : everything that the control could correct.
     mode : reading of products, a key of ``MULT_MODES``.
-    allowed : number of tables, None: all of them.
-    given : terms that tables of another kind hold in any case.
+    allowed : number of tables, None: not limited.
+    given : terms that tables of another kind always contain.
     """
     needed = table_count(terms, mode)
     if allowed is None or needed <= allowed:
         return Choice(list(terms), (), allowed, needed, 0.0)
     gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
-    # the best set of each axis such that all together take no more tables than there are, by dynamic programming
+    # the best set of each axis such that all together do not take more tables than allowed, by dynamic programming
     best: dict[int, tuple[float, list[tuple[Term, ...]]]] = {0: (0.0, [])}
     for gain in gains:
         options = gain.by_count(mode, allowed)
@@ -456,7 +456,7 @@ def without_products(
 ) -> list[str]:
     """Say what stays uncorrected because no products are written: their names, and the rms over the volume.
 
-    ``terms`` are the ordinary ones and the products, ``given`` as in :func:`chosen_terms`. Nothing if that is zero.
+    ``terms`` are the ordinary terms and the products, ``given`` as in :func:`chosen_terms`. Empty if nothing is missed.
     """
     ordinary = [term for term in terms if term.carrier[0].lever is None]
     gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
@@ -472,14 +472,14 @@ def without_products(
 
 
 def _left_out(gains: Sequence[_Gains], kept: Sequence[Sequence[Term]]) -> tuple[list[tuple[str, float]], float]:
-    """Return (name, rms mm) of the terms that are not kept, and the rms over the volume (mm) that they leave together."""
+    """Return (name, rms mm) of the terms not kept, and the rms over the volume (mm) that they leave together."""
     pairs = list(zip(gains, kept, strict=True))
     left = sum(gain.taken(gain.terms) - gain.taken(part) for gain, part in pairs)
     return [item for gain, part in pairs for item in gain.missed(part)], float(np.sqrt(max(left, 0.0)))
 
 
 def _named(missed: Sequence[tuple[str, float]]) -> str:
-    """Names with their rms in um, the largest first; what is below 0.01 um is left out."""
+    """Names with their rms in um, largest first; values below 0.01 um are left out."""
     return ", ".join(
         f"{name} ({size / MM_PER_UM:.2f} um rms)"
         for name, size in sorted(missed, key=lambda item: -item[1])
@@ -490,9 +490,9 @@ def _named(missed: Sequence[tuple[str, float]]) -> str:
 def terms_of_tables(
     machine: Machine, errors: ErrorTable, terms: Sequence[Term], mode: str, choice: Choice, names: set[str]
 ) -> list[Term]:
-    """Return the terms ``names`` that given tables hold if they are as good as the chosen ones, else the chosen ones.
+    """Return the terms ``names`` of existing tables if they are as good as the chosen terms, else the chosen terms.
 
-    Two sets may leave nearly the same error, so that slightly different errors prefer another one.
+    Two sets may leave nearly the same error; then slightly different errors lead to a different choice.
     """
     own = [term for term in terms if term.name in names]
     if not choice.dropped or not own or table_count(own, mode) > (choice.allowed or 0):
@@ -512,7 +512,7 @@ def terms_of_tables(
 class _Gains:
     """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
 
-    ``given`` are terms that are there in any case and take no table; ``target`` is the square of what is to be taken out.
+    ``given`` are terms that are always present and need no table; ``target`` is the mean square to be removed, mm^2.
     """
 
     terms: tuple[Term, ...]
@@ -536,7 +536,7 @@ class _Gains:
         tool_mm, weight = tool_of(machine, None), sample.weight / np.sum(sample.weight)
         target = -volumetric_error(machine, errors, sample.position_mm)[:, output]
         own = [term for term in terms if term.carrier[0].output == output]
-        # natural values of no more than the last decimal need no table
+        # natural values that do not exceed the last decimal need no table
         reach = [1.0 if (lever := t.carrier[0].lever) is None else machine.axes[lever].length_mm for t in own]
         largest = [float(np.max(np.abs(term.start), initial=0.0)) for term in own]
         own = [term for term, size, span in zip(own, largest, reach, strict=True) if size * span > _NOTHING_MM]
@@ -556,7 +556,7 @@ class _Gains:
         return cls(tuple(own), tuple(others), normal, right, float(weight @ target**2), columns)
 
     def taken(self, terms: Sequence[Term]) -> float:
-        """Squares that a set of terms takes out, mm^2."""
+        """Mean square that a set of terms removes, mm^2."""
         held = [term for term in (*terms, *self.given) if term.name in self.columns]
         if not held:
             return 0.0
@@ -565,7 +565,7 @@ class _Gains:
         return float(self.right[where] @ solution)
 
     def missed(self, kept: Sequence[Term]) -> list[tuple[str, float]]:
-        """Return (name, rms mm) of the terms that are not kept: what each would take out in addition."""
+        """Return (name, rms mm) of the terms not kept: the additional rms that each would remove."""
         own = self.taken(kept)
         return [
             (term.name, float(np.sqrt(max(self.taken([*kept, term]) - own, 0.0))))

@@ -1,8 +1,8 @@
 """SINUMERIK leadscrew and measuring-system error compensation (LEC, MSEC, EEC): one table per axis.
 
 Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 237-239, 242; 808D Function Manual p. 106.
-The control adds the table value to the ACTUAL position, so that a positive value moves the axis in the negative
-direction (p. 238): the table holds the measured error, actual minus nominal.
+The control adds the table value to the ACTUAL position, so a positive value moves the axis in the negative direction
+(p. 238): the table contains the measured error, actual minus nominal.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.toml_files import Section
 
-#: Variables of the table without ``$``, with the number of their indices (K3-2013, p. 242).
+#: Variables of the table, without ``$``, and how many indices each has (K3-2013, p. 242).
 VARIABLES = {
     "AA_ENC_COMP": 3,
     "AA_ENC_COMP_STEP": 2,
@@ -53,7 +53,7 @@ BYTES_PER_VALUE = 8
 
 @dataclass(frozen=True)
 class EecTables:
-    """Tables by (axis 0..2, encoder); the values are errors in mm (actual minus nominal), as the file has them."""
+    """Tables by (axis 0..2, encoder); the values are errors in mm (actual minus nominal), exactly as in the file."""
 
     tables: Mapping[tuple[int, int], LinearTable]
 
@@ -67,7 +67,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
 
     @classmethod
     def check_settings(cls, settings: EecSettings, section: Section, machine: Machine) -> EecSettings:
-        """Fill in what follows from the model, and the measuring systems that the position control uses."""
+        """Fill in what follows from the model, and the measuring systems used for position control."""
         return checked_encoder_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
@@ -88,7 +88,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         return EecTables(tables)
 
     def context(self, tables: EecTables) -> dict[str, Any]:
-        """Return tables, machine data and the sign with a number from the file."""
+        """Return the tables, the machine data, and the sign convention with an example value from the file."""
         settings = self.settings
         return {
             "sign_statement": self._sign_statement(tables),
@@ -168,17 +168,17 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         return found
 
     def parse(self, files: Sequence[SourceFile]) -> EecTables:
-        """Read the tables of the machine's axes; an axis without any assignment has no table."""
+        """Read the tables of the machine's axes; an axis without assignments has no table."""
         return eec_tables_from(read_assignments(files, VARIABLES), self.settings)
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[EecTables, list[str]]:
-        """Read an archive or a program of a real control: the tables that act, and what was passed over."""
+        """Read an archive or a program from a real control: the active tables, and a list of what was skipped."""
         findings = Findings()
         given = foreign_assignments(files, VARIABLES, findings)
         return foreign_eec_tables(given, self.machine, self.settings, findings), findings.statements()
 
     def emulate(self, tables: EecTables, points: Points) -> FloatArray:
-        """Return minus the interpolated values of the active measuring system: the actual position is corrected by it."""
+        """Return minus the interpolated values of the active measuring system: they correct the actual position."""
         correction = np.zeros((len(points), 3))
         for (axis, encoder), table in tables.tables.items():
             if encoder == self.settings.active[axis]:
@@ -209,7 +209,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         """Return MD32450 for the mean reversal of each axis along itself: positive where the tool stops short.
 
         Source: MD32450 is positive if the encoder leads the machine part (SINUMERIK parameter manuals), the usual case;
-        then the position reached in positive direction is the smaller one, and the reversal value B is negative.
+        then the position reached in the positive direction is the smaller, and the reversal value B is negative.
         """
         rows = []
         for axis, name in enumerate(self.settings.axis_names):
@@ -221,7 +221,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         return rows
 
     def usage(self, tables: EecTables) -> list[Usage]:
-        """Return the nodes of each axis against what the control can hold."""
+        """Return the number of nodes of each axis against the limit of the control."""
         settings = self.settings
         return [
             Usage(f"nodes of {settings.axis_names[axis]}", len(table.values), settings.max_points, "nodes")
@@ -236,7 +236,7 @@ class SiemensEec(Controller[EecSettings, EecTables]):
 def eec_terms(
     machine: Machine, settings: EecSettings, errors: ErrorTable, lever_origin_mm: Sequence[float] | None = None
 ) -> list[Term]:
-    """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of their grids.
+    """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of each grid.
 
     ``lever_origin_mm`` as in :func:`compgen.controls.shared.terms.one_dimensional_terms`.
     """
@@ -260,10 +260,11 @@ def eec_terms(
 def foreign_eec_tables(
     given: ArchiveAssignments, machine: Machine, settings: EecSettings, findings: Findings
 ) -> EecTables:
-    """Return the tables that act, from the files of a real control.
+    """Return the active tables from the files of a real control.
 
-    Kept apart are tables of axes that the machine file lacks, tables that the archive's machine data switch off, and
-    tables of zeros; a table that acts in another measuring system than the machine file's is refused with its line.
+    Tables of axes that the machine file lacks, tables that the archive's machine data switch off, and tables of zeros
+    are skipped and noted. A table that acts on a measuring system not named in the machine file raises an InputError
+    with its line.
     """
     parts: dict[tuple[str, int], TableParts] = {}
     for item in given.items:
@@ -299,7 +300,7 @@ def foreign_eec_tables(
 
 
 def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTables:
-    """Return the tables that assignments make; InputError for an encoder that the settings do not have."""
+    """Return the tables that the assignments define; InputError for an encoder that is not in the settings."""
     parts: dict[tuple[int, int], TableParts] = {}
     for item in items:
         encoder = item.index_number(0, 1)

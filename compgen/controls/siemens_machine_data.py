@@ -1,4 +1,4 @@
-"""SINUMERIK models, settings and machine data: capacity, limits of CEC tables, and what to set before they act."""
+"""SINUMERIK models, settings and machine data: capacity, limits of CEC tables, and what to set to activate them."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from compgen.data.toml_files import (
     whole,
 )
 
-# What the SINUMERIK models can hold: numbers of tables and nodes, and the usual values of limiting machine data.
+# Capacity of the SINUMERIK models: numbers of tables and nodes, and the usual values of limiting machine data.
 #
-# Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 264 (828D), newer edition p. 277 (number of
-# tables of the 840D sl); 802D sl Function Manual 11/2012, p. 215, 220; 808D Function Manual 01/2017, p. 106. The bounds of
-# 2000 and 5000 nodes and the defaults of MD32720 and MD32730 are not from a manual that could be read.
+# Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 264 (828D), newer edition p. 277 (number
+# of tables of the 840D sl); 802D sl Function Manual 11/2012, p. 215, 220; 808D Function Manual 01/2017, p. 106. The
+# bounds of 2000 and 5000 nodes and the defaults of MD32720 and MD32730 do not come from an available manual.
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ class Profile:
 
     Parameters
     ----------
-    cec_tables : number of CEC tables; None: it follows from the number of axes, or is not documented.
+    cec_tables : number of CEC tables; None: depends on the number of axes, or not documented.
     cec_nodes : nodes per CEC table; None: not documented.
     eec_nodes : nodes per encoder table.
-    eec_nodes_documented : False if ``eec_nodes`` is the smallest number that is documented for any model.
+    eec_nodes_documented : False if ``eec_nodes`` is the smallest number documented for any model.
     tables_per_axis : CEC tables for each axis of the control, 0 if their number is fixed.
     """
 
@@ -67,11 +67,11 @@ PROFILES = {
     "808D": Profile(None, None, eec_nodes=200),
     "802D sl": Profile(2, 350, eec_nodes=200, eec_nodes_documented=False),
 }
-#: Axes that a control of a machine with X, Y and Z has at least.
+#: Fewest axes on the control of a machine with X, Y and Z.
 FEWEST_AXES = 3
-#: What counts where the machine file names no model.
+#: Model used where the machine file does not name one.
 USUAL = "840D sl"
-#: Defaults of MD32720 (mm) and MD32730 (%) as far as they are known, the same for all models.
+#: Defaults of MD32720 (mm) and MD32730 (%) as far as known, the same for all models.
 DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT = 1.0, 10.0
 
 _NOT_DOCUMENTED = (
@@ -80,12 +80,12 @@ _NOT_DOCUMENTED = (
 )
 
 
-# Settings of the SINUMERIK tables: names of the axes, node distances, measuring systems, capacity, and in which kind of
-# file tables are: "ini" (initialisation file with header, loaded as data) or "program" (sub-program that is run).
+# Settings of the SINUMERIK tables: axis names, node spacing, measuring systems, capacity, and the kind of file:
+# "ini" (initialisation file with header, loaded as data) or "program" (sub-program that is run).
 
 
 _NAME = re.compile(r"[A-Z_][A-Z0-9_]{0,31}")
-#: No sentence of the vendor gives the sign; two independent traces lead to this one (``preflight.SIGN_TRACES``).
+#: The vendor's documents do not state the sign; two independent traces lead to this one (``preflight.SIGN_TRACES``).
 INFERRED_SIGN = "error"
 _MODE_MISSING = (
     "is missing. With products = true the file multiplies tables, and no readable document says what the two factors do "
@@ -100,7 +100,7 @@ Encoders = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
 @accepts({"anyOf": [*_OF_AXIS, table_schema(dict.fromkeys(AXES, {"anyOf": _OF_AXIS}))]})
 def _encoders(value: Any) -> Encoders:
-    """Measuring systems of the axes: 0 or 1, a list of both, or a table of these by axis (0 for one that is absent)."""
+    """Measuring systems of the axes: 0 or 1, a list of both, or a table of these by axis (0 for a missing axis)."""
     if isinstance(value, dict):
         if not set(value) <= set(AXES):
             raise ValueError("expected 0, 1, [0, 1], or a table of these with the keys X, Y, Z")
@@ -147,7 +147,7 @@ def _per_axis(value: Any) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class SiemensSettings:
-    """Settings of encoder tables and of cross tables alike."""
+    """Settings shared by encoder tables and cross tables."""
 
     profile: str = setting(
         choice(*PROFILES),
@@ -177,9 +177,9 @@ class CecSettings(SiemensSettings):
 
     Parameters
     ----------
-    sign_stated : False where the machine file does not say it and the inferred one is taken.
-    mode_stated : False where the machine file does not say it: then no file with products is written or read.
-    tables_available : tables that the control has, or None if that is not known.
+    sign_stated : False if the machine file does not state the sign and the inferred one is used.
+    mode_stated : False if the machine file does not state the mode; then no file with products is written or read.
+    tables_available : tables that the control has, or None if not known.
     max_sum_mm, max_velo_percent : None if not stated.
     """
 
@@ -230,7 +230,7 @@ class CecSettings(SiemensSettings):
 
     @property
     def tables_usable(self) -> int | None:
-        """How many tables the errors may take, None if no number is known."""
+        """How many tables the errors may take, None if not known."""
         if self.tables_available is None:
             return None
         kept = sum(1 for index in self.kept_tables if index < self.tables_available)
@@ -244,8 +244,8 @@ class EncoderSettings(SiemensSettings):
     Parameters
     ----------
     encoders : for X, Y, Z the measuring systems that get a table: 0 is measuring system 1, 1 is measuring system 2.
-    active : for X, Y, Z the one that the position control uses.
-    eec_nodes_known : False if the number of nodes is not documented for the model and not stated.
+    active : for X, Y, Z the measuring system that the position control uses.
+    eec_nodes_known : False if the number of nodes is neither documented for the model nor stated.
     """
 
     encoders: Encoders = setting(
@@ -274,7 +274,7 @@ class EecSettings(EncoderSettings):
 
 @dataclass(frozen=True)
 class CecEecSettings(CecSettings, EncoderSettings):
-    """``[controllers.siemens-cec-eec]``: the encoder tables have the keys with ``eec_``."""
+    """``[controllers.siemens-cec-eec]``: keys of the encoder tables start with ``eec_``."""
 
     eec_max_points: int = setting(
         whole(3, 100_000), PROFILES[USUAL].eec_nodes, meaning="nodes per encoder table, at least 3"
@@ -297,7 +297,7 @@ Encoder = TypeVar("Encoder", bound=EncoderSettings)
 
 
 def checked_cec_settings(settings: Cec, section: Section, machine: Machine) -> Cec:
-    """Return the settings of cross tables with what follows from the model and from ``mult_mode``.
+    """Return the settings of cross tables, completed from the model and from ``mult_mode``.
 
     Without ``mult_mode`` and ``products`` no products are written: a wrong mode is worse than a wrong sign.
     """
@@ -316,7 +316,7 @@ def checked_cec_settings(settings: Cec, section: Section, machine: Machine) -> C
 
 
 def checked_encoder_settings(settings: Encoder, section: Section, machine: Machine, prefix: str = "") -> Encoder:
-    """Return the settings of encoder tables with what follows from the model; ``prefix`` of their keys."""
+    """Return the settings of encoder tables, completed from the model; ``prefix`` is the prefix of their keys."""
     profile = PROFILES[settings.profile]
     settings = unless_stated(settings, section, **{f"{prefix}max_points": profile.eec_nodes})
     _check_steps(settings, section, machine, prefix)
@@ -331,7 +331,7 @@ def checked_encoder_settings(settings: Encoder, section: Section, machine: Machi
 
 
 def _check_steps(settings: SiemensSettings, section: Section, machine: Machine, prefix: str) -> None:
-    """Refuse steps that give more nodes than the control takes, and an INI file that is to switch something on."""
+    """Refuse steps that give more nodes than the control takes, and ``program_enables`` with an INI file."""
     if settings.program_enables and settings.container == "ini":
         raise section.fail("program_enables", 'needs container = "program": an INI file switches nothing on')
     most, key = getattr(settings, f"{prefix}max_points"), f"{prefix}step_mm"
@@ -341,7 +341,7 @@ def _check_steps(settings: SiemensSettings, section: Section, machine: Machine, 
             raise section.section(key).fail(letter, message)
 
 
-# Limits of SINUMERIK CEC tables: what the sum reaches over the volume, how fast it changes, and the rules of a set.
+# Limits of SINUMERIK CEC tables: largest sum over the volume, its rate of change, and the rules for a set.
 #
 # Rules: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245-249, 264.
 
@@ -351,7 +351,7 @@ _MOST_ACROSS = 21
 
 
 def _positions(machine: Machine, tables: CecMap, axis: int, most: int | None) -> FloatArray:
-    """Nodes of all tables over an axis within its travel and the ends; thinned to ``most``, extremes of tables kept."""
+    """Nodes of all tables over an axis within its travel, plus the ends; thinned to ``most``, table extremes kept."""
     low, high = machine.axes[axis].range_mm
     own = [entry.table for entry in tables.values() if entry.input_axis == axis]
     nodes = np.concatenate([[low, high], *(table.nodes_mm for table in own)])
@@ -376,13 +376,13 @@ def _sums(tables: CecMap, mode: str, positions: Sequence[FloatArray], travel: Se
 
 
 def _travels(tables: CecMap) -> list[tuple[int, ...]]:
-    """Directions of travel that make a difference to some table."""
+    """Combinations of travel directions that make a difference to at least one table."""
     directed = {entry.input_axis for entry in tables.values() if entry.direction}
     return list(product(*[(1, -1) if axis in directed else (1,) for axis in range(3)]))
 
 
 def largest_sums(machine: Machine, tables: CecMap, mode: str) -> list[tuple[float, tuple[float, float, float]]]:
-    """Return for each output axis the sum of largest size over the travel, with its sign (mm), and where it is.
+    """Return for each output axis the largest sum in magnitude over the travel, with its sign (mm), and its position.
 
     Sums are multilinear between nodes, so the largest is at a node; all are searched, up to 81 positions per axis.
     """
@@ -398,7 +398,7 @@ def largest_sums(machine: Machine, tables: CecMap, mode: str) -> list[tuple[floa
 
 
 def largest_slopes(machine: Machine, tables: CecMap, mode: str) -> FloatArray:
-    """Return the largest change of each output's sum per travel of each base axis, shape (3 outputs, 3 bases), mm/mm."""
+    """Return the largest slope of each output's sum along each base axis, shape (3 outputs, 3 bases), mm/mm."""
     slopes = np.zeros((3, 3))
     for base in range(3):
         most = [_MOST_ACROSS if axis != base else None for axis in range(3)]
@@ -412,7 +412,7 @@ def largest_slopes(machine: Machine, tables: CecMap, mode: str) -> FloatArray:
 
 
 def set_violations(machine: Machine, tables: CecMap, max_points: int, tables_available: int | None) -> list[str]:
-    """Return broken rules of single tables and of the set: grid, travel, numbers of tables and nodes, references."""
+    """Return broken rules of single tables and of the set: grid, travel, number of tables and nodes, references."""
     found: list[str] = []
     factors = {entry.multiplier - 1 for entry in tables.values() if entry.multiplier}
     for index, entry in sorted(tables.items()):
@@ -437,7 +437,7 @@ def set_violations(machine: Machine, tables: CecMap, max_points: int, tables_ava
 
 
 def speed_percent(slopes: FloatArray, output: int, max_speed_mm_min: Sequence[float]) -> float:
-    """Return how fast the sum into an axis changes, in % of the axis' own largest speed, all bases at theirs.
+    """Return how fast the sum into an axis changes, in % of that axis' maximum speed, all bases at their maximum speed.
 
     Rule: largest change per travel, times the speed of the base, against MD32730 / 100 times MD32000 of the output.
     """
@@ -446,7 +446,7 @@ def speed_percent(slopes: FloatArray, output: int, max_speed_mm_min: Sequence[fl
 
 
 def stated_limit_violations(machine: Machine, tables: CecMap, settings: CecSettings) -> list[str]:
-    """Return where the sums exceed MD32720, or change faster than MD32730, as far as these are stated."""
+    """Return where the sums exceed MD32720 or change faster than MD32730, if these are stated."""
     found = []
     if settings.max_sum_mm is not None:
         for axis, (value, place) in enumerate(largest_sums(machine, tables, settings.mult_mode)):
@@ -468,7 +468,7 @@ def stated_limit_violations(machine: Machine, tables: CecMap, settings: CecSetti
 
 
 def cec_usage(machine: Machine, tables: CecMap, settings: CecSettings) -> list[Usage]:
-    """Return nodes of the longest table, number of tables, largest sums and their largest change against the limits."""
+    """Return nodes of the longest table, number of tables, largest sums and their rate of change against the limits."""
     nodes = max(len(entry.table.values) for entry in tables.values())
     found = [Usage("nodes of the longest table", nodes, settings.max_points, "nodes")]
     if settings.tables_available is not None:
@@ -485,7 +485,7 @@ def cec_usage(machine: Machine, tables: CecMap, settings: CecSettings) -> list[U
     return found
 
 
-# What must be set on a SINUMERIK before CEC tables act: sign in words, machine data with values, warnings.
+# What to set on a SINUMERIK before CEC tables act: sign in words, machine data with values, warnings.
 
 
 Sums = Sequence[tuple[float, tuple[float, float, float]]]
@@ -496,9 +496,9 @@ NOTICEABLE_JUMP_MM = 5e-4
 
 
 def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums, *, stated: bool) -> str:
-    """Return the sign convention in words with the largest sum of the file as a worked number.
+    """Return the sign convention in words, with the largest sum in the file as a worked example.
 
-    ``stated`` is False where the machine file leaves the sign to what is inferred.
+    ``stated`` is False if the machine file does not state the sign and the inferred one is used.
     """
     output = max(range(3), key=lambda axis: abs(sums[axis][0]))
     value, place = sums[output]
@@ -518,7 +518,7 @@ def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums, *, sta
 def cec_parameters(
     machine: Machine, names: Sequence[str], tables: CecMap, mode: str, sums: Sums
 ) -> list[dict[str, str]]:
-    """Return the machine and setting data with the values that these tables need."""
+    """Return the machine data and setting data, with the values that these tables need."""
     rows = [
         parameter_row(
             f"MD18342 $MN_MM_CEC_MAX_POINTS[{index}]", str(len(entry.table.values)), "nodes of the table, exactly"
@@ -554,7 +554,7 @@ def cec_parameters(
 
 
 def _indices_in_words(tables: CecMap) -> str:
-    """Indices in words: ``0 ... 4, 6``; those between that belong to other axes are not named."""
+    """Indices in words: ``0 ... 4, 6``; indices in between that belong to other axes are not listed."""
     found = sorted(tables)
     ends = [index for index in found if index - 1 not in tables or index + 1 not in tables]
     parts: list[str] = []
@@ -581,7 +581,7 @@ def cec_overwrites(tables: CecMap, kept: Sequence[int]) -> list[str]:
 def cec_warnings(
     machine: Machine, names: Sequence[str], tables: CecMap, settings: CecSettings, sums: Sums
 ) -> list[str]:
-    """Return what the user must know: limits that are not stated but would be exceeded, a jump at the reference."""
+    """Return warnings: usual limits that would be exceeded where none are stated, a jump at the reference point."""
     found = []
     for axis, (value, _) in enumerate(sums):
         if settings.max_sum_mm is None and abs(value) > DEFAULT_MAX_SUM_MM:
@@ -610,7 +610,7 @@ def cec_warnings(
 
 
 def cec_reservations(tables: CecMap, settings: CecSettings) -> list[str]:
-    """Return what the verdict must say: an inferred sign, products that are missing, a number of tables not known."""
+    """Return what the verdict must say: an inferred sign, missing products, an unknown number of tables."""
     found = []
     if not settings.sign_stated:
         found.append(

@@ -1,4 +1,4 @@
-"""SINUMERIK tables as text: the strict reader of our own files, and the reader of start-up archives."""
+"""SINUMERIK tables as text: a strict reader for exported files, and a reader for start-up archives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import nearest, one_line
 from compgen.errors import CompgenWarning, InputError
 
-# What both kinds of SINUMERIK tables share: reading assignments from text, and equidistant tables.
+# Shared by both kinds of SINUMERIK tables: reading assignments from text, and equidistant tables.
 #
 # Lexical grammar (SINUMERIK 840D sl / 828D Extended Functions K3, 03/2013, p. 242; 802D sl Function Manual, p. 222)::
 #
@@ -27,26 +27,26 @@ from compgen.errors import CompgenWarning, InputError
 #     assignment = "$" variable "[" index { "," index } "]" "=" value [ ";" comment ]
 #     value      = number without exponent | "(" axis name ")" | axis name in quotation marks
 #
-# The same assignments may be in a sub-program (name ``..._SPF``) that switches the function off before them, makes
-# that effective by NEWCONF, and may switch it on again behind them.
+# The same assignments may be in a sub-program (name ``..._SPF``) that switches the function off first, makes this
+# effective with NEWCONF, and may switch it on again after them.
 
 
-#: Positions of nodes are written in whole multiples of this.
+#: Node positions are written in whole multiples of this.
 POSITION_QUANTUM_MM = Decimal("0.000001")
 POSITION_DIGITS = 6
 
-#: Switches that may be among the tables, without ``$``, with the number of their indices (K3-2013, p. 239, 245).
+#: Switches that may be among the tables, without ``$``, and how many indices each has (K3-2013, p. 239, 245).
 SWITCHES = {
     "MA_ENC_COMP_ENABLE": 2,
     "MA_CEC_ENABLE": 1,
     "SN_CEC_TABLE_ENABLE": 1,
     "SN_CEC_TABLE_WEIGHT": 1,
 }
-#: Switches that write-protect the tables while they are 1 (MD32700, MD32710).
+#: Switches that write-protect the tables while set to 1 (MD32700, MD32710).
 PROTECTING = ("MA_ENC_COMP_ENABLE", "MA_CEC_ENABLE")
 MAKE_EFFECTIVE = "NEWCONF"
 
-#: A step that was rounded misses MAX by less than this share of itself: 39 steps of 19.7436 mm are 770.0004 mm.
+#: With a rounded step, the last node misses MAX by less than this fraction of the step: 39 x 19.7436 mm = 770.0004 mm.
 _ROUNDED = Decimal("0.01")
 _LONGEST_LINE = 1000
 _MOST_CHARACTERS = 20_000_000
@@ -58,7 +58,7 @@ _NUMBER = number_pattern(12, 15)
 
 @dataclass(frozen=True)
 class Assignment:
-    """One assignment to a system variable: ``variable`` without ``$``, its indices and its value as text."""
+    """One assignment to a system variable: ``variable`` without ``$``, its indices, its value as text."""
 
     variable: str
     index: tuple[str, ...]
@@ -95,20 +95,19 @@ class Assignment:
 
 
 def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int]) -> list[Assignment]:
-    """Return every assignment of the files in their order.
+    """Return every assignment in the files, in order.
 
     Parameters
     ----------
     files : the texts; each ends with ``M17``.
-    index_counts : the known variables, without ``$``, and how many indices each has. Those of :data:`SWITCHES` may
+    index_counts : the known variables, without ``$``, and how many indices each has. Variables in :data:`SWITCHES` may
         be assigned several times; the last assignment is returned.
 
     Raises
     ------
     InputError
         with file and line for an unknown variable, a wrong number of indices, a second assignment to one variable,
-        text that is not an assignment, a table that is written while its function is on, a file that does not end with
-        M17.
+        text that is not an assignment, a table written while its function is on, or a file that does not end with M17.
     """
     seen: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     for source in files:
@@ -136,7 +135,7 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
 
 
 def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterator[Assignment]:
-    """Yield the assignments of one file in their order; a file that is cut or has anything else is an error."""
+    """Yield the assignments of one file in order; a truncated file or any other content is an error."""
     ended, started, number, dotted = False, False, 1, False
     codes = (line.partition(";")[0].strip().upper() for line in plain_lines(source, _MOST_CHARACTERS, _LONGEST_LINE))
     for number, code in ((number, code) for number, code in enumerate(codes, start=1) if code):
@@ -170,7 +169,7 @@ def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterato
 
 
 def _plain_indices(text: str) -> tuple[str, ...]:
-    """The indices of a variable without blanks and leading zeros, so that [0,01] and [0,1] are one."""
+    """The indices of a variable without blanks and leading zeros: [0,01] and [0,1] are the same."""
     words = [word.strip() for word in re.split(r"[,.]", text)]
     return tuple(str(int(word)) if word.isdigit() and len(word) < 10 else word for word in words)
 
@@ -179,7 +178,7 @@ def _plain_indices(text: str) -> tuple[str, ...]:
 class LinearTable:
     """An equidistant table in exact decimal numbers (mm): nodes ``start + n step`` up to ``last``.
 
-    ``values`` has one number per node; between nodes the control interpolates linearly, outside the end values hold,
+    ``values`` has one number per node. The control interpolates linearly between nodes and holds the end values outside;
     a ``modulo`` table repeats with the period ``last - start`` (K3-2013, p. 237, 242, 248).
     """
 
@@ -191,7 +190,7 @@ class LinearTable:
 
     @property
     def intervals(self) -> Fraction:
-        """Number of steps from the first to the last node, exact; a whole number in a proper table."""
+        """Number of steps from the first to the last node, exact; a whole number in a valid table."""
         return (Fraction(self.last_mm) - Fraction(self.start_mm)) / Fraction(self.step_mm)
 
     @property
@@ -205,16 +204,16 @@ class LinearTable:
         return np.array([float(value) for value in self.values])
 
     def at(self, position_mm: FloatArray) -> FloatArray:
-        """Interpolated value at positions of any shape; what lies beyond ``last_mm`` has the value there.
+        """Interpolated value at positions of any shape; beyond ``last_mm`` the value at ``last_mm`` is held.
 
-        The last node is at ``last_mm``, or beyond it where that is not a whole number of steps.
+        The last node is at ``last_mm``, or beyond it if ``last_mm`` is not a whole number of steps from the start.
         """
         start, last = float(self.start_mm), float(self.last_mm)
         position = start + np.mod(position_mm - start, last - start) if self.modulo else np.minimum(position_mm, last)
         return np.interp(position, self.nodes_mm, self.numbers)
 
     def context(self) -> dict[str, object]:
-        """Return what the templates need of a table."""
+        """Return the data of the table for the templates."""
         return {
             "step_mm": float(self.step_mm),
             "minimum_mm": float(self.start_mm),
@@ -241,7 +240,7 @@ def exact_values(units: NDArray[np.int64], decimals: int) -> tuple[Decimal, ...]
 
 @dataclass
 class TableParts:
-    """The assignments that make one table, collected in any order; ``what`` names the table in messages."""
+    """The assignments that define one table, collected in any order; ``what`` names the table in messages."""
 
     what: str
     source: SourceFile
@@ -249,14 +248,14 @@ class TableParts:
     nodes: dict[int, Assignment] = field(default_factory=dict)
 
     def add(self, item: Assignment) -> None:
-        """Take one assignment: the value of a node, or a scalar variable of the table."""
+        """Add one assignment: the value of a node, or a scalar variable of the table."""
         if item.variable in ("AN_CEC", "AA_ENC_COMP"):
             self.nodes[item.index_number(1, 999_999)] = item
         else:
             self.scalars[f"${item.variable}"] = item
 
     def scalar(self, name: str) -> Assignment:
-        """Return the assignment of one scalar variable; InputError if the files do not have it."""
+        """Return the assignment of one scalar variable; InputError if it is missing from the files."""
         if name not in self.scalars:
             raise self.source.fail(
                 f"{self.what}: {name} is missing (the control would keep an older value): is the file truncated?"
@@ -265,19 +264,19 @@ class TableParts:
 
     @property
     def is_zero(self) -> bool:
-        """Whether every node is zero: whatever is not known of such a table does not matter."""
+        """Whether every node is zero: unknown details of such a table do not matter."""
         return all(item.number() == 0 for item in self.nodes.values())
 
     @property
     def largest(self) -> str:
-        """Largest value of a node in size, as people read it; of a rotary axis it is in degrees."""
+        """Largest node value in magnitude, as text; degrees for a rotary axis."""
         return f"{max((abs(float(item.number())) for item in self.nodes.values()), default=0.0):g} mm or degrees"
 
     def foreign_table(self, prefix: str) -> tuple[LinearTable, int, float]:
-        """Return a table as a real control may hold it, how many reserved nodes lie beyond MAX, and a doubt in um.
+        """Return a table as a real control may contain it, the number of reserved nodes beyond MAX, and a doubt in um.
 
-        Where MAX is not a whole number of steps from MIN, the node behind it ends the last, shorter interval; whether the
-        control interpolates to it or holds the node before is not documented, and the doubt is what that can matter.
+        If MAX is not a whole number of steps from MIN, the next node ends the last, shorter interval; whether the
+        control interpolates to it or holds the previous node is not documented. The doubt is the largest difference.
         """
         start_mm, last_mm, step_mm = self._grid(prefix)
         whole, part = divmod(last_mm - start_mm, step_mm)
@@ -327,7 +326,7 @@ class TableParts:
 
 
 def table_violations(machine: Machine, axis: int, table: LinearTable, most: int, what: str) -> list[str]:
-    """Return the rules of a single table that are broken: whole number of steps, node count, cycle, travel."""
+    """Return the broken rules of a single table: whole number of steps, node count, cycle, travel."""
     found = []
     if table.intervals.denominator != 1:
         found.append(
@@ -344,28 +343,28 @@ def table_violations(machine: Machine, axis: int, table: LinearTable, most: int,
 
 
 def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
-    """Return the axis, 0..2, that has this name on the control; InputError if none has."""
+    """Return the axis, 0..2, that has this name on the control; InputError if there is none."""
     if name not in axis_names:
         raise item.fail(f"no axis of the machine file is named {one_line(name)[:32]!r}; axis_names has {axis_names}")
     return list(axis_names).index(name)
 
 
-# What a SINUMERIK really holds: start-up archives, punched files and sub-programs that this program did not write.
+# Files from real SINUMERIK controls: start-up archives, punched files and sub-programs not written by this program.
 #
-# An archive is a chain of files. In the binary form (``.arc``) NUL bytes with the name ``_N_NC_CEC_INI`` precede each,
-# in the text form a line ``%_N_NC_CEC_INI``. The tables are those of its initialisation files; part programs that
-# write the same variables do not act, and are passed over. Where a file holds one part only, that part is
-# read, program or not.
+# An archive is a chain of files. Each is preceded by NUL bytes with the name ``_N_NC_CEC_INI`` in the binary form
+# (``.arc``), or by a line ``%_N_NC_CEC_INI`` in the text form. The tables are in its initialisation files; part programs
+# that write the same variables have no effect and are skipped. If a file contains only one part, that part is read,
+# whether or not it is a program.
 #
-# Nothing that could change a table is passed over: a line of tables that is not understood is an error with its number.
-# Everything else is counted, and said in one line.
+# Nothing that could change a table is skipped: a line of a table that is not understood is an error with its number.
+# Everything else is counted and reported in one line.
 
 
-#: What is not known of a table of a real control is said from here on, um.
+#: Doubts about a table of a real control are reported from this size on, um.
 WORTH_SAYING_UM = 0.1
-#: Kinds of files whose assignments are data of the control, by the last word of their name.
+#: Kinds of files (last word of the name) whose assignments are data of the control.
 DATA_KINDS = ("INI", "TEA", "SEA", "EEC", "CEC")
-#: Other machine data and variables, which do not change what a table holds; None: any value.
+#: Other machine data and variables that do not change a table, with their allowed values; None: any value.
 HARMLESS: Mapping[str, tuple[str, ...] | None] = {
     "MN_MM_CEC_MAX_POINTS": None,
     "MA_MM_ENC_COMP_MAX_POINTS": None,
@@ -377,10 +376,10 @@ HARMLESS: Mapping[str, tuple[str, ...] | None] = {
     "AN_CEC_OUTPUT_NCU": ("0", "1"),
     "AN_CEC_TYPE": ("0",),
 }
-#: Cylinder error compensation has the same three letters; where it is zero it does nothing.
+#: Cylinder error compensation has the same abbreviation; it has no effect if it is zero.
 _OTHER_CEC = re.compile(r"SN_CEC_(?:\d|BAS|COMP|CALC)[A-Z0-9_]*")
-#: Words of a program that have no bearing on a table: units, path and display modes, dwells, messages, labels (what jumps
-#: to them is refused), declarations without a table in them.
+#: Program words that do not affect tables: units, path and display modes, dwells, messages, labels (jumps to them are
+#: refused), declarations without a table.
 _MODE = r"(?:G(?!70|700)\d{1,3}|D0|SUPA|DISPLOF|DISPLON|SBLOF|SBLON)"
 _IDLE_WORD = re.compile(
     r"METRIC|NEWCONF|STOPRE|M0?[01]|MSG ?\(.*\)|G0?4 ?[FS] ?=?[\d.]+|CHANDATA ?\( ?\d{1,3} ?\)|"
@@ -404,7 +403,7 @@ _TABLE_VARIABLES = {head + key for head in ("AN_CEC", "AA_ENC_COMP") for key in 
 
 
 def noted_table(part: TableParts, prefix: str, travel_mm: tuple[float, float], findings: Findings) -> LinearTable:
-    """Return the table of a real control, and note what is unusual about it; ``travel_mm`` of its input axis."""
+    """Return the table of a real control and note anything unusual; ``travel_mm`` is the travel of its input axis."""
     table, surplus, doubt_um = part.foreign_table(prefix)
     modulo = part.scalars.get(f"{prefix}_IS_MODULO")
     if modulo is None:
@@ -429,7 +428,7 @@ def noted_table(part: TableParts, prefix: str, travel_mm: tuple[float, float], f
 
 @dataclass(frozen=True)
 class _ArchivePart:
-    """One file of an archive: its name, its kind (``INI``, ``SPF``; empty: not said), and its numbered lines."""
+    """One file of an archive: its name, its kind (``INI``, ``SPF``; empty: not stated), and its numbered lines."""
 
     name: str
     kind: str
@@ -437,19 +436,19 @@ class _ArchivePart:
 
     @property
     def writes_tables(self) -> bool:
-        """Whether some line, comments aside, gives a table a value."""
+        """Whether any line other than a comment assigns a value to a table."""
         return any(_WRITES_TABLE.match(line.upper()) for _, line in self.lines)
 
 
 @dataclass(frozen=True)
 class ArchiveAssignments:
-    """Assignments of a real file: those of the tables, and switches elsewhere in an archive."""
+    """Assignments of a real file: table assignments, and switches elsewhere in an archive."""
 
     items: list[Assignment]
     machine_data: dict[tuple[str, tuple[str, ...]], Assignment]
 
     def switched_off(self, variable: str, index: tuple[str, ...]) -> bool:
-        """Whether the machine data of an archive say 0 for a switch; False where they do not say it."""
+        """Whether the machine data of an archive set a switch to 0; False if they do not contain it."""
         item = self.machine_data.get((variable, index))
         return item is not None and item.number() == 0
 
@@ -457,13 +456,13 @@ class ArchiveAssignments:
 def foreign_assignments(
     files: Sequence[SourceFile], tables: Mapping[str, int], findings: Findings
 ) -> ArchiveAssignments:
-    """Return the assignments of tables and switches of real files; InputError with the line for what is not understood.
+    """Return the assignments to tables and switches in real files; InputError with the line if not understood.
 
     Parameters
     ----------
-    files : archives, punched files, sub-programs; text as it was decoded, NUL bytes included.
-    tables : the variables to be read, without ``$``, and how many indices each has.
-    findings : gets what is passed over.
+    files : archives, punched files, sub-programs; decoded text, NUL bytes included.
+    tables : the variables to read, without ``$``, and how many indices each has.
+    findings : receives what is skipped.
     """
     items: dict[tuple[str, tuple[str, ...]], Assignment] = {}
     machine_data: dict[tuple[str, tuple[str, ...]], Assignment] = {}
@@ -488,9 +487,9 @@ def foreign_assignments(
 
 
 def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], bool]:
-    """Return the parts of a text that are to be read, and whether it is an archive of several files.
+    """Return the parts of a text to read, and whether it is an archive of several files.
 
-    They are the only part, or the initialisation files of an archive; the others are counted.
+    These are the only part, or the initialisation files of an archive; other parts are counted.
     """
     found: list[_ArchivePart] = []
     name, kind = "", ""
@@ -530,7 +529,7 @@ def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], 
 def _assignments_of_part(
     source: SourceFile, part: _ArchivePart, tables: Mapping[str, int], findings: Findings, *, archive: bool
 ) -> Iterator[Assignment]:
-    """Assignments of one part that matter; the others are counted, what is not understood is refused."""
+    """Yield the relevant assignments of one part; others are counted, anything not understood is refused."""
     ended, any_table, number = False, False, 0
     for number, line in part.lines:
         code = _BLOCK_NUMBER.sub("", line.partition(";")[0].strip().upper(), count=1)
@@ -541,7 +540,7 @@ def _assignments_of_part(
             continue
         match = _ARCHIVE_ASSIGNMENT.fullmatch(" ".join(code.split())) if code.startswith("$") else None
         if match is None:
-            # what is not an assignment must not change a table: inch, jumps, calculations, anything with a table in it
+            # other statements must not change a table: refuse inch, jumps, calculations, anything that mentions a table
             if _INCH_WORD.fullmatch(code):
                 raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
             if not _IDLE_WORD.fullmatch(code) and (not archive or _MENTIONS_TABLE.search(code)):
@@ -565,7 +564,7 @@ def _assignments_of_part(
 def _item(
     source: SourceFile, number: int, match: re.Match[str], tables: Mapping[str, int], findings: Findings
 ) -> Assignment | None:
-    """One assignment if it belongs to the tables; None for what is passed over."""
+    """One assignment if it belongs to the tables; None if it is skipped."""
     variable, index_text, value = match.group(1), match.group(2) or "", match.group(3).strip()
     index = _plain_indices(index_text) if index_text.strip() else ()
     plain, unusual = _plain_value(value)
@@ -599,7 +598,7 @@ def _item(
 
 
 def _plain_value(value: str) -> tuple[str, str]:
-    """A value as the control writes it (1 for TRUE, a point, no exponent), and what was unusual about it."""
+    """A value as the control writes it (1 for TRUE, decimal point, no exponent), and what was unusual about it."""
     if value in _TRUTH:
         return _TRUTH[value], ""
     if _COMMA_NUMBER.fullmatch(value):
