@@ -1,4 +1,4 @@
-"""Where model and measurement disagree, and the effect that explains it."""
+"""Where the model and the measurement disagree, and which effect explains it."""
 
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis
 from compgen.diagnose.diagnose import DiagnoseOptions, diagnose

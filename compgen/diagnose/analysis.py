@@ -1,4 +1,4 @@
-"""The diagnosis of one measurement up to the chosen set, with lack of fit and homogeneity."""
+"""Diagnosis of one measurement up to the chosen set of effects, with lack of fit and homogeneity."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from compgen.diagnose.search import (
     search,
 )
 
-# What speaks for and against a set of groups: lack of fit, what is left over, changes from run to run, homogeneity.
+# Evidence for and against a set of groups: lack of fit, what remains, changes from run to run, homogeneity.
 
 
-#: Limits: standard normal deviate of the lack of fit, likelihood ratio of runs, p-value of the homogeneity.
+#: Limits: standard normal deviate of the lack of fit, likelihood ratio of the runs, p-value of the homogeneity test.
 LACK_OF_FIT_Z = 3.0
 RUN_RATIO = 12.0
 HOMOGENEITY_P = 2e-3
-#: Evidence of the best remaining generic group, in units of the criterion beyond its handicap.
+#: Least evidence for the best remaining generic group, in units of the criterion above its handicap.
 DIRECTED, DIRECTED_SLOW = 20.0, 26.0
 
 
 @dataclass(frozen=True)
 class Remaining:
-    """A generic group that is left over, with its evidence (2 log, without handicap)."""
+    """A remaining generic group with its evidence (2 log, without handicap)."""
 
     group: int
     evidence: float
@@ -56,17 +56,17 @@ class Remaining:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for a set.
+    """Evidence for a set of groups.
 
     Parameters
     ----------
     lack_of_fit_z : deviate of the global lack of fit against pure error; nan without repeats.
-    directed : generic groups that are left over, best first.
-    run_ratio : likelihood ratio of what changes from run to run.
-    homogeneity_p : p-value of every named member, by its group.
-    uneven : chi-square that the unevenness of every named member explains, by its group.
-    chi2 : drop-one chi-square of every member, by its group.
-    excess : residual sum of squares beyond its expectation.
+    directed : remaining generic groups, best first.
+    run_ratio : likelihood ratio of the changes from run to run.
+    homogeneity_p : p-value of each named member, keyed by group.
+    uneven : chi-square explained by the unevenness of each named member, keyed by group.
+    chi2 : drop-one chi-square of each member, keyed by group.
+    excess : residual sum of squares above its expected value.
     """
 
     lack_of_fit_z: float
@@ -79,12 +79,12 @@ class Evidence:
 
     @property
     def misfits(self) -> bool:
-        """Whether the set leaves something that the noise does not explain."""
+        """Whether the residuals after fitting the set exceed what the noise explains."""
         return bool(self.lack_of_fit_z > LACK_OF_FIT_Z) or bool(self.directed)
 
     @property
     def changes_between_runs(self) -> bool:
-        """Whether repeats of a line differ by more than the noise within them."""
+        """Whether repeats of a line differ by more than the noise within a repeat."""
         return self.run_ratio > RUN_RATIO
 
 
@@ -95,14 +95,14 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
     named = [g for g in chosen.members if design.groups[g].tier == "named"]
     chi2 = {g: gain_of(design, [m for m in chosen.members if m != g], g) for g in chosen.members}
     even = {g: homogeneity(design, chosen, g, layout) for g in named}
-    # deviate of the F-test of what the set leaves, against the pure error of the repeats
+    # deviate of the F-test of the residuals after the set against the pure error of the repeats
     freedom, z = design.freedom - size, float("nan")
     if 0 < noise.freedom < freedom:
         error = noise.quadratic / noise.freedom
         f_ratio = (left - noise.quadratic) / (freedom - noise.freedom) / error
         p = float(fdtrc(freedom - noise.freedom, noise.freedom, f_ratio)) if f_ratio > 0 else 1.0
         z = -10.0 if f_ratio <= 0 else float(-ndtri(p)) if p > 0 else 40.0
-    # generic groups with more evidence left than chance gives
+    # generic groups whose remaining evidence exceeds chance
     generic = [
         g for g, group in enumerate(design.groups)
         if group.tier == "generic" and g not in chosen.members and design.size(g)
@@ -125,7 +125,7 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
 
 
 def contribution(design: Design, chosen: Chosen, member: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Parameters (k,) of a member fitted together with the others, their covariance (k, k), and its raw contribution (n,)."""
+    """Parameters (k,) of a member in the joint fit, their covariance (k, k), and its raw contribution (n,)."""
     index = design.coordinates(chosen.members)
     solution, inverse = _solved(design.rows(chosen.members)[:, index], design.score[index])
     offsets = np.cumsum([0, *(design.size(g) for g in chosen.members)])
@@ -145,7 +145,7 @@ def _solved(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def leftover(design: Design, chosen: Chosen) -> FloatArray:
-    """Whitened residual without base model and chosen set, scaled to the degrees of freedom that are left, (N,)."""
+    """Whitened residual after base model and chosen set, scaled to the remaining degrees of freedom, (N,)."""
     basis = orthonormal(design.directions(chosen.members)) if chosen.members else None
     left = design.residual if basis is None else design.residual - basis @ (basis.T @ design.residual)
     used = design.count - design.freedom + (0 if basis is None else basis.shape[1])
@@ -155,8 +155,8 @@ def leftover(design: Design, chosen: Chosen) -> FloatArray:
 def homogeneity(design: Design, chosen: Chosen, member: int, layout: MeasurementLayout) -> tuple[float, float]:
     """p-value of the test that an effect has the same size everywhere, and the chi-square of its unevenness.
 
-    Its contribution is multiplied by stations, quarters of the time, load, directions and position; a true effect
-    leaves nothing for these products to explain, a wrong name that takes up part of something else does.
+    Its contribution is multiplied by stations, Legendre terms in time, load, directions and position. These products
+    explain nothing if the effect is real; they do if a wrong name has absorbed part of another effect.
     """
     effect = design.groups[member].effect
     assert effect is not None
@@ -189,20 +189,20 @@ def homogeneity(design: Design, chosen: Chosen, member: int, layout: Measurement
     return float(fdtrc(k, freedom, gained / k / max(left / freedom, 1e-300))), gained
 
 
-# The diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence.
+# Diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence.
 
 
 Show = Callable[[str], None]
 
-#: Share of what wider curves explain above which one smooth term in one direction replaces them.
+#: If one smooth term in one direction explains at least this share of what wider curves explain, it replaces them.
 ONE_TERM = 0.85
-#: Named effects that wider curves are compared with.
+#: Most named effects that the wider curves compete with.
 MOST_NAMED = 4
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Everything that the verdict is drawn from; ``missing`` are effects whose covariates the data lack."""
+    """All results that the verdict is based on; ``missing`` are effects whose covariates are not in the data."""
 
     fit: BaseFit
     noise: Noise
@@ -226,10 +226,10 @@ def analyse(
     Parameters
     ----------
     fit : the base fit.
-    most_named : largest number of named effects.
+    most_named : maximum number of named effects.
     only : names of effects to look for; default all.
-    sigma_mm : standard uncertainty of each reading, (n,), if one is given.
-    show : is told each step in words.
+    sigma_mm : standard uncertainty of each reading, (n,), if given.
+    show : called with a description of each step.
     """
     show("building the catalogue")
     repeats = has_repeats(fit.observed.layout)
@@ -253,7 +253,7 @@ def analyse(
     if more:
         show("fitting the noise together with what was found")
         noise = noise_of(fit, [*fixed, *more] if repeats else more, sigma_mm=sigma_mm, before=noise)
-        del design  # before the next one is built: it is large
+        del design  # free the memory before the next one is built
         design = design_of(fit, groups, whitener(fit.observed.layout, noise))
         rules = rules_of(design, most_named)
         chosen = search(design, rules)
@@ -264,17 +264,17 @@ def analyse(
 
 
 def _groups_of(fit: BaseFit, only: Sequence[str]) -> tuple[list[Group], list[str], list[Group]]:
-    """All groups of the search, names that lack a covariate, and the named groups that have no scan position."""
+    """All groups of the search, names without the covariate they need, and named groups with a single scan position."""
     named, missing = named_groups(fit.readings, only)
     groups = [*base_groups(fit.readings), *named, *generic_groups(fit.readings, fit.observed.layout)]
     return groups, missing, [group for group in named if group.scans == 1]
 
 
 def needed(design: Design, wider: Sequence[Wider]) -> list[Wider]:
-    """Return the wider bases that are worth their columns in addition to the names, and that no single smooth term replaces.
+    """Return the wider bases that justify their columns next to named effects and that no single smooth term replaces.
 
-    A machine whose curves are steeper has them in several errors of an axis; what acts in one direction alone is
-    something else.
+    A machine with steeper curves has them in several errors of an axis; an effect in only one direction has another
+    cause.
     """
     groups = design.groups
     along = [g for g, group in enumerate(groups) if group.covariates in (("x",), ("y",), ("z",))]

@@ -1,4 +1,4 @@
-"""What may change within a session of axis runs: names of the catalogue, and smooth terms without a name."""
+"""What may change within a session of axis runs: effects of the catalogue, and smooth terms without a name."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from compgen.diagnose.axis_session import AxisSession
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Effect, catalogue
 
-#: Number of positions that count for the time constant of a warm-up (the columns are nearly alike), and for a drift at a
-#: constant rate: as slow as these sessions are, most drifts are the beginning or the end of a warm-up.
+#: Scan positions charged for the time constant of a warm-up (the columns are nearly alike), and for a drift at a
+#: constant rate: in sessions this slow, most drifts are the beginning or the end of a warm-up.
 WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
-#: Waves in the session that are tried, and what they count as (neighbours are nearly alike).
+#: Numbers of waves per session that are tried, and the scan positions charged for them (neighbours are nearly alike).
 WAVES, WAVE_SCANS = np.concatenate([np.arange(0.5, 4.1, 0.25), np.arange(4.5, 10.1, 0.5)]), 10.0
-#: Waves in a run from which a swing is doubtful beside a reversal, and the share of a swing that must be left to see.
+#: Waves per run from which a swing can be confused with a reversal, and the share of a swing that must remain visible.
 RUN_LIKE, LEAST_WAVE = 0.6, 0.3
-#: Time constants of a jump that fades, as shares of the session, and most readings at which it may begin.
+#: Time constants of a fading jump, as shares of the session, and the maximum number of readings at which it may begin.
 FADING, MOST_ONSETS = (0.07, 0.2), 150
-#: Most columns of "every target of every run has a value of its own", and the degree of the curve of a run.
+#: Most columns of "every target of every run has a separate value", and the degree of the curve of a run.
 MOST_OF_RUNS, CURVE = 60, 4
-#: Windows of disturbed readings are looked for in sessions up to this size; beyond it, one reading in several begins one.
+#: Windows of disturbed readings that are tried; if there are k times as many, only every k-th.
 MOST_WINDOWS = 800
-#: Numbers of readings in a burst that are tried; those up to LONGEST_FREE may each have a value of their own.
+#: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
 
 def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candidate]:
-    """Return everything that is compared; ``only`` limits the names."""
+    """Return all candidates to compare; ``only`` limits the names."""
     known = catalogue()
     warm = known["warmup_drift"]
     slow = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
@@ -44,7 +44,7 @@ def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candid
 
 
 def invisible_of(session: AxisSession) -> tuple[str, ...]:
-    """Names that these runs cannot show: what is equal in every run is part of the curve of the axis."""
+    """Names that these runs cannot show: whatever is the same in every run is part of the curve of the axis."""
     letter = session.letter
     hidden = [f"periodic_{letter}"]
     seen = {candidate.name for candidate in _logged(session, catalogue())}
@@ -80,12 +80,12 @@ def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]
 
 
 def _runs(session: AxisSession) -> float:
-    """Positions that count for a step or a bad run; equal, so that the first run off and a step after it weigh the same."""
+    """Scan positions charged for a step or a bad run: equal, so a bad first run and a step after it weigh the same."""
     return float(session.leg.max()) + 1.0
 
 
 def _disturbed(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
-    """One run (or one way of it) that is off, and shorter bursts."""
+    """One run that is off, in one or both directions, and shorter bursts."""
     bad, burst = known["bad_run"], known["disturbed_readings"]
     runs = set() if not session.in_runs else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
     runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)} if runs else set()
@@ -114,7 +114,7 @@ def _disturbed(session: AxisSession, known: Mapping[str, Effect]) -> list[Candid
 
 
 def _free(item: Candidate, count: int) -> Candidate:
-    """The same readings of a session with ``count``, each with a value of its own."""
+    """The same readings, each with a separate value; the session has ``count`` readings."""
     return replace(item, columns=np.eye(count, item.last - item.first + 1, -item.first), free=True)
 
 
@@ -124,7 +124,7 @@ def _ends(chosen: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def _logged(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
-    """Effects that need a temperature or a dwell that was logged and changed between repeats."""
+    """Effects that need a logged temperature or dwell that changed between repeats."""
     found = []
     for name in _logged_names(session.letter):
         effect = known[name]
@@ -137,7 +137,7 @@ def _logged(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate
 
 
 def _varies(session: AxisSession, columns: FloatArray, least: float = 1e-3) -> bool:
-    """Whether something is left of columns beside the means of the cells."""
+    """Whether anything is left of the columns after subtracting the means of the cells."""
     count = np.bincount(session.cell)[:, None]
     means = np.stack([np.bincount(session.cell, column) for column in columns.T], axis=1) / count
     return bool(np.linalg.norm(columns - means[session.cell]) > least * np.linalg.norm(columns))
@@ -166,7 +166,7 @@ def _generic(session: AxisSession) -> list[Candidate]:
     for waves in WAVES.tolist():
         angle = np.pi * (t + 1) * waves
         text = f"the readings swing with time, about {waves:.3g} waves in the session"
-        # a wave as long as a run looks like a reversal, and one of exactly that length is part of the curve of the axis
+        # a wave about as long as a run looks like a reversal; one of exactly that length is part of the axis curve
         as_run = waves > RUN_LIKE * (int(session.cycle.max()) + 1)
         columns = np.column_stack([np.sin(angle), np.cos(angle)])
         add(text, ("time", "approach") if as_run else ("time",), columns, WAVE_SCANS, LEAST_WAVE)
@@ -207,7 +207,7 @@ def _generic(session: AxisSession) -> list[Candidate]:
 
 
 def _products(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Every column of the one times every column of the other."""
+    """Every column of ``first`` times every column of ``second``."""
     return np.asarray((first[:, :, None] * second[:, None, :]).reshape(len(first), -1))
 
 

@@ -1,8 +1,8 @@
-"""Diagnosis of axis runs (ISO 230-2): what changed during the session, what the reversal is, and figures without the former.
+"""Diagnosis of axis runs (ISO 230-2): changes during the session, the reversal, and the figures without the changes.
 
-First what changes with time, from the scatter within the cells (one target in one direction), in which everything static
-cancels. Then the reversal, from the means of the cells, with the noise and the changes found before. What changed with
-time is taken off the readings in one piece, and B, M, E, R and A follow from the same readings before and after.
+Changes with time come first, from the scatter within the cells (one target in one direction), where everything static
+cancels. The reversal follows from the means of the cells, with the noise and the changes already found. The changes are
+subtracted from the readings together, and B, M, E, R and A are computed from the same readings before and after.
 """
 
 from __future__ import annotations
@@ -34,66 +34,67 @@ from compgen.kinematics.kernel_switch import one_thread
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
 Show = Callable[[str], None]
 
-#: What statistics cannot tell.
+#: What statistics cannot decide.
 WARM_UP_NOTE = (
     "a warm-up of the machine and one of the sensor look alike: only a stationary drift test distinguishes them"
 )
 NO_REPEATS = "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
-#: Figures that are shown: reversal, its mean, systematic deviations, repeatability and accuracy, um.
+#: Figures shown, um: reversal, range of mean bidirectional deviation, systematic deviation, repeatability, accuracy.
 SHOWN = ("B", "M", "E", "R", "A")
-#: Readings beside the means of the targets, and beside those of the cells, below which nothing is said.
+#: Least degrees of freedom after fitting the means of the targets, and after fitting those of the cells.
 LEAST_FREEDOM, LEAST_REPEATS = 20, 8
-#: p-value of backlash, and of a reversal that varies along the axis.
+#: p-value required for backlash and for a reversal that varies along the axis.
 REVERSAL_P = 1.5e-3
-#: A reversal within this many standard uncertainties of zero at an end of the axis begins there.
+#: A reversal within this many standard uncertainties of zero at an end of the axis is taken to start from zero there.
 ZERO_AT_END = 2.5
-#: The smooth part must explain this share of a reversal that varies, else its law is not known.
+#: The smooth part must explain this share of a varying reversal; otherwise its law is unknown.
 SMOOTH_SHARE = 0.7
-#: Names within this of the best criterion are reported as alternatives (99 %).
+#: Names whose criterion is within this of the best are reported as alternatives (99 %).
 ALIAS = 9.2
-#: A name that explains less than this share of what has no name is tentative.
+#: A named effect that explains less than this share of what the unnamed terms explain is tentative.
 LEAST_SHARE = 0.5
-#: The same for a drift beside something smooth in time, which could as well be part of it.
+#: The same for a drift found together with a smooth term in time, of which it could be a part.
 LEAST_SHARE_OF_DRIFT = 2.0
-#: Chi-square that a reversal needs beside something without a name, and beside runs that do not repeat.
+#: Chi-square that a reversal needs if something unnamed was found, and if the runs do not repeat.
 LEAST_BESIDE, LEAST_BESIDE_RUNS = 40.0, 200.0
-#: An effect must not depend on position, direction or time by more than this share of itself.
+#: An effect may vary with position, direction or time by at most this share of itself; p-value of the test.
 UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
-#: Time constant of a step that fades, as a share of the session; readings that a disturbance must have to show that it does.
+#: Time constant of a fading step, as a share of the session; least readings of a disturbance to test it for fading.
 FADES, LEAST_WINDOW = 0.15, 4
-#: A warm-up with a time constant beyond this share of the session has hardly begun to level off.
+#: A warm-up whose time constant exceeds this multiple of the session has hardly begun to level off.
 HARDLY_LEVELS = 1.5
-#: A tentative drift is taken off where the means of the runs move in the second half by no more than this share of the
-#: first, and where no more than this share of their movement is left.
+#: A tentative drift is subtracted if the means of the runs move in the second half by no more than this share of their
+#: movement in the first half, and if no more than this share of their movement remains.
 LEVELS_OFF, LEAST_FOLLOWED = 0.8, 0.5
-#: Why a name is tentative whose drift has a part that differs along the axis or by direction.
+#: Why a drift is tentative if part of it differs along the axis or by direction.
 NOT_THE_SAME = "the drift is not the same at all positions and in both directions"
-#: Excess kurtosis of what is left, freed from its memory, beyond which that is no noise (in 200 sessions with noise of a
-#: memory up to 0.85 the largest was 2.0), and the skewness over its standard error.
+#: Limits for the whitened residuals to count as noise: excess kurtosis (the largest in 200 sessions with noise of
+#: memory up to 0.85 was 2.0), and skewness over its standard error.
 JUMPS, LEANS = 3.0, 4.5
-#: Memory that noise of a measurement may have; twice the log likelihood that a longer one must bring, or such a memory.
+#: Usual upper limit of the memory of measurement noise; gain in twice the log likelihood that shows a longer memory;
+#: memory above which the readings count as wandering in any case.
 USUAL_MEMORY, WANDERS, MOST_MEMORY = 0.9, 5.0, 0.94
-#: Twice the log likelihood that a scatter which changes with time must bring, the same with position or direction, and the
-#: natural logarithms of the scatter at one end over that at the other that are tried (in 20 sessions the largest was 8.1).
+#: Gain in twice the log likelihood required for a scatter that changes with time, and with position or direction; trial
+#: values of the natural logarithm of the scatter ratio of the two ends (the largest gain in 20 sessions was 8.1).
 SCATTER_GROWS, SCATTER_CHANGES, SCATTERS = 10.0, 13.0, (-2.0, -1.4, -0.8, 0.8, 1.4, 2.0)
-#: Memory from which a note says that the scatter has one.
+#: Memory above which a note reports it.
 MEMORY = 0.5
-#: Correlation of time and position from which a session that goes target by target cannot tell them apart.
+#: Correlation of time and position above which a session measured target by target cannot separate the two.
 ALIKE = 0.7
-#: Weight from which one effect of whole runs may as well be the other.
+#: Weight above which one effect of whole runs could equally be the other.
 AS_WELL = 0.2
-#: Effects whose readings are left out of the figures; all other changes are taken off.
+#: Effects whose readings are left out of the figures; all other changes are subtracted.
 LEFT_OUT = ("bad_run", "disturbed_readings")
-#: Effects of the machine that a machine file keeps; a warm-up of one session is not among them.
+#: Effects that are stored in a machine file; the warm-up of one session is not one of them.
 MACHINE_EFFECTS = ("thermal_scale", "spindle_growth", "servo_lag")
 
 
 @dataclass(frozen=True)
 class AxisEffect:
-    """A named effect: parameters as (value, u) by name in the unit of the name; ``shift_mm`` (n,) is what it adds.
+    """A named effect: parameters (value, u) keyed by name, in the unit of the name; ``shift_mm`` (n,) is what it adds.
 
-    ``left_out`` are readings (numbers in time) that are of no use because of it. ``remains`` says what of a tentative drift
-    is taken off all the same, and what stays; empty for all others.
+    ``left_out`` are readings (numbers in time) that it makes unusable. ``remains`` says which part of a tentative drift
+    is subtracted anyway and which part stays; empty for all other effects.
     """
 
     name: str
@@ -115,7 +116,7 @@ class AxisEffect:
 
 @dataclass(frozen=True)
 class AxisUnknown:
-    """Something without a name, in words, what it depends on, its RMS, and the name that it resembles, if any."""
+    """An unnamed effect: description, what it depends on, RMS, and the name that it resembles, if any."""
 
     text: str
     covariates: tuple[str, ...]
@@ -125,7 +126,7 @@ class AxisUnknown:
 
 @dataclass(frozen=True)
 class AxisFindings:
-    """What was found on one axis; ``phi`` is the correlation of neighbouring readings, ``sigma_mm`` their scatter."""
+    """Findings for one axis; ``phi`` is the correlation of neighbouring readings, ``sigma_mm`` their scatter."""
 
     session: AxisSession
     effects: tuple[AxisEffect, ...]
@@ -154,7 +155,7 @@ class AxisFindings:
 
 
 def check_axis_names(machine: Machine, runs: AxisRuns, names: Sequence[str]) -> None:
-    """Raise InputError for names that no axis run can show."""
+    """Raise InputError for names that axis runs cannot show."""
     letters = {AXES[axis] for axis in runs.axes}
     known = [
         name for name, effect in catalogue().items()
@@ -177,15 +178,15 @@ def findings_of(
     against: ErrorTable | None = None,
     show: Show = lambda _: None,
 ) -> list[AxisFindings]:
-    """Diagnose every axis by itself.
+    """Diagnose each axis separately.
 
     Parameters
     ----------
     machine, runs : the machine and its runs.
-    order : where the order of time comes from.
-    most : most changes with time at once.
+    order : how the readings are ordered in time.
+    most : maximum number of changes with time.
     only : names to look for; default all.
-    add : names that are added whether they were found or not.
+    add : names to add whether found or not.
     u_um : standard uncertainty of a reading; used where nothing was repeated.
     against : errors that the mean curve is compared with.
     """
@@ -195,7 +196,7 @@ def findings_of(
     found = []
     value, active = runs.deviation_mm.copy(), active_effects(machine)
     for session in sessions_of(machine, runs, order) if active else ():
-        for item in active:  # what the machine file says already is taken off
+        for item in active:  # subtract the effects that are already in the machine file
             change = item.change_mm(session.readings)
             if change is not None:
                 value[session.row] -= change
@@ -232,7 +233,7 @@ def _findings(
     if repeated and not unknown:
         unknown = _restless(changes)
     static, irregular = reversal.found(names, add, source)
-    # a reversal is doubtful where it changes with time, and a small one where anything else has no name
+    # a reversal is doubtful if it changes with time; a small one also if anything else is unnamed
     if any({"time", "approach"} <= set(other.covariates) for other in unknown):
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
@@ -258,10 +259,10 @@ def _findings(
 
 
 def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list[AxisUnknown]]:
-    """The changes with time: those with a name, the most telling first, and those without one.
+    """The changes with time: named ones, the strongest first, and unnamed ones.
 
-    Of what goes by whole runs (a run that is off, a step) one of each kind is a name; where there are more, the runs do not
-    repeat. The last run off and a step before it are the same readings: they count as the one of which there is none yet.
+    Of the effects on whole runs (a bad run, a step), one of each kind is accepted; if there are more, the runs do not
+    repeat. A bad last run and a step before it affect the same readings: it counts as the kind not found yet.
     """
     search, members = changes.search, changes.members
     generic = [k for k in members if search.candidates[k].tier == "generic"]
@@ -281,7 +282,7 @@ def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list
 
 
 def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, ...]:
-    """("time", "approach") if the runs that are off are all of one direction: then it is the reversal that changes."""
+    """("time", "approach") if all bad runs have the same direction: then the reversal changes."""
     off = [session.direction[item.left_out] for item in effects if item.name == "bad_run"]
     alike = off and np.ptp(np.concatenate(off)) == 0
     return ("time", "approach") if alike else ()
@@ -294,7 +295,7 @@ def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
 def _common_part(
     session: AxisSession, item: AxisEffect, effects: Sequence[AxisEffect], changes: _Changes
 ) -> AxisEffect:
-    """A tentative drift with the sentence that it is taken off, if the means of the runs show it."""
+    """Add to a tentative drift the statement that it is subtracted, if the means of the runs show it."""
     if item.name not in DRIFTS or item.grade != "tentative" or not session.in_runs:
         return item
     off = [other.left_out for other in effects if other.grade != "tentative"]
@@ -316,10 +317,10 @@ def _common_part(
 
 
 def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
-    """Whether the means of the runs (ways, runs) go one way and less and less, up and down alike, as the drift does.
+    """Whether the means of the runs (ways, runs) move in one sense and level off, up and down alike, as the drift does.
 
-    A way by itself (one direction) may differ from this by what the uncertainty ``u_mm`` of a mean allows, two of them for
-    each difference of means.
+    A single way (one direction) may deviate from this within the uncertainty: twice that of each difference of means,
+    where one mean has the uncertainty ``u_mm``.
     """
     runs = means.shape[1]
     if runs < 3 or not np.isfinite(means).all():
@@ -327,7 +328,7 @@ def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
     sense, half = np.sign(drift[:, -1].sum() - drift[:, 0].sum()), (runs - 1) // 2
     up, left = sense * means, (sense * (means - drift)).mean(axis=0)
     first, second = up[:, half] - up[:, 0], up[:, -1] - up[:, -1 - half]
-    # of a difference, and of a difference of two with one in common
+    # twice the uncertainty of a difference of means, and of the difference of two of these with one mean in common
     step, turn = 2.0 * 2.0**0.5 * u_mm, 2.0 * 6.0**0.5 * u_mm
     return bool(
         np.diff(up).min() > -step
@@ -339,7 +340,7 @@ def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
 
 
 def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
-    """Members with the best position of every name that the user wants."""
+    """Members plus the best scan position of every name requested by the user."""
     for name in add:
         own = [k for k, c in enumerate(search.candidates) if c.name == name]
         if own and not any(search.candidates[k].name == name for k in members):
@@ -349,7 +350,7 @@ def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
 
 
 class _Changes:
-    """The chosen changes with time, fitted beside the means of the cells, weighted over the grid of noise."""
+    """The chosen changes with time, fitted together with the means of the cells, weighted over the noise grid."""
 
     def __init__(self, search: Search, members: Sequence[int]) -> None:
         self.search, self.members, self.session = search, list(members), search.session
@@ -368,7 +369,7 @@ class _Changes:
         self.phi = float(self.weights @ (points[:, 0] * (1.0 - points[:, 1])))
 
     def estimate(self, columns: FloatArray, extra: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values and covariance of ``extra`` (n, k) beside ``columns`` (n, m), both weighted over the grid."""
+        """Values and covariance of ``extra`` (n, k), fitted with ``columns`` (n, m), both weighted over the grid."""
         design = np.hstack([columns, extra])
         value, square, total = np.zeros(extra.shape[1]), np.zeros((extra.shape[1],) * 2), []
         for point, (weight, rss) in enumerate(zip(self.weights, self.square, strict=True)):
@@ -385,7 +386,7 @@ class _Changes:
 
 
 def _restless(changes: _Changes) -> list[AxisUnknown]:
-    """What is left jumps, leans to one side, wanders, or does not scatter equally, more than noise does."""
+    """Residuals that jump, are skewed, wander, or scatter unequally, more than noise does."""
     session, point = changes.session, int(np.argmax(changes.weights))
     design = np.hstack([changes.grid.cells, changes.columns])
     inverse = changes.grid.inverse(point)
@@ -412,7 +413,7 @@ def _restless(changes: _Changes) -> list[AxisUnknown]:
 
 
 def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
-    """A scatter that grows or falls along the session, along the axis, or differs by direction."""
+    """A scatter that changes during the session, along the axis, or with direction."""
     session, search = changes.session, changes.search
     chosen = np.flatnonzero(changes.weights > 0.1 * changes.weights.max())
     points = [changes.grid.points[k] for k in chosen]
@@ -446,7 +447,7 @@ def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
 
 
 def _left(grid: NoiseGrid, point: int, y: FloatArray, columns: FloatArray) -> float:
-    """Return y'Py beside columns (n, k)."""
+    """Return y'Py with columns (n, k) fitted."""
     pulled = grid.free(point, np.column_stack([y, columns]))
     gram = columns.T @ pulled[:, 1:]
     right = columns.T @ pulled[:, 0]
@@ -486,7 +487,7 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
         for parameter, v in zip(item.effect.card.parameters, own, strict=False)
     }
     parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
-    if item.name in DRIFTS:  # what remains is the state at the end of the session, the warm one
+    if item.name in DRIFTS:  # refer the readings to the end of the session, the warm state
         shift = shift - shift[-1]
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
     return AxisEffect(
@@ -497,7 +498,7 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
 
 
 def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str, float], ...]:
-    """Names that explain the readings nearly as well instead of a member, with their weights."""
+    """Names that explain the readings nearly as well as a member, with their weights."""
     best: dict[str, float] = {}
     for k, candidate in enumerate(search.candidates):
         if candidate.tier == "named" and criteria[member] - criteria[k] < ALIAS:
@@ -510,14 +511,14 @@ def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str
 
 
 def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, float]:
-    """p-value that an effect depends on position, direction or time, and the share of it that does."""
+    """p-value of the test whether an effect depends on position, direction or time, and the share that does."""
     session = changes.session
     item = changes.search.candidates[member]
     half = np.where(session.time > np.median(session.time), 1.0, -1.0)
     unit = shift / max(float(np.abs(shift).max()), 1e-12)
     columns = np.hstack([changes.grid.cells, changes.columns])
     fading, number = [], np.arange(len(session), dtype=np.float64)
-    # what a step or a disturbance would do that fades, beside the column of its name
+    # shape of a fading step or disturbance, in addition to the column of the effect
     if item.name == "step_between_runs":
         since = number - item.effect.settings["at"] if item.effect is not None else number
         fading = [np.where(since >= 0.0, np.exp(-np.maximum(since, 0.0) / (FADES * len(session))), 0.0)]
@@ -545,7 +546,7 @@ def _text(
     parameters: Mapping[str, tuple[float, float | None]],
     alias: Sequence[tuple[str, float]],
 ) -> str:
-    """Say in words what was found."""
+    """Describe what was found."""
     size = next((value for key, (value, _) in parameters.items() if key.startswith("c")), float("nan"))
     span = float(session.time[-1] - session.time[0])
     if item.name == "warmup_drift":
@@ -577,7 +578,7 @@ def _text(
 
 
 def _unknown_of(changes: _Changes, member: int) -> AxisUnknown:
-    """A smooth term without a name, and the name that comes nearest to it."""
+    """An unnamed smooth term, with the name that resembles it most."""
     search = changes.search
     item = search.candidates[member]
     rest = [k for k in changes.members if k != member]
@@ -596,7 +597,7 @@ def _unknown_of(changes: _Changes, member: int) -> AxisUnknown:
 
 
 class _Reversal:
-    """Half the difference of both directions at every target, with its covariance, beside the changes with time."""
+    """Half the difference up minus down at every target, with its covariance, fitted with the changes with time."""
 
     def __init__(self, changes: _Changes, u_um: float | None) -> None:
         self.changes, self.session = changes, changes.session
@@ -635,7 +636,7 @@ class _Reversal:
         return np.asarray(np.polynomial.legendre.legvander(self.s, degree))
 
     def _fit(self, shapes: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-        """Coefficients, covariance and chi-square that is left."""
+        """Coefficients, covariance and remaining chi-square."""
         inverse = np.linalg.pinv(self.covariance, rcond=1e-10, hermitian=True)
         covariance = np.linalg.pinv(shapes.T @ inverse @ shapes, rcond=1e-12, hermitian=True)
         value = np.asarray(covariance @ (shapes.T @ inverse @ self.half))
@@ -646,7 +647,7 @@ class _Reversal:
         return float(fdtrc(count, self.freedom, chi2 / count)) if count > 0 else 1.0
 
     def found(self, only: Sequence[str], add: Sequence[str], source: str) -> tuple[list[AxisEffect], list[AxisUnknown]]:
-        """Backlash and lost motion, and a reversal that follows no law."""
+        """Backlash and lost motion, and a reversal without a smooth law."""
         backlash, lost = f"backlash_{self.session.letter}", f"lost_motion_{self.session.letter}"
         if not len(self.targets):
             return [], []
@@ -679,7 +680,7 @@ class _Reversal:
         return effects, unknown
 
     def _alias(self, backlash: str, lost: str, left: float) -> tuple[tuple[str, float], ...]:
-        """Backlash, and lost motion where one that begins at zero at an end (or both) explains the readings nearly as well."""
+        """Backlash, and lost motion if one that is zero at an end (or both) explains the readings nearly as well."""
         shapes = (0.5 * (1.0 + self.s), 0.5 * (1.0 - self.s), 1.0 - self.s**2)
         other = min(self._fit(shape[:, None])[2] for shape in shapes)
         weight = 1.0 / (1.0 + np.exp(np.clip(0.5 * (left - other), -50.0, 50.0)))
@@ -687,8 +688,8 @@ class _Reversal:
         return tuple(entry for entry in found if entry[0] == backlash or entry[1] >= 0.01)
 
     def _constant(self, varies: bool, smooth: FloatArray, covariance: FloatArray, gain: float, irregular: bool) -> bool:
-        """Whether there is a backlash: a mean reversal that is not that of one which begins at zero at an end."""
-        if irregular:  # then the scatter from target to target is the noise of the mean
+        """Whether there is backlash: a mean reversal not explained by a reversal that starts from zero at an end."""
+        if irregular:  # the scatter from target to target then determines the uncertainty of the mean
             spread = self.half.std(ddof=1) / np.sqrt(len(self.half))
             p = 2.0 * float(stdtr(len(self.half) - 1, -abs(self.half.mean()) / max(spread, 1e-12)))
             if p > 0.02:
@@ -749,7 +750,7 @@ class _Reversal:
 
 
 def figures_of(session: AxisSession, deviation_mm: FloatArray, kept: IntArray) -> dict[str, float]:
-    """B, M, E, R, A of some readings in um, as far as they show them."""
+    """B, M, E, R, A of the readings ``kept`` in um, as far as they can be computed."""
     try:
         test = positioning_test(
             run_statistics(session.position_mm[kept], session.direction[kept].astype(np.float64), deviation_mm[kept])
@@ -765,9 +766,9 @@ def figures_of(session: AxisSession, deviation_mm: FloatArray, kept: IntArray) -
 def _taken_off(
     session: AxisSession, effects: Sequence[AxisEffect]
 ) -> tuple[FloatArray, IntArray, tuple[str, ...], dict[str, dict[str, float]], list[str]]:
-    """What is taken off each reading, which are left out, the names, and the figures before and after.
+    """What is subtracted from each reading, readings left out, names, figures before and after, and notes.
 
-    An effect without which R or A would be larger is not taken off: a small one can do that by chance.
+    Effects are dropped from the subtraction while it would make R or A larger: a small effect can do that by chance.
     """
     everything = np.arange(len(session))
     before = figures_of(session, session.deviation_mm, everything)
@@ -777,7 +778,7 @@ def _taken_off(
     notes: list[str] = []
     while True:
         left_out: IntArray = np.zeros(0, dtype=np.int64)
-        for item in kept_effects:  # no readings of a cell that would keep fewer than two
+        for item in kept_effects:  # leave out no readings of a cell that would keep fewer than two
             trial = np.union1d(left_out, item.left_out).astype(np.int64)
             rest = np.bincount(np.delete(session.cell, trial), minlength=int(session.cell.max()) + 1)
             if not len(item.left_out) or rest.min() >= 2:
@@ -800,7 +801,7 @@ def _taken_off(
 
 
 def _residuals(session: AxisSession, grid: NoiseGrid, effects: Sequence[AxisEffect]) -> tuple[FloatArray, FloatArray]:
-    """Readings less the means of their targets, without and with the effects, (n,)."""
+    """Readings minus the means of their targets, without and with the effects, (n,)."""
     base = np.eye(len(session.targets_mm))[session.target]
 
     def freed(values: FloatArray) -> FloatArray:
@@ -812,7 +813,7 @@ def _residuals(session: AxisSession, grid: NoiseGrid, effects: Sequence[AxisEffe
 
 
 def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: IntArray) -> tuple[float, float] | None:
-    """RMS of readings predicted from the others, without and with the changes that predict; one repeat of each cell in turn."""
+    """RMS of left-out readings minus their prediction, without and with the changes; one repeat per cell in turn."""
     changes = [item for item in effects if not item.static and not len(item.left_out)]
     if not changes or not session.repeated:
         return None
@@ -836,7 +837,7 @@ def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: Int
 
 
 def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
-    """The mean curve against predicted errors: RMS of the difference without its mean, and whether it is more than noise."""
+    """Mean curve against predicted errors: RMS of the difference without its mean, and whether it exceeds the noise."""
     session = changes.session
     name = f"E{session.letter}{session.letter}"
     predicted = errors.at(session.readings.position_mm)[:, ERROR_NAMES.index(name)]
@@ -856,7 +857,7 @@ def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
 
 @dataclass(frozen=True, repr=False)
 class AxisDiagnosis(DisplayedDiagnosis):
-    """Diagnosis of axis runs, one part for each axis."""
+    """Diagnosis of axis runs, with one part per axis."""
 
     machine: Machine
     runs: AxisRuns
@@ -864,13 +865,13 @@ class AxisDiagnosis(DisplayedDiagnosis):
 
     @property
     def word(self) -> str:
-        """Verdict: the most telling one of all axes."""
+        """Overall verdict: "named" before "unknown" before "none" over all axes."""
         words = [part.word for part in self.axes]
         return next((word for word in ("named", "unknown") if word in words), "none")
 
     @property
     def acceptable(self) -> bool:
-        """Whether the gap shrinks on readings left out wherever something was named that predicts."""
+        """Whether the misfit of left-out readings shrinks wherever a named effect predicts them."""
         return all(part.held_out is None or part.held_out[1] < part.held_out[0] for part in self.axes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -980,7 +981,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
         return found
 
     def extended(self) -> str:
-        """The machine file with what of the effects belongs to the machine; empty without such an effect or a file."""
+        """The machine file with the effects that belong to the machine; empty without such effects or a file."""
         sections = [text for part in self.axes for text in _sections(part)]
         if not sections or self.machine.file is None:
             return ""
@@ -988,7 +989,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
         return "\n".join([text, "", "", "# found by volcomp diagnose in axis runs", *sections])
 
     def removed_csv(self) -> str:
-        """What was taken off which reading, um: one row for each reading in the order of time."""
+        """What was subtracted from each reading, um: one row per reading in time order."""
         rows: dict[str, list[Any]] = {}
         names = list(
             dict.fromkeys(item.name for part in self.axes for item in part.effects if item.name in part.taken_off)
@@ -1030,7 +1031,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
 
 
 def _sections(part: AxisFindings) -> list[str]:
-    """``[effects.NAME]`` sections: the reversal in the normalisation of the machine file, and what follows temperatures."""
+    """``[effects.NAME]`` sections: the reversal, normalised as in the machine file, and the effects of the machine."""
     session, found = part.session, []
     reversal = np.zeros(3)
     for item in part.effects:

@@ -1,12 +1,12 @@
-"""What changes with time in the runs of one axis: noise with a memory, candidates, and the set of them that explains it.
+"""Changes with time in the runs of one axis: noise with memory, candidates, and the set of candidates that explains it.
 
     y = cell means + S c + noise,   cov(noise) = sigma^2 V,   V_ij = (1 - w) phi^|t_i - t_j| + w 1[i = j]
 
-The likelihood is that of the contrasts in which the cell means cancel (REML), sigma in closed form, summed over a grid of
-(phi, w): noise that wanders and an effect that wanders are weighed against each other and not fitted one after the other.
-A set S is judged by 2 log likelihood less a penalty for every member; the thresholds are calibrated by simulated
-sessions without any effect (docs/diagnosis-benchmark.md). An effect of one parameter is fitted freely; coefficients of
-several columns have a normal distribution of width lambda sigma, so that many columns cannot explain everything.
+The likelihood is computed from the contrasts in which the cell means cancel (REML), with sigma in closed form, and
+summed over a grid of (phi, w): wandering noise and a wandering effect are weighed against each other, not fitted in turn.
+The criterion of a set S is 2 log likelihood minus a penalty for every member; the thresholds are calibrated with
+simulated sessions without any effect (docs/diagnosis-benchmark.md). An effect with one parameter is fitted freely; the
+coefficients of several columns have a normal prior, or many columns could explain everything.
 """
 
 from __future__ import annotations
@@ -27,47 +27,47 @@ from compgen.effects import Effect
 
 Tier = Literal["named", "generic"]
 
-#: Correlation of neighbouring readings, and share of white noise beside the part with a memory.
+#: Correlation of neighbouring readings, and share of white noise next to the part with memory.
 PHI = (0.0, 0.25, 0.5, 0.7, 0.83, 0.92, 0.98)
 WHITE = (0.0, 0.4, 0.8)
-#: Logarithm of what speaks for each memory beforehand: what is alike over more than ten readings is rather a change than noise.
+#: Log prior of each memory: what stays similar over more than ten readings is more likely a change than noise.
 LOG_PRIOR = dict(zip(PHI, (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, -3.0), strict=True))
-#: Readings of resolution: residuals are never taken to be smaller than this, mm.
+#: Resolution of the readings: residuals are never assumed to be smaller than this, mm.
 LEAST_MM = 2e-6
-#: Variances over sigma^2 that the coefficients of several columns may have.
+#: Prior variances over sigma^2 that are tried for the coefficients of several columns.
 LAMBDA = np.array([2.0, 20.0, 200.0, 2000.0])
-#: The same for columns of a smooth term that are fitted freely, each at the price that a name pays for its own: large effects
-#: must not cost more in four columns than in three names.
+#: The same for columns of a smooth term that are fitted freely, each with the penalty of a named effect: a large effect
+#: must not cost more with four columns than with three names.
 FREE = 1e9
 LAMBDAS = np.append(LAMBDA, FREE)
 #: Names of slow drifts.
 DRIFTS = ("warmup_drift", "linear_drift")
-#: Smallest share of a column that must be left beside the means and the other members.
+#: Least share of a column that must remain after fitting the means and the other members.
 LEAST_SEEN = 1e-3
-#: Improvement of the criterion that a member must bring.
+#: Least improvement of the criterion by a member.
 LEAST_GAIN = 5.5
-#: Criteria closer than this are the same: the last run off, and a step before it, are the same readings.
+#: Criteria closer than this are equal: a bad last run and a step before it affect the same readings.
 SAME = 1e-6
-#: What a smooth term without a name must bring beyond a name.
+#: What an unnamed smooth term must gain in addition to what a named effect must.
 GENERIC_HANDICAP = 8.0
-#: Kinds of smooth terms from which a search begins.
+#: Kinds of smooth terms from which a search is started.
 STARTS = 5
-#: Runs that are off, or steps, from which a search begins where the first one found anything that goes by runs.
+#: Bad runs or steps from which a search is started if the first searches found anything that depends on the run.
 RUN_STARTS = 8
-#: Names of what goes by whole runs.
+#: Names of effects on whole runs.
 OF_RUNS = ("bad_run", "step_between_runs")
-#: What every name beyond the first must bring before a smooth term without a name gives way to it: two events that happen
-#: to cancel or to follow each other are less likely than one.
+#: What every name beyond the first must gain to replace an unnamed smooth term: two events that happen to cancel or to
+#: follow each other are less likely than one.
 MORE_NAMES = 4.0
-#: What readings with a value of their own each must bring beyond a common offset.
+#: What readings with a separate value each must gain in addition to what a common offset must.
 FREE_HANDICAP = 6.0
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """Columns (n, k) that may be added; ``first`` ... ``last`` are the readings that a disturbance covers.
+    """Columns (n, k) that may be added; ``first`` ... ``last`` are the readings covered by a disturbance.
 
-    ``scans`` counts the positions (time constants, boundaries, windows) among which this one was chosen.
+    ``scans`` is the number of scan positions (time constants, boundaries, windows) from which this one was chosen.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Candidate:
     free: bool = False
 
     def penalty(self, freedom: int) -> float:
-        """Twice the log likelihood that the columns have to bring before they count."""
+        """Gain in twice the log likelihood that the columns must exceed."""
         scan = 2.0 * float(np.log(self.scans))
         if self.columns.shape[1] == 1 and self.tier == "named":
             return float(np.log(freedom)) + scan
@@ -93,8 +93,8 @@ class Candidate:
 class NoiseGrid:
     """Inverse covariances of the noise for every (phi, w); sigma is 1.
 
-    A noise with a memory is a Markov chain: the inverse T of K_ij = phi^|t_i - t_j| has three diagonals. With
-    V = a K + b I, inv(V) = inv(a I + b T) T is applied to a vector in n steps, and no covariance is ever inverted.
+    Noise with memory is a Markov chain: the inverse T of K_ij = phi^|t_i - t_j| is tridiagonal. With V = a K + b I,
+    inv(V) = inv(a I + b T) T is applied to a vector in O(n) operations; no covariance is ever inverted.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class NoiseGrid:
         scatter: FloatArray | None = None,
         points: Sequence[tuple[float, float]] | None = None,
     ) -> None:
-        """Prepare the grid; ``scatter`` (n,) divides all readings, for noise that is not equal everywhere."""
+        """Prepare the grid; ``scatter`` (n,) divides all readings if the noise is not uniform."""
         step = session.time / (np.median(np.diff(session.time)) if session.timed else 1.0)
         n = len(session)
         self.cells = np.zeros((n, int(session.cell.max()) + 1))
@@ -111,7 +111,7 @@ class NoiseGrid:
         self.freedom = n - self.cells.shape[1]
         self.points = list(points or [(phi, w) for phi in PHI for w in (WHITE if phi else (0.0,))])
         self._bands = [_bands(np.diff(step), phi, w) for phi, w in self.points]
-        #: inv(V) N and inv(N' inv(V) N) for the indicators N of the cells, which free a vector from the cell means.
+        #: inv(V) N and inv(N' inv(V) N) for the indicators N of the cells, to remove the cell means from a vector.
         self._right, self._middle = [], []
         constant = []
         for point, (_, _, determinant) in enumerate(self._bands):
@@ -134,7 +134,7 @@ class NoiseGrid:
         return 0.5 * (found + found.T)
 
     def free(self, point: int, columns: FloatArray) -> FloatArray:
-        """P times columns (n, k); P is inv(V) freed from the cell means."""
+        """P times columns (n, k); P is inv(V) with the cell means projected out."""
         right = self._right[point]
         return self.solve(point, columns) - right @ (self._middle[point] @ (right.T @ columns))
 
@@ -144,25 +144,25 @@ class NoiseGrid:
         return self.inverse(point) - right @ (self._middle[point] @ right.T)
 
     def log_likelihood(self, square: FloatArray, extra: FloatArray) -> FloatArray:
-        """Log likelihood (...) summed over the grid, for y'Py and further log determinants of shape (points, ...)."""
+        """Log likelihood (...) summed over the grid, for y'Py and extra log determinants of shape (points, ...)."""
         shape = (-1, *([1] * (square.ndim - 1)))
         own = -0.5 * self.freedom * np.log(square / self.freedom) - 0.5 * (extra + self.constant.reshape(shape))
         return np.asarray(logsumexp(own + self.prior.reshape(shape), axis=0))
 
     def log_likelihoods(self, square: FloatArray) -> FloatArray:
-        """Log likelihood at every point of the grid, (points,), for y'Py (points,)."""
+        """Log likelihood at each grid point, (points,), for y'Py (points,)."""
         return np.asarray(-0.5 * self.freedom * np.log(square / self.freedom) - 0.5 * self.constant + self.prior)
 
     def weights(self, square: FloatArray) -> FloatArray:
-        """Posterior weight of every point of the grid, (points,), for y'Py (points,)."""
+        """Posterior weight of each grid point, (points,), for y'Py (points,)."""
         own = self.log_likelihoods(square)
         return np.asarray(np.exp(own - logsumexp(own)))
 
 
 def _bands(apart: FloatArray, phi: float, w: float) -> tuple[FloatArray, FloatArray, float]:
-    """Diagonal and lower diagonal of T (2, n), the Cholesky factor of a I + b T in bands, and log det V.
+    """Diagonal and lower diagonal of T (2, n), the banded Cholesky factor of a I + b T, and log det V.
 
-    ``apart`` (n - 1,) are the distances of neighbouring readings in time. A little white noise keeps V regular.
+    ``apart`` (n - 1,) are the time intervals between neighbouring readings. A little white noise keeps V regular.
     """
     n = len(apart) + 1
     r = np.minimum(phi**apart, 1.0 - 1e-9) if phi else np.zeros(n - 1)
@@ -179,7 +179,7 @@ def _bands(apart: FloatArray, phi: float, w: float) -> tuple[FloatArray, FloatAr
 
 
 def _times(bands: FloatArray, columns: FloatArray) -> FloatArray:
-    """A symmetric matrix of three diagonals times columns (n, k)."""
+    """A symmetric tridiagonal matrix times columns (n, k)."""
     found = bands[0][:, None] * columns
     found[1:] += bands[1, :-1, None] * columns[:-1]
     found[:-1] += bands[1, :-1, None] * columns[1:]
@@ -188,10 +188,10 @@ def _times(bands: FloatArray, columns: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Block:
-    """All candidates of k columns: numbers ``rows`` (m,), and for each point of the grid their Gram matrix C'PC.
+    """All candidates with k columns: numbers ``rows`` (m,), and their Gram matrix C'PC at each grid point.
 
-    ``columns`` are (m, k, n). The matrix is kept as eigenvalues (points, m, k) with the columns turned into the axes
-    ``turn`` (points, m, k, k), in which ``right`` (points, m, k) is C'Py. ``size`` (m,) is the mean square of the columns.
+    ``columns`` are (m, k, n). The matrix is stored as eigenvalues ``value`` (points, m, k) and eigenvectors ``turn``
+    (points, m, k, k); ``right`` (points, m, k) is C'Py in these axes. ``size`` (m,) is the mean square of the columns.
     """
 
     rows: IntArray
@@ -204,10 +204,10 @@ class _Block:
 
 @dataclass(frozen=True)
 class _State:
-    """A set of members, freed from each other: what it leaves of y'Py, log determinant, trace of P, and T'b, all by point.
+    """A set of orthonormalised members: remaining y'Py, log determinant, trace of P, and T'b, at each grid point.
 
-    ``turn`` (points, K, r) makes the Gram matrix of the members (with the prior of those of several columns) the unit; the
-    first ``free`` columns are of members without a prior.
+    ``turn`` T (points, K, r) turns the Gram matrix of the members (with the prior of those with several columns) into
+    the identity; the first ``free`` columns belong to members without a prior.
     """
 
     members: tuple[int, ...]
@@ -220,10 +220,10 @@ class _State:
 
 
 class Search:
-    """Looks for the set of candidates that explains the readings.
+    """Search for the set of candidates that explains the readings.
 
-    All that is compared depends on products C'PC and C'Py alone. They are made once; the columns of a member are multiplied
-    with those of all candidates when it is first tried, and no (n, n) matrix is touched after that.
+    All comparisons depend only on the products C'PC and C'Py, which are computed once. The columns of a member are
+    multiplied by those of all candidates when it is first tried; after that, no (n, n) matrix is used.
     """
 
     def __init__(self, session: AxisSession, grid: NoiseGrid, candidates: Sequence[Candidate]) -> None:
@@ -235,26 +235,26 @@ class Search:
         pulled = [grid.free(point, self.y[:, None])[:, 0] for point in range(len(grid.points))]
         self._square = np.array([self.y @ own for own in pulled])
         self._blocks, self._trace = _blocks_of(grid, self.candidates, pulled)
-        #: P C (points, n, k) of a member, and C'P C of all candidates with it by block, (points, m, k, own k).
+        #: P C (points, n, k) of a member, and C'P C of all candidates with it, per block, (points, m, k, member's k).
         self._pulled: dict[int, FloatArray] = {}
         self._cross: dict[int, list[FloatArray]] = {}
-        #: Variance over sigma^2 of members of several columns, from when they were last chosen.
+        #: Variance over sigma^2 of members with several columns, from when they were last chosen.
         self._lambda: dict[int, float] = {}
         self._best_lambda = np.full(len(self.candidates), LAMBDA[1])
         self._known: dict[frozenset[tuple[int, float]], tuple[FloatArray, FloatArray]] = {}
 
     def columns_of(self, members: Sequence[int]) -> FloatArray:
-        """Columns of some candidates side by side, (n, k)."""
+        """Columns of the given candidates side by side, (n, k)."""
         if not members:
             return np.zeros((len(self.session), 0))
         return np.hstack([self.candidates[k].columns for k in members])
 
     def square(self, members: Sequence[int]) -> FloatArray:
-        """Return y'Py (points,) beside some members, never below the resolution."""
+        """Return y'Py (points,) with the members fitted, never below the resolution."""
         return np.maximum(self._state(members).square, self.grid.freedom * LEAST_MM**2)
 
     def suspects(self) -> tuple[tuple[str, float], ...]:
-        """Names with what each explains by itself, rise of twice the log likelihood, the most telling first."""
+        """Names with the gain in twice the log likelihood of each on its own, the largest first."""
         best: dict[str, float] = {}
         for candidate, gain in zip(self.candidates, self.criteria([])[0].tolist(), strict=True):
             if candidate.tier == "named" and not candidate.free:
@@ -268,14 +268,14 @@ class Search:
         return self._pulled[member]
 
     def _crossed(self, member: int) -> list[FloatArray]:
-        """Products of all candidates with a member, in the axes of each candidate."""
+        """Products of all candidates with a member, in the eigenvector axes of each candidate."""
         if member not in self._cross:
             own = self._pull(member)
             self._cross[member] = [_crossed(block, own) for block in self._blocks]
         return self._cross[member]
 
     def _state(self, members: Sequence[int]) -> _State:
-        """Free the members from each other: those of one column together, then those of several with their prior."""
+        """Orthonormalise the members: first those with one column together, then those with several and their prior."""
         unbound = [k for k in members if self._lambda.get(k) == FREE and self.candidates[k].columns.shape[1] > 1]
         single = [k for k in members if self.candidates[k].columns.shape[1] == 1 or k in unbound]
         order = [*single, *(k for k in members if k not in single)]
@@ -307,7 +307,7 @@ class Search:
         return 2.0 * float(self.grid.log_likelihood(square, state.determinant))
 
     def gains(self, members: Sequence[int]) -> FloatArray:
-        """What every candidate brings beside a set: rise of twice the log likelihood, (candidates,)."""
+        """Gain of every candidate when added to a set: increase of twice the log likelihood, (candidates,)."""
         state = self._state(members)
         floor = self.grid.freedom * LEAST_MM**2
         square = np.maximum(state.square, floor)
@@ -326,9 +326,9 @@ class Search:
         return found
 
     def _explained(self, state: _State, number: int, point: int) -> tuple[FloatArray, FloatArray]:
-        """What the candidates of a block take off y'Py beside a set, and log det(1 + lambda C'PC), (m, lambdas).
+        """Reduction of y'Py by the candidates of a block added to a set, and log det(1 + lambda C'PC), (m, lambdas).
 
-        One column is fitted freely (one lambda, no determinant) if enough of it can be seen.
+        A single column is fitted freely (one lambda, no determinant) if enough of it is visible.
         """
         block = self._blocks[number]
         m, k = block.columns.shape[:2]
@@ -339,13 +339,13 @@ class Search:
             size = block.value[point, :, 0] - np.sum(beside[:, 0] ** 2, axis=1)
             seen = size > LEAST_SEEN * block.size * max(state.trace[point], 1e-12)
             taken = np.where(seen, right[:, 0] ** 2 / np.where(seen, size, 1.0), 0.0)
-            # a free column takes its share of what the columns with a prior could explain: their determinant falls
+            # a free column takes over part of what the columns with a prior could explain: their determinant decreases
             alone = block.value[point, :, 0] - np.sum(beside[:, 0, : state.free[point]] ** 2, axis=1)
             more = np.where(seen, np.log(np.where(seen, size / np.where(seen, alone, 1.0), 1.0)), 0.0)
             return taken[:, None], more[:, None]
         price = float(np.log(self.grid.freedom))
         if beside.shape[2] < k:
-            # C'PC is the eigenvalues (m, k) less B B' with B (m, k, r), r < k: the formula of Woodbury
+            # C'PC is diagonal with the eigenvalues (m, k), minus B B' with B (m, k, r), r < k: Woodbury's formula
             value = block.value[point]
             taken, determinant = _ridged(value, right, price)
             if not beside.shape[2]:
@@ -364,12 +364,12 @@ class Search:
         return _ridged(np.maximum(value, 0.0), turned, price)
 
     def criteria(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Gain and gain less penalty of every candidate beside a set."""
+        """Gain, and gain minus penalty, of every candidate when added to a set."""
         gains, _ = self._compared(members)
         return gains, gains - self._penalties
 
     def _compared(self, members: Sequence[int]) -> tuple[FloatArray, FloatArray]:
-        """Gain of every candidate beside a set, and the variance over sigma^2 with which it is had."""
+        """Gain of every candidate when added to a set, and the variance over sigma^2 that gives it."""
         key = frozenset((k, self._lambda.get(k, 0.0)) for k in members)
         if key not in self._known:
             gains = self.gains(sorted(members))
@@ -377,12 +377,12 @@ class Search:
         return self._known[key]
 
     def _choose(self, members: Sequence[int], chosen: int) -> None:
-        """Give a candidate that joins a set the variance that suits it there."""
+        """Set the best variance of a candidate that is added to a set."""
         if self.candidates[chosen].columns.shape[1] > 1 and chosen not in members:
             self._lambda[chosen] = float(self._compared(members)[1][chosen])
 
     def total(self, members: Sequence[int]) -> float:
-        """Criterion of a set against the empty one; every member pays by what it brings beside those before it."""
+        """Criterion of a set relative to the empty set; members are added in order, each gain minus its penalty."""
         value, before = 0.0, self.level([])
         for count in range(1, len(members) + 1):
             now = self.level(members[:count])
@@ -391,15 +391,15 @@ class Search:
         return value
 
     def run(self, most: int) -> list[int]:
-        """Return the best set: names first and then all, all from the start, or from one smooth term, whichever explains more.
+        """Return the best set from several searches: names first and then all, all at once, or from one smooth term.
 
-        A step at a time does not find a smooth term that explains in one what several names explain together.
+        Stepwise search alone can miss a smooth term that explains what several names explain together.
         """
         everything = np.ones(len(self.candidates), dtype=bool)
         results = []
 
         def keep(members: list[int]) -> None:
-            # criterion of the set, less what several names at once are unlikely
+            # criterion of the set, minus a charge because several names at once are unlikely
             named = sum(self.candidates[k].tier == "named" for k in members)
             results.append((self.total(members) - MORE_NAMES * max(named - 1, 0), members, dict(self._lambda)))
 
@@ -421,13 +421,13 @@ class Search:
         return members
 
     def _runs(self, most: int) -> list[int]:
-        """Names of whole runs, those first that explain most: two runs that are off may hide each other from the first step."""
+        """Effects on whole runs, those that explain most first: two bad runs may hide each other in the first step."""
         gains = self.criteria([])[0]
         found = [k for k, c in enumerate(self.candidates) if c.name in OF_RUNS and c.columns.shape[1] == 1]
         return sorted(found, key=lambda k: -gains[k])[:most]
 
     def _grown(self, members: list[int], allowed: NDArray[np.bool_], most: int) -> list[int]:
-        """Forward steps, and after each of them every member is exchanged if another suits better beside the rest."""
+        """Forward steps; after each, every member is exchanged if another candidate fits better with the rest."""
         while len(members) < most:
             best, criterion = self._best(members, allowed)
             if criterion < LEAST_GAIN:
@@ -453,7 +453,7 @@ class Search:
         return members
 
     def _open(self, members: Sequence[int], allowed: NDArray[np.bool_]) -> FloatArray:
-        """Criteria beside some members; a session has one drift with a name at most."""
+        """Criteria of the candidates that may join the members; at most one named drift per session."""
         criteria = np.where(allowed, self.criteria(members)[1], -np.inf)
         if any(self._drifts[k] for k in members):
             criteria[self._drifts] = -np.inf
@@ -468,20 +468,20 @@ class Search:
 def _first_of(
     results: Sequence[tuple[float, list[int], dict[int, float]]],
 ) -> tuple[float, list[int], dict[int, float]]:
-    """First of the results (criterion, members, variances) with the best criterion."""
+    """First of the results (criterion, members, variances) that has the best criterion."""
     most = max(result[0] for result in results)
     return next(result for result in results if result[0] >= most - SAME)
 
 
 def _first_best(criteria: FloatArray) -> int:
-    """First of the candidates with the best criterion: rounding does not choose between two that are the same readings."""
+    """First candidate with the best criterion: rounding must not decide between two that affect the same readings."""
     return int(np.flatnonzero(criteria >= criteria.max() - SAME)[0])
 
 
 def _blocks_of(
     grid: NoiseGrid, candidates: Sequence[Candidate], pulled: Sequence[FloatArray]
 ) -> tuple[list[_Block], FloatArray]:
-    """Candidates by their number of columns, and the trace of P at every point; ``pulled`` are Py (n,) by point."""
+    """Candidates by number of columns, and the trace of P at each grid point; ``pulled`` contains Py (n,) per point."""
     sizes = np.array([c.columns.shape[1] for c in candidates], dtype=np.int64)
     numbers = [np.flatnonzero(sizes == k) for k in np.unique(sizes).tolist()]
     columns = [np.stack([candidates[r].columns.T for r in rows.tolist()]) for rows in numbers]
@@ -491,7 +491,7 @@ def _blocks_of(
     for point in range(len(grid.points)):
         projector = grid.projector(point)
         trace.append(float(np.trace(projector)))
-        # sum of P from any row and column on: the Gram matrix of windows is a difference of four of these
+        # sums of P from each row and column on: the Gram matrix of windows is a combination of four of these
         summed = np.zeros((len(projector) + 1,) * 2)
         summed[:-1, :-1] = projector[::-1, ::-1].cumsum(axis=0).cumsum(axis=1)[::-1, ::-1]
         for gram, own, at in zip(grams, columns, windows, strict=True):
@@ -506,9 +506,9 @@ def _blocks_of(
 
 
 def _window(columns: FloatArray) -> tuple[int, int, float] | None:
-    """First reading, the one after the last, and value of a column that is constant there and zero elsewhere.
+    """First reading, the one after the last, and value of a column that is constant between them and zero elsewhere.
 
-    Several columns of one reading each, one after the other, have the value NaN. None for all other columns.
+    For several columns of one reading each, one after the other, the value is NaN. None for all other columns.
     """
     rows = np.flatnonzero(columns.any(axis=1))
     if not len(rows) or rows[-1] - rows[0] + 1 != len(rows):
@@ -541,7 +541,7 @@ def _gram(
 
 
 def _crossed(block: _Block, pulled: FloatArray) -> FloatArray:
-    """C'P times the columns of a member, in the axes of each candidate, (points, m, k, own k), from PC (points, n, own k)."""
+    """C'P times a member's columns, in each candidate's axes, (points, m, k, own k), from PC (points, n, own k)."""
     m, k, n = block.columns.shape
     points, _, own = pulled.shape
     found = block.columns.reshape(m * k, n) @ pulled.transpose(1, 0, 2).reshape(n, points * own)
@@ -550,9 +550,9 @@ def _crossed(block: _Block, pulled: FloatArray) -> FloatArray:
 
 
 def _orthogonal(gram: FloatArray, ridge: FloatArray, single: int) -> tuple[FloatArray, float]:
-    """T with T'(G + ridge) T = 1, and log det(1 + G / ridge) of those with a prior beside the first ``single`` without one.
+    """T with T'(G + ridge) T = 1, and log det(1 + G / ridge) of the columns with a prior, given the ``single`` without.
 
-    What the columns without a prior have in common is counted once.
+    The first ``single`` columns have no prior; what they have in common is counted once.
     """
     if not len(gram):
         return np.zeros((0, 0)), 0.0
@@ -573,9 +573,9 @@ def _orthogonal(gram: FloatArray, ridge: FloatArray, single: int) -> tuple[Float
 
 
 def _ridged(value: FloatArray, right: FloatArray, price: float) -> tuple[FloatArray, FloatArray]:
-    """What columns take off, and log det(1 + lambda C'PC), (m, lambdas), from eigenvalues and C'Py in their axes, (m, k).
+    """Reduction of y'Py and log det(1 + lambda C'PC), (m, lambdas), from eigenvalues and C'Py in their axes, (m, k).
 
-    The last are those that are fitted freely, at a price for each column.
+    The last lambda is the free fit, at a price for each column.
     """
     grown = LAMBDAS * value[:, :, None]
     taken = np.sum(right[:, :, None] ** 2 * LAMBDAS / (1.0 + grown), axis=1)

@@ -1,8 +1,8 @@
-"""One axis of ISO 230-2 runs in the order of time: readings, cells of repeats, one-way runs, and what can be fitted to them.
+"""One axis of ISO 230-2 runs in time order: readings, cells of repeats, and one-way runs.
 
-A cell is one target in one direction: five runs of it are five repeats, and their scatter is the noise plus whatever
-changes with time. Everything static (the curve of the axis, its reversal) is in the means of the cells, so that the
-scatter within the cells knows nothing of it.
+A cell is one target in one direction: five runs give five repeats, and their scatter is the noise plus whatever
+changes with time. Everything static (the curve of the axis, its reversal) is in the means of the cells and does not
+affect the scatter within them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from compgen.data.names import AXES
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Readings
 
-#: Order of the readings in time: as logged, run by run up then down, down then up, all up runs first, rows of the file.
+#: Time order of the readings: as logged, run by run up then down, down then up, all up runs first, rows of the file.
 Order = Literal["auto", "up-down", "down-up", "one-way", "rows"]
 ORDERS: tuple[Order, ...] = get_args(Order)
 ORDER_TEXTS = {
@@ -31,27 +31,27 @@ ORDER_TEXTS = {
     "one-way": "all runs up, then all runs down",
     "rows": "the rows of the file",
 }
-#: Targets closer than this are the same one, mm.
+#: Targets closer than this are the same target, mm.
 SAME_TARGET_MM = 1e-4
 
 
 @dataclass(frozen=True)
 class AxisSession:
-    """n readings of one axis, ascending in time.
+    """n readings of one axis in time order.
 
     Parameters
     ----------
     machine, axis : the machine, and the axis 0, 1, 2.
-    row : row of each reading in the runs that were given.
+    row : row of each reading in the given runs.
     position_mm, direction, run, deviation_mm : as in :class:`AxisRuns`, each (n,).
     target : number of the target, ascending in position, (n,).
     cell : number of target and direction, (n,).
     leg : number of the one-way run in time, from 0, (n,).
-    cycle : number of the run in time, from 0; both ways of a run have the same, (n,).
+    cycle : number of the run in time, from 0; both directions of a run have the same number, (n,).
     time : time in s if ``timed``, else number of the reading, (n,).
     timed : whether times were logged and used.
     order : where the order comes from, a key of ``ORDER_TEXTS``.
-    readings : the same readings as the effects of the catalogue take them.
+    readings : the same readings in the form that the effects of the catalogue use.
     """
 
     machine: Machine
@@ -97,18 +97,18 @@ class AxisSession:
 
     @property
     def repeated(self) -> bool:
-        """Whether most readings have repeats in their cell."""
+        """Whether most readings have repeats in their cells."""
         return float(np.mean(np.bincount(self.cell)[self.cell] > 1)) >= 0.5
 
     @property
     def in_runs(self) -> bool:
-        """Whether it went run by run; a session that went target by target has no runs that may be bad or stepped."""
+        """Whether it was measured run by run; measured target by target, it has no bad runs or steps between runs."""
         return len(self) >= 2.5 * (int(self.leg.max()) + 1)
 
     def run_means_mm(self, values_mm: FloatArray, used: NDArray[np.bool_]) -> FloatArray:
-        """Means of the runs up and down, free from the curve of the axis, mm, (ways, runs); each way has the mean zero.
+        """Means of the runs up and down without the curve of the axis, mm, (ways, runs); each way has zero mean.
 
-        Only readings ``used`` (n,) count; a run that lacks a target is compared at the others. NaN: no reading of that run.
+        Only readings ``used`` (n,) count; a run without a target is compared at the others. NaN: run without readings.
         """
         runs, targets = np.eye(int(self.cycle.max()) + 1)[self.cycle], np.eye(len(self.targets_mm))[self.target]
         means = []
@@ -127,12 +127,12 @@ class AxisSession:
         return span / (int(self.cycle.max()) + 1)
 
     def place(self, k: int) -> str:
-        """Say in words which reading ``k`` is."""
+        """Describe reading ``k``."""
         way = "up" if self.direction[k] > 0 else "down"
         return f"run {self.run[k]} {way} at {self.position_mm[k]:g} mm"
 
     def window(self, first: int, last: int) -> str:
-        """Say in words which readings ``first`` ... ``last`` are: a run, a way of it, or readings from .. to .."""
+        """Describe readings ``first`` ... ``last``: a run, one direction of a run, or readings from .. to .."""
         rows = np.arange(first, last + 1)
         legs = np.unique(self.leg[rows])
         if 1 < len(rows) == np.count_nonzero(np.isin(self.leg, legs)):
@@ -143,7 +143,7 @@ class AxisSession:
         return self.place(first) if first == last else f"from {self.place(first)} to {self.place(last)}"
 
     def part(self, kept: IntArray) -> AxisSession:
-        """Return some of the readings; numbers of runs and times stay as they are."""
+        """Return some of the readings; run numbers and times are unchanged."""
         names = ("row", "position_mm", "direction", "run", "deviation_mm", "target", "leg", "cycle", "time")
         taken = {name: getattr(self, name)[kept] for name in names}
         _, cell = np.unique(self.cell[kept], return_inverse=True)
@@ -151,7 +151,7 @@ class AxisSession:
 
 
 def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list[AxisSession]:
-    """Return the readings of every axis by itself, in the order of time."""
+    """Return the readings of each axis separately, in time order."""
     found = []
     for axis in runs.axes:
         rows = np.flatnonzero(runs.axis == axis)
@@ -162,7 +162,7 @@ def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list
         _, cell = np.unique(2 * target.ravel() + (direction > 0), return_inverse=True)
         changed = np.diff(run) != 0
         leg = np.cumsum(np.concatenate([[False], changed | (np.diff(direction) != 0)])).astype(np.int64)
-        # a run there and back by its label, or two ways where every way has a number of its own
+        # a run there and back by its label, or two one-way runs if each has a separate number
         cycle = np.cumsum(np.concatenate([[False], changed])).astype(np.int64)
         single = all(len(np.unique(direction[cycle == k])) == 1 for k in range(int(cycle.max()) + 1))
         if single and len(np.unique(direction)) == 2:
@@ -179,10 +179,10 @@ def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list
 
 
 def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, FloatArray, str]:
-    """Rows in the order of time, the time of each (s, or number of the reading), and where the order comes from.
+    """Rows in time order, the time of each (s, or number of the reading), and where the order comes from.
 
-    The order of the rows counts only where the user says so: files list all runs up and then all runs down, or go by
-    targets, far more often than by time.
+    The order of the rows is used only on request: files are sorted by direction or by target far more often than by
+    time.
     """
     run, way = runs.run[rows], runs.direction[rows]
     along = runs.position_mm[rows] * way
@@ -200,7 +200,7 @@ def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, Fl
         logged = runs.covariates.get(name)
         if logged is None or not np.isfinite(logged[rows]).all() or np.ptp(logged[rows]) == 0.0:
             continue
-        # readings of one time (a time for each run) follow each other as the axis moves
+        # readings with the same time (one time per run) are sorted as the axis moves
         sequence = np.lexsort((*keys["up-down"], logged[rows]))
         distinct = len(np.unique(logged[rows])) == len(rows)
         return (
