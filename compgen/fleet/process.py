@@ -1,7 +1,7 @@
 """One measurement through the pipeline, judged by the acceptance policy against the active tables.
 
-:func:`process` runs the chain in a temporary folder and returns what is to be kept. The ``judge_...`` functions are the rules
-of the policy: each adds to a :class:`Judgement` why the tables are held back, with the figures behind it.
+:func:`process` runs the pipeline in a temporary folder and returns what is to be stored. The ``judge_...`` functions
+are the rules of the policy: each adds reasons to hold the tables back, with their figures, to a :class:`Judgement`.
 """
 
 from __future__ import annotations
@@ -52,17 +52,17 @@ from compgen.tables.diff import difference
 from compgen.tables.judge import SafetyLimits
 from compgen.tables.verification import MISFIT_CODES
 
-#: A measurement that is dated more than this in the future has a wrong time.
+#: A measurement dated further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
-#: Kinds of events: the clock of the store went back; the folder of a machine was given to this store.
+#: Kinds of events: the store's clock went back; a machine's folder was given to this store.
 CLOCK, ADOPTED = "clock", "adopted"
-#: Key of the figures of a version: which tables a file or a person says were on.
+#: Key in a version's figures: which tables were on, as stated by a file or a person.
 STATED = "active_table_stated"
 
 
 @dataclass
 class Judgement:
-    """Reasons to hold tables back, reservations that are shown only, and figures by name; all grow while rules are looked at."""
+    """Reasons to hold tables back, reservations that are only shown, and figures by name; each rule adds to them."""
 
     hold: list[str] = field(default_factory=list)
     reservations: list[str] = field(default_factory=list)
@@ -71,7 +71,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Past:
-    """What the store knows about a machine: decisions, tables with figures, measurements, events; all of them."""
+    """Everything the store knows about a machine: decisions, tables with figures, measurements, events."""
 
     decisions: Sequence[DecisionRecord]
     tables: Sequence[TableRecord]
@@ -80,12 +80,12 @@ class Past:
 
     @property
     def swaps(self) -> list[DecisionRecord]:
-        """Decisions that changed the active tables, since the folder was given to this store."""
+        """Decisions that changed the active tables since the folder was given to this store."""
         return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
 
     @property
     def stated(self) -> str | None:
-        """What a file or a person said last of the tables that were on, since the folder was given to this store."""
+        """Latest statement of which tables were on, by a file or a person, since this store got the folder."""
         said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
         said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
         return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
@@ -98,10 +98,10 @@ class Past:
 
 @dataclass(frozen=True)
 class Case:
-    """One measurement to be judged: how its machine is recalibrated, what the store knows of it, and the time now.
+    """One measurement to be judged: the job of its machine, what the store knows of the machine, the current time.
 
-    ``said`` is what a person or the file says of the tables that were on while it was made, None if neither does;
-    ``taken`` are the tables whose effect is taken out of the readings, None if none were on.
+    ``said`` states which tables were on during the measurement, by a person or the file, None if neither states it;
+    ``taken`` are the tables whose effect is removed from the readings, None if none were on.
     """
 
     store: Store
@@ -116,13 +116,13 @@ class Case:
 
     @property
     def version_taken(self) -> int | None:
-        """Version of the tables whose effect is taken out."""
+        """Version of the tables whose effect is removed."""
         return None if self.taken is None else self.taken.version
 
 
 @dataclass(frozen=True)
 class ActiveState:
-    """The tables that are active now: parsed by control, their version, and the errors that they were made from."""
+    """The tables that are active now: parsed, by control; their version; and the errors they were made from."""
 
     version: int
     tables: Mapping[str, ReadTables]
@@ -130,7 +130,7 @@ class ActiveState:
 
     @classmethod
     def of(cls, case: Case) -> ActiveState | None:
-        """Return those of the machine of a case, None if no tables are active."""
+        """Return the active state of the case's machine, None if no tables are active."""
         on = active_of(case.past.tables)
         if on is None:
             return None
@@ -142,7 +142,7 @@ class ActiveState:
 def judge_measurement(
     judgement: Judgement, policy: Policy, measurement: MeasurementRecord, now: datetime, latest: datetime | None
 ) -> None:
-    """Look at age and temperature; ``latest`` is when the newest measurement behind an active table was made."""
+    """Check age and temperature; ``latest`` is the time of the newest measurement behind an active table."""
     age = now - measurement.measured_at
     judgement.figures["age_days"] = age.total_seconds() / 86400.0
     if age < -FUTURE:
@@ -157,9 +157,10 @@ def judge_measurement(
 
 
 def judge_misfit(judgement: Judgement, result: RunResult) -> None:
-    """Hold what a large misfit speaks against, and note what else keeps the verdict from a plain "accepted".
+    """Hold back tables with a large misfit, and note what else keeps the verdict from a plain "accepted".
 
-    A person may approve over a misfit, as `--allow-misfit` does; residuals above their uncertainty alone are shown only.
+    A person may approve despite a misfit, as `--allow-misfit` does; residuals that only exceed their uncertainty are
+    shown.
     """
     for item in result.results:
         found = item.verification
@@ -173,7 +174,7 @@ def judge_misfit(judgement: Judgement, result: RunResult) -> None:
 
 
 def judge_order(judgement: Judgement, case: Case) -> None:
-    """Hold what was measured before a proposal that waits, so that it does not take that proposal's place."""
+    """Hold a measurement older than a waiting proposal, so that it does not replace that proposal."""
     for table in case.past.tables:
         if table.state == "pending":
             made = case.store.identification(table.identification_id).measured_at
@@ -187,10 +188,10 @@ def judge_order(judgement: Judgement, case: Case) -> None:
 
 
 def judge_assumption(judgement: Judgement, case: Case) -> None:
-    """Hold where the time of the measurement does not say which tables were on.
+    """Hold if the time of the measurement does not determine which tables were on.
 
-    Only for a measurement that does not say it itself, of a machine that is measured with its tables on. A wrong
-    assumption goes into the errors in full: the new tables then undo the compensation, or apply it twice.
+    Only for a measurement that does not state it, on a machine that is measured with its tables on. A wrong assumption
+    enters the errors in full: the new tables then undo the compensation, or apply it twice.
     """
     job, measurement, past, taken = case.job, case.measurement, case.past, case.version_taken
     swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
@@ -231,14 +232,14 @@ def judge_assumption(judgement: Judgement, case: Case) -> None:
 
 
 def version_said(text: str) -> int | str | None:
-    """Return the version that ``active_table`` names, None for "none" or "bare", another text as it is."""
+    """Return the version that ``active_table`` names, None for "none" or "bare", any other text unchanged."""
     word = text.lower()
     number = word.removeprefix("v")
     return None if word in ("none", "bare") else int(number) if number.isdecimal() and number.isascii() else text
 
 
 def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
-    """Say how a person states which tables were on; ``tables`` is a version, "none" or how to write either."""
+    """Tell a person how to state which tables were on; ``tables`` is a version, "none" or a placeholder for either."""
     return (
         f"state it: `volcomp recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
         f"or `# active_table = {tables}` in the next file"
@@ -246,7 +247,7 @@ def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
 
 
 def _doubtful(decision: DecisionRecord, past: Past, now: datetime) -> bool:
-    """Whether the clock was ahead when this was decided: something that came later has an earlier time."""
+    """Whether the clock was ahead at this decision: a later entry has an earlier time."""
     if decision.at > now:
         return True
     if any(item.at < decision.at <= _seen(item) for item in past.events if item.kind == CLOCK):
@@ -256,7 +257,7 @@ def _doubtful(decision: DecisionRecord, past: Past, now: datetime) -> bool:
 
 
 def _seen(event: EventRecord) -> datetime:
-    """Time of the newest entry when the clock was found to have gone back, from the end of the message."""
+    """Time of the newest entry when the clock was found to have gone back, read from the end of the message."""
     try:
         return datetime.fromisoformat(event.message.rsplit(" ", 1)[-1]) + timedelta(seconds=1)
     except ValueError:
@@ -264,10 +265,10 @@ def _seen(event: EventRecord) -> datetime:
 
 
 def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
-    """Hold where the machine seems to have changed by what some tables add, or by the opposite.
+    """Hold if the machine seems to have changed by what some tables add, or by its opposite.
 
-    The change is that against the errors behind the active tables, or behind the last ones that were; it is compared with
-    what each version adds that is or was active.
+    The change is relative to the errors behind the active tables, or the last active ones; it is compared with what
+    each version that is or was active adds.
     """
     machine, taken = case.machine, case.version_taken
     were_active, last = _were_active(case)
@@ -275,13 +276,13 @@ def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
         return
     old_errors = case.store.errors_of(last)
     if not set(old_errors.names) <= set(result.identification.errors.names):
-        return  # held for that; a part of the errors has no field to compare
+        return  # already held for that; an incomplete set of errors has no field to compare
     points = Points(volume_points(machine))
     adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
     added = {f"version {version}": field for version, field in adds.items()}
     order, on = list(adds), active_of(case.past.tables)
     active = None if on is None else on.version
-    if taken in adds:  # the clock may be late: a later version was on already
+    if taken in adds:  # the clock may be slow: a later version may already have been on
         later = order[order.index(taken) + 1 :]
         added |= {f"version {version} instead of version {taken}": adds[version] - adds[taken] for version in later}
     missing = {f"version {version}": adds[version] for version in order if version in (taken, active)}
@@ -301,7 +302,7 @@ def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
 
 
 def _were_active(case: Case) -> tuple[dict[int, ReadTables], IdentificationRecord | None]:
-    """Return the tables that are or were active, by version in the order in which they became so, and the last errors."""
+    """Return the tables that are or were active, by version in the order of activation, and the last errors."""
     by_id = {table.id: table for table in case.past.tables}
     order = [
         item.table_id for item in case.past.decisions if AFTER[item.kind] == "active" and item.table_id is not None
@@ -317,7 +318,7 @@ def _were_active(case: Case) -> tuple[dict[int, ReadTables], IdentificationRecor
 
 
 def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
-    """What tables add to the commands, mean of both directions of travel, (n, 3), mm."""
+    """What the tables add to the commands, mean of both directions of travel, (n, 3), mm."""
     sides = [np.full_like(points.position_mm, side) for side in (1.0, -1.0)]
     return np.asarray(
         0.5 * sum(tables.correction(machine, Points(points.position_mm, approach=side)) for side in sides)
@@ -325,7 +326,7 @@ def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
 
 
 def judge_twins(judgement: Judgement, case: Case) -> None:
-    """Hold what came for another machine as well: readings belong to one machine."""
+    """Hold files that also arrived for another machine: readings belong to one machine."""
     store, job = case.store, case.job
     found = [f"{name} ({what})" for name, what in store.same_files_of_others(case.record, case.measurement)]
     contents = store.contents_of(case.measurement)
@@ -359,10 +360,10 @@ def _day(time: datetime) -> str:
 
 
 def shows_all(judgement: Judgement, store: Store, result: RunResult, active: ActiveState) -> bool:
-    """Whether the measurement shows every error that the active tables take out; otherwise the new ones would drop some.
+    """Whether the measurement shows every error that the active tables correct; otherwise the new ones would drop some.
 
-    A laser along one axis shows its positioning only: tables from that alone forget squareness, straightness and angles,
-    and nothing in that measurement says so.
+    A laser along one axis shows only its positioning: tables made from that alone lose squareness, straightness and
+    angular errors, and nothing in the measurement says so.
     """
     known = {*result.identification.errors.names}
     missing = [name for name in store.errors_of(active.identification).names if name not in known]
@@ -376,7 +377,7 @@ def shows_all(judgement: Judgement, store: Store, result: RunResult, active: Act
 
 
 def _identified(result: RunResult) -> tuple[ErrorTable, Covariance | None]:
-    """Return the errors of a run and their covariance, as far as it is known."""
+    """Return the errors of a run and their covariance, None if it is not known."""
     found = result.identification
     return found.errors, joint_covariance(found) if found.has_covariance else None
 
@@ -403,7 +404,7 @@ def judge_change(judgement: Judgement, case: Case, result: RunResult, active: Ac
 def judge_tables(
     judgement: Judgement, machine: Machine, result: RunResult, new: Mapping[str, ReadTables], active: ActiveState
 ) -> None:
-    """Compare what the new tables leave with what the active ones leave now, and how far the axes move."""
+    """Compare the residuals of the new tables with those of the active ones now, and find how far the axes move."""
     remaining: dict[str, Any] = {}
     moved: dict[str, Any] = {}
     reversal = identified_reversal(result.identification)
@@ -431,7 +432,7 @@ def apply_limits(
     active: Mapping[str, ReadTables],
     policy: Policy,
 ) -> None:
-    """Hold back what does not shrink the residual, or moves the axes by more than the limits."""
+    """Hold back tables that do not shrink the residual, or move the axes by more than the limits."""
     moved = judgement.figures.setdefault("correction", {})
     for control, tables in new.items():
         shift = _at_reference(machine, tables, active.get(control))
@@ -457,7 +458,7 @@ def apply_limits(
 
 
 def _at_reference(machine: Machine, new: ReadTables, active: ReadTables | None) -> Sequence[float]:
-    """Change of the correction at the reference point, um, x, y, z; the larger one of both directions of travel."""
+    """Change of the correction at the reference point, um, x, y, z; the larger of the two directions of travel."""
     position = np.array([machine.reference_point_mm], dtype=np.float64)
     found = np.zeros(3)
     for side in (1.0, -1.0):
@@ -469,9 +470,9 @@ def _at_reference(machine: Machine, new: ReadTables, active: ReadTables | None) 
     return [float(value) / MM_PER_UM + 0.0 for value in found]
 
 
-# --- the whole chain -----------------------------------------------------------------------------------------------
+# --- the whole pipeline --------------------------------------------------------------------------------------------
 
-#: Files of a run that belong to the identification; with one control they are in the same folder as its own.
+#: Files of a run that belong to the identification; with one control they share the folder of the control's files.
 NOT_OF_A_CONTROL = (
     "identified.errors.csv",
     COVARIANCE,
@@ -482,16 +483,16 @@ NOT_OF_A_CONTROL = (
     "fitted.errors.csv",
     "fit.json",
 )
-#: The newest of the versions that were active with which a change is compared.
+#: A change is compared with at most this many of the newest versions that were active.
 LOOKED_BACK = 20
-#: How temporary folders begin; their names say nothing to a reader.
+#: Prefix of temporary folders; their names mean nothing to a reader.
 FOLDER = "compgen-recal-"
 _TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\](?:measurement|settings)[/\\]")
 
 
 @dataclass(frozen=True)
 class Processed:
-    """What is to be kept, and the id of the tables that it was judged against."""
+    """What is to be stored, and the id of the tables it was judged against."""
 
     result: NewResult
     judged_against: int | None
@@ -500,12 +501,12 @@ class Processed:
 def process(
     store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord, stated: str | None = None
 ) -> Processed:
-    """Run the chain for one measurement and judge the outcome; nothing outside a temporary folder is written.
+    """Run the pipeline for one measurement and judge the outcome; writes only to a temporary folder.
 
     Parameters
     ----------
-    stated : the tables that were on while the machine was measured, by a person: a version or "none". It counts before
-        what the file says; None if nobody says so.
+    stated : the tables that were on during the measurement, as stated by a person: a version or "none". It takes
+        precedence over the file; None if not stated.
 
     Raises
     ------
@@ -515,7 +516,7 @@ def process(
     started = time.monotonic()
     settings = job.settings_sha256()
     machine = load_machine(job.machine)
-    if job.original is not None:  # as manifest and messages name it
+    if job.original is not None:  # the name used in manifest and messages
         machine = replace(machine, source=job.original, copy=machine.source)
     past = store.together(
         lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
@@ -541,7 +542,7 @@ def process(
             active=None if was_active is None else ActiveTables(was_active),
             instrument=job.instrument,
             limits=SafetyLimits(job.policy.max_step_um),
-            allow_misfit=True,  # a misfit that refuses the tables of `run` holds them back here: judge_misfit
+            allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
         )
         judgement = _judged(case, outcome)
         told = [str(item.message) for item in caught if issubclass(item.category, CompgenWarning)]
@@ -559,7 +560,7 @@ def process(
 
 
 def without_folder(message: str) -> str:
-    """Return a message that names files of a measurement as the inbox has them."""
+    """Return the message with the files of a measurement named as in the inbox."""
     return _TEMPORARY.sub("", message)
 
 
@@ -578,7 +579,7 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
 
 
 def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
-    """Return the tables that were active while the machine was measured: what is said, else what the job says."""
+    """Return the tables that were active during the measurement: as stated, else as the job says."""
     tables = past.tables
     version = None if said is None else version_said(said)
     if said is not None and version is None:
@@ -600,7 +601,7 @@ def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, sa
 
 
 def _tables_read(store: Store, machine: Machine, table: TableRecord, control: str) -> ReadTables | None:
-    """Parse the table files proper of one control (no manifest, no notes); None if there are none."""
+    """Parse the table files of one control, without manifest and notes; None if there are none."""
     names = table.summary.get("tables", {}).get(control, [])
     files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
     return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
@@ -610,7 +611,7 @@ def _tables_read(store: Store, machine: Machine, table: TableRecord, control: st
 
 
 def _judged(case: Case, result: RunResult) -> Judgement:
-    """Look at all rules, in the order in which a person reads their reasons."""
+    """Apply all rules, in the order in which a person reads their reasons."""
     judgement, active, policy = Judgement(), ActiveState.of(case), case.job.policy
     latest = None if active is None else active.identification.measured_at
     judge_measurement(judgement, policy, case.measurement, case.now, latest)
@@ -643,9 +644,9 @@ def _judged(case: Case, result: RunResult) -> Judgement:
 
 
 def _result(folder: Path, machine: Machine, outcome: RunResult, judgement: Judgement) -> dict[str, Any]:
-    """Return the fields of a :class:`NewResult` that come from the chain, whose files are in ``folder``."""
+    """Return the fields of a :class:`NewResult` that come from the pipeline, whose files are in ``folder``."""
     judgement.figures["tables"] = {item.verification.controller: list(item.export.files) for item in outcome.results}
-    files: list[StoredTableFile] = []  # of every control, by their names below the control's own folder
+    files: list[StoredTableFile] = []  # of every control, by their names below the control's folder
     for item in outcome.results:
         control = item.verification.controller
         root = folder / control if len(outcome.results) > 1 else folder

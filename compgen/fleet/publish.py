@@ -1,4 +1,4 @@
-"""Publication: the output folder of a machine follows the store, and a command is notified of every decision and failure."""
+"""Publication: a machine's output folder follows the store; a command is notified of every decision and failure."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from compgen.fleet import logs
 from compgen.fleet.records import HELD_BACK, MachineRecord, TableRecord, TableState, active_of
 from compgen.fleet.store import Store
 
-# The output folder of a machine follows the store: one folder for each version, and the pointer ``active``.
+# The output folder of a machine follows the store: one folder per version, and the pointer ``active``.
 #
 #     OUT/v0001/ ...                 versions that are or were active
 #     OUT/active -> v0001            symbolic link, swapped atomically; absent while no tables are active
 #     OUT/proposed/v0002/            waits for approval
 #     OUT/proposed/HELD-v0003/       held back by the policy
 #     OUT/proposed/NOT-ACCEPTED-v0004/   refused by the round trip
-#     OUT/.store.json                whose folder this is: machine, number of decisions, and their hash
+#     OUT/.store.json                owner of this folder: machine, number of decisions, and their hash
 #
-# Everything is made under another name and renamed; doing it again changes nothing. It is done under a lock of the folder,
-# after the decision is in the store, so the last one to come always leaves the folder as the store says.
+# Everything is written under a temporary name and renamed; doing it again changes nothing. It is done under a lock on
+# the folder, after the decision is in the store, so the last process always leaves the folder as the store says.
 #
-# Folder and store know each other by the history of the machine: the hash of all decisions with the contents of their
-# tables. A store in which that history is shorter (an older backup) or another one never writes here. What this program did
-# not write is never deleted and nothing is written through a link.
+# Folder and store recognise each other by the machine's history: the hash of all decisions with the contents of their
+# tables. A store with a shorter history (an older backup) or a different one never writes here. Files that this program
+# did not write are never deleted, and nothing is written through a link.
 
 
 Value = TypeVar("Value")
@@ -44,11 +44,11 @@ Value = TypeVar("Value")
 POINTER = "active"
 PROPOSED = "proposed"
 LEDGER = ".store.json"
-#: Prefix of the folder below ``proposed`` by state; tables in other states are not there.
+#: Prefix of the folder below ``proposed`` by state; tables in other states do not appear there.
 PREFIX: dict[TableState, str] = {"pending": "", "held": "HELD-", "refused": "NOT-ACCEPTED-"}
-#: Prefixes of what is left of a folder that holds files of others, and of a folder that belonged to another store.
+#: Prefixes for the rest of a folder that contains foreign files, and for a folder that belonged to another store.
 LEFT, SET_ASIDE = "LEFT-", "SET-ASIDE-"
-#: Refused and held tables of which the folder keeps the newest; all of them are in the store.
+#: The folder keeps this many of the newest refused and held tables; the store keeps all of them.
 KEPT = 3
 _VERSION = re.compile(r"v([0-9]{4,})")
 _PROPOSED = re.compile(r"(?:HELD-|NOT-ACCEPTED-)?v([0-9]{4,})")
@@ -56,28 +56,28 @@ _TEMPORARY = re.compile(r"\.((?:HELD-|NOT-ACCEPTED-)?v([0-9]{4,}))\.tmp")
 
 
 def check_folder(store: Store, machine: MachineRecord, folder: Path) -> None:
-    """Raise InputError unless the folder is that of this machine and this store; nothing is changed.
+    """Raise InputError unless the folder belongs to this machine and this store; nothing is changed.
 
-    Called before a measurement is processed and before a decision, so that no wrong store goes on with a history that is
-    not that of the machine.
+    Called before a measurement is processed and before a decision, so that a wrong store does not continue a history
+    that is not the machine's.
     """
     try:
-        seen = _look(folder)  # before the store: what another process does meanwhile, it adds there first
+        seen = _look(folder)  # before the store: another process adds to the store first
         _compare(store, machine, store.tables(machine, figures=False), folder, seen)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=folder) from error
 
 
 def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:
-    """Make the folder what the store says and return the active tables.
+    """Bring the folder in line with the store and return the active tables.
 
-    Files of the active and the proposed versions that are missing or altered are put back; those of a retired version
-    when it becomes active again.
+    Missing or altered files of the active and the proposed versions are restored; those of a retired version when it
+    becomes active again.
 
     Raises
     ------
     InputError
-        if it cannot be written, or is not the folder of this machine and store (:func:`check_folder`).
+        if it cannot be written, or does not belong to this machine and store (:func:`check_folder`).
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,7 +86,7 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
             tables = store.tables(machine, figures=False)
             _compare(store, machine, tables, folder, seen)
             ledger = _ledger_text(store, machine)
-            # what a process that was killed left behind; nobody else works here now
+            # left behind by a process that was killed; no other process works here now
             (folder / f".{POINTER}.tmp").unlink(missing_ok=True)
             by_version = {table.version: table for table in tables}
             for path in [*folder.glob(".*.tmp"), *(folder / PROPOSED).glob(".*.tmp")]:
@@ -117,7 +117,7 @@ def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord |
 
 
 def is_published(store: Store, machine: MachineRecord, folder: Path) -> bool:
-    """Whether :func:`publish` would change nothing: the files are there, byte for byte, and no others of this program."""
+    """Whether :func:`publish` would change nothing: the files match byte for byte, and this program wrote no others."""
     try:
         seen = _look(folder)
         tables = store.tables(machine, figures=False)
@@ -147,7 +147,7 @@ def is_published(store: Store, machine: MachineRecord, folder: Path) -> bool:
 
 
 def _is_complete(folder: Path, files: Sequence[tuple[str, str, str]], note: bytes) -> bool:
-    """Whether the folder of a version holds its files (control, name, SHA-256) and the note ``version.json``."""
+    """Whether the folder of a version contains its files (control, name, SHA-256) and the note ``version.json``."""
     required = {**_by_place(files), "version.json": sha256_of(note)}
     paths = {folder / name: digest for name, digest in required.items()}
     return not folder.is_symlink() and all(
@@ -157,7 +157,7 @@ def _is_complete(folder: Path, files: Sequence[tuple[str, str, str]], note: byte
 
 
 def set_aside(folder: Path) -> Path | None:
-    """Move everything that an earlier store published into a folder of its own and return that; None if there is nothing."""
+    """Move everything that an earlier store published into a separate folder and return it; None if nothing."""
     if not folder.is_dir():
         return None
     with _locked(folder):
@@ -169,18 +169,18 @@ def set_aside(folder: Path) -> Path | None:
         number = next(k for k in range(1, 10**6) if not (folder / f"{SET_ASIDE}{k}").exists())
         target = folder / f"{SET_ASIDE}{number}"
         target.mkdir()
-        for path in [*([pointer] if pointer.is_symlink() else []), *names]:  # first what a control may read
+        for path in [*([pointer] if pointer.is_symlink() else []), *names]:  # the pointer first: controls read it
             path.rename(target / path.name)
         _sync(folder)
         return target
 
 
-# --- whose folder it is --------------------------------------------------------------------------------------------
+# --- ownership of the folder ---------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a folder holds: where the pointer leads (None: nowhere), the text of the ledger, names of version folders."""
+    """Contents of a folder: target of the pointer (None: nowhere), text of the ledger, names of version folders."""
 
     pointer: str | None
     ledger_text: str | None
@@ -188,7 +188,7 @@ class _Seen:
 
     @property
     def ledger(self) -> dict[str, Any] | None:
-        """What the ledger says; None where it is missing, damaged, or of an older program."""
+        """Contents of the ledger; None if it is missing, damaged, or from an older program."""
         try:
             found = json.loads(self.ledger_text or "")
         except ValueError:
@@ -241,7 +241,7 @@ def _look(folder: Path) -> _Seen:
 
 
 def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord], folder: Path, seen: _Seen) -> None:
-    """Leave a folder alone whose store or machine is another one, or whose store was newer than this one."""
+    """Refuse a folder that belongs to another store or machine, or whose store was newer than this one."""
     known = {version_name(table): table for table in tables if table.state in ("active", "retired")}
     then = (
         f"give the right store (`store` in the job file) or a newer backup; if this store is right, `volcomp recal adopt "
@@ -256,7 +256,7 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     if unknown:
         raise InputError(f"holds {', '.join(unknown)}, which this store never made active; {then}", file=folder)
     ledger = seen.ledger
-    if ledger is None:  # then by the contents
+    if ledger is None:  # then compare the contents
         for name in seen.versions:
             if _is_of_others(folder / name, _about(store, machine, known[name])):
                 raise InputError(
@@ -281,9 +281,9 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
 
 
 def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:
-    """Whether the folder of a version says that it was made by another store; a damaged or missing note says nothing."""
+    """Whether the note in a version's folder shows that another store made it; a missing or unreadable one does not."""
     path = folder / "version.json"
-    if not path.is_file():  # nor a pipe, which would be waited for
+    if not path.is_file():  # not a pipe either: reading it would block
         return False
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
@@ -294,17 +294,17 @@ def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:
 
 
 def version_name(table: TableRecord) -> str:
-    """Return the name of the folder of a version."""
+    """Return the folder name of a version."""
     return f"v{table.version:04d}"
 
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; the system gives the lock back whatever happens to this one."""
+    """Keep other processes out; the system releases the lock whatever happens to this one."""
     with (folder / ".lock").open("a") as stream:
         try:
             import fcntl
-        except ImportError:  # a system without such locks
+        except ImportError:  # a system that lacks such locks
             yield
             return
         try:
@@ -316,10 +316,10 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _clear(folder: Path, contents: Mapping[str, bytes], name: str) -> None:
-    """Delete the files that this program wrote into a folder, then the folder; what others put there stays as LEFT-NAME."""
-    for path in sorted(folder.rglob("*"), reverse=True):  # what lies inside a folder comes before the folder
+    """Delete the files that this program wrote into a folder, then the folder; other files stay as LEFT-NAME."""
+    for path in sorted(folder.rglob("*"), reverse=True):  # the contents of a folder come before the folder
         if path.is_dir() and not path.is_symlink():
-            with contextlib.suppress(OSError):  # not empty: something of others
+            with contextlib.suppress(OSError):  # not empty: contains other files
                 path.rmdir()
             continue
         place = path.relative_to(folder).as_posix()
@@ -341,7 +341,7 @@ def _contents(store: Store, machine: MachineRecord, table: TableRecord) -> dict[
 
 
 def _by_place(files: Sequence[tuple[str, str, Value]]) -> dict[str, Value]:
-    """Return something about files (control, name, value) by place: with several controls each has its own sub-folder."""
+    """Return the values of files (control, name, value) by place: with several controls each has a subfolder."""
     several = len({control for control, _, _ in files}) > 1
     return {f"{control}/{name}" if several else name: value for control, name, value in files}
 
@@ -351,7 +351,7 @@ def _note(store: Store, machine: MachineRecord, table: TableRecord) -> bytes:
 
 
 def _about(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, Any]:
-    """Return what ``version.json`` says."""
+    """Return the contents of ``version.json``."""
     measurement = store.measurement_behind(table)
     return {
         "machine": machine.name,
@@ -364,7 +364,7 @@ def _about(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str
 
 
 def _complete(store: Store, machine: MachineRecord, table: TableRecord, target: Path) -> None:
-    """Make the folder of one version, or put back what is missing or altered in it."""
+    """Make the folder of one version, or restore what is missing or altered in it."""
     contents = _contents(store, machine, table)
     if target.is_symlink() or (target.exists() and not target.is_dir()):
         raise InputError("is not a folder that this program made; move it away", file=target)
@@ -394,7 +394,7 @@ def _make(target: Path, contents: dict[str, bytes]) -> None:
 
 
 def _proposed(tables: Sequence[TableRecord]) -> dict[str, TableRecord]:
-    """Return the tables that the folder of proposals shows, by the names of their folders."""
+    """Return the tables shown in the folder of proposals, by folder name."""
     closed = {table.id for table in [table for table in tables if table.state in HELD_BACK][:-KEPT]}
     shown = [table for table in tables if table.state in PREFIX and table.id not in closed]
     return {f"{PREFIX[table.state]}{version_name(table)}": table for table in shown}
@@ -412,7 +412,7 @@ def _propose(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
         if path.name in required or table is None or path.is_symlink() or not path.is_dir():
             continue
         if not _is_of_others(path, _about(store, machine, table)):
-            gone = path.with_name(f".{path.name}.tmp")  # renamed first: nobody sees half of it
+            gone = path.with_name(f".{path.name}.tmp")  # renamed first: no reader sees it half deleted
             path.rename(gone)
             _clear(gone, _contents(store, machine, table), path.name)
     for name, table in required.items():
@@ -420,7 +420,7 @@ def _propose(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
 
 
 def _sync(folder: Path) -> None:
-    """Make the names in a folder last through a power failure, where the system can."""
+    """Make the names in a folder survive a power failure, if the system can."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -429,26 +429,26 @@ def _sync(folder: Path) -> None:
             os.close(handle)
 
 
-# The notification command: it gets one JSON object on stdin for every decision and every failure, at least once.
+# The notification command gets one JSON object on stdin for every decision and every failure, at least once.
 #
-# What was told already is kept in the store as events, after the command ended well: a command that fails is tried
-# again by the next run. So one whose process is killed in between, or two at the same time, tell it twice: the same object.
+# A notification is recorded in the store as an event after the command has succeeded; a failed command is tried again
+# by the next run. If the process is killed in between, or two run at the same time, the same object is sent twice.
 
 
-#: How long a notification command may take, s.
+#: Time limit of a notification command, s.
 TIMEOUT_S = 60.0
-#: What is older than this is not told any more, for example when notifications are switched on.
+#: Nothing older than this is notified, for example when notifications are switched on.
 OLDEST = timedelta(days=1)
-#: Kind of the events that say what was told.
+#: Kind of the events that record notifications.
 NOTIFIED = "notified"
-#: Bytes of its stderr that are kept.
+#: Bytes of the command's stderr that are kept.
 MOST_SAID = 2000
 
 
 def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list[str]:
-    """Tell what was not told yet, oldest first; return why it could not be told (empty: all was)."""
+    """Send the pending notifications, oldest first; return why any could not be sent (empty: all were)."""
     for subject, message in untold(store, machine) if command else ():
-        if subject in _told(store, machine):  # by another runner, meanwhile
+        if subject in _told(store, machine):  # meanwhile, by another runner
             continue
         problem = _send(command, message)
         if problem:
@@ -459,7 +459,7 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
 
 
 def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
-    """Return what should be told and was not yet, oldest first, by a name that stays."""
+    """Return the pending notifications, oldest first, each with a permanent name."""
     every, decisions, attempts = store.together(
         lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
     )
@@ -493,11 +493,11 @@ def _told(store: Store, machine: MachineRecord) -> set[str]:
 def _send(command: Sequence[str], message: dict[str, Any]) -> str:
     """Run the command with the message on stdin; return what went wrong, empty if nothing.
 
-    However long it hangs, however much it prints and whatever it leaves running, this ends in time: its output is read
-    and dropped but for the beginning of stderr, and a command that takes too long is ended with its children.
+    Returns in time however long the command hangs, however much it prints and whatever it leaves running: its output
+    is read and discarded except for the beginning of stderr; a command that takes too long is killed with its children.
     """
     try:
-        with tempfile.TemporaryFile() as stream:  # it may read as slowly as it likes, or not at all
+        with tempfile.TemporaryFile() as stream:  # the command may read slowly, or not at all
             stream.write((json.dumps(message) + "\n").encode())
             stream.seek(0)
             pipes: Any = {"stdin": stream, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
@@ -537,6 +537,6 @@ class _Said:
                 self._kept += part[: MOST_SAID - len(self._kept)]
 
     def text(self) -> str:
-        """Return what came; a child that went on running may keep the stream open for ever."""
+        """Return what was read; a child that is still running may keep the stream open for ever."""
         self._thread.join(1.0)
         return " ".join(bytes(self._kept).decode("utf-8", "replace").split())[:200]

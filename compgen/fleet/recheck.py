@@ -1,14 +1,14 @@
-"""The shortest re-check: the fewest points at which a requested change of one error would be seen with a given power.
+"""The shortest re-check: the fewest points at which a requested change of one error is detected with a given power.
 
-The readings are J (e + s p) + N n + noise: errors e as last identified, a change of size s in the shape p, and nuisances n
-(station places and dead lengths, found anew each time). With the covariance of e from the last calibration as prior, the
-information on s is what is left of p' J' W J p once e and n are eliminated (Schur complement of the normal matrix, which
-``compgen.plan`` sets up and which adds up over points). The two-sided test at error probability alpha detects s with
-power Phi(s sqrt(I) - z) + Phi(-s sqrt(I) - z), z the 1 - alpha / 2 quantile. The other errors are
-taken as unchanged within that covariance.
+The readings are J (e + s p) + N n + noise: errors e as last identified, a change of size s and shape p, and nuisance
+parameters n (station positions and dead lengths, found anew each time). With the covariance of e from the last
+calibration as prior, the information I on s is what remains of p' J' W J p once e and n are eliminated (Schur
+complement of the normal matrix, which ``compgen.plan`` sets up and which is a sum over points). The two-sided test at
+error probability alpha detects s with power Phi(s sqrt(I) - z) + Phi(-s sqrt(I) - z), z the 1 - alpha / 2 quantile. The
+other errors are taken as unchanged within that covariance.
 
-Points are added greedily from a lattice over the volume, the one that raises the information most first; then each is
-dropped again without which the power is still reached.
+Points are added greedily from a lattice over the volume, the one that raises the information most first; then every
+point that the power does not need is dropped again.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ from compgen.plan import PlannedStations, planned, planned_noise
 
 #: Levels of the lattice of candidate points on each axis.
 LEVELS = 4
-#: Most points of a re-check; whoever needs more measures anew.
+#: Largest number of points of a re-check; if more are needed, a full calibration is better.
 MOST_POINTS = 40
-#: Eigenvalues of the scaled nuisances below this share have no data.
+#: Scaled nuisance parameters with eigenvalues below this fraction have no data.
 NO_DATA = 1e-10
 
 
 @dataclass(frozen=True)
 class Recheck:
-    """Points (n, 3) in mm in the order of their worth, and what they show.
+    """Points (n, 3) in mm, the most useful first, and what they show.
 
-    ``u`` is the standard uncertainty of the change, mm or rad; ``smallest`` the change that is seen with the requested power.
+    ``u`` is the standard uncertainty of the change, mm or rad; ``smallest`` the smallest change that is detected with
+    the requested power.
     """
 
     request: RequestedChange
@@ -76,7 +77,7 @@ class Recheck:
 
 
 def power_of(size: float, u: float, confidence: float) -> float:
-    """Power of the two-sided test for a change of ``size`` that is measured with standard uncertainty ``u``."""
+    """Power of the two-sided test for a change of ``size`` measured with standard uncertainty ``u``."""
     z = norm.ppf(0.5 + 0.5 * confidence)
     return float(norm.cdf(size / u - z) + norm.cdf(-size / u - z))
 
@@ -88,12 +89,12 @@ def shortest_recheck(
     covariance: Covariance | None = None,
     options: IdentifyOptions | None = None,
 ) -> Recheck:
-    """Find few points at which ``stations`` would see the requested change.
+    """Find as few points as possible at which ``stations`` detect the requested change.
 
     Parameters
     ----------
     machine : chain, nodes, and which errors its model contains.
-    stations : as for :func:`compgen.plan.prediction`; in each pass a station reads every point once.
+    stations : as for :func:`compgen.plan.prediction`; a station reads every point once per pass.
     request : error, size of its change, power and confidence.
     covariance : of the errors of the last calibration; None takes them as exactly known.
     options : standard uncertainty of a reading.
@@ -120,7 +121,7 @@ def shortest_recheck(
         return found > 0.0 and power_of(request.size, found**-0.5, request.confidence) >= request.power
 
     chosen = _greedy(len(candidates), information, reached, request)
-    for k in reversed(chosen.copy()):  # points without which the power is still reached, the latest first
+    for k in reversed(chosen.copy()):  # drop points that the power does not need, the latest first
         fewer = [each for each in chosen if each != k]
         if fewer and reached(fewer):
             chosen = fewer
@@ -146,7 +147,7 @@ def _check(request: RequestedChange) -> None:
 
 
 def _shape(layout: ErrorParameters, name: str) -> FloatArray:
-    """Change of the unknowns (errors,) that is the requested shape with size 1, up to the gauge of the layout."""
+    """Change of the unknowns (errors,) with the requested shape and size 1, up to the gauge of the layout."""
     known = next((item for item in error_values(layout) if item[0] == name), None)
     if known is None:
         raise InputError(f"{name!r} is not in the model of machine {layout.machine.name!r}; ask for one that is")
@@ -158,7 +159,7 @@ def _shape(layout: ErrorParameters, name: str) -> FloatArray:
     share = np.interp(position_mm, (position_mm[0], position_mm[-1]), (0.0, 1.0))
     bowed = error_named(name).is_straightness
     target = 4.0 * share * (1.0 - share) if bowed else share
-    free = [np.ones_like(share), *([share] if bowed else [])]  # constants, and slopes of straightness, are the gauge
+    free = [np.ones_like(share), *([share] if bowed else [])]  # gauge: constants, and slopes of straightness
     solution = np.linalg.lstsq(np.column_stack([matrix, *free]), target, rcond=None)[0]
     shape[columns] = solution[: matrix.shape[1]]
     return shape
@@ -182,13 +183,13 @@ def _prior(layout: ErrorParameters, covariance: Covariance) -> FloatArray:
 
 
 def _information(matrix: FloatArray, shape: FloatArray, prior: FloatArray | None, errors: int) -> float:
-    """Information on the size of the change once everything else is eliminated, 1/mm^2 or 1/rad^2."""
+    """Information on the size of the change with everything else eliminated, 1/mm^2 or 1/rad^2."""
     column = matrix[:, :errors] @ shape
     own = float(shape @ column[:errors])
     if prior is None:
         rest, mixed = matrix[errors:, errors:], column[errors:]
     else:
-        # errors are F z with z of unit covariance, so that what is known exactly needs no infinite information
+        # errors are F z with z of unit covariance: exactly known errors need no infinite information
         map_ = np.zeros((len(matrix), prior.shape[1] + len(matrix) - errors))
         map_[:errors, : prior.shape[1]] = prior
         map_[errors:, prior.shape[1] :] = np.eye(len(matrix) - errors)
@@ -209,8 +210,8 @@ def _greedy(
     reached: Callable[[Sequence[int]], bool],
     request: RequestedChange,
 ) -> list[int]:
-    """Begin with the corners and add the best candidate until the power is reached."""
-    ends = (0, LEVELS - 1)  # without the corners new stations are hardly located
+    """Start with the corners and add the best candidate until the power is reached."""
+    ends = (0, LEVELS - 1)  # new stations are poorly located without the corners
     chosen = [(x * LEVELS + y) * LEVELS + z for x in ends for y in ends for z in ends]
     while not reached(chosen):
         if len(chosen) >= min(MOST_POINTS, count):
@@ -232,7 +233,7 @@ def format_recheck_points(recheck: Recheck) -> str:
 
 
 def write_recheck_points(path: Path, recheck: Recheck) -> Path:
-    """Write the points as a points file, whole or not at all."""
+    """Write the points as a points file, atomically."""
     folder = OutputFolder(path.parent)
     folder.add(path.name, format_recheck_points(recheck))
     return next(iter(folder.commit().values()))

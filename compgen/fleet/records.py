@@ -1,6 +1,6 @@
-"""Records that the store returns (frozen, times in UTC), the states of a set of tables, and what a person requests.
+"""Records that the store returns (frozen, times in UTC), the states of a set of tables, and requests of a person.
 
-``volcomp recal --help`` loads this module: it needs no library.
+``volcomp recal --help`` loads this module, so it imports no library.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from compgen.errors import InputError
 TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
 DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "reject", "rollback"]
 
-#: Beginning of a reason that is shown with the tables but does not hold them back.
+#: Prefix of a reason that is shown with the tables but does not hold them back.
 RESERVATION = "reservation: "
 
 
 @dataclass(frozen=True)
 class MachineRecord:
-    """A machine by the name that the job file gives it."""
+    """A machine with its name in the job file."""
 
     id: int
     name: str
@@ -34,13 +34,12 @@ class MachineRecord:
 
 @dataclass(frozen=True)
 class MeasurementRecord:
-    """One measurement, known by the SHA-256 of its files.
+    """One measurement, identified by the SHA-256 of its files.
 
     ``measured_at`` comes from the file's comment ``measured_at`` (``measured_at_source`` = "file"; "file, no zone" if it
-    names no zone and is taken as local time) or from the time of the file itself ("file time"). ``active_table`` is the
-    comment ``active_table``: a version or "none"; None if the
-    file says nothing. ``temperatures_c`` holds lowest, mean and highest value of each channel. ``files`` are name and
-    SHA-256.
+    has no time zone and is taken as local time) or from the file's time stamp ("file time"). ``active_table`` is the
+    comment ``active_table``: a version or "none"; None if the file does not state it. ``temperatures_c`` contains the
+    lowest, mean and highest value of each channel. ``files`` are name and SHA-256.
     """
 
     id: int
@@ -74,7 +73,7 @@ class AttemptRecord:
 class IdentificationRecord:
     """Errors of the bare machine from one measurement; contents through ``Store.errors_of`` and ``covariance_of``.
 
-    ``active_table_id`` is the set of tables that was active while the machine was measured and was taken out;
+    ``active_table_id`` is the set of tables that was active during the measurement and whose effect was removed;
     ``revision`` counts how often the measurement was identified.
     """
 
@@ -97,9 +96,9 @@ class IdentificationRecord:
 class TableRecord:
     """A set of tables of one machine; ``version`` counts from 1.
 
-    ``accepted`` says whether the round trip accepted the files, ``reasons`` why the policy holds them back, and the
-    reservations of the verdict, which begin with :data:`RESERVATION` and hold nothing back; ``summary`` holds the figures
-    of the judgement, ``state`` what the last decision made of it.
+    ``accepted`` says whether the round trip accepted the files. ``reasons`` are why the policy holds them back, and the
+    reservations of the verdict, which begin with :data:`RESERVATION` and hold nothing back. ``summary`` contains the
+    figures of the judgement, ``state`` follows from the last decision.
     """
 
     id: int
@@ -130,7 +129,7 @@ class DecisionRecord:
 
 @dataclass(frozen=True)
 class EventRecord:
-    """Something that happened and is not a decision: an unreadable file, a clock that went backwards."""
+    """An event other than a decision: an unreadable file, a clock that went backwards."""
 
     id: int
     machine_id: int | None
@@ -142,7 +141,7 @@ class EventRecord:
 
 @dataclass(frozen=True)
 class StoredTableFile:
-    """One file of a set of tables: the control that it belongs to, its name and contents."""
+    """One file of a set of tables: its control, name and contents."""
 
     controller: str
     name: str
@@ -151,7 +150,7 @@ class StoredTableFile:
 
 @dataclass(frozen=True)
 class NewMeasurement:
-    """A measurement to be kept: contents by file name, and what is known about it, see :class:`MeasurementRecord`."""
+    """A measurement to be stored: contents by file name, and what is known about it, see :class:`MeasurementRecord`."""
 
     sha256: str
     name: str
@@ -164,11 +163,11 @@ class NewMeasurement:
 
 @dataclass(frozen=True)
 class NewResult:
-    """What processing a measurement gave, kept in one transaction.
+    """Result of processing a measurement, stored in one transaction.
 
-    ``hold`` lists why the policy holds the tables back, ``reservations`` what is shown with them; with ``approve`` they
-    become active at once unless held or not accepted. ``revision`` counts how often the measurement is identified; from
-    the second time on ``actor`` and ``reason`` say who requested it and why.
+    ``hold`` lists why the policy holds the tables back, ``reservations`` what is shown with them; with ``approve`` the
+    tables become active at once unless held or not accepted. ``revision`` counts how often the measurement has been
+    identified; from the second time on ``actor`` and ``reason`` say who requested it and why.
     """
 
     machine_text: bytes
@@ -192,20 +191,20 @@ class NewResult:
 
 
 def reservations_of(reasons: Sequence[str]) -> list[str]:
-    """Return the reasons that do not hold the tables back, without their beginning."""
+    """Return the reasons that do not hold the tables back, without their prefix."""
     return [text.removeprefix(RESERVATION) for text in reasons if text.startswith(RESERVATION)]
 
 
-# --- states of a set of tables: what the decisions make of it ------------------------------------------------------
+# --- states of a set of tables, as they follow from the decisions --------------------------------------------------
 #
 # propose -> pending        approve -> active       another approved -> retired    rollback to it -> active
 # hold    -> held           reject  -> rejected     a newer proposal -> superseded
-# refuse  -> refused        (the round trip did not accept the files: for good)
+# refuse  -> refused        (the round trip did not accept the files: final)
 
 
-#: Who decides where no person does.
+#: Actor of decisions that no person makes.
 AUTOMATIC = "automatic"
-#: State right after a decision about a set of tables.
+#: State of a set of tables right after a decision about it.
 AFTER: dict[DecisionKind, TableState] = {
     "propose": "pending",
     "hold": "held",
@@ -217,9 +216,9 @@ AFTER: dict[DecisionKind, TableState] = {
 }
 #: States in which a person may decide.
 OPEN: tuple[TableState, ...] = ("pending", "held")
-#: States in which the policy or the round trip speaks against the tables.
+#: States in which the policy or the round trip objects to the tables.
 HELD_BACK: tuple[TableState, ...] = ("held", "refused")
-#: States that a rollback may bring back.
+#: States from which a rollback may reactivate tables.
 WAS_ACTIVE: tuple[TableState, ...] = ("retired",)
 
 
@@ -232,7 +231,7 @@ def active_id(decisions: Sequence[DecisionRecord]) -> int | None:
 
 
 def active_of(tables: Iterable[TableRecord]) -> TableRecord | None:
-    """Return the one of a machine's sets of tables that is active, None if none is."""
+    """Return the active one of a machine's sets of tables, None if none is."""
     return next((table for table in tables if table.state == "active"), None)
 
 
@@ -248,7 +247,7 @@ def state_of(table_id: int, decisions: Sequence[DecisionRecord]) -> TableState:
 def before_active(decisions: Sequence[DecisionRecord]) -> int | None:
     """Return the id of the tables that were active before the active ones were first approved, None if none were.
 
-    A rollback counts as if what it undid had never been: after versions 1, 2, 3 and a rollback to 2 the one before is 1.
+    What a rollback undid counts as if it had never happened: after versions 1, 2, 3 and a rollback to 2, this is 1.
     """
     stack: list[int | None] = [None]
     for decision in decisions:
@@ -263,12 +262,12 @@ def before_active(decisions: Sequence[DecisionRecord]) -> int | None:
     return stack[-2] if len(stack) > 1 else None
 
 
-# --- what a person requests ----------------------------------------------------------------------------------------
+# --- requests of a person ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class RequestedChange:
-    """A change that is to be seen: ``size`` in mm or rad (of the squareness, or of the line or bow of a curve)."""
+    """A change to be detected: ``size`` in mm or rad (of the squareness, or of the line or bow of a curve)."""
 
     error: str = option(required=True, metavar="NAME", text="Error whose change is to be seen, e.g. EC0Y.")
     size: float = option(required=True, name="--change", metavar="SIZE", text="Its size, um or urad.")
@@ -277,7 +276,7 @@ class RequestedChange:
 
     @classmethod
     def from_file_units(cls, error: str, size: float, **how: float) -> RequestedChange:
-        """Return the change of ``size`` um or urad; InputError for what is not the name of an error."""
+        """Return the change of ``size`` um or urad; InputError for an unknown error name."""
         if error not in ERROR_NAMES:
             raise InputError(f"{error!r} is not an error; {nearest(error, ERROR_NAMES)}", field="--error")
         return cls(error, size * error_named(error).si_per_unit, **how)
@@ -285,9 +284,9 @@ class RequestedChange:
 
 @dataclass(frozen=True)
 class ReprocessRequest:
-    """Which measurement is to be processed again (None: the newest), who wants it and why: neither may be empty.
+    """Measurement to be processed again (None: the newest), who requests it and why; neither may be empty.
 
-    ``active_table`` states which tables were on while it was made, a version or "none"; None: what the file says.
+    ``active_table`` states which tables were on during the measurement, a version or "none"; None: as the file states.
     """
 
     measurement: str | None = option(

@@ -1,7 +1,7 @@
-"""One pass over the machines of a job: take what is new in the inboxes, process it, keep it, publish it.
+"""One pass over the machines of a job: take new files from the inboxes, process, store and publish them.
 
-Machines do not disturb each other: whatever goes wrong with one becomes part of its outcome. The passes are made in this
-process (:func:`run_jobs`), or in processes of this machine or on a cluster (:func:`run_fleet`), with the same results.
+Machines do not affect each other: whatever goes wrong with one becomes part of its outcome. The passes run in this
+process (:func:`run_jobs`), or in processes of this computer or on a cluster (:func:`run_fleet`), with the same results.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ from compgen.kinematics.parallel import (
 )
 from compgen.plugins import WithPlugins, with_plugins
 
-#: Causes that may pass by themselves, so that a measurement is tried again instead of being given up: a full disk or one
-#: with a limit, a file that cannot be read now, too many open files.
+#: Causes that may go away by themselves, so a measurement is retried instead of given up: a full disk or quota, a file
+#: that cannot be read now, too many open files.
 PASSING = (
     errno.ENOSPC,
     errno.EDQUOT,
@@ -62,7 +62,7 @@ PASSING = (
 
 
 def passes(error: BaseException) -> bool:
-    """Whether the cause may pass by itself: one of :data:`PASSING`, too little memory, a store that is away."""
+    """Whether the cause may go away by itself: one of :data:`PASSING`, too little memory, an unreachable store."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, MemoryError | StoreError) or (isinstance(cause, OSError) and cause.errno in PASSING):
@@ -77,13 +77,13 @@ Mapper = Callable[[Callable[[MachineJob], "MachineOutcome"], Iterable[MachineJob
 
 @dataclass(frozen=True)
 class MachineOutcome:
-    """What one pass did for one machine; it can be sent between processes.
+    """Result of one pass over one machine; it can be sent between processes.
 
     ``state`` is "ok", "held" (the newest tables are held back or refused), "failed" (something could not be taken or
     processed) or "stopped" (the pass ended before its turn: nothing is known of it); ``messages`` say why. ``processed``
     names the measurements of this pass, ``active`` is the active version, ``waiting`` are the versions that wait for a
-    person. With ``again`` something may pass by itself (a full disk, an unreadable file, another runner, a store that is
-    away), with ``unreachable`` it is the store.
+    person. ``again``: the cause may go away by itself (a full disk, an unreadable file, another runner, an unreachable
+    store); ``unreachable``: it is the store.
     """
 
     machine: str
@@ -111,7 +111,7 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """0: all is well; 1: something is held back or failed; 2: the store went away; 3: an internal error."""
+        """0: all is well; 1: something is held back or failed; 2: the store is unreachable; 3: an internal error."""
         if any(item.internal for item in self.outcomes):
             return 3
         return 2 if any(item.unreachable for item in self.outcomes) else 0 if self.accepted else 1
@@ -129,9 +129,9 @@ def run_jobs(
     stop: StopCheck = lambda: False,
     clock: Clock | None = None,
 ) -> RunOutcome:
-    """Make one pass over the machines ``names`` (default all); ``mapper`` may spread them over processes.
+    """Make one pass over the machines ``names`` (default all); ``mapper`` may distribute them over processes.
 
-    ``clock`` tells the time of a simulated factory; None: that of the computer or the database.
+    ``clock`` gives the time of a simulated factory; None: the time of the computer or the database.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def _passed(
     try:
         with opened() as store:
             outcome = _Pass(store, job, store.add_machine(job.name), stop, elsewhere).run()
-    except (LostError, StoppedError, ClusterError):  # of workers elsewhere
+    except (LostError, StoppedError, ClusterError):  # from workers in other processes
         raise
     except CompgenError as error:
         lost = isinstance(error, StoreError)
@@ -181,7 +181,7 @@ def _passed(
 
 
 class _Pass:
-    """One pass over one machine; collects messages as it goes. ``elsewhere`` processes instead of this process."""
+    """One pass over one machine; collects messages on the way. ``elsewhere`` processes instead of this process."""
 
     def __init__(
         self,
@@ -200,7 +200,7 @@ class _Pass:
         self.again = False
 
     def run(self) -> MachineOutcome:
-        """Take, process, publish, notify; as long as nothing is new the store is read at one moment and nothing is written."""
+        """Take, process, publish, notify; if nothing is new, one snapshot of the store is read, nothing is written."""
         found, received = inbox.scan(self.job, self.store.now()), []
         problems = [(problem.subject, problem.message) for problem in found.problems]
         for group in found.groups:
@@ -223,7 +223,7 @@ class _Pass:
             self._problem("inbox", *problem)
         for item in received:
             self.store.add_measurement(self.machine, inbox.measurement_of(*item))
-        settings = self.job.settings_sha256()  # a machine file that is missing ends here; what came in is kept
+        settings = self.job.settings_sha256()  # a missing machine file ends the pass here; files taken so far are kept
         if self.elsewhere is None:
             self.process_all(settings)
         elif self._waiting(settings):
@@ -239,7 +239,7 @@ class _Pass:
         return self._outcome(active, settings)
 
     def _unchanged(self) -> MachineOutcome | None:
-        """Return the outcome where nothing is to be done: all was taken, processed, published and told. Else None."""
+        """Return the outcome if there is nothing to do: all taken, processed, published and notified. Else None."""
         store, machine = self.store, self.machine
         newest = store.newest_entry(machine)
         if self.present - {item.sha256 for item in store.measurements(machine)} or (newest and newest > store.now()):
@@ -254,7 +254,7 @@ class _Pass:
         return self._outcome(active_of(store.tables(machine, figures=False)), settings)
 
     def _problem(self, kind: str, subject: str, message: str, *, fail: bool = True) -> None:
-        """Report something; it is kept in the store if it is news there."""
+        """Report a problem; it is stored if the store does not know it yet."""
         self.failed = self.failed or fail
         self.again = self.again or fail
         subject, message = visible(plain(subject), flat=True), plain(message)
@@ -263,13 +263,13 @@ class _Pass:
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)
 
     def _waiting(self, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
-        """Return what has no result yet in the order of measurement; what failed comes again only with other settings."""
+        """Return measurements without a result, in order of measurement; failed ones only if the settings changed."""
         attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
         done = self.store.identified(self.machine) | {i.measurement_id for i in attempts if i.outcome == "failed"}
         return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
 
     def process_all(self, settings: str) -> None:
-        """Process what waits; where another runner has a measurement, the later ones are left to it as well."""
+        """Process waiting measurements; if another runner has one, the later ones are left to it as well."""
         seen: set[int] = set()
         waiting = self._waiting(settings)
         while waiting:
@@ -279,7 +279,7 @@ class _Pass:
                 break
             seen.add(measurement.id)
             try:
-                with one_thread():  # the same bytes however many processors there are
+                with one_thread():  # the same bytes whatever the number of processors
                     claims.work_on(self.store, measurement, partial(self._keep, measurement, settings))
             except ClaimLostError as error:
                 self.messages.append(f"{measurement.name}: {error}; it is left to the next run")
@@ -311,9 +311,9 @@ class _Pass:
         logs.info("measurement processed", machine=self.job.name, measurement=measurement.name, **fields)
 
     def _outcome(self, active: TableRecord | None, settings: str) -> MachineOutcome:
-        """Judge by what the store holds, so that the same inbox gives the same outcome however often it is run."""
+        """Judge by the contents of the store: the same inbox gives the same outcome however often it is run."""
         tables = self.store.tables(self.machine, figures=False)
-        # what failed is reported as long as it is in the inbox: who removed or mended it knows of it
+        # a failure is reported as long as its file is in the inbox: whoever removed or repaired the file knows of it
         names = {item.id: item.name for item in self.store.measurements(self.machine) if item.sha256 in self.present}
         for attempt in self.store.attempts(self.machine):
             name = names.get(attempt.measurement_id)
@@ -338,21 +338,21 @@ class _Pass:
 
 # --- passes in other processes -------------------------------------------------------------------------------------
 
-#: Events about processes that ended over a measurement, and after how many of them it is set aside.
+#: Kind of the events about processes that died on a measurement, and after how many of them it is set aside.
 DIED, TRIES = "process ended", 3
-#: Why a cluster has to be on this machine.
+#: Why a cluster has to run on this computer.
 LOCAL_STORE = "the store is an SQLite file, which only processes of one machine may share; use postgresql://HOST/NAME"
 
 
 @dataclass(frozen=True)
 class Pass:
-    """One pass over a machine as another process makes it; it brings the form of the logs along."""
+    """One pass over a machine, made by another process; it carries the log format along."""
 
     url: str
     log: logs.Format
 
     def __repr__(self) -> str:
-        return "Pass()"  # the URL may hold a password
+        return "Pass()"  # the URL may contain a password
 
     def __call__(self, job: MachineJob) -> MachineOutcome:
         """Make the pass."""
@@ -361,14 +361,14 @@ class Pass:
 
 
 def pass_of(url: str) -> WithPlugins:
-    """Return the pass on the store ``url`` with this process's logs and plug-ins."""
+    """Return the pass on the store ``url`` with the log format and plug-ins of this process."""
     return with_plugins(Pass(url, logs.form()))
 
 
 class Elsewhere:
-    """Workers that share nothing with this computer but the store: they process, everything else is done here.
+    """Workers that share only the store with this computer: they process, everything else is done here.
 
-    Inboxes are read, tables published and decisions told by this process. A worker gets the settings of a machine with
+    This process reads inboxes, publishes tables and sends notifications. A worker gets the settings of a machine with
     the files that they name.
     """
 
@@ -379,7 +379,7 @@ class Elsewhere:
         self._function = Packed(with_plugins(StoredPass(url, logs.form())))
 
     def call(self, function: Packed, item: Packed, stop: Stop) -> MachineOutcome:
-        """Make the pass over a machine; ``function`` is that of workers with the same files."""
+        """Make the pass over a machine; ``function`` is the one for workers with the same files."""
 
         def elsewhere(job: MachineJob) -> MachineOutcome:
             found: MachineOutcome = self._workers.call(self._function, Packed(Parcel.of(job)), stop)
@@ -390,20 +390,20 @@ class Elsewhere:
         return _passed(lambda: nullcontext(self._store), item.value(), stop, elsewhere)
 
     def close(self) -> None:
-        """Close the store; the workers go on."""
+        """Close the store; the workers continue."""
         self._store.close()
 
 
 @dataclass(frozen=True, repr=False)
 class Parcel:
-    """The settings of a machine for a computer without its files: ``files`` are those that they name, by what they are."""
+    """The settings of a machine for a computer without its files; ``files`` are the files they name, by purpose."""
 
     job: MachineJob
     files: Mapping[str, Mapping[str, bytes]]
 
     @classmethod
     def of(cls, job: MachineJob) -> Parcel:
-        """Pack the machine file, the instrument file, the user's templates, and what lies in the inboxes of others."""
+        """Pack the machine file, the instrument file, the user's templates, and the inboxes of the other machines."""
         source, folder = load_machine(job.machine).source, job.templates
         assert source is not None
         files = {"machine": {source.name: read_bytes(source)}}
@@ -419,7 +419,7 @@ class Parcel:
         return cls(replace(job, inbox=job.inbox.resolve(), others=others, original=source), files)
 
     def unpacked(self, folder: Path) -> MachineJob:
-        """Write the files below a folder and return the settings that name them there."""
+        """Write the files to a folder and return the settings that name them there."""
         places: dict[str, Any] = {}
         for kind, contents in self.files.items():
             paths = write_files(folder / kind, contents)
@@ -429,10 +429,10 @@ class Parcel:
 
 @dataclass(frozen=True, repr=False)
 class StoredPass(Pass):
-    """Processes what the store holds of a machine, and nothing else."""
+    """Processes the stored measurements of a machine, and nothing else."""
 
     def __call__(self, parcel: Parcel) -> MachineOutcome:  # type: ignore[override]
-        """Process what waits; the outcome says what came of that alone."""
+        """Process waiting measurements; the outcome covers only these."""
         logs.configure(self.log)
         with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, closing(open_store(self.url)) as store:
             job = parcel.unpacked(folder / "settings")
@@ -443,10 +443,10 @@ class StoredPass(Pass):
 
 
 def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = False) -> Workers:
-    """Return what works on the machines of the store ``url``: a cluster, or processes of this computer.
+    """Return the workers for the machines of the store ``url``: a cluster, or processes of this computer.
 
-    Even one worker is a process of its own: a measurement that brings it down, or takes too long, takes nothing with it
-    but its own pass. ``copied`` as for :class:`compgen.kinematics.parallel.Processes`.
+    Even a single worker is a separate process: a measurement that crashes it, or takes too long, ends only that pass.
+    ``copied`` as for :class:`compgen.kinematics.parallel.Processes`.
 
     Raises
     ------
@@ -454,16 +454,16 @@ def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = Fa
         if the cluster cannot be used, for example not with this store.
     """
     if cluster is not None:
-        from compgen.kinematics.parallel import Cluster  # the library is an optional one
+        from compgen.kinematics.parallel import Cluster  # an optional library
 
         return Cluster(cluster, same_host=LOCAL_STORE if sqlite_path(url) is not None else "")
     return Processes(workers, copied=copied and workers == 1, died=partial(note_death, url))
 
 
 def note_death(url: str, job: MachineJob, pid: int, late: bool) -> None:
-    """Keep that the process ``pid`` ended while it worked on a measurement; after three times it is set aside.
+    """Record that process ``pid`` died while working on a measurement; after three times the measurement is set aside.
 
-    With ``late`` it was ended because it took too long, and the measurement is set aside at once.
+    With ``late`` it was killed because it took too long, and the measurement is set aside at once.
     """
     try:
         with closing(open_store(url)) as store:
@@ -499,7 +499,7 @@ def run_fleet(
     cluster: str | None = None,
     stop: Stop = lambda: False,
 ) -> RunOutcome:
-    """Make one pass over the machines ``names`` (default all) with so many processes, or on a Dask cluster.
+    """Make one pass over the machines ``names`` (default all) with ``workers`` processes, or on a Dask cluster.
 
     Raises
     ------
@@ -514,13 +514,13 @@ def run_fleet(
 
 
 def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop = lambda: False) -> RunOutcome:
-    """Make one pass over the machines ``names`` (default all) with workers that are there; see :func:`run_fleet`."""
+    """Make one pass over the machines ``names`` (default all) with existing workers; see :func:`run_fleet`."""
 
     def mapper(_: Callable[[MachineJob], MachineOutcome], chosen: Iterable[MachineJob]) -> list[MachineOutcome]:
         jobs = ordered = list(chosen)
         if len(jobs) > 1:
-            # The others go before a machine whose last measurement was left by a runner that was killed: so one that
-            # brings down all that runs here (too little memory) does not keep the machines behind it waiting for ever.
+            # A machine whose last measurement was left by a killed runner goes last: if it crashes everything that runs
+            # here (too little memory), the other machines do not wait for ever.
             with closing(open_store(job.store)) as store:
                 left = claims.unfinished(store)
                 names = {machine.name for machine in store.machines() if machine.id in left}
@@ -534,7 +534,7 @@ def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop 
 
 
 def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
-    """Return the outcome of a machine whose pass did not come to an end."""
+    """Return the outcome of a machine whose pass did not finish."""
     if isinstance(error, StoppedError):
         return MachineOutcome(job.name, "stopped", (f"not looked at: {error}",))
     outcome = MachineOutcome(job.name, "failed", (str(error),), again=True)
@@ -543,7 +543,7 @@ def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
 
 
 def work_of(fleet: Workers) -> Callable[[MachineJob, str, Stop], MachineOutcome]:
-    """Return the work of a :class:`compgen.fleet.watch.Watch` whose passes are made by ``fleet``."""
+    """Return the work function of a :class:`compgen.fleet.watch.Watch` whose passes are made by ``fleet``."""
 
     @lru_cache(maxsize=1)
     def workers(url: str) -> Workers:
@@ -554,7 +554,7 @@ def work_of(fleet: Workers) -> Callable[[MachineJob, str, Stop], MachineOutcome]
             made = workers(url)
             found: MachineOutcome = made.call(Packed(pass_of(url)), Packed(job), stop)
             return found
-        except CompgenError as error:  # lost, stopped, or a worker that cannot be used
+        except CompgenError as error:  # lost, stopped, or an unusable worker
             return _lost(job, error)
 
     return work

@@ -35,7 +35,7 @@ Record = TypeVar("Record")
 class MachineStatus:
     """Status of one machine; times are ISO texts in UTC.
 
-    ``state``: "new" (nothing was measured), "ok", "waiting" (a person has to decide), "held" (the newest tables are held
+    ``state``: "new" (not measured yet), "ok", "waiting" (for a person's decision), "held" (the newest tables are held
     back or refused) or "failed" (the last attempt failed).
     """
 
@@ -122,7 +122,7 @@ def _state(tables: Sequence[TableRecord], attempts: Sequence[AttemptRecord]) -> 
 
 
 def schedule_text(schedule: Schedule | None) -> str:
-    """Say in a few words when a machine is looked at."""
+    """Say in a few words when a machine is checked."""
     if schedule is None:
         return ""
     return schedule.expression if isinstance(schedule, Cron) else f"every {schedule.minutes} min"
@@ -173,13 +173,13 @@ def _iso(time: datetime) -> str:
     return time.isoformat(timespec="seconds")
 
 
-# --- the fleet at one glance: nothing of the contents is loaded ----------------------------------------------------
+# --- overview of the fleet: no contents are loaded -----------------------------------------------------------------
 
 #: Machines on one page.
 PAGE = 100
 #: Decisions on one page of the audit trail.
 AUDIT = 200
-#: What is wrong with a machine or waits, the most urgent first, and how it is called.
+#: Statuses of a machine, the most urgent first, and their names.
 STATUSES = {
     "failed": "failed",
     "held": "held back",
@@ -193,11 +193,11 @@ STATUSES = {
 
 @dataclass(frozen=True)
 class FleetRow:
-    """One machine, as far as the overview shows it.
+    """One machine as shown in the overview.
 
-    ``waiting`` are the versions that wait for a person, newest first, ``pending`` whether one of them is not held back;
-    ``newest`` is the state of the newest version; ``failure`` says why the last attempt failed, if it did;
-    ``reserved`` whether the verdict on the active tables has reservations.
+    ``waiting``: versions that wait for a person, newest first; ``pending``: whether one of them is not held back;
+    ``newest``: state of the newest version; ``failure``: why the last attempt failed, if it did; ``reserved``: whether
+    the verdict on the active tables has reservations.
     """
 
     machine: MachineRecord
@@ -234,7 +234,7 @@ class Fleet:
 
 
 def fleet(store: Store) -> Fleet:
-    """Return the fleet, in one transaction; the database sums up, so that few rows come per machine."""
+    """Return the fleet, in one transaction; the database aggregates, so few rows per machine are transferred."""
     found = store.read(lambda connection: {name: connection.execute(q).all() for name, q in _queries().items()})
     active = {row.machine_id: row for row in found["active"]}
     newest = {row.machine_id: AFTER[row.kind] for row in found["newest"]}
@@ -302,7 +302,7 @@ def _queries() -> dict[str, sa.Select[Any]]:
 
 
 def _newest_decisions(which: sa.ColumnElement[bool], by: Sequence[sa.Column[int]]) -> sa.FromClause:
-    """The newest decision of those that fulfil a condition for each value of ``by``, as something to select from."""
+    """Selectable with the newest decision that meets a condition, for each value of ``by``."""
     decisions = database.decisions
     last = sa.select(decisions.c.machine_id, sa.func.max(decisions.c.sequence).label("sequence"))
     found = last.where(which).group_by(*by).subquery()
@@ -323,7 +323,7 @@ def _active(newest: sa.Subquery) -> sa.Select[Any]:
 
 @dataclass(frozen=True)
 class FleetPage:
-    """The machines of one page, how many there are by status in all, and which page of how many it is."""
+    """The machines of one page, their total number by status, the page number and the number of pages."""
 
     rows: Sequence[FleetRow]
     counts: Mapping[str, int]
@@ -333,7 +333,7 @@ class FleetPage:
 
 
 def fleet_page(rows: Sequence[FleetRow], words: str, status: str, page: int) -> FleetPage:
-    """Choose by part of the name and by status; pages count from 1, one beyond the last is the last."""
+    """Filter by part of the name and by status; pages count from 1, a number beyond the last gives the last."""
     chosen = [r for r in rows if words.lower() in r.machine.name.lower() and status in ("", r.status)]
     pages = max(1, -(-len(chosen) // PAGE))
     page = min(max(page, 1), pages)
@@ -350,7 +350,7 @@ def machine_by_id(store: Store, machine_id: int) -> MachineRecord | None:
 
 @dataclass(frozen=True)
 class AuditPage:
-    """Decisions of one page, the newest first, each with machine and version; which page of how many it is."""
+    """Decisions of one page, newest first, each with machine and version; page number and number of pages."""
 
     rows: Sequence[tuple[DecisionRecord, str, int | None]]
     page: int
@@ -359,7 +359,7 @@ class AuditPage:
 
 @at_one_moment
 def audit_page(store: Store, page: int, *, people: bool) -> AuditPage:
-    """Return one page of the audit trail, with ``people`` only what persons decided."""
+    """Return one page of the audit trail, with ``people`` only the decisions of persons."""
     decisions, tables, machines = database.decisions, database.tables, database.machines
     who = decisions.c.actor != AUTOMATIC if people else sa.true()
     count = store.read(lambda c: c.execute(sa.select(sa.func.count()).select_from(decisions).where(who)).scalar_one())

@@ -1,6 +1,6 @@
-"""The store: machines, measurements, identified errors, tables and decisions; rows are only ever added.
+"""The store: machines, measurements, identified errors, tables and decisions; rows are only added.
 
-Open it with :func:`open_store`. Decisions are made in :mod:`compgen.fleet.decisions`; leases, and what the processing of a
+Open it with :func:`open_store`. Decisions are in :mod:`compgen.fleet.decisions`; leases, and what the processing of a
 measurement adds, are in :mod:`compgen.fleet.claims`.
 """
 
@@ -45,7 +45,7 @@ from compgen.identify.covariance import Covariance, parse_covariance
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
 Clock = Callable[[], datetime]
-#: The store whose reads go through one connection at the moment, that connection, and what was read by it.
+#: The store whose reads currently share one connection, that connection, and what was read through it.
 _together: ContextVar[tuple[Store, sa.Connection, dict[Any, Any]] | None] = ContextVar("compgen_store", default=None)
 
 #: Identifications, each with the time of its measurement.
@@ -57,7 +57,7 @@ _IDENTIFICATIONS: sa.Select[Any] = sa.select(database.identifications, database.
 def at_one_moment(
     function: Callable[Concatenate[Store, Arguments], Result],
 ) -> Callable[Concatenate[Store, Arguments], Result]:
-    """Let a function whose first argument is the store read everything as it is at one moment (:meth:`Store.together`)."""
+    """Let a function whose first argument is the store read from one snapshot (:meth:`Store.together`)."""
 
     @wraps(function)
     def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
@@ -69,7 +69,7 @@ def at_one_moment(
 def read_once(
     function: Callable[Concatenate[Store, Arguments], Result],
 ) -> Callable[Concatenate[Store, Arguments], Result]:
-    """As :func:`at_one_moment`, for a method with plain arguments: what is read twice at one moment is fetched once."""
+    """As :func:`at_one_moment`, for a method with plain arguments: repeated reads of a snapshot are fetched once."""
 
     @wraps(function)
     def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
@@ -87,10 +87,10 @@ def read_once(
 
 
 class Store:
-    """A store that is open; every method is one transaction. ``clock`` is for tests.
+    """An open store; every method is one transaction. ``clock`` is for tests.
 
-    A method raises StoreError once the file of an SQLite store was moved, removed, replaced or overwritten: what is written
-    to an open file that nobody finds any more is lost, and what goes into another store spoils both.
+    Methods raise StoreError once the file of an SQLite store has been moved, removed, replaced or overwritten: data
+    written to an open file without a path are lost, and data written to another store corrupt both.
     """
 
     def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None, number: int = 0) -> None:
@@ -98,11 +98,11 @@ class Store:
         self._file = _StoreFile(Path(str(engine.url.database)), number) if engine.dialect.name == "sqlite" else None
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self.engine.dispose()
 
     def now(self, connection: sa.Connection | None = None) -> datetime:
-        """Return the time by which leases count: that of the PostgreSQL server, or of this machine."""
+        """Return the time used for leases: from the PostgreSQL server, or from this computer."""
         if self._clock is not None:
             return self._clock()
         if self.engine.dialect.name != "postgresql":
@@ -113,7 +113,7 @@ class Store:
         return found.astimezone(UTC)
 
     def read(self, action: Callable[[sa.Connection], Result]) -> Result:
-        """Do ``action`` in a transaction that only reads; again while the store cannot be reached."""
+        """Run ``action`` in a read-only transaction; retry while the store cannot be reached."""
 
         def once() -> Result:
             self._check_file()
@@ -127,18 +127,18 @@ class Store:
             return retried(once, self.url)
         except (CompgenError, UnicodeDecodeError):
             raise
-        except ValueError as error:  # no time, no JSON
+        except ValueError as error:  # invalid time or JSON
             raise StoreError(f"the store {shown(self.url)} is damaged: {error}; restore a backup") from error
 
     def snapshot(self) -> sa.Connection:
-        """Return a connection that only reads, and that sees the store as it is at one moment."""
+        """Return a read-only connection that sees a snapshot of the store."""
         connection = self.engine.connect().execution_options(reading=True)
         if self.engine.dialect.name == "postgresql":
             return connection.execution_options(isolation_level="REPEATABLE READ")
         return connection
 
     def together(self, action: Callable[[], Result]) -> Result:
-        """Do ``action``, which reads several times, on the store as it is at one moment: its reads fit together."""
+        """Run ``action``, which reads several times, on one snapshot of the store: its reads are consistent."""
         current = _together.get()
         if current is not None and current[0] is self:
             return action()
@@ -155,19 +155,19 @@ class Store:
         return retried(once, self.url)
 
     def write(self, action: Callable[[sa.Connection], Result]) -> Result:
-        """Do ``action`` in a transaction, all of it or nothing; again while the store cannot be reached."""
+        """Run ``action`` in a transaction, all or nothing; retry while the store cannot be reached."""
 
         def once() -> Result:
             self._check_file()
             with self.engine.begin() as connection:
                 found = action(connection)
-                self._check_file()  # again, right before it counts
+                self._check_file()  # again, right before the commit
                 return found
 
         return retried(once, self.url)
 
     def _check_file(self) -> None:
-        """Raise StoreError unless the path still leads to the store that was opened."""
+        """Raise StoreError unless the path still refers to the store that was opened."""
         if self._file is not None and not self._file.is_same():
             raise StoreError(
                 f"the store {shown(self.url)} was moved, removed or replaced while it was open; nothing was written: "
@@ -175,10 +175,10 @@ class Store:
             )
 
     def version(self) -> tuple[object, ...]:
-        """Return something that is another one after every change: what was read before may be shown while it is equal.
+        """Return a value that changes with every change of the store: earlier reads are valid while it is equal.
 
-        Rows are only added. SQLite numbers them in the order in which they count; on PostgreSQL a lower number may
-        come later, so they are counted as well.
+        Rows are only added. SQLite numbers them in the order in which they take effect; on PostgreSQL a lower number
+        may come later, so the rows are counted as well.
         """
         counted = self.engine.dialect.name == "postgresql"
         tables = [table for table in database.ALL if "id" in table.c and table is not database.claims]
@@ -189,11 +189,11 @@ class Store:
     # --- machines ---------------------------------------------------------------------------------------------------
 
     def add_machine(self, name: str) -> MachineRecord:
-        """Return the machine ``name``, which is added if it is not known."""
+        """Return the machine ``name``, added if not known."""
         found = self.read(lambda connection: _machine_named(connection, name))
         if found is not None:
             return found
-        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+        with suppress(sa.exc.IntegrityError):  # another process was faster
             self.write(lambda c: c.execute(sa.insert(database.machines).values(name=name, at=self.now(c))))
         return self.machine(name)
 
@@ -210,7 +210,7 @@ class Store:
         return [MachineRecord(*row) for row in self._rows(query)]
 
     def machine_of(self, identification: IdentificationRecord) -> Machine:
-        """Return the machine as its file described it when the errors were identified."""
+        """Return the machine as described by its file when the errors were identified."""
         table = database.machine_versions
         query = sa.select(table.c.sha256).where(table.c.id == identification.machine_version_id)
         content = self.blob(self.read(lambda c: c.execute(query).scalar_one()))
@@ -219,11 +219,11 @@ class Store:
     # --- measurements -----------------------------------------------------------------------------------------------
 
     def add_measurement(self, machine: MachineRecord, new: NewMeasurement) -> MeasurementRecord:
-        """Keep a measurement with its contents and return it; the same contents are kept once."""
+        """Store a measurement with its contents and return it; the same contents are stored once."""
         known = self.find_measurement(machine, new.sha256)
         if known is not None:
             return known
-        with suppress(sa.exc.IntegrityError):  # somebody else was faster
+        with suppress(sa.exc.IntegrityError):  # another process was faster
             self.write(lambda c: _insert_measurement(c, machine.id, new, self.now(c)))
         found = self.find_measurement(machine, new.sha256)
         if found is None:
@@ -238,7 +238,7 @@ class Store:
     def measurements(
         self, machine: MachineRecord | None = None, *, sha256: str | None = None
     ) -> list[MeasurementRecord]:
-        """Return the measurements of a machine (or of all) in the order in which they were made."""
+        """Return the measurements of a machine (or of all) in the order of measurement."""
         table, listed = database.measurements, database.measurement_files
         query = _where(sa.select(table).order_by(table.c.measured_at, table.c.id), table, machine)
         inner = sa.select(listed.c.measurement_id, listed.c.name, listed.c.sha256).order_by(listed.c.id)
@@ -256,16 +256,16 @@ class Store:
         return {name: self.blob(digest) for name, digest in measurement.files}
 
     def measurement_behind(self, table: TableRecord) -> MeasurementRecord:
-        """Return the measurement from which a set of tables was made; its files are left out."""
+        """Return the measurement from which a set of tables was made, without its files."""
         measured, found = database.measurements, database.identifications
         query = sa.select(measured).join(found, found.c.measurement_id == measured.c.id)
         (row,) = self._rows(query.where(found.c.id == table.identification_id))
         return MeasurementRecord(**row._mapping, files=())
 
     def same_files_of_others(self, machine: MachineRecord, measurement: MeasurementRecord) -> list[tuple[str, str]]:
-        """Return (machine, measurement in words) of other machines to which one of the measurement's files came too.
+        """Return (machine, measurement in words) of other machines that also received one of the measurement's files.
 
-        What a person rejected there does not count: that is how the wrong machine lets go of it.
+        Measurements that a person rejected there do not count: this is how a file is withdrawn from the wrong machine.
         """
         files, measured, found = database.measurement_files, database.measurements, database.identifications
         own = {digest for _, digest in measurement.files}
@@ -297,7 +297,7 @@ class Store:
 
     @at_one_moment
     def newest_entry(self, machine: MachineRecord) -> datetime | None:
-        """Return the time of the machine's last measurement received or decision, None if there is none."""
+        """Return the time of the last measurement received or decision made for the machine, None if there is none."""
         times = [item.received_at for item in self.measurements(machine)]
         return max(times + [item.at for item in self.decisions(machine)], default=None)
 
@@ -310,7 +310,7 @@ class Store:
     # --- identified errors and tables -------------------------------------------------------------------------------
 
     def identifications(self, machine: MachineRecord | None = None) -> list[IdentificationRecord]:
-        """Return the identified errors of a machine (or of all) in the order in which they were measured."""
+        """Return the identified errors of a machine (or of all) in the order of measurement."""
         table, measured = database.identifications, database.measurements
         query = _where(_IDENTIFICATIONS, table, machine).order_by(measured.c.measured_at, table.c.id)
         return [IdentificationRecord(**row._mapping) for row in self._rows(query)]
@@ -339,7 +339,7 @@ class Store:
     def tables(self, machine: MachineRecord | None = None, *, figures: bool = True) -> list[TableRecord]:
         """Return the sets of tables of a machine (or of all) by version, with their states.
 
-        Without ``figures`` their summaries stay empty, which saves much where the whole fleet is looked at.
+        Without ``figures`` their summaries stay empty, which saves much time for the whole fleet.
         """
         decided: dict[int, list[DecisionRecord]] = {}
         for decision in self.decisions(machine):
@@ -359,7 +359,7 @@ class Store:
 
     @read_once
     def file_hashes(self, machine: MachineRecord) -> dict[int, list[tuple[str, str, str]]]:
-        """Return control, name and SHA-256 of the files of every set of tables of a machine, by its id, in a fixed order."""
+        """Return control, name and SHA-256 of the files of a machine's sets of tables, by id, in a fixed order."""
         files, tables = database.table_files, database.tables
         query = sa.select(files.c.table_id, files.c.controller, files.c.name, files.c.sha256)
         query = query.join(tables, tables.c.id == files.c.table_id).where(tables.c.machine_id == machine.id)
@@ -370,7 +370,7 @@ class Store:
 
     @read_once
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
-        """Return all decisions in their order: who, what, when, why."""
+        """Return all decisions in order: who, what, when, why."""
         table = database.decisions
         query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.sequence)
         return [DecisionRecord(*row) for row in self._rows(query)]
@@ -378,7 +378,7 @@ class Store:
     # --- events and contents ----------------------------------------------------------------------------------------
 
     def add_event(self, kind: str, subject: str, message: str, machine: MachineRecord | None = None) -> bool:
-        """Keep an event unless the last one of this machine, kind and subject says the same; return whether it is new."""
+        """Store an event unless the last of this machine, kind and subject is the same; return whether it is new."""
         table, machine_id, message = database.events, None if machine is None else machine.id, database.plain(message)
         same = sa.and_(
             table.c.machine_id.is_not_distinct_from(machine_id), table.c.kind == kind, table.c.subject == subject
@@ -409,11 +409,11 @@ class Store:
 
 
 class _StoreFile:
-    """The file of an SQLite store as it was opened, for finding out whether another one came into its place.
+    """The file of an SQLite store as it was opened, to detect whether another file has replaced it.
 
-    A copy may also be written over it (``cp``), which leaves its place on the disk. Every file has a number of its own, also
-    a backup; and in a store rows are only added, so those that were in the file must still be there as they were, which an
-    older raw copy does not have. The file is looked into when its time changed.
+    A copy may also be written over it (``cp``), which keeps its inode. Every file, also a backup, has a unique number;
+    and rows are only added to a store, so earlier rows must still be there unchanged, unlike in an older raw copy. The
+    file is inspected when its time stamp or size changes.
     """
 
     #: Tables whose newest rows are compared.
@@ -426,7 +426,7 @@ class _StoreFile:
         self._has_rows()
 
     def is_same(self) -> bool:
-        """Whether the path leads to the file that was opened, and that still holds the rows that it held."""
+        """Whether the path refers to the file that was opened, and this still contains its earlier rows."""
         place, written = self._look()
         if place != self._place:
             return False
@@ -445,10 +445,10 @@ class _StoreFile:
         return (found.st_dev, found.st_ino), (found.st_mtime_ns, found.st_size)
 
     def _has_rows(self) -> bool | None:
-        """Whether the rows that are known are in the file itself; None where that cannot be told while it is written.
+        """Whether the known rows are in the file itself; None if this cannot be determined while it is being written.
 
-        The file is read without its write-ahead log, and by SQLite: to open and close it in another way would give the
-        locks of this process away.
+        The file is read without its write-ahead log, and through SQLite: opening and closing it in another way would
+        release the locks of this process.
         """
         if self._written is None:
             return None
@@ -457,10 +457,10 @@ class _StoreFile:
             address = f"{self._path.absolute().as_uri()}?mode=ro&immutable=1"
             with closing(sqlite3.connect(address, uri=True)) as connection:
                 number = connection.execute("PRAGMA user_version").fetchone()[0]
-                if number not in (0, self._number):  # 0: it is in the log still
+                if number not in (0, self._number):  # 0: still in the log
                     return False
                 if connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0:
-                    return not self._rows  # a new store whose tables are in the log still
+                    return not self._rows  # a new store whose tables are still in the log
                 for table in self.TABLES:
                     known = self._rows.get(table)
                     query = f"SELECT * FROM {table} WHERE id = ?"
@@ -485,7 +485,7 @@ def files_of(connection: sa.Connection, table_id: int) -> list[StoredTableFile]:
 
 
 def inflated(sha256: str, packed: bytes | None) -> bytes:
-    """Return contents as they were kept; StoreError unless they are those of this SHA-256."""
+    """Return contents as they were stored; StoreError unless they match this SHA-256."""
     try:
         content = zlib.decompress(packed or b"")
     except zlib.error:
@@ -496,19 +496,19 @@ def inflated(sha256: str, packed: bytes | None) -> bytes:
 
 
 def open_store(url: str, *, clock: Clock | None = None) -> Store:
-    """Open a store, make it if it does not exist, upgrade it if it is old.
+    """Open a store; create it if it does not exist, upgrade it if it is old.
 
     Parameters
     ----------
     url : ``sqlite:///FILE``, a bare path, or ``postgresql://USER:PASSWORD@HOST/NAME``.
-    clock : for tests: the time, with its zone.
+    clock : for tests: the time, with its time zone.
 
     Raises
     ------
     InputError
-        for a URL that is none, or a store of a newer program.
+        for an invalid URL, or a store of a newer program.
     StoreError
-        if it cannot be reached after some attempts.
+        if it cannot be reached after several attempts.
     """
     engine = engine_of(url)
     number = retried(lambda: upgrade(engine), url)
@@ -546,10 +546,10 @@ def _insert_measurement(connection: sa.Connection, machine_id: int, new: NewMeas
 
 @at_one_moment
 def counting(store: Store, machine: MachineRecord) -> list[IdentificationRecord]:
-    """Return for each measurement the identification that speaks for it, in the order in which they were measured.
+    """Return the representative identification of each measurement, in the order of measurement.
 
-    It is the one behind the active tables; else the newest whose tables nobody rejected and the round trip accepted; else
-    the newest.
+    It is the one behind the active tables; else the newest whose tables nobody rejected and the round trip accepted;
+    else the newest.
     """
     states = {table.identification_id: table.state for table in store.tables(machine, figures=False)}
     every: dict[int, list[IdentificationRecord]] = {}
@@ -563,25 +563,25 @@ def counting(store: Store, machine: MachineRecord) -> list[IdentificationRecord]
     return [max(group, key=rank) for group in every.values()]
 
 
-# Backup and restore: all rows of a store into a new SQLite file and back, whatever the database; also to move a store.
+# Backup and restore: copy all rows of a store to a new SQLite file and back, for any database; also to move a store.
 
 
-#: Rows that are held in memory at once.
+#: Rows in memory at once.
 ROWS = 200
 MAGIC = b"SQLite format 3\0"
-#: How a file system says that it knows no links.
+#: Error numbers of a file system that does not support links.
 NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 
 
 def backup(url: str, path: Path) -> dict[str, int]:
-    """Write a copy of the store to a new file as it is at one moment; return the number of rows by table.
+    """Write a snapshot of the store to a new file; return the number of rows by table.
 
     Raises
     ------
     InputError
         if the file exists or cannot be written.
     StoreError
-        if contents are damaged: a copy of them would be found out when it is needed.
+        if contents are damaged: otherwise the damage would only show when the copy is needed.
     """
     if path.exists():
         raise InputError("exists already; a backup is never written over another one", file=path)
@@ -597,7 +597,7 @@ def backup(url: str, path: Path) -> dict[str, int]:
                     connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
 
             retried(end_log, target.url)
-        try:  # never over another file that came meanwhile, where the file system can promise that
+        try:  # never overwrite a file created meanwhile, if the file system can guarantee that
             os.link(temporary, path)
         except OSError as error:
             if error.errno not in NO_LINKS or path.exists():
@@ -612,7 +612,7 @@ def backup(url: str, path: Path) -> dict[str, int]:
 
 
 def restore(path: Path, url: str) -> dict[str, int]:
-    """Fill an empty store from a backup, which stays as it is; return the number of rows by table.
+    """Fill an empty store from a backup, which is not changed; return the number of rows by table.
 
     Raises
     ------
@@ -624,7 +624,7 @@ def restore(path: Path, url: str) -> dict[str, int]:
     if not path.is_file():
         raise InputError("no such backup", file=path)
     with working_folder("restore-") as folder:
-        # a backup of an older program is upgraded, and may be on a read-only medium
+        # a backup from an older program is upgraded, and may be on a read-only medium
         copy = folder / "copy.sqlite"
         try:
             with path.open("rb") as stream:
@@ -640,7 +640,7 @@ def restore(path: Path, url: str) -> dict[str, int]:
 
 
 def _copy(source: Store, target: Store) -> dict[str, int]:
-    """Copy all rows as they were at one moment, in one transaction."""
+    """Copy all rows of a snapshot, in one transaction."""
     try:
         with source.snapshot() as reading, target.engine.begin() as writing:
             counts = dict.fromkeys((table.name for table in database.ALL), 0)

@@ -1,4 +1,4 @@
-"""The long-running form: each machine by its schedule, until it is told to stop; edits of the job file are picked up."""
+"""The long-running mode: each machine on its schedule until stopped; changes to the job file are picked up."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from compgen.fleet import logs
 from compgen.fleet.job import DAYS, WATCH_POLL_S, Cron, Every, Job, MachineJob, Schedule, job_of_text
 from compgen.fleet.runner import MachineOutcome, run_machine
 
-#: A machine without a schedule is looked at this often.
+#: Schedule of a machine that has none.
 UNSCHEDULED = Every(5)
-#: After a trouble that may pass by itself a machine is looked at again after so long, then twice as long, at most, s.
+#: After a problem that may go away by itself: delay before the next pass, doubled each time, and its maximum, s.
 AGAIN_S, AGAIN_AT_MOST_S = 10.0, 900.0
 
 Work = Callable[[MachineJob, str, Callable[[], bool]], MachineOutcome]
 
 
 def trigger_of(schedule: Schedule) -> Any:
-    """Return the trigger that means the schedule, in local time."""
+    """Return the trigger for the schedule, in local time."""
     if isinstance(schedule, Every):
         return IntervalTrigger(minutes=schedule.minutes)
     days = {"day": _listed(schedule.days)}
@@ -48,9 +48,9 @@ def _listed(numbers: tuple[int, ...]) -> str:
 
 
 class Watch:
-    """Keeps a job running; ``on_outcome`` is told of every pass over a machine, ``threads`` passes run at once.
+    """Keeps a job running; ``on_outcome`` is called after every pass over a machine, ``threads`` passes run at once.
 
-    ``notify`` is a command instead of those of the job file.
+    ``notify`` is a command that replaces those of the job file.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class Watch:
         )
 
     def stop(self, *_: object) -> None:
-        """Ask to stop; the measurement that is being processed is finished first."""
+        """Request a stop; the measurement being processed is finished first."""
         self.stopped.set()
 
     def run(self, *, signals: bool = True) -> None:
-        """Run until :meth:`stop`, SIGTERM or SIGINT; InputError if the job file is wrong at the beginning."""
+        """Run until :meth:`stop`, SIGTERM or SIGINT; InputError if the job file is invalid at the start."""
         self._load()
         if signals:
             for number in (signal.SIGTERM, signal.SIGINT):
@@ -88,7 +88,7 @@ class Watch:
         logs.info("watching", job=str(self.path), machines=len(self.job.machines) if self.job else 0)
         try:
             while not self.stopped.wait(self.poll_s):
-                # take an edited job file; one that is wrong is reported once, and what was known before stays
+                # take an edited job file; an invalid one is reported once, and the previous one stays in use
                 try:
                     content = read_bytes(self.path)
                     if content == self._content:
@@ -113,7 +113,7 @@ class Watch:
         self.job, self._content = job, content
 
     def _schedule(self, job: Job) -> None:
-        """Add, replace and remove what changed against the job before; new and changed machines run at once."""
+        """Add, replace and remove what changed since the previous job; new and changed machines run at once."""
         before = {} if self.job is None else self.job.machines
         same_store = self.job is not None and self.job.store == job.store
         for name in before.keys() - job.machines.keys():
@@ -136,12 +136,12 @@ class Watch:
             return
         outcome = self.work(machine, url, self.stopped.is_set)
         if outcome.again:
-            # do not wait for the schedule, which may be a week, where something may pass by itself
+            # if the cause may go away by itself, do not wait for the schedule, which may be a week
             name = machine.name
             count = self._troubles[name] = self._troubles.get(name, 0) + 1
             wait_s = min(AGAIN_S * 2.0 ** min(count - 1, 60), AGAIN_AT_MOST_S)
             when = datetime.now().astimezone() + timedelta(seconds=wait_s)
-            with suppress(JobLookupError):  # the machine was taken out of the job file meanwhile
+            with suppress(JobLookupError):  # the machine was meanwhile removed from the job file
                 planned = self._scheduler.get_job(name)
                 if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
                     self._scheduler.modify_job(name, next_run_time=when)
