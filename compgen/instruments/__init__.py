@@ -1,3 +1,3 @@
-"""The six-DOF laser instrument of Jia et al. 2022: constants, signals from errors and back."""
+"""The six-DOF laser instrument of Jia et al. 2022: constants, signals from errors, and errors from signals."""
 
 from __future__ import annotations

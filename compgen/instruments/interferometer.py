@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 # Refractive index of air, for interferometers that did not compensate the wavelength.
 
 
-#: What the air is taken to be where nothing says, and what an uncompensated instrument assumes.
+#: Air if nothing else is given, and as assumed by an uncompensated instrument.
 REFERENCE_C = 20.0
 STANDARD_PRESSURE_HPA = 1013.25
 STANDARD_HUMIDITY_PERCENT = 50.0
@@ -36,7 +36,7 @@ def refractive_index(
     """Phase refractive index of air by the modified Edlen equation (Birch & Downs 1993, eq. 1-3, 1994), 450 ppm CO2.
 
     Temperature, pressure and humidity are numbers or arrays (n,). ``wavelength_nm`` is the vacuum wavelength; the
-    saturation pressure of water is that of Buck (1981).
+    saturation pressure of water is from Buck (1981).
     """
     t, pascal = np.asarray(temperature_c, dtype=np.float64), 100.0 * np.asarray(pressure_hpa, dtype=np.float64)
     wavenumber = (1000.0 / wavelength_nm) ** 2  # squared, 1/um^2
@@ -50,13 +50,13 @@ def refractive_index(
 
 # Interferometer equation with the index of air, and the growth of the machine's scales.
 #
-# The phase counts half wavelengths of the air that is there (Jia et al. 2022, eq. 1): with the vacuum wavelength lambda,
-# the index n of the air and the distance D that the beam goes to the target and back,
+# The phase counts half wavelengths in the actual air (Jia et al. 2022, eq. 1): with the vacuum wavelength lambda,
+# the index n of the air and the distance D to the target, travelled there and back,
 #
 #     n(t) D(t) - n(0) D(0) = lambda phi / (4 pi)
 #
-# A displacement that an instrument made with an assumed index n_a is N = lambda phi / (4 pi n_a). So the change of the
-# distance is (n_a N - (n - n(0)) D(0)) / n; the last term is the dead path, the distance at the first row of a run.
+# A displacement computed by an instrument with an assumed index n_a is N = lambda phi / (4 pi n_a). So the change of
+# the distance is (n_a N - (n - n(0)) D(0)) / n; the last term is the dead path, the distance at the first row of a run.
 
 
 MM_PER_NM = 1e-6
@@ -75,7 +75,7 @@ def needs_air(readings: SixDof) -> bool:
 
 
 def compensated(readings: SixDof, instrument: SixDofInstrument) -> tuple[SixDof, dict[str, Any]]:
-    """Return readings whose ``displacement_mm`` is the true change of the distance, and what was done to them.
+    """Return readings whose ``displacement_mm`` is the true change of the distance, and notes on what was done.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def compensated(readings: SixDof, instrument: SixDofInstrument) -> tuple[SixDof,
 
 
 def growth_mm(machine: Machine, readings: SixDof, axis: int) -> FloatArray:
-    """What the scale of ``axis`` adds to the command at its temperature, (n,), mm; zero where it is not known.
+    """What the scale of ``axis`` adds to the command at its temperature, (n,), mm; zero where unknown.
 
     The scale has grown about the reference point: alpha (T - 20 degC)(q - q_ref), as for tracer lengths.
     """
@@ -133,7 +133,7 @@ def growth_mm(machine: Machine, readings: SixDof, axis: int) -> FloatArray:
 
 
 def growth_notes(machine: Machine, readings: SixDof) -> dict[str, Any]:
-    """What ``identify.json`` says about the temperature of the scales."""
+    """Entry of ``identify.json`` on the temperature of the scales."""
     notes = {}
     for axis, name in enumerate(AXES):
         rows = readings.axis == axis

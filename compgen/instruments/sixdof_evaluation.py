@@ -26,29 +26,29 @@ from compgen.instruments.sixdof_reduction import (
     zeroed,
 )
 
-# Runs of all axes to the 21 errors: mean over runs, lines out of the straightness, squareness from their slopes.
+# Runs of all axes to the 21 errors: mean over runs, lines removed from straightness, squareness from their slopes.
 
 
-#: (S_xy, S_xz, S_yz): for each the two straightnesses, as (component, moving axis), whose slopes add up to it.
+#: (S_xy, S_xz, S_yz): each is the sum of the slopes of two straightnesses, as (component, moving axis).
 SLOPES = (((1, 0), (0, 1)), ((2, 0), (0, 2)), ((2, 1), (1, 2)))
 SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
-#: Positions of two runs that differ by less are the same target, mm.
+#: Positions of two runs closer than this are the same target, mm.
 SAME_MM = 1e-4
 
 
 @dataclass(frozen=True)
 class AxisErrors:
-    """Errors of one axis at its target positions, n of them.
+    """Errors of one axis at its n target positions.
 
     Parameters
     ----------
     position_mm : ascending, (n,).
     delta_mm, eps_rad : means over all runs, (n, 3), zero at the reference point.
     spread : half of the range over the runs, (n, 6): three translations in mm, three rotations in rad (half-range
-        repeatability); nan where there is one run only.
-    reversal : mean of the runs in positive direction less those in negative direction, (n, 6), or None.
+        repeatability); nan for a single run.
+    reversal : mean of the runs in positive direction minus mean of those in negative direction, (n, 6), or None.
     count : runs at each position, (n,).
-    turned_by : how often the rotation of each other axis, where it was, is still in the translations.
+    turned_by : how many times the rotation of each other axis, where it was, is still contained in the translations.
     """
 
     axis: int
@@ -63,14 +63,14 @@ class AxisErrors:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The identified errors and what they were made of.
+    """The identified errors and the values they were computed from.
 
     Parameters
     ----------
     errors : in mm and rad, zero at the machine's reference point, uncertainties nan.
     axes : means of each measured axis.
-    slopes : slope of each straightness by ISO name, rad, carriers' rotation taken out.
-    squareness_rad : S_xy, S_xz, S_yz by the ISO name (EC0Y, EB0Z, EA0Z), as far as both axes were measured: 90 degrees
+    slopes : slope of each straightness by ISO name, rad, carriers' rotation removed.
+    squareness_rad : S_xy, S_xz, S_yz by the ISO name (EC0Y, EB0Z, EA0Z), if both axes were measured: 90 degrees
         minus the angle between the positive axes.
     """
 
@@ -91,7 +91,7 @@ def axis_errors(machine: Machine, runs: Sequence[AxisRun]) -> AxisErrors:
     for run in runs:
         values = np.hstack([run.delta_mm, run.eps_rad])
         for direction in np.unique(run.direction):
-            # means at the targets, nan where there is no reading
+            # means at the targets, nan without readings
             rows = run.direction == direction
             index = np.searchsorted(positions, run.position_mm[rows] + SAME_MM) - 1
             index = np.clip(index, 0, len(positions) - 1)
@@ -115,7 +115,7 @@ def axis_errors(machine: Machine, runs: Sequence[AxisRun]) -> AxisErrors:
 
 
 def evaluate(machine: Machine, instrument: SixDofInstrument, runs: Sequence[AxisRun]) -> Evaluation:
-    """Return the errors of every measured axis, and of squareness where both axes were measured."""
+    """Return the errors of every measured axis, and squareness if both axes were measured."""
     measured_axes = sorted({run.axis for run in runs})
     axes = {axis: axis_errors(machine, [run for run in runs if run.axis == axis]) for axis in measured_axes}
     return evaluate_axes(machine, instrument, axes)
@@ -127,7 +127,7 @@ def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[
     curves: dict[str, Curve] = {}
     slopes: dict[str, float] = {}
     for axis, entry in axes.items():
-        # without what the rotation of the other axes, where they were, adds to the measured translations
+        # remove what the rotation of the other axes, where they were, adds to the measured translations
         stood, turn = instrument.axes[axis].position_mm or (0.0, 0.0, 0.0), np.zeros(3)
         for other, times in entry.turned_by.items():
             if other in axes:
@@ -162,9 +162,9 @@ def _as_curve(position_mm: FloatArray, value: FloatArray) -> Curve:
 
 
 def axis_runs(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[AxisRun]:
-    """Errors of the moved axis over every run; a CompgenWarning where chain and readings contradict each other.
+    """Errors of the moved axis over every run; a CompgenWarning if chain and readings contradict each other.
 
-    ``as_printed`` of the instrument takes the paper's own equations instead of the traced ones.
+    ``as_printed`` of the instrument selects the paper's equations instead of the traced ones.
     """
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     grown = {axis: growth_mm(machine, readings, axis) for axis in {run.axis for run in reduced}}
@@ -191,7 +191,7 @@ def evaluate_readings(machine: Machine, readings: SixDof, instrument: SixDofInst
 # Repeatability and comparison with reference instruments in the style of Tables 2 and 3 of Jia et al. 2022.
 
 
-#: Rows of the tables: title, unit, and how much of it 1 mm or 1 rad is; in the order of ROLES.
+#: Rows of the tables: title, unit, and factor from mm or rad to it; in the order of ROLES.
 ROWS = (
     ("positioning", "nm", 1e6),
     ("horizontal straightness", "um", 1.0 / MM_PER_UM),
@@ -204,7 +204,7 @@ SQUARENESS_ROWS = (("EC0Y", "S_xy"), ("EB0Z", "S_xz"), ("EA0Z", "S_yz"))
 
 
 def each_run(machine: Machine, instrument: SixDofInstrument, runs: Sequence[AxisRun]) -> list[Evaluation]:
-    """Evaluate the first run of every axis together, then the second ones, and so on, as far as all axes have them."""
+    """Evaluate the first run of every axis together, then the second runs, and so on, as long as all axes have one."""
     by_axis = [[run for run in runs if run.axis == axis] for axis in sorted({run.axis for run in runs})]
     return [evaluate(machine, instrument, list(together)) for together in zip(*by_axis, strict=False)]
 
@@ -229,10 +229,10 @@ def half_ranges(evaluations: Sequence[Evaluation]) -> dict[str, float]:
 
 
 def largest_differences(errors: ErrorTable, reference: ErrorTable, line: str = "ls") -> dict[str, float]:
-    """Largest absolute difference to a reference by error, mm and rad; errors that only one of them has are left out.
+    """Largest absolute difference to a reference by error, mm and rad; errors that only one of them has are omitted.
 
-    The reference is compared at its own positions within the travel of the errors. What the reference instrument has
-    its own zero for is taken out: a line for straightness, the first value for the other curves.
+    The reference is compared at its own positions within the travel of the errors. The arbitrary
+    zero of the reference instrument is removed: a line for straightness, the first value for the other curves.
     """
     result = {}
     for name in errors.names:

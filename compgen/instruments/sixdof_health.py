@@ -1,4 +1,4 @@
-"""What the readings say about the instrument itself: tests that need no truth (``docs/sixdof.md``, "Health")."""
+"""Checks of the instrument from its readings alone, without reference values (``docs/sixdof.md``, "Health")."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from compgen.instruments.sixdof_instrument import (
 from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import RelativeRun, drift_of, errors_of_run, expected_away, reduce_runs
 
-#: A regression counts when its slope is so many standard errors from zero and explains so much of the variance.
+#: A regression counts if its slope is at least this many standard errors and it explains this share of the variance.
 SIGNIFICANT, EXPLAINED = 6.0, 0.5
-#: Slopes of coarse and fine parts of two curves differ by less than this share where the one makes the other.
+#: If one curve causes the other, the slopes of their coarse and fine parts differ by less than this share.
 ALIKE = 0.25
-#: An offset of L beyond this is not a slip but another set-up, mm.
+#: A larger offset of L is a different set-up, not a mistake, mm.
 LARGEST_OFFSET_MM = 300.0
-#: A reduced depth that is off by more belongs to no such target, mm.
+#: A larger deviation of the reduced depth is impossible for such a target, mm.
 LARGEST_DEPTH_MM = 60.0
-#: Share of its variance that may be noise for a drift monitor to be compared with.
+#: Largest share of noise in the variance of a drift monitor that is still used for comparison.
 NOISY = 0.2
-#: Readings of a run below which no regression is made.
+#: Fewest readings of a run for a regression.
 LEAST = 8
-#: Curvature of Y_QD2 - Y_QD1 below which nothing is said, mm.
+#: Smaller curvature of Y_QD2 - Y_QD1 is not reported, mm.
 STRAIGHT_MM = 0.2 * MM_PER_UM
-#: Spots that move by less than this say nothing about their channel, mm; share below which a difference is small.
+#: Spots that move by less tell nothing about their channel, mm; a difference below this share is small.
 SPREAD_MM, SWAPPED = 3.0 * MM_PER_UM, 0.3
 #: Share of one PSD2 step that counts as "the same zero".
 ZERO_MM = 1e-9
@@ -45,14 +45,14 @@ ZERO_MM = 1e-9
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Something that the readings show.
+    """A suspected fault of the instrument or its set-up.
 
     Parameters
     ----------
     name : ``crosstalk_yaw``, ``crosstalk_pitch``, ``beam_drift``, ``distance_offset``, ``detector_swap``, ``mode``,
         ``second_beam``, ``drift_zero``.
     axis : letter of the axis.
-    text : what was seen and what may be behind it.
+    text : what was seen and its possible cause.
     evidence : the numbers.
     """
 
@@ -67,10 +67,10 @@ class Suspicion:
 
 
 def sixdof_health(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[Suspicion]:
-    """Return what the readings show: the readings hold true displacements.
+    """Return all suspicions; the readings must contain true displacements.
 
-    A correlation of straightness with an angle of the same axis is a hint, not a proof: a machine may bend so. The
-    evidence says how well the suspected cause would explain it.
+    A correlation of straightness with an angle of the same axis is a hint, not a proof: a machine may bend that way.
+    The evidence states how well the suspected cause would explain it.
     """
     reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
     found: list[Suspicion] = []
@@ -81,7 +81,7 @@ def sixdof_health(machine: Machine, readings: SixDof, instrument: SixDofInstrume
         found += _swapped(readings, runs)
         found += _drift(readings, instrument, runs)
         found += _crosstalk(machine, instrument, runs)
-    # PSD2 must keep one zero for all axes: readings that begin anew at zero in every run lose the common reference
+    # PSD2 must keep one zero for all axes: readings that restart at zero in every run lose the common reference
     for name in ("y_psd2_mm", "z_psd2_mm"):
         monitor = readings.signals_mm[name]
         starts = np.array([monitor[run.rows[0]] for run in reduced])
@@ -116,7 +116,7 @@ def second_beam_lines(readings: SixDof, runs: Sequence[RelativeRun]) -> dict[str
 
 
 def _second_beam(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """Y_QD2 - Y_QD1 depends neither on the errors nor on drift: it is a straight line in L."""
+    """Check that Y_QD2 - Y_QD1 is a straight line in L: it depends neither on the errors nor on drift."""
     lines = second_beam_lines(readings, runs)
     if not lines:
         return
@@ -135,7 +135,7 @@ def _second_beam(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Susp
 
 
 def _contradiction(machine: Machine, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """The displacement goes the other way than chain, mode and beam direction have it."""
+    """Find displacements whose sign contradicts chain, mode and beam direction."""
     expected = expected_away(machine, instrument)[runs[0].axis]
     wrong = [run.run for run in runs if run.away != expected]
     if wrong:
@@ -147,7 +147,7 @@ def _contradiction(machine: Machine, instrument: SixDofInstrument, runs: Sequenc
 
 
 def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """Angles and drift monitor are small; the spots of a long run are not: two channels that were exchanged."""
+    """Find two exchanged channels: angles and drift monitor are small, the spots of a long run are not."""
     spots = readings.signals_mm
 
     def size(first: str, second: str | None = None) -> float:
@@ -169,7 +169,7 @@ def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicio
 
 
 def _drift(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """What is left of the drift in angle or straightness, about the mean of the runs, follows the drift monitor."""
+    """Find residual drift: angle or straightness, about the mean of the runs, follows the drift monitor."""
     if len(runs) < 2 or len({len(run.rows) for run in runs}) != 1:
         return
     axis, fixed = runs[0].axis, SetUp(runs[0].axis, 1, instrument.axes[runs[0].axis].set_up.beam_direction)
@@ -194,13 +194,13 @@ def _drift(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[Relati
 
 
 def _free(values: FloatArray) -> FloatArray:
-    """Values (runs, n) about the mean of the runs, each run without its own mean, in one line."""
+    """Values (runs, n) about the mean of the runs, each run without its mean, flattened."""
     rest = values - values.mean(axis=0)
     return np.asarray((rest - rest.mean(axis=1, keepdims=True)).ravel())
 
 
 def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
-    """Straightness in proportion to an angle of the same axis: an arm, t or L, that is not right."""
+    """Find straightness in proportion to an angle of the same axis: an incorrect arm, t or L."""
     if any(run.away != expected_away(machine, instrument)[run.axis] for run in runs):
         return
     errors = [errors_of_run(machine, instrument, run) for run in runs]
@@ -216,7 +216,7 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
     arm = float(np.abs(cross_talk_arm_mm(optics, set_up, runs[0].distance_mm)).mean())
     for channel, (name, sign) in enumerate((("yaw", kappa), ("pitch", -kappa))):
         straight, angle = delta[:, DIRECTIONS[axis][1 + channel]], eps[:, ROTATIONS[axis][channel]]
-        # the regression without lines counts if it is the same without cubics: smooth curves are alike by chance at first
+        # the regression without lines must agree with that without cubics: smooth curves are often alike by chance
         found, fine = (
             _regression(*(value - np.polyval(np.polyfit(along, value, order), along) for value in (angle, straight)))
             for order in (1, 3)
@@ -234,7 +234,7 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
 
 
 def _regression(cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
-    """Slope of the effect by the cause, both centred, its standard errors, and the explained share; None if it says nothing."""
+    """Slope of effect against cause, both centred, in standard errors too, and explained share; None if insignificant."""
     square = float(cause @ cause)
     if len(cause) < LEAST or square == 0.0:
         return None

@@ -1,7 +1,7 @@
 """The six-DOF instrument: its optics, the linear model of its signals, and the instrument file.
 
 Signals = S_g errors + S_s systematics + S_d drift; :func:`error_matrix`, :func:`systematic_columns` and
-:func:`drift_matrix` are the three, :func:`solve_errors` inverts the first. :func:`read_instrument` reads the constants.
+:func:`drift_matrix` return these matrices, :func:`solve_errors` inverts the first, :func:`read_instrument` reads constants.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Optics:
     focal_length_mm : f of the lenses of the angle channels.
     beam_separation_mm : h, beam 2 runs at y = -h of the unit.
     glass_index : n of plate, cube corners and first prism.
-    cube_side_mm : a, side of the equilateral entry face of the cube corner; its apex lies sqrt(6) a / 6 behind it.
+    cube_side_mm : a, side of the equilateral entry face of the cube corner; its apex is sqrt(6) a / 6 behind it.
     plate_thickness_mm : L_D of the plate that carries the reflecting film in front of the cube corner.
     prism_leg_mm : b of the right-angle prisms.
     exit_to_prism_mm : l_0 from the exit (and detector) plane of the unit to the prism.
@@ -99,8 +99,8 @@ class Optics:
 
 # The linear model of the instrument: signals = S_g g + S_s p + S_d alpha, and its closed-form inverse.
 #
-# Jia et al. 2022, eq. 5-7 with the corrections that exact ray tracing asks for (``docs/sixdof.md``). Every matrix is made
-# for a beam along the positive axis and turned by half a turn about the vertical direction for one along the negative
+# Jia et al. 2022, eq. 5-7 with the corrections from exact ray tracing (``docs/sixdof.md``). Every matrix is made
+# for a beam along the positive axis and rotated by half a turn about the vertical direction for one along the negative
 # axis, whose horizontal channels are read with the opposite sign: a positive reading always means the positive axis.
 
 
@@ -156,7 +156,7 @@ def path_mm(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArra
 
 
 def cross_talk_arm_mm(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> FloatArray:
-    """Arm by which an angle of the axis shows as straightness: +t if the target moves, -(L + l_p + t) if the unit does."""
+    """Arm by which an angle of the axis appears as straightness: +t if target moves, -(L + l_p + t) if unit moves."""
     if set_up.mode == 1:
         return np.full(np.shape(distance_mm), optics.reduced_depth_mm)
     return np.asarray(-(distance_mm + optics.lever_mm(set_up.axis) + optics.reduced_depth_mm))
@@ -263,7 +263,7 @@ class _Builder:
 def systematic_columns(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -> Columns:
     """S_s by parameter: signals in mm per mm or rad, each of shape (n, 7).
 
-    Names as in the paper: ``delta_?ic, eps_?ic`` target installed, ``delta_?ir, eps_?ir`` prism installed,
+    Names as in the paper: ``delta_?ic, eps_?ic`` target installation, ``delta_?ir, eps_?ir`` prism installation,
     ``delta_?mc<k>, eps_?mc<k>`` cube corner k (1, 2 on X; 3, 4 on Y; 5, 6 on Z), ``eps_?mrs1, eps_?mrs2`` faces of the
     prism, ``eps_PEy, eps_PEz`` beam 2 against beam 1. Translations and rotations along and about machine axes.
     """
@@ -274,7 +274,7 @@ def systematic_columns(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -
     (lambda: None, builder.first_prism, builder.second_prism)[set_up.axis]()
     if set_up.beam_direction > 0:
         return builder.columns
-    # half a turn about the vertical direction; beams belong to the unit's own frame: y is read with the opposite sign, z alike
+    # half a turn about the vertical; beams are in the unit's frame: y is read with the opposite sign, z unchanged
     vertical, turned = "xyz"[DIRECTIONS[set_up.axis][2]], {}
     for name, column in builder.columns.items():
         rest = name.partition("_")[2]
@@ -286,7 +286,7 @@ def systematic_columns(optics: Optics, set_up: SetUp, distance_mm: FloatArray) -
 def systematic_signals(
     optics: Optics, set_up: SetUp, distance_mm: FloatArray, values: Mapping[str, float]
 ) -> FloatArray:
-    """Signals of the systematic parameters ``values`` (mm, rad; those of other axes are passed over), (n, 7), mm."""
+    """Signals of the systematic parameters ``values`` (mm, rad; those of other axes are ignored), (n, 7), mm."""
     columns = systematic_columns(optics, set_up, distance_mm)
     total = np.zeros((len(distance_mm), len(SIGNALS)))
     for name, value in values.items():
@@ -296,9 +296,9 @@ def systematic_signals(
 
 
 def solve_errors(optics: Optics, set_up: SetUp, distance_mm: FloatArray, signals_mm: FloatArray) -> FloatArray:
-    """Errors (n, 6), mm and rad in the order of ROLES, from signals (n, 7) freed of systematics and drift.
+    """Errors (n, 6), mm and rad in the order of ROLES, from signals (n, 7) without systematics and drift.
 
-    S_g is triangular: angles first, then roll, then the translations with the cross-talk of the angles taken out. The
+    S_g is triangular: angles first, then roll, then the translations with the cross-talk of the angles removed. The
     second horizontal spot is not needed.
     """
     matrix = error_matrix(optics, set_up, distance_mm)
@@ -328,7 +328,7 @@ SQUARENESS_SIGNS = (-1.0, 1.0, -1.0)
 
 @toml_files.accepts({"anyOf": [{"enum": [1, -1]}, {**toml_files.array_schema({"enum": [1, -1]}, 3), "maxItems": 3}]})
 def _signs(value: Any) -> tuple[float, float, float]:
-    """One sign for all three, or a list of three: +1 keeps the program's own convention, -1 turns it."""
+    """One sign for all three, or a list of three: +1 keeps the program's convention, -1 reverses it."""
     turns = toml_files.numbers(value) if isinstance(value, list) else (toml_files.number(value),) * 3
     if len(turns) != 3 or any(turn not in (-1.0, 1.0) for turn in turns):
         raise ValueError("expected 1, -1, or a list of three of them (for XY, XZ, YZ)")
@@ -362,7 +362,7 @@ class AxisSetUp:
     Parameters
     ----------
     set_up : axis, mode and beam direction.
-    distance_first_mm : L at the first target position of a run; None if the readings hold the distance.
+    distance_first_mm : L at the first target position of a run; None if the readings contain the distance.
     position_mm : where the other axes were (its own component does not count); None: machine zero.
     target_offset_mm : from the reference point of the tool (spindle nose) to the front centre of the first cube corner.
     systematics : calibrated parameters of this axis, mm and rad.
@@ -383,8 +383,8 @@ class SixDofInstrument:
     ----------
     optics : constants.
     axes : set-up of each measured axis by number (0, 1, 2).
-    line : the line that is taken out of straightness: least squares, or minimum zone.
-    as_printed : use equations 5-7 as the paper prints them, for comparison with it only.
+    line : the line that is removed from straightness: least squares, or minimum zone.
+    as_printed : use equations 5-7 as printed in the paper, only for comparison with it.
     squareness_signs : signs of S_xy, S_xz, S_yz in EC0Y, EB0Z, EA0Z.
     u_systematics : standard uncertainties of calibrated parameters, mm and rad.
     u_constants : standard uncertainties of constants by their key in the file.

@@ -18,18 +18,18 @@ SPOTS = ("y_qd1_mm", "z_qd1_mm", "z_qd2_mm", "y_psd1_mm", "z_psd1_mm", "y_psd2_m
 
 @dataclass(frozen=True)
 class SixDof:
-    """Readings of runs along axes, n rows, one a target position.
+    """Readings of runs along axes, n rows, one per target position.
 
     Parameters
     ----------
     axis : 0, 1, 2 of each row, (n,).
     position_mm : commanded position of that axis, (n,).
     run : number of the run, (n,).
-    signals_mm : by column name, each (n,): spots, angles times focal length, interferometer; ``y_qd2_mm`` if it is there.
-    distance_mm : absolute optical distance L of each row, nan where it is not given, (n,).
-    direction : sign of travel, 0 where it is not given, (n,).
-    covariates : ``time_s``, air and temperatures by column name, each (n,); ``phase_rad`` where the interferometer's
-        phase was given instead of its displacement, which then is nan until :func:`compensated` has made it.
+    signals_mm : by column name, each (n,): spots, angles times focal length, interferometer; ``y_qd2_mm`` if present.
+    distance_mm : absolute optical distance L of each row, nan if not given, (n,).
+    direction : sign of travel, 0 if not given, (n,).
+    covariates : ``time_s``, air and temperatures by column name, each (n,); ``phase_rad`` if the interferometer's
+        phase was given instead of its displacement, which is then nan until :func:`compensated` computes it.
     metadata : comments ``key = value``.
     origin : (file, line) of each row.
     """
@@ -55,7 +55,7 @@ class SixDof:
 
 
 def _signal(table: CsvTable, column: str) -> FloatArray:
-    """Read a signal; a spot further out than any detector is wide is a slip of unit."""
+    """Read a signal; a spot farther out than any detector is wide indicates a wrong unit."""
     return (within(50.0, "mm", "beyond any detector; is the unit mm?") if column in SPOTS else CsvTable.numbers)(
         table, column
     )
@@ -69,7 +69,7 @@ _SIXDOF = Schema(
         Field("signals_mm", (*SPOTS, "displacement_mm", "y_qd2_mm"), _signal, digits=9, presence="each"),
         Field("distance_mm", ("distance_mm",), presence="filled"),
         Field("direction", ("direction",), CsvTable.signs, digits=0, presence="filled", fill=0.0),
-        # the phase of an interferometer that does not say its displacement, time, air and temperatures
+        # phase of an interferometer that does not output displacement; time, air and temperatures
         Field(
             "covariates", ("phase_rad", "time_s", "pressure_hpa", "humidity_percent"), digits=3, presence="covariates"
         ),
@@ -89,7 +89,7 @@ def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
                 message = f"run {key[1]} of {key[0]} is also in {seen[key]}; number the runs of all files"
                 raise InputError(message, file=table.path, field="column run")
             seen[key] = table.path
-    for table in tables:  # the interferometer's reading is there once, and of one kind in all files
+    for table in tables:  # each file needs exactly one kind of interferometer reading
         kinds = [name for name in ("displacement_mm", "phase_rad") if name in table.columns]
         if len(kinds) != 1:
             message = "contains both of them" if kinds else "contains neither of them"
@@ -108,7 +108,7 @@ def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
 
 
 def format_sixdof(readings: SixDof) -> str:
-    """Return the text of a ``*.sixdof.csv`` file: signals with 9 decimals of a mm; what is not known everywhere is left out."""
+    """Return the text of a ``*.sixdof.csv`` file: signals in mm, 9 decimals; without columns not known in all rows."""
     signals = {name: values for name, values in readings.signals_mm.items() if not np.isnan(values).any()}
     unknown = {"distance_mm"} if np.isnan(readings.distance_mm).any() else set()
     unknown |= set() if readings.direction.any() else {"direction"}

@@ -1,8 +1,8 @@
 """Six-DOF signals to errors of the moved axis, run by run.
 
 First the motion of the target relative to the unit (:func:`reduce_runs`), then the errors of the machine model
-(:func:`errors_of_run`): the one place where bodies, sides and reference points are turned into each other. The printed
-equations of the paper are at the end, for comparison only.
+(:func:`errors_of_run`): the only place that converts between bodies, sides and reference points. The printed equations
+of the paper are at the end, for comparison only.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from compgen.instruments.sixdof_readings import SixDof
 # Raw signals of one run to the motion of the target relative to the unit.
 #
 # Whichever body moves, the instrument sees the same thing: the pose of the target in the frame of unit and prism. So both
-# modes are reduced as "the target moves"; what moves which way in the machine is said in one place, :mod:`frames`.
+# modes are reduced as "the target moves"; what moves which way in the machine is defined once, below.
 
 
-#: Slope of the interferometer's reading against the command below which it holds deviations only.
+#: Below this slope against the command, the interferometer's readings are deviations only.
 DEVIATIONS_ONLY = 0.5
-#: How far the slope may be from -1, 0 or +1.
+#: Largest deviation of the slope from -1, 0 or +1.
 LARGEST_SCALE_ERROR = 0.01
 
 
@@ -50,14 +50,14 @@ class RelativeRun:
 
     Parameters
     ----------
-    axis, run : which one.
+    axis, run : axis and number of the run.
     rows : rows of the readings.
     position_mm : commanded positions of the axis, (n,).
     distance_mm : optical distance L, (n,).
-    shift_mm : displacement of the front centre of the first cube corner in machine axes, nominal travel left out, (n, 3).
+    shift_mm : displacement of the front centre of the first cube corner in machine axes, without nominal travel, (n, 3).
     turn_rad : rotation of the target, (n, 3).
     away : +1 if the target moves along the positive axis relative to the unit when the command rises, else -1.
-    direction : sign of travel, 0 where it is not given, (n,).
+    direction : sign of travel, 0 if not given, (n,).
     """
 
     axis: int
@@ -72,12 +72,12 @@ class RelativeRun:
 
 
 def reduce_runs(readings: SixDof, instrument: SixDofInstrument, expected_away: dict[int, int]) -> list[RelativeRun]:
-    """Return every run, reduced.
+    """Reduce every run.
 
     Parameters
     ----------
-    expected_away : by axis, which way the target moves relative to the unit when the command rises, as machine and mode
-        have it; it counts where the interferometer's readings hold deviations only.
+    expected_away : by axis, which way the target moves relative to the unit when the command rises, from machine
+        and mode; used if the interferometer's readings are deviations only.
 
     Raises
     ------
@@ -116,9 +116,9 @@ def relative_motion(
     distance_mm: FloatArray,
     nominal_mm: FloatArray,
 ) -> FloatArray:
-    """Motion of the target relative to the unit, (n, 6) in the order of ROLES, systematics and drift taken out.
+    """Motion of the target relative to the unit, (n, 6) in the order of ROLES, systematics and drift removed.
 
-    ``nominal_mm`` is the part of the interferometer's reading that the commanded travel makes.
+    ``nominal_mm`` is the part of the interferometer's reading due to the commanded travel.
     """
     optics, entry = instrument.optics, instrument.axes[axis]
     fixed = SetUp(axis, 1, entry.set_up.beam_direction)
@@ -139,7 +139,7 @@ def signals_of(readings: SixDof, rows: NDArray[np.int64]) -> FloatArray:
 def drift_of(readings: SixDof, rows: NDArray[np.int64], focal_length_mm: float) -> FloatArray:
     """Tilt of both beams toward unit +y and +z from the drift monitor, (n, 2), rad.
 
-    Its zero is that of the readings: for squareness it must be one and the same for all axes.
+    Its zero is the zero of the readings: for squareness it must be the same for all axes.
     """
     monitor = [readings.signals_mm[name][rows] for name in ("y_psd2_mm", "z_psd2_mm")]
     return np.column_stack(monitor) / focal_length_mm
@@ -175,7 +175,7 @@ def _travel(
 def _distance(
     readings: SixDof, rows: NDArray[np.int64], entry: AxisSetUp, instrument: SixDofInstrument, travel_mm: FloatArray
 ) -> FloatArray:
-    """Optical distance L of each row: as it was read, else from the first target position; ``travel_mm`` along the axis."""
+    """Optical distance L of each row: as read, else from the first target position; ``travel_mm`` along the axis."""
     read = readings.distance_mm[rows]
     if not np.isnan(read).any():
         return read
@@ -198,21 +198,21 @@ def _distance(
 
 # Motion of the target relative to the unit to errors of the machine model, tool relative to workpiece.
 #
-# The one place where bodies, sides and reference points are turned into each other (``docs/sixdof.md``).
+# The only place that converts between bodies, sides and reference points (``docs/sixdof.md``).
 #
-# Unit on the workpiece side, target at the tool (A): what is measured is the error E of the tool point that the target's
-# front centre is, tool offset ``target_offset_mm``. Unit on the tool side, target on the workpiece (B): the error of
-# the unit's reference point (where beam 1 meets the reflector; X: the exit point), which then has that offset. In both,
-# with the model's own lever arms,
+# Unit on the workpiece side, target at the tool (A): the measurement gives the error E of the tool point at the
+# target's front centre, tool offset ``target_offset_mm``. Unit on the tool side, target on the workpiece (B): the error
+# of the unit's reference point (where beam 1 meets the reflector; X: the exit point), which then has that offset. In both,
+# with the model's lever arms,
 #
 #     delta_i(q) = E(q) - eps_i(q) x lever_i(q) - (sum of eps of the carriers of i) x q e_i
 #
-# with all eps zero at the machine's reference point. In B the unit, and with it the measured directions, is turned by
-# the eps of all axes at the first position of the run; that turn is put back.
+# with all eps zero at the machine's reference point. In B the unit, and with it the measured directions, is rotated by
+# the eps of all axes at the first position of the run; that rotation is undone.
 #
-# Which of the two it is follows from chain and mode: A if the moving body is the target on a tool-side axis, or the unit on
+# Chain and mode decide which of the two applies: A if the moving body is the target on a tool-side axis, or the unit on
 # a workpiece-side axis. The interferometer shows it too: in A the target moves along the positive axis as the command
-# rises. Where the two disagree, the readings are taken for the motion of the moving body in its own axes, errors and
+# rises. If the two disagree, the readings are taken as the motion of the moving body in its own axes, errors and
 # coordinate alike (the component convention of the paper), with a warning.
 
 
@@ -220,9 +220,9 @@ def _distance(
 class AxisRun:
     """Errors of one axis over one run: translations (n, 3) mm, rotations (n, 3) rad, zero at the reference point.
 
-    The translations are those of the carriage's reference point of the machine model, the rotation of other axes left
-    in (:func:`turned_by`). ``unit_at_tool`` says that it was the unit that the tool's side carried;
-    ``contradiction`` why the component convention was taken, or is empty.
+    The translations are at the carriage's reference point in the machine model and still contain the rotation of the
+    other axes (:func:`turned_by`). ``unit_at_tool``: the unit was on the tool side; ``contradiction``: why the
+    component convention was used, or empty.
     """
 
     axis: int
@@ -244,7 +244,7 @@ def expected_away(machine: Machine, instrument: SixDofInstrument) -> dict[int, i
 
 
 def errors_of_run(machine: Machine, instrument: SixDofInstrument, run: RelativeRun) -> AxisRun:
-    """Errors of the axis over a run; a CompgenWarning where chain and readings contradict each other."""
+    """Errors of the axis over a run; a CompgenWarning if chain and readings contradict each other."""
     entry, at_tool = instrument.axes[run.axis], run.away < 0
     if run.away != expected_away(machine, instrument)[run.axis]:
         # the errors of the moving body in its own axes and at its own reference point
@@ -276,7 +276,7 @@ def along(axis: int, position_mm: FloatArray) -> FloatArray:
 
 
 def zeroed(machine: Machine, axis: int, position_mm: FloatArray, values: FloatArray) -> FloatArray:
-    """Values (n, k) less their values at the machine's reference point, linear between positions, constant outside."""
+    """Values (n, k) minus their values at the machine's reference point, linear between positions, constant outside."""
     order = np.argsort(position_mm, kind="stable")
     at = machine.reference_point_mm[axis]
     return np.asarray(values - [np.interp(at, position_mm[order], column[order]) for column in values.T])
@@ -292,7 +292,7 @@ def motion_of_unit(instrument: SixDofInstrument, run: RelativeRun) -> tuple[Floa
 def lever_arm(machine: Machine, axis: int, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
     """Lever arm of the rotation of ``axis`` at positions (n, 3) with tool offset (3,), (n, 3), mm.
 
-    The model's: the tool offset plus the travel of the axes between the axis and the tool (tool side), or of all
+    As in the model: the tool offset plus the travel of the axes between the axis and the tool (tool side), or of all
     tool-side axes and of the workpiece-side axes from the foundation up to and including it (workpiece side).
     """
     lever = np.tile(tool_mm, (len(position_mm), 1))
@@ -302,9 +302,9 @@ def lever_arm(machine: Machine, axis: int, position_mm: FloatArray, tool_mm: Flo
 
 
 def turned_by(machine: Machine, axis: int, *, unit_at_tool: bool) -> dict[int, int]:
-    """By other axis: how often its rotation, where it was, turns the measured travel of ``axis``.
+    """By other axis: how many times its rotation, where it was, turns the measured travel of ``axis``.
 
-    The carriers turn the travel as the workpiece sees it (+1); a unit on the tool's side is itself turned by all axes
+    The carriers turn the travel relative to the workpiece (+1); a unit on the tool side is itself turned by all axes
     (-1).
     """
     chain = machine.chain
@@ -316,11 +316,11 @@ def turned_by(machine: Machine, axis: int, *, unit_at_tool: bool) -> dict[int, i
     return {other: (other in carriers) - unit_at_tool for other in others}
 
 
-# Equations 5 to 7 of Jia et al. 2022 as they are printed, for comparison with the paper only.
+# Equations 5 to 7 of Jia et al. 2022 as printed, only for comparison with the paper.
 #
 # Exact ray tracing refutes them in several places (``docs/sixdof.md``, "What the print has otherwise"): the cross-talk of
-# the angles in mode 1, the drift in yaw and pitch, the roll of Y and Z. Nothing else of the program uses this module. Where
-# the print cannot be read (pitch of Y, the sign of the drift) the traced form is used.
+# the angles in mode 1, the drift in yaw and pitch, the roll of Y and Z. Nothing else in the program uses this part.
+# Where the print is illegible (pitch of Y, the sign of the drift) the traced form is used.
 
 
 WARNING = (
@@ -330,7 +330,7 @@ WARNING = (
 
 
 class _Terms:
-    """What the equations speak of, for one run of n rows."""
+    """Quantities in the equations, for one run of n rows."""
 
     def __init__(self, readings: SixDof, optics: Optics, entry: AxisSetUp, run: RelativeRun) -> None:
         signals = signals_of(readings, run.rows)

@@ -1,7 +1,7 @@
 """Scatter, calibration and uncertainty budget of a six-DOF measurement.
 
-:func:`uncertainty_budget` carries the scatter of the readings (:func:`scatter_of`) and everything that calibration leaves
-uncertain (:func:`calibration_changes`) through the whole reduction by differences.
+:func:`uncertainty_budget` propagates the scatter of the readings (:func:`scatter_of`) and everything that calibration
+leaves uncertain (:func:`calibration_changes`) through the whole reduction by finite differences.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ from compgen.instruments.sixdof_reduction import (
     relative_motion,
 )
 
-# How much single readings scatter: stated noise of the detectors, and what repeated runs show beyond it.
+# Scatter of single readings: stated noise of the detectors, and additional scatter of repeated runs.
 #
 # Scatter is described where it arises: as motion of the body (translations and rotations of target or unit, (6,), before
-# anything is zeroed), because an angle that scatters does so together with the straightness that its arm makes.
+# anything is zeroed), because an angle scatters together with the straightness that its arm causes.
 
 
 DETECTORS = {
@@ -70,7 +70,7 @@ STEP_MM = 1e-3
 class Scatter:
     """Covariance of one reading of an axis by source, each (groups, 6, 6), mm and rad.
 
-    A group is a target position in one direction of travel; ``rows`` says for each run to which group its rows belong.
+    A group is a target position in one direction of travel; ``rows`` gives the group of each row of each run.
     """
 
     axis: int
@@ -87,7 +87,7 @@ def body_motion(instrument: SixDofInstrument, run: RelativeRun, at_tool: bool) -
 
 
 def moved_run(instrument: SixDofInstrument, run: RelativeRun, at_tool: bool, change: FloatArray) -> RelativeRun:
-    """The run with the body moved by ``change`` (n, 6) further; changes since its first row, as :func:`reduce_runs`."""
+    """The run with the body moved by ``change`` (n, 6) further; relative to its first row, as :func:`reduce_runs`."""
     if at_tool:
         beam = instrument.axes[run.axis].set_up.beam_direction * np.eye(3)[run.axis]
         reach = (run.distance_mm + instrument.optics.lever_mm(run.axis))[:, None] * beam
@@ -99,7 +99,7 @@ def moved_run(instrument: SixDofInstrument, run: RelativeRun, at_tool: bool, cha
 
 
 def unit_moves(machine: Machine, instrument: SixDofInstrument, run: RelativeRun) -> bool:
-    """Whether the errors are made from the motion of the unit."""
+    """Whether the errors are computed from the motion of the unit."""
     if run.away == expected_away(machine, instrument)[run.axis]:
         return run.away < 0
     return instrument.axes[run.axis].set_up.mode == 2
@@ -118,9 +118,9 @@ def scatter_of(
 ) -> Scatter:
     """Scatter of the readings of one axis, whose runs are ``runs``.
 
-    The stated noise counts unchanged. What repeated runs scatter beyond it (each run freed of an offset and a line, which
-    its first row makes) is the source ``repeatability``. Without repeats and without stated noise the differences of
-    neighbouring positions take its place.
+    The stated noise counts unchanged. Additional scatter of repeated runs (each run without an offset and a line, which
+    come from its first row) is the source ``repeatability``. Without repeats and without stated noise the differences
+    of neighbouring positions are used instead.
     """
     rows, size = groups_of(runs)
     count = np.bincount(np.concatenate(rows), minlength=size).astype(np.float64)
@@ -128,7 +128,7 @@ def scatter_of(
     stated = _stated(readings, instrument, runs, rows, size, at_tool) if instrument.noise else {}
     motion = [body_motion(instrument, run, at_tool) for run in runs]
     observed = _repeats(runs, motion, rows, size) if len(runs) > 1 else None
-    if observed is None and not stated:  # by second differences of neighbours, which a smooth curve hardly shows
+    if observed is None and not stated:  # second differences of neighbours, almost zero for a smooth curve
         seconds = [values[2:] - 2 * values[1:-1] + values[:-2] for values in motion if len(values) > 3]
         observed = np.diag(np.mean(np.vstack(seconds) ** 2, axis=0) / 6.0) if seconds else np.zeros((6, 6))
     sources = dict(stated)
@@ -143,7 +143,7 @@ def scatter_of(
 def _repeats(
     runs: Sequence[RelativeRun], motion: Sequence[FloatArray], rows: Sequence[NDArray[np.int64]], size: int
 ) -> FloatArray | None:
-    """Covariance (6, 6) of single readings about the mean of the runs; None where too few positions are repeated."""
+    """Covariance (6, 6) of single readings about the mean of the runs; None if too few positions are repeated."""
     total, weight = np.zeros((6, 6)), 0.0
     table = np.full((len(runs), size, 6), np.nan)
     for table_run, values, index in zip(table, motion, rows, strict=True):
@@ -165,7 +165,7 @@ def _repeats(
 
 
 def student_variance(freedom: float) -> float:
-    """Variance of Student's t for so many degrees of freedom: what a variance from few readings has to be multiplied by."""
+    """Variance of Student's t for these degrees of freedom: the factor for a variance from few readings."""
     return freedom / max(freedom - 2.0, 0.5)
 
 
@@ -179,7 +179,7 @@ def _stated(
 ) -> dict[str, FloatArray]:
     """Covariances (groups, 6, 6) of the body's motion by the stated noise of detectors and drift monitor.
 
-    The motion that 1 mm more of a signal makes, (n, 6), is found by differences of the real reduction.
+    The motion per mm of a signal, (n, 6), is found by finite differences of the actual reduction.
     """
 
     def motion(run: RelativeRun, name: str, step: float) -> FloatArray:
@@ -205,18 +205,18 @@ def _stated(
     return result
 
 
-# What calibration leaves uncertain, as changes of readings and instrument by standard uncertainties.
+# Everything that calibration leaves uncertain, as changes of readings and instrument by standard uncertainties.
 
 
 #: Parameters of the beams, one for all axes; the others belong to the prism or the target of one axis.
 SHARED = ("eps_PEy", "eps_PEz")
 Case = tuple[SixDof, SixDofInstrument]
-#: Returns readings and instrument changed by a step of what is uncertain.
+#: Returns readings and instrument changed by a step of the uncertain quantity.
 Change = Callable[[float], Case]
 
 
 def calibration_changes(readings: SixDof, instrument: SixDofInstrument) -> Iterator[tuple[str, float, Change]]:
-    """Everything that calibration leaves uncertain: its name, its standard uncertainty, and the change by a step of it."""
+    """Everything that calibration leaves uncertain: its name, its standard uncertainty, and the change by a step."""
     u = {name: instrument.u_constants.get(name, 0.0) for name in U_CONSTANTS}
     cases: list[tuple[str, float, str, Sequence[str], Sequence[int]]] = []  # name, u, what changes, its names, axes
     cases += [(item.name, u[item.name], "optics", (item.name,), ()) for item in fields(Optics)]
@@ -258,7 +258,7 @@ def _changed(
     if what == "scale":
         signals |= {name: signals[name] * (1 + step) for name in names}
         return replace(readings, signals_mm=signals), instrument
-    # both beams move parallel to themselves by so much from the first to the last row of each run of the axis
+    # both beams shift parallel to themselves by this amount from the first to the last row of each run of the axis
     ramp_mm = np.zeros(len(readings))
     for which, _, rows in readings.runs():
         if which in on:
@@ -267,18 +267,18 @@ def _changed(
     return replace(readings, signals_mm=signals), instrument
 
 
-# Uncertainty of every error: scatter of the readings, and calibration, through the whole reduction by differences.
+# Uncertainty of every error: scatter and calibration, propagated through the whole reduction by finite differences.
 
 
-#: Steps of a body's motion for its derivative: mm and rad; everything behind it is linear but the minimum zone.
+#: Steps of a body's motion for its derivative: mm and rad; all later steps are linear except the minimum zone.
 STEPS = (1e-4, 1e-4, 1e-4, 1e-6, 1e-6, 1e-6)
-#: Probability with which runs that differ by the scatter of their readings alone are taken to differ by more.
+#: Probability of a false alarm: runs that differ only by the scatter of their readings are taken to differ by more.
 UNLIKELY = 0.02
 
 
 @dataclass(frozen=True)
 class SixDofBudget:
-    """What makes the uncertainty of the error values.
+    """The uncertainty budget of the error values.
 
     Parameters
     ----------
@@ -310,10 +310,10 @@ def uncertainty_budget(machine: Machine, readings: SixDof, instrument: SixDofIns
 
     Parameters
     ----------
-    machine, readings, instrument : as for the evaluation; the readings hold true displacements.
+    machine, readings, instrument : as for the evaluation; the readings contain true displacements.
 
-    The scatter is that of the stated noise and of repeated runs (:mod:`scatter`); each mean of n runs has 1/sqrt(n) of
-    it. Each uncertain constant is moved up and down by its standard uncertainty, and the whole chain repeated.
+    The scatter comes from the stated noise and repeated runs (:func:`scatter_of`); each mean of n runs has 1/sqrt(n) of
+    it. Each uncertain constant is moved up and down by its standard uncertainty, and the whole chain is repeated.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)
@@ -345,7 +345,7 @@ def uncertainty_budget(machine: Machine, readings: SixDof, instrument: SixDofIns
 
 
 def with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:
-    """The table with the standard uncertainties that a factor (k, r) has; nan where it has none at all."""
+    """The table with the standard uncertainties of a factor (k, r); nan if the factor is empty."""
     u = np.sqrt(np.einsum("ij,ij->i", factor, factor)) if factor.size else np.full(len(factor), np.nan)
     return errors.with_values(u=u)
 
@@ -354,15 +354,15 @@ Column = tuple[str, FloatArray]
 
 
 def _run_to_run(errors: ErrorTable, random: Sequence[Column], evaluations: Sequence[Evaluation]) -> list[Column]:
-    """What whole runs differ by beyond the scatter of their readings: drift from run to run, slopes above all.
+    """Differences of whole runs beyond the scatter of their readings: run-to-run drift, mainly slopes.
 
-    The variance of the mean of R runs by their differences is compared with that by the scatter; where it is larger
-    than chance has it (``UNLIKELY``), the differences themselves are a source, divided by the root of R (R - 1).
+    The variance of the mean of R runs from their differences is compared with the variance from the scatter; if it is
+    larger than chance explains (``UNLIKELY``), the differences are a source, divided by the root of R (R - 1).
     """
     count = len(evaluations)
     if count < 2:
         return []
-    from scipy.special import chdtri  # imported here: slow to load, and one run needs none of it
+    from scipy.special import chdtri  # imported here: slow to load, and not needed for a single run
 
     tables = []  # the values of each at the positions of the errors
     for item in evaluations:
