@@ -56,11 +56,11 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import CompgenWarning, InputError
 
-# Settings of ``[controllers.heidenhain-com]``: generation, sign, node positions, limits, tables saved on the control.
+# Settings ``[controllers.heidenhain-com]``: generation, sign, node positions, limits, tables saved on the control.
 
 
 POSITION, BACKLASH, ACTIVE = "AXISPOS", "BACKLASH", "ACTIVE"
-#: Spacings of the older controls are 2^n times this (TNC 407 technical manual, p. 153).
+#: Spacings on the older controls are 2^n times this (TNC 407 technical manual, p. 153).
 SPACING_UNIT_MM = Decimal("0.0001")
 SMALLEST_EXPONENT, LARGEST_EXPONENT = 6, 23
 #: Entries of one .COM file (TNC 407 technical manual, p. 622, error 3 of module 9095).
@@ -69,7 +69,7 @@ MOST_ENTRIES = 256
 
 @accepts({"type": "string", "pattern": "^[A-Za-z0-9_]{1,12}$"})
 def name_on_control(value: Any) -> str:
-    """The name of an axis, which is that of a column too."""
+    """The name of an axis, which is also the name of its column."""
     if not isinstance(value, str) or not re.fullmatch(r"[A-Za-z0-9_]{1,12}", value, re.ASCII):
         raise ValueError("expected a name of letters and digits")
     return value
@@ -99,9 +99,9 @@ class HeidenhainSettings:
     ----------
     older : True for the older controls (datum and power-of-two spacing), False for free positions.
     subtracts : True if the entries are errors, which the control subtracts; False if it adds them.
-    datum_mm, exponent : first node and n of the spacing 2^n x 0.0001 mm per axis; None: chosen.
-    com, cma : layouts of tables that were saved on the control, None: our own.
-    keep_name : whether the name in the first line of such a table stays, or becomes that of the written file.
+    datum_mm, exponent : first node and n of the spacing 2^n x 0.0001 mm per axis; None: chosen automatically.
+    com, cma : layouts of tables saved on the control, None: the default layout.
+    keep_name : whether to keep the name in the first line of such a table, or to write the name of the file.
     """
 
     com: ComLayout | None = file_setting(
@@ -162,12 +162,12 @@ class HeidenhainSettings:
 
     @property
     def sign(self) -> int:
-        """Sign of an entry in what the control adds to the command."""
+        """Sign with which the control adds an entry to the command."""
         return -1 if self.subtracts else 1
 
     @property
     def has_positions(self) -> bool:
-        """Whether the tables have a column with the positions."""
+        """Whether the tables have a position column."""
         return self.com is None or POSITION in self.com.names
 
     def com_layout(self, axis: int) -> ComLayout:
@@ -196,7 +196,7 @@ def _wide(columns: list[tuple[str, int]]) -> list[tuple[str, int]]:
 
 
 def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) -> None:
-    """Hold the saved tables against what has to be written into them; the errors point at their header line."""
+    """Check that the saved tables have the required columns; errors point at their header line."""
     for layout, due in ((settings.com, settings.axis_names), (settings.cma, (ACTIVE, *settings.axis_names))):
         missing = [] if layout is None else [name for name in due if name not in layout.names]
         if layout is not None and missing:
@@ -221,17 +221,17 @@ def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) 
             )
 
 
-# Node positions of HEIDENHAIN tables: free ones where the curves need them, or datum and power-of-two spacing.
+# Node positions of HEIDENHAIN tables: free positions where the curves need them, or datum and power-of-two spacing.
 #
-# Power of two: TNC 407 technical manual, p. 153. For a wanted spacing of 7 mm the largest spacing 2^n x 0.0001 mm that is
-# not wider is 6.5536 mm (n = 16).
+# Power of two: TNC 407 technical manual, p. 153. For a requested spacing of 7 mm the largest spacing 2^n x 0.0001 mm
+# that is not wider is 6.5536 mm (n = 16).
 
 
-#: Places for nodes between those of the curves: angular errors with a lever of their own travel are bent there.
+#: Candidate nodes between those of the curves: the effect of an angle with its own travel as lever is curved there.
 MOST_CANDIDATES, MOST_PARTS = 200, 4
-#: Free tables go on by this much beyond both ends with the end value, so that what is outside does not matter.
+#: Tables with free positions extend this far beyond both ends with the end value: behaviour outside does not matter.
 MARGIN_MM = Decimal(10)
-#: Neighbours of the oldest tables may differ by this share of their distance at most (TNC 407 manual, p. 156).
+#: Adjacent entries of the oldest tables may differ by at most this fraction of their distance (TNC 407 manual, p. 156).
 GRADIENT_SHARE = 1.0 / 64.0
 QUANTUM_MM = Decimal("0.0001")
 
@@ -246,7 +246,7 @@ def spacing_mm(exponent: int) -> Decimal:
 
 
 def widest_exponent(wanted_mm: float) -> int:
-    """Return n of the widest spacing that is not wider than wanted.
+    """Return n of the widest spacing that is not wider than requested.
 
     >>> widest_exponent(7.0)
     16
@@ -256,7 +256,7 @@ def widest_exponent(wanted_mm: float) -> int:
 
 
 def intervals(travel_mm: float, spacing: Decimal) -> int:
-    """Return how many spacings cover a travel; one node more covers both of its ends.
+    """Return how many intervals cover a travel; the number of nodes is one more.
 
     >>> intervals(500.0, spacing_mm(16)), intervals(800.0, spacing_mm(16))
     (77, 123)
@@ -264,26 +264,26 @@ def intervals(travel_mm: float, spacing: Decimal) -> int:
     return int((Decimal(repr(travel_mm)) / spacing).to_integral_value(rounding=ROUND_CEILING))
 
 
-# Compensation-value tables (.COM) and their assignment (.CMA): what they hold, read from text, and their limits.
+# Compensation-value tables (.COM) and their assignment (.CMA): contents, reader, limits.
 #
-# [axis of the column in the .COM] = F([axis of the column of the .CMA in which that .COM is named]) (MANUALplus 620
-# technical manual, p. 718). Several tables may correct one axis; they add up.
+# [axis of the column in the .COM] = F([axis of the column in the .CMA that names this .COM]) (MANUALplus 620 technical
+# manual, p. 718). Several tables may correct one axis; they add up.
 
 
-#: What an export or the serial transfer of older controls makes of names and extensions.
+#: Changes to names and extensions by an export or by the serial transfer of older controls.
 PREFIXES = ("NOT-ACCEPTED-", "PREVIOUS-")
 EXTENSIONS = {"COM": "COM", "V": "COM", "CMA": "CMA", "S": "CMA"}
 
 
 @dataclass(frozen=True)
 class ComTable:
-    """One .COM file: entries in mm, as the file has them.
+    """One .COM file: entries in mm, exactly as in the file.
 
     Parameters
     ----------
-    positions : of the input axis, ascending.
+    positions : positions of the input axis, ascending.
     columns : entries by corrected axis 0..2.
-    backlash : entries of the column BACKLASH, None if it is blank or not there.
+    backlash : entries of the column BACKLASH, None if it is blank or missing.
     """
 
     positions: tuple[Decimal, ...]
@@ -296,7 +296,7 @@ class ComTable:
         return np.array([float(position) for position in self.positions])
 
     def at(self, output: int, position_mm: FloatArray) -> FloatArray:
-        """Interpolated entries of a column, the end values outside, shape of ``position_mm``."""
+        """Interpolated entries of a column, end values held outside, shape of ``position_mm``."""
         return np.interp(position_mm, self.nodes_mm, [float(value) for value in self.columns[output]])
 
     def backlash_at(self, position_mm: FloatArray) -> FloatArray | None:
@@ -321,12 +321,12 @@ class ComTables:
 
     @property
     def total_points(self) -> int:
-        """Entries of all tables together."""
+        """Number of entries in all tables."""
         return sum(len(table.positions) for table in self.tables.values())
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a file without extension and what an export put before it, in capitals.
+    """Return the name of a file in capitals, without extension and without the prefix added by an export.
 
     >>> file_stem("NOT-ACCEPTED-axis_y.com")
     'AXIS_Y'
@@ -337,17 +337,17 @@ def file_stem(name: str) -> str:
 
 
 def _kind(file: SourceFile, table: TextTable) -> str:
-    """COM or CMA, by the first line of the file, else by the extension of its name."""
+    """COM or CMA, from the first line of the file, else from the file extension."""
     found = EXTENSIONS.get(table.kind) or EXTENSIONS.get(file.path.suffix[1:].upper())
     if found is None:
         raise file.fail("is neither a .COM nor a .CMA table by its first line or its name", 1)
     return found
 
 
-# What the templates of HEIDENHAIN tables show: cells in their fields, parameters to set, worked numbers, warnings.
+# Data for the templates of HEIDENHAIN tables: cells in their fields, parameters to set, worked examples, warnings.
 
 
-#: Totals that are remembered of older controls, without a document.
+#: Totals reported for older controls, without a document as source.
 USUAL_TOTAL, USUAL_TABLES = 640, 10
 POSITION_DECIMALS = 4
 
@@ -375,12 +375,12 @@ def _largest(tables: ComTables) -> tuple[int, int, int]:
 # HEIDENHAIN compensation-value tables: .COM files over each axis and the .CMA file that assigns them.
 #
 # Sources: TNC 407/415/425 technical manual (01.98), p. 151-156, 622; MANUALplus 620 technical manual, p. 708, 716, 718;
-# iTNC 530 HSCI technical manual (07.2013), p. 647-686. What none of them settles is in
+# iTNC 530 HSCI technical manual (07.2013), p. 647-686. Points that none of them settles are in
 # ``templates/heidenhain-com/format.toml``.
 
 
 class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
-    """Tables of each axis over each axis: positioning, straightness, squareness; no products, no constant lever arm."""
+    """Tables of each axis over each axis: positioning, straightness, squareness; no products, no fixed lever arm."""
 
     name = "heidenhain-com"
     settings_class = HeidenhainSettings
@@ -406,19 +406,19 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return settings
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return nine terms: each axis as a function of each axis; those over one axis share their nodes."""
+        """Return nine terms: each axis as a function of each axis; terms over one axis share their nodes."""
         nodes = [self._com_nodes_mm(errors, axis) for axis in range(3)]
         pairs = [(output, axis) for axis in range(3) for output in range(3)]
         return one_dimensional_terms(self.machine, errors, nodes, pairs)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ComTables:
-        """Round the entries, with the sign of the control, and let the end values go on beyond the ends."""
+        """Round the entries, with the sign of the control, and extend the end values beyond the ends."""
         terms = {term.name: term for term in basis}
         tables = {}
         for axis in range(3):
             nodes_mm = terms[one_dimensional_name(axis, axis)].nodes_mm
             exact = [Decimal(repr(float(node))).quantize(QUANTUM_MM) for node in nodes_mm]
-            # beyond both ends at least one more, which gets the end value: tables end with no slope
+            # at least one more node beyond each end, with the end value: tables end with zero slope
             step, before = (exact[1] - exact[0] if self.settings.older else MARGIN_MM), 1
             datum = self.settings.datum_mm[axis]
             if self.settings.older and datum is not None:
@@ -435,13 +435,13 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return ComTables(tables)
 
     def context(self, tables: ComTables) -> dict[str, Any]:
-        """Return the context beyond the common one; ``com`` holds layout and rows by letter, ``cma`` those of the .CMA."""
+        """Return the additional context: ``com`` has layout and rows by axis letter, ``cma`` those of the .CMA."""
         settings = self.settings
         com = {}
         for axis in range(3):
             layout = settings.com_layout(axis)
             low, high = (Decimal(repr(end)).quantize(QUANTUM_MM) for end in self.machine.axes[axis].range_mm)
-            nothing = ComTable((low, high), {axis: (Decimal(0), Decimal(0))})  # nothing is corrected over this axis
+            nothing = ComTable((low, high), {axis: (Decimal(0), Decimal(0))})  # no correction over this axis
             rows = self._com_rows(layout, axis, tables.tables.get(axis, nothing))
             com[AXES[axis]] = {"layout": layout, "rows": rows}
         cma = settings.cma_layout()
@@ -500,7 +500,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return self.settings.sign * total
 
     def violations(self, tables: ComTables) -> list[str]:
-        """Return broken limits: entries, tables, spacing of the older controls, travel left out."""
+        """Return broken limits: entries, tables, spacing of the older controls, travel not covered."""
         settings = self.settings
         found = []
         for axis, table in sorted(tables.tables.items()):
@@ -531,17 +531,17 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return nodes_by_axis((axis, table.nodes_mm) for axis, table in tables.tables.items())
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return what the column BACKLASH takes: reversals along the axis itself, unless it stays empty."""
+        """Return what goes into the column BACKLASH: reversals along the axis itself, unless it stays empty."""
         if self.settings.backlash == "empty":
             return ReversalCurves({})
         own = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
         return ReversalCurves(own, reversal.metadata)
 
     def with_reversal(self, tables: ComTables, reversal: ReversalCurves) -> ComTables:
-        """Put half of each reversal into the axis' own column and the other direction into the column BACKLASH.
+        """Put half of each reversal into the column of the axis and the other direction into the column BACKLASH.
 
-        With the reversal B the tool is at +B/2 after positive travel, so the correction is -B/2 then and +B/2
-        after negative travel, in addition to what the curves say.
+        With reversal B the tool is at +B/2 after positive travel, so the correction is -B/2 then and +B/2 after
+        negative travel, in addition to the curves.
         """
         settings = self.settings
         found = dict(tables.tables)
@@ -578,7 +578,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         ]
 
     def usage(self, tables: ComTables) -> list[Usage]:
-        """Return entries, their total, tables and slope against the limits, as far as they are known."""
+        """Return entries, their total, tables and slope against the limits, where known."""
         settings = self.settings
         longest = max(len(table.positions) for table in tables.tables.values())
         found = [Usage("entries of the longest table", longest, settings.max_points, "entries")]
@@ -594,13 +594,13 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return 3 * 0.5 * 10.0**-self.settings.decimals
 
     def _com_nodes_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
-        """Return the nodes that hold the corrections over an axis, ascending, mm; those beyond the ends come later."""
+        """Return the nodes of the corrections over an axis, ascending, mm; nodes beyond the ends are added later."""
         candidates = self._candidates_mm(errors, axis)
         terms = one_dimensional_terms(self.machine, errors, [candidates] * 3, [(output, axis) for output in range(3)])
         wanted = np.array([term.start for term in terms])
         tolerances = np.array([worth_mm(errors, axis, self.settings.loss_mm, output) for output in range(3)])
         if self.settings.older:
-            # nodes with the widest spacing, a power of two, that loses nothing
+            # nodes with the widest power-of-two spacing that stays within the permitted loss
             scaled, stated = wanted / tolerances[:, None], self.settings.exponent[axis]
             tried: list[tuple[float, EquidistantGrid]] = []
             for exponent in range(LARGEST_EXPONENT, SMALLEST_EXPONENT - 1, -1) if stated is None else (stated,):
@@ -622,14 +622,14 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             tolerances = 1.3 * tolerances
 
     def _candidates_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
-        """Positions that may be nodes: those of the curves and some between them, in whole 0.0001 mm, all of the travel."""
+        """Candidate nodes: those of the curves and some in between, in whole 0.0001 mm, over the whole travel."""
         nodes = curve_nodes_mm(self.machine, errors, axis, MOST_CANDIDATES)
         parts = int(np.clip(MOST_CANDIDATES // len(nodes), 1, MOST_PARTS))
         fine = np.interp(np.arange(parts * (len(nodes) - 1) + 1) / parts, np.arange(len(nodes)), nodes)
         return np.unique(np.round(fine, 4))
 
     def _grid(self, axis: int, step: Decimal) -> EquidistantGrid:
-        """Nodes of a spacing from the last one at or below the travel to the first one at or above its end."""
+        """Equidistant nodes from the last one at or below the start of the travel to the first at or above its end."""
         low, high = (Decimal(repr(end)) for end in self.machine.axes[axis].range_mm)
         stated = self.settings.datum_mm[axis]
         datum = low.quantize(QUANTUM_MM, rounding=ROUND_FLOOR) if stated is None else stated
@@ -638,7 +638,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return EquidistantGrid(first, step, max(count, 2))
 
     def _active(self, table: TextTable, present: set[str]) -> dict[int, str]:
-        """Stem of the .COM file by input axis of the line that is marked; every file that is named must be there."""
+        """Stem of the .COM file by input axis, from the marked line; every named file must be present."""
         marked: list[int] = []
         lines: list[dict[int, str]] = []
         if ACTIVE not in [column.name for column in table.columns]:
@@ -703,7 +703,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         return ComTable(positions, filled, backlash)
 
     def _positions(self, axis: int, table: TextTable) -> tuple[Decimal, ...]:
-        """Positions of the rows, ascending: column AXISPOS, or datum and spacing of the machine file without one."""
+        """Positions of the rows, ascending: column AXISPOS, else datum and spacing from the machine file."""
         if POSITION in [column.name for column in table.columns]:
             found = [table.number(row, POSITION) for row in table.rows]
             for k in range(1, len(found)):

@@ -1,4 +1,4 @@
-"""HEIDENHAIN KinematicsComp as a draft (``heidenhain-kinematics``): columns C1 to C6 and rows of the kinematics table."""
+"""HEIDENHAIN KinematicsComp draft (``heidenhain-kinematics``): columns C1 to C6 and rows of the kinematics table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from compgen.kinematics.exact_chain import exact_error
 
 #: Errors of the columns C1 to C6 by axis.
 COLUMNS = tuple(tuple(name for name in CURVE_NAMES if name[2] == letter) for letter in AXES)
-#: Entries in COMPTAB, from which every MachAxis row is deducted (p. 686).
+#: Limit of entries in COMPTAB; every MachAxis row reduces it by one (p. 686).
 MOST_COMPTAB = 100
 MARGIN_MM = Decimal(10)
 
@@ -65,7 +65,7 @@ class DraftSettings:
         return math.radians(1.0) if self.degrees else 1.0
 
     def written(self, value: float, *, angular: bool) -> Decimal:
-        """Return a value (mm or rad) rounded in the unit of the file."""
+        """Return a value (mm or rad) in the unit of the file, rounded."""
         decimals = self.angle_decimals if angular else self.decimals
         scaled = value / self.rad_per_unit if angular else value
         return Decimal(int(np.rint(scaled * 10**decimals))).scaleb(-decimals)
@@ -144,12 +144,12 @@ def _entries(table: TextTable, column: str) -> tuple[Decimal, ...]:
 # HEIDENHAIN KinematicsComp as a draft: columns C1 to C6 in a .COM file per axis, and rows for the kinematics table.
 #
 # Source: iTNC 530 HSCI technical manual (07.2013), p. 666-686, 722. For a linear axis X the columns are C1 EXX, C2 EYX,
-# C3 EZX, C4 EAX, C5 EBX, C6 ECX; rows ``Trans`` of the kinematics table refer to them in the column COMPTAB. What no
-# document settles is in ``templates/heidenhain-kinematics/format.toml``; the maker of the machine must integrate it.
+# C3 EZX, C4 EAX, C5 EBX, C6 ECX; rows ``Trans`` of the kinematics table refer to them in the column COMPTAB. Points
+# that no document settles are in ``templates/heidenhain-kinematics/format.toml``; the machine builder integrates it.
 
 
 class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
-    """All 21 errors as columns C1 to C6 and constants of the kinematics table: a draft for hand integration."""
+    """All 21 errors as columns C1 to C6 and constants of the kinematics table: a draft to be integrated by hand."""
 
     name = "heidenhain-kinematics"
     settings_class = DraftSettings
@@ -174,7 +174,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         return error_terms(self.machine, errors, [np.unique(np.round(part, 4)) for part in nodes])
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> DraftTables:
-        """Round the errors in the units of the file; the end values go on beyond the ends."""
+        """Round the errors in the units of the file; the end values continue beyond the ends."""
         tables: dict[int, DraftTable] = {}
         constants: dict[str, Decimal] = {}
         for term in basis:
@@ -226,7 +226,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> DraftTables:
-        """Read the rows for the kinematics table and the .COM files to which they refer."""
+        """Read the rows for the kinematics table and the .COM files that they refer to."""
         read = [read_table(file) for file in files]
         chains = [table for table in read if table.kind == "TAB"]
         if len(chains) != 1:
@@ -262,14 +262,14 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
     def emulate(self, tables: DraftTables, points: Points) -> FloatArray:
         """Return minus the error of the tool tip in the chain with the entries as errors: exact finite rotations.
 
-        The control moves to target minus error, worked out at the commanded position (one step). X is the only
-        reference of squareness.
+        The control moves to target minus error, evaluated at the commanded position (one step). The squareness
+        reference is always X.
         """
         with_reference = replace(self.machine, squareness_reference="X")
         return -exact_error(with_reference, tables.errors(self.settings), points.position_mm, points.tool_mm) + 0.0
 
     def violations(self, tables: DraftTables) -> list[str]:
-        """Return broken limits: entries, rows of the kinematics table, travel left out."""
+        """Return broken limits: entries, rows of the kinematics table, travel not covered."""
         settings = self.settings
         found = []
         for axis, table in sorted(tables.tables.items()):
@@ -297,7 +297,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         ]
 
     def resolution_mm(self) -> float:
-        """Half of the last decimal of three tables in mm, and of six angles at a lever of one metre."""
+        """Half of the last decimal of three tables in mm, plus that of six angles at a lever of one metre."""
         angle_rad = 0.5 * 10.0**-self.settings.angle_decimals * self.settings.rad_per_unit
         return 3 * 0.5 * 10.0**-self.settings.decimals + 6 * 1000.0 * angle_rad
 
@@ -330,7 +330,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         return [sign + name, "Trans", name[1], "", _plain(value, self.settings.angle_decimals)]
 
     def _sign_statement(self, tables: DraftTables) -> str:
-        """Sign with a number from the files."""
+        """Sign convention with an example value from the files."""
         settings = self.settings
         for axis, table in sorted(tables.tables.items()):
             if 1 in table.columns:
@@ -349,7 +349,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         )
 
     def _reference(self, table: TextTable, row: Row, name: str) -> tuple[int, int]:
-        """Axis and column number of a row such as ``EYX Trans Y X..C2``; they must agree with the name of the error."""
+        """Axis and column number of a row such as ``EYX Trans Y X..C2``; they must match the name of the error."""
         found = re.fullmatch(r"([A-Za-z0-9_]{1,12})\.\.C([1-6])", row.cells.get("COMPTAB", ""), re.ASCII)
         if name not in CURVE_NAMES or row.cells.get("KEY") != "Trans" or found is None:
             raise table.file.fail("expected a row such as 'EYX Trans Y X..C2' with an error's name in DOC", row.line)

@@ -1,8 +1,9 @@
 """Tables of HEIDENHAIN controls as text: ``BEGIN name .COM MM``, a header of column names from ``NR`` on, ``[END]``.
 
-The start of a column's name in the header is where its field begins. The header row, blank-separated columns and the
+A field starts where the name of its column starts in the header. The header row, blank-separated columns and the
 last line ``[END]`` are documented (iTNC 530 HSCI technical manual, p. 670, 671, 684); the first line is usual in all
-text tables of the maker; field widths are not documented, so a table saved on the control can be taken as it is.
+text tables of this manufacturer; field widths are not documented, so the layout of a table saved on the control can be
+used as it is.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from compgen.data.files import read_bytes
 from compgen.data.messages import doubled, one_line
 from compgen.errors import InputError
 
-#: No table of a control is anywhere near this long, has lines of this length, or so much before its header.
+#: Limits far above any real table: length of the file, length of a line, lines before the header.
 MOST_CHARACTERS, MOST_IN_LINE, MOST_BEFORE_HEADER = 2_000_000, 1000, 200
 BEGIN, END, NUMBER_COLUMN = "BEGIN", "[END]", "NR"
 UNITS = ("MM", "INCH", "IN")
@@ -31,7 +32,7 @@ _COLUMN = re.compile(r"[A-Za-z0-9_.+-]{1,32}", re.ASCII)
 
 @dataclass(frozen=True)
 class TableColumn:
-    """One column: its name and where its field starts; ``width`` is 0 for the last one, whose field has no end."""
+    """One column: its name and where its field starts; ``width`` is 0 for the last column, whose field is open."""
 
     name: str
     start: int
@@ -40,7 +41,7 @@ class TableColumn:
 
 @dataclass(frozen=True)
 class Row:
-    """One row: the cells by column name (blank ones are left out) and its line in the file."""
+    """One row: the cells by column name (without blank cells) and its line in the file."""
 
     cells: dict[str, str]
     line: int
@@ -48,10 +49,10 @@ class Row:
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table as it was read.
+    """A table as read from the file.
 
-    ``words`` are those of the first line, ``before`` the lines up to the header and with it, ``after`` the lines from
-    ``[END]`` on, ``header_line`` the number of the header's line.
+    ``words`` are the words of the first line, ``before`` the lines up to and including the header, ``after`` the lines
+    from ``[END]`` on, ``header_line`` the line number of the header.
     """
 
     file: SourceFile
@@ -74,7 +75,7 @@ class TextTable:
         return found.group(1).upper() if found else ""
 
     def number(self, row: Row, column: str) -> Decimal:
-        """Return a cell as a number; InputError for a blank one and for anything but a plain decimal number."""
+        """Return a cell as a number; InputError if it is blank or not a plain decimal number."""
         text = row.cells.get(column)
         if text is None:
             raise self.file.fail(f"column {column} is blank here; a filled column has a number in every row", row.line)
@@ -82,7 +83,7 @@ class TextTable:
 
 
 def read_table(file: SourceFile) -> TextTable:
-    """Read one table; InputError with the line for whatever is malformed or cut."""
+    """Read one table; InputError with the line if anything is malformed or truncated."""
     lines = plain_lines(SourceFile(file.path, file.text.removeprefix("\ufeff")), MOST_CHARACTERS, MOST_IN_LINE)
     words = tuple(lines[0].split())
     if len(words) < 3 or words[0] != BEGIN:
@@ -128,7 +129,7 @@ def _columns(file: SourceFile, header: str, line: int) -> tuple[TableColumn, ...
 
 
 def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: int, due: int) -> Row:
-    """Cells of one row: one word per column by their order, or, where some are blank, by the fields."""
+    """Cells of one row: one word per column in order, or by field position if some cells are blank."""
     found = list(_WORD.finditer(line))
     if len(found) > len(columns):
         raise file.fail(f"{len(found)} values are given for {len(columns)} columns", number)
@@ -152,12 +153,12 @@ def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: in
     return Row(cells, number)
 
 
-# --- writing: layouts of our own, and those of a table saved on a control ----------------------------------------------
+# --- writing: default layouts, and layouts of tables saved on a control -----------------------------------------------
 
 
 @dataclass(frozen=True)
 class ComLayout:
-    """What stays of a table when its rows are filled in: lines before and after, fields of the columns, line ends."""
+    """A table without its rows: lines before and after, fields of the columns, line ends."""
 
     before: tuple[str, ...]
     columns: tuple[TableColumn, ...]
@@ -175,7 +176,7 @@ class ComLayout:
         return InputError(message, file=self.source, line=len(self.before))
 
     def check(self, row: Sequence[str]) -> None:
-        """Raise InputError if a cell does not fit its field with a blank behind it."""
+        """Raise InputError if a cell and one following blank do not fit in its field."""
         for column, cell in zip(self.columns, row, strict=True):
             if column.width and len(cell) >= column.width:
                 raise self.fail(
@@ -185,7 +186,7 @@ class ComLayout:
 
 
 def own_layout(name: str, kind: str, columns: Sequence[tuple[str, int]]) -> ComLayout:
-    """Return a layout of our own: name, extension, and (column, width of its field) in order."""
+    """Return a default layout from name, extension, and (column, field width) in order."""
     header = "".join(f"{column:<{width}}" for column, width in columns).rstrip()
     starts = [sum(width for _, width in columns[:k]) for k in range(len(columns))]
     last = len(columns) - 1
@@ -196,7 +197,7 @@ def own_layout(name: str, kind: str, columns: Sequence[tuple[str, int]]) -> ComL
 
 
 def template_layout(path: Path, kind: str) -> ComLayout:
-    """Return the layout of an empty table saved on a control; InputError with the line if it cannot be filled in.
+    """Return the layout of an empty table saved on a control; InputError with the line if it is not usable.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): error parameters, list file, both file formats."""
+"""Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): parameters, list file, both file formats."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics.first_order import coefficients, factor
 from compgen.kinematics.many_points import full_grid
 
-# Error parameters of the ISG kernel's volumetric compensation: names, grids and strict numbers of both file formats.
+# Error parameters of the ISG kernel's volumetric compensation: names, grids and number syntax of both file formats.
 #
 # Source: ISG kernel help "List of parameters supported" (page 296423819), "Units of measure" (296426379). Lengths are
 # mm, angles rad, arguments of linear axes mm.
 
 
-# Error parameters and list file of the ISG kernel's volumetric compensation, read strictly from text.
+# Strict reader of the error parameters and the list file of the ISG kernel's volumetric compensation.
 
-#: Errors by the control's name (position errors have no leading E): ``"C0Y"`` -> ``"EC0Y"``, ``"EXX"`` -> ``"EXX"``.
+#: ISO names by the control's name (position errors have no leading E): ``"C0Y"`` -> ``"EC0Y"``, ``"EXX"`` -> ``"EXX"``.
 ISO_NAMES: dict[str, str] = {(name[1:] if name in SQUARENESS_NAMES else name): name for name in ERROR_NAMES}
 CONTROL_NAMES: dict[str, str] = {iso: control for control, iso in ISO_NAMES.items()}
 
-#: Constants of the control that are no errors: tool position at machine zero (mm), logical axis numbers.
+#: Constants of the control that are not errors: tool position at machine zero (mm), logical axis numbers.
 TOOL_NAMES = ("P0X", "P0Y", "P0Z")
 LOGICAL_NAMES = ("LNX", "LNY", "LNZ")
 ARGUMENTS = "XYZ"
@@ -58,7 +58,7 @@ ARGUMENTS = "XYZ"
 _LETTERS = "XYZABC"
 _PAIRS = tuple("".join(pair) for pair in itertools.product(_LETTERS, _LETTERS))
 _ORIENTATION_NAMES = ("N0X", "N0Y", "N0Z")
-#: Every parameter name that the control's documents list.
+#: Every parameter name listed in the documents of the control.
 KNOWN_NAMES: frozenset[str] = frozenset(
     [
         *(f"{pair[0]}0{pair[1]}" for pair in _PAIRS),
@@ -74,7 +74,7 @@ KNOWN_NAMES: frozenset[str] = frozenset(
 
 @dataclass(frozen=True)
 class ErrorParameter:
-    """One parameter as a file has it, with its place; ``name`` is the control's."""
+    """One parameter as in the file, with its line; ``name`` is the control's name."""
 
     name: str
     field: ParameterGrid
@@ -84,7 +84,7 @@ class ErrorParameter:
 
 @dataclass(frozen=True)
 class ParameterFile:
-    """What one error-parameter file holds; ``records`` counts its rows of numbers."""
+    """Contents of one error-parameter file; ``records`` counts its rows of numbers."""
 
     parameters: tuple[ErrorParameter, ...]
     records: int
@@ -92,7 +92,7 @@ class ParameterFile:
 
 
 def check_name(source: SourceFile, line: int, name: str) -> None:
-    """Refuse a name that is neither an argument nor a parameter of the control (its error 70468)."""
+    """Refuse a name that is neither an argument nor a parameter of the control (error 70468 on the control)."""
     if name not in KNOWN_NAMES and name not in _LETTERS:
         hint = nearest(name[:20], [*ISO_NAMES, *TOOL_NAMES, *ARGUMENTS])
         raise source.fail(
@@ -108,8 +108,8 @@ def is_rotary(name: str) -> bool:
 def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGrid], dict[str, float]]:
     """Return the fields by ISO name and the other constants by the control's name.
 
-    Each parameter may be given once, over all files. Parameters of rotary axes are left out with a warning; others that
-    the model of three linear axes does not have must be zero.
+    Each parameter may be given only once in all files. Parameters of rotary axes are left out with a warning; other
+    parameters that are not in the model of three linear axes must be zero.
     """
     seen: dict[str, ErrorParameter] = {}
     for item in parameters:
@@ -142,14 +142,14 @@ def _constant(item: ErrorParameter) -> float:
 
 # The list file (``volcomp0.lis``) that configures one volumetric compensation of the ISG kernel.
 #
-# One ``name value`` a line, ``#`` starts a comment. Source: ISG kernel help "Overview of compensation parameters"
+# One ``name value`` per line, ``#`` starts a comment. Source: ISG kernel help "Overview of compensation parameters"
 # (563009163), "Number of workpiece axes" (P-VOLC-00008, 106014347), Beckhoff TF5280 "Updating" (1218769547).
 
 
 Direction = Literal["workpiece_to_tool", "tool_to_workpiece"]
 T = TypeVar("T")
 
-#: Keys that the emulator acts on, and those that change nothing for three linear axes at rest.
+#: Keys that the emulator uses, and keys that have no effect for three linear axes at rest.
 _ACTING = ("x", "y", "z", "chain", "workpiece_axes", "negate", "set_to_zero", "interpolation", "use_axis_offsets")
 _INERT = (
     "a", "b", "c", "alternative_model", "enable_splicing", "diagnosis_file", "manual_activation", "filter_steps",
@@ -160,10 +160,10 @@ _INDEXED = re.compile(r"(file|file_format)\[([0-9]{1,3})\]")
 
 @dataclass(frozen=True)
 class ListFile:
-    """One list file; ``files`` and ``formats`` by their index, ``negate`` and ``set_to_zero`` as letters of XYZ.
+    """One list file; ``files`` and ``formats`` by index, ``negate`` and ``set_to_zero`` as letters of XYZ.
 
-    ``chain`` holds X, Y and Z in the order of the control, ``workpiece_axes`` how many of them carry the workpiece;
-    the defaults are the control's.
+    ``chain`` lists X, Y and Z in the order of the control, ``workpiece_axes`` is how many of them carry the workpiece;
+    the defaults are those of the control.
     """
 
     logical_axes: tuple[int | None, int | None, int | None] = (None, None, None)
@@ -178,24 +178,24 @@ class ListFile:
 
 
 def chain_text(chain: Chain, direction: Direction) -> str:
-    """Return the axes of a chain in the order in which the control reads them."""
+    """Return the axes of a kinematic chain in the order in which the control reads them."""
     order = "".join(letter for letter in chain.name if letter in "XYZ")
     return order if direction == "workpiece_to_tool" else order[::-1]
 
 
 def chain_of(listing: ListFile, direction: Direction) -> Chain:
-    """Return the chain that a list file means."""
+    """Return the kinematic chain that a list file describes."""
     order = listing.chain if direction == "workpiece_to_tool" else listing.chain[::-1]
     return Chain(f"W{order[: listing.workpiece_axes]}F{order[listing.workpiece_axes :]}T")
 
 
 def base_name(path: str) -> str:
-    """Return the file name at the end of a path of the control (either kind of slash)."""
+    """Return the file name at the end of a path on the control (either kind of slash)."""
     return path.replace("\\", "/").rpartition("/")[2]
 
 
 def is_list_file(source: SourceFile) -> bool:
-    """Whether a file is a list file: by its suffix, else by its first line, which then is one key and one value."""
+    """Whether a file is a list file: by its suffix, else by its first line (one key and one value)."""
     if source.path.suffix.lower() in (".lis", ".csv"):
         return source.path.suffix.lower() == ".lis"
     for line in source.text[:20_000].split("\n"):
@@ -209,14 +209,14 @@ def is_list_file(source: SourceFile) -> bool:
 
 
 def parse_list(source: SourceFile) -> ListFile:
-    """Read a list file; InputError with the line for an unknown or doubled key and for a wrong value."""
+    """Read a list file; InputError with the line for an unknown or repeated key or a wrong value."""
     entries = _entries(source)
     check_complete(source, len(entries), "entries")
     files = {int(key[5:-1]): value for key, (value, _) in entries.items() if key.startswith("file[")}
     formats = {int(key[12:-1]): value.upper() for key, (value, _) in entries.items() if key.startswith("file_format[")}
     if not files:
         raise source.fail("refers to no parameter file: file[0] is missing; is the list truncated?")
-    known = choice("GRID", "AUTO")  # other modes interpolate in a way that is not documented in public
+    known = choice("GRID", "AUTO")  # the interpolation of other modes is not publicly documented
     axes = tuple(_take(source, entries, letter, _whole(1, 65535), None) for letter in "xyz")
     return ListFile(
         logical_axes=(axes[0], axes[1], axes[2]),
@@ -232,7 +232,7 @@ def parse_list(source: SourceFile) -> ListFile:
 
 
 def _entries(source: SourceFile) -> dict[str, tuple[str, int]]:
-    """Values and lines by key in lower case (the published examples differ in case)."""
+    """Values and lines by lower-case key (the published examples differ in case)."""
     entries: dict[str, tuple[str, int]] = {}
     for line, text in content_lines(source, "#"):
         key, *value = text.split(maxsplit=1)
@@ -271,18 +271,18 @@ def _whole(lowest: int, highest: int) -> Callable[[str], int]:
 
 @accepts({"type": "string", "pattern": r"^(?!.*(.).*\1)[XYZ]*$"})
 def axis_letters(value: object) -> str:
-    """Return some of the letters X, Y, Z, each once, in that order; ValueError for anything else."""
+    """Return the given letters out of X, Y, Z in that order, each at most once; ValueError for anything else."""
     if not isinstance(value, str) or len(set(value)) != len(value) or not set(value) <= set("XYZ"):
         raise ValueError("expected some of the letters X, Y, Z, each at most once")
     return "".join(sorted(value))
 
 
-# What the machine file says to the ISG kernel's volumetric compensation, and what the control has loaded.
+# Settings in the machine file for the ISG kernel's volumetric compensation, and what the control has loaded.
 
 
 @accepts({"type": "string", "maxLength": 200, "pattern": r"^[!-\"$-~]*$"})
 def folder_of_control(value: object) -> str:
-    """A folder on the control, with a slash at its end; empty for none."""
+    """A folder on the control, ending with a slash; empty for none."""
     if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
         raise ValueError("expected a folder on the control: printable ASCII without blanks and '#'")
     if not value or value[-1] in "\\/":
@@ -331,8 +331,8 @@ class IsgCsvSettings(IsgSettings):
 class IsgTables:
     """What the control has loaded: errors by ISO name, other constants, and the list file if there is one.
 
-    ``records`` counts rows of numbers over ``files`` (names of the parameter files); ``remarks`` are findings about
-    the text that the control's documents do not cover.
+    ``records`` counts the rows of numbers in all ``files`` (names of the parameter files); ``remarks`` are findings
+    about syntax that the documents of the control do not cover.
     """
 
     fields: Mapping[str, ParameterGrid]
@@ -343,7 +343,7 @@ class IsgTables:
     remarks: tuple[str, ...] = ()
 
 
-# Words for the people at the machine: what the exported files of the ISG kernel say, and what must be set and checked.
+# Texts for the people at the machine: meaning of the exported files, and what must be set and checked.
 
 
 _DIRECTIONS = {
@@ -352,10 +352,11 @@ _DIRECTIONS = {
 }
 
 
-# Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): what its two file formats share.
+# Volumetric compensation of the ISG kernel (Beckhoff TwinCAT CNC TF5280): code shared by its two file formats.
 #
-# The control reads ISO 230 errors and evaluates E = C P itself; it then takes the error off the command. The list file
-# says which chain, which axes and which sign. What no public document settles is a setting here and is said in the files.
+# The control reads ISO 230 errors and evaluates E = C P itself; it then subtracts the error from the command. The list
+# file gives the chain, the axes and the sign. Points that no public document settles are settings here and are noted in
+# the files.
 
 
 LENGTH_DIGITS, ANGLE_DIGITS, POSITION_DIGITS = 9, 12, 6
@@ -366,16 +367,16 @@ LIST_ENTRIES = 9
 
 
 def rounded(name: str, values: FloatArray) -> FloatArray:
-    """Return values of an error (ISO name) rounded as they are written."""
+    """Return values of an error (ISO name) rounded as written to the file."""
     digits = LENGTH_DIGITS if error_named(name).kind == "linear" else ANGLE_DIGITS
     flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
     return np.array(flat).reshape(np.shape(values))
 
 
 class VolumetricController(Controller[IsgSettings, IsgTables]):
-    """The kernel's volumetric compensation; a subclass knows one format of the parameter file.
+    """The kernel's volumetric compensation; each subclass handles one format of the parameter file.
 
-    ``file_format`` is the control's word for it, ``parameter_file`` the name of the exported file.
+    ``file_format`` is the control's name for the format, ``parameter_file`` the name of the exported file.
     """
 
     file_format: str
@@ -392,11 +393,11 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
 
     @abstractmethod
     def body(self, tables: IsgTables) -> dict[str, Any]:
-        """Return what the template of the parameter file needs."""
+        """Return the context for the template of the parameter file."""
 
     @classmethod
     def check_settings(cls, settings: IsgSettings, section: Section, machine: Machine) -> IsgSettings:
-        """Take the reversed axes as those that the list file negates, unless the machine file says which."""
+        """Let the list file negate the reversed axes, unless the machine file states ``negate``."""
         return unless_stated(settings, section, negate=settings.reversed_axes)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
@@ -405,7 +406,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         return error_terms(self.machine, errors, nodes)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> IsgTables:
-        """Round the errors as they are written; the list file comes with them."""
+        """Round the errors as written to the file, and add the list file."""
         fields = {}
         for term in sorted(basis, key=lambda term: ERROR_NAMES.index(term.name)):
             numbers = rounded(term.name, np.asarray(values[term.name], dtype=np.float64))
@@ -423,7 +424,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         )
 
     def parse(self, files: Sequence[SourceFile]) -> IsgTables:
-        """Read parameter files, and the list file if it is among them, in any order."""
+        """Read parameter files, and the list file if given, in any order."""
         lists = [source for source in files if is_list_file(source)]
         sources = [source for source in files if source not in lists]
         if len(lists) > 1:
@@ -452,9 +453,9 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         )
 
     def emulate(self, tables: IsgTables, points: Points) -> FloatArray:
-        """Return minus E = C P of the parsed numbers with the chain of the list file (of the machine without one).
+        """Return minus E = C P of the parsed numbers with the chain of the list file (without one, of the machine).
 
-        The tool offset is the points', else P0X, P0Y, P0Z of the file, else the machine's.
+        The tool offset is that of the points, else P0X, P0Y, P0Z from the file, else that of the machine.
         """
         listing = tables.listing
         chain = self.machine.chain if listing is None else chain_of(listing, self.settings.chain_direction)
@@ -477,13 +478,13 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         return np.asarray(result * signs + 0.0)
 
     def tool_of(self, tables: IsgTables) -> FloatArray:
-        """Tool offset that the control uses without a tool of its own, shape (3,), mm."""
+        """Tool offset used if the points do not give one, shape (3,), mm."""
         if any(name in tables.constants for name in TOOL_NAMES):
             return np.array([tables.constants.get(name, 0.0) for name in TOOL_NAMES])
         return np.array(self.machine.tool_offset_mm)
 
     def violations(self, tables: IsgTables) -> list[str]:
-        """Return limits that are broken, travel that is not covered, and where list and machine file disagree."""
+        """Return broken limits, travel not covered, and differences between list file and machine file."""
         settings = self.settings
         found = list(tables.remarks)
         if tables.records > settings.max_records:
@@ -491,7 +492,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
                 f"{tables.records} records, max_records is {settings.max_records}: the control refuses the file; raise "
                 f"vol_comp[0].max_records in the start-up list and max_records in the machine file"
             )
-        uncovered: dict[str, list[str]] = {}  # one message per axis and range, naming the errors that it holds for
+        uncovered: dict[str, list[str]] = {}  # one message per axis and range, with the errors that it applies to
         for name, item in tables.fields.items():
             for axis, nodes in zip(item.axes, item.nodes_mm, strict=True):
                 for message in coverage_violations(self.machine, axis, float(nodes[0]), float(nodes[-1]), ""):
@@ -503,7 +504,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         return found + self._list_violations(tables)
 
     def _list_violations(self, tables: IsgTables) -> list[str]:
-        """Return where the list file differs from the one that the machine file asks for, or from the files given."""
+        """Return where the list file differs from the one that the machine file requires, or from the given files."""
         if tables.listing is None:
             return [f"{len(tables.files)} parameter files, the control takes {MOST_FILES}"] * (
                 len(tables.files) > MOST_FILES
@@ -535,11 +536,11 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         return found
 
     def usage(self, tables: IsgTables) -> list[Usage]:
-        """Return the records of the parameter files against what the control takes."""
+        """Return the records of the parameter files against the limit of the control."""
         return [Usage("records (max_records)", tables.records, self.settings.max_records, "records")]
 
     def resolution_mm(self) -> float:
-        """Half a digit of three lengths, and of six angles and two squareness errors at the longest lever."""
+        """Half of the last digit of three lengths, plus that of eight angles (two squareness) at the longest lever."""
         machine = self.machine
         lever_mm = np.maximum(np.abs(machine.lower_mm), np.abs(machine.upper_mm)) + np.abs(machine.tool_offset_mm)
         return 0.5 * (3 * 10.0**-LENGTH_DIGITS + 8 * 10.0**-ANGLE_DIGITS * float(np.max(lever_mm)))
@@ -551,7 +552,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         )
 
     def context(self, tables: IsgTables) -> dict[str, Any]:
-        """Return what the templates need: numbers, list entries, the sign in words, parameters and checks."""
+        """Return the template context: numbers, list entries, the sign in words, parameters and checks."""
         listing = tables.listing or self._list_of(self.parameter_file, self.file_format)
         # the grid point of 3 x 3 x 3 with the largest correction of each axis
         lines = [(axis.range_mm[0], 0.5 * sum(axis.range_mm), axis.range_mm[1]) for axis in self.machine.axes]
@@ -662,14 +663,14 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
 
 # ISG_CSV: the error parameters as white-space separated columns (kernel help, page 296429067).
 #
-# A header names arguments and parameters, rows of numbers follow; ``//`` starts a comment, a line with ``#`` ends a
+# A header names arguments and parameters; rows of numbers follow. ``//`` starts a comment, a line with ``#`` ends a
 # block. Several argument columns make a grid, e.g. errors of X at several Z.
 
 _Row = tuple[int, list[str]]
 
 
 def parse_csv(source: SourceFile) -> ParameterFile:
-    """Read an ISG_CSV file; InputError with file and line for anything that the grammar does not have."""
+    """Read an ISG_CSV file; InputError with file and line for anything outside the grammar."""
     parameters: list[ErrorParameter] = []
     records = 0
     exponent: int | None = None
@@ -698,7 +699,7 @@ def _blocks(source: SourceFile) -> list[list[_Row]]:
 
 
 def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
-    """Return the parameters of one block: header and rows that form a grid over its arguments."""
+    """Return the parameters of one block: a header, and rows that form a grid over its arguments."""
     (header_line, names), rows = block[0], block[1:]
     _check_header(source, header_line, names)
     if not rows:
@@ -762,7 +763,7 @@ class IsgCsv(VolumetricController):
 
 
 def _table_blocks(fields: Mapping[str, ParameterGrid], constants: Mapping[str, float]) -> list[dict[str, Any]]:
-    """Blocks in the order of the file: constants, tool position, then the curves of X, Y, Z that share their nodes."""
+    """Blocks in the order of the file: constants, tool position, then curves of X, Y, Z grouped by common nodes."""
     groups: dict[tuple[Any, ...], dict[str, ParameterGrid]] = {}
     for name, item in sorted(fields.items(), key=lambda pair: pair[1].axes):
         key = (item.axes, *(nodes.tobytes() for nodes in item.nodes_mm))
@@ -776,7 +777,7 @@ def _table_blocks(fields: Mapping[str, ParameterGrid], constants: Mapping[str, f
 
 
 def _rows(group: Mapping[str, ParameterGrid]) -> dict[str, Any]:
-    """Block of the parameters that share one grid: its names, rows, and digits of each column."""
+    """Block of the parameters on one grid: names, rows, and digits of each column."""
     first = next(iter(group.values()))
     letters = [AXES[axis] for axis in first.axes]
     positions = itertools.product(*(nodes.tolist() for nodes in first.nodes_mm))
@@ -792,8 +793,9 @@ def _rows(group: Mapping[str, ParameterGrid]) -> dict[str, Any]:
 
 # ETALON_EXCHANGE: the exchange file of Etalon's software, variant "Vendor" (ISG kernel help, page 296430091).
 #
-# ``[EXY]`` starts a parameter; ``VALUE = number`` gives a constant, ``Gridpoints = {`` rows ``argument value`` and ``}``
-# a curve over the axis' own position. ``//`` starts a comment. :func:`errors_from_etalon` imports such a file.
+# ``[EXY]`` starts a parameter; ``VALUE = number`` gives a constant; ``Gridpoints = {``, rows ``argument value`` and
+# ``}`` give a curve over the position of the axis. ``//`` starts a comment. :func:`errors_from_etalon` imports such a
+# file.
 
 
 _SECTION = re.compile(r"\[\s{0,9}([A-Za-z0-9_]{1,40})\s{0,9}\]")
@@ -803,7 +805,7 @@ _GRID = re.compile(r"gridpoints\s{0,40}=\s{0,40}\{", re.IGNORECASE)
 
 @dataclass
 class _Section:
-    """One ``[NAME]`` while it is read; ``open`` between the braces of its grid points."""
+    """One ``[NAME]`` while being read; ``open`` is True between the braces of its grid points."""
 
     name: str
     line: int
@@ -814,7 +816,7 @@ class _Section:
 
 
 def parse_etalon(source: SourceFile) -> ParameterFile:
-    """Read an ETALON_EXCHANGE file; InputError with file and line for anything that the grammar does not have."""
+    """Read an ETALON_EXCHANGE file; InputError with file and line for anything outside the grammar."""
     sections: list[_Section] = []
     exponent: int | None = None
     for line, text in content_lines(source):
@@ -843,7 +845,7 @@ def parse_etalon(source: SourceFile) -> ParameterFile:
 
 
 def _take_line(source: SourceFile, sections: list[_Section], line: int, text: str) -> None:
-    """Add one line to the section that is being read, or start a new one."""
+    """Add one line to the current section, or start a new one."""
     current = sections[-1] if sections else None
     header = _SECTION.match(text)
     if header and not (current and current.open):
@@ -882,7 +884,7 @@ def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> 
 
 
 def is_exchange_text(text: str) -> bool:
-    """Whether a text begins, after comments, with a parameter name in brackets, as an exchange file does."""
+    """Whether a text starts, after comments, with a parameter name in brackets, as an exchange file does."""
     for line in text[:20_000].split("\n"):
         content = line.partition("//")[0].strip()
         if content:
@@ -891,16 +893,16 @@ def is_exchange_text(text: str) -> bool:
 
 
 def errors_from_etalon(text: str, path: Path | None = None) -> ErrorTable:
-    """Import an exchange file that a laser tracer's software wrote ("Vendor" variant).
+    """Import an exchange file written by laser tracer software ("Vendor" variant).
 
     Parameters
     ----------
     text : contents of the file; lengths in mm, angles in rad, positions in mm.
-    path : where it came from, for messages.
+    path : path of the file, for messages.
 
     Returns
     -------
-    the errors as in the file, squareness in the convention of ISO 230-1 (X is the reference); uncertainties unknown.
+    the errors as in the file, squareness by the ISO 230-1 convention (reference X); uncertainties unknown.
     Errors of rotary axes are left out with a warning.
     """
     source = SourceFile(path or Path("exchange file"), text)
@@ -951,13 +953,13 @@ def _section(name: str, item: ParameterGrid) -> dict[str, Any]:
     }
 
 
-# Errors from the files that users have: ``*.errors.csv``, or an exchange file that a laser tracer's software wrote.
+# Errors from users' files: ``*.errors.csv``, or an exchange file written by laser tracer software.
 
 
 def read_error_file(path: str | Path) -> ErrorTable:
     """Read an ``*.errors.csv`` file (um, urad) or an Etalon exchange file, variant Vendor (mm, rad).
 
-    Which of the two it is shows in the text: an exchange file begins, after comments, with a name in brackets.
+    The format is detected from the text: an exchange file starts, after comments, with a name in brackets.
     """
     source = Path(path)
     text = read_text(source)

@@ -56,7 +56,7 @@ class FieldGrid:
 
 @dataclass(frozen=True)
 class NeutralTables:
-    """The field, the curves (mm and rad, squareness reference X), or both; ``conflicts`` describes contradicting files."""
+    """The field, the curves (mm and rad, squareness reference X), or both; ``conflicts``: contradictions, in words."""
 
     field: FieldGrid | None
     curves: ErrorTable | None

@@ -65,8 +65,8 @@ _UNITS_PER_MM_QUANTUM = 10 ** (FACTOR_DECIMALS - MM_DECIMALS)
 class CecTable:
     """One table: output over input axis (0..2); ``multiplier`` is the NUMBER (index + 1) of the other factor, or 0.
 
-    ``direction`` is 0 (both), 1 or -1: the travel direction of the input axis in which the table acts. ``enabled`` is SD41300,
-    ``weight`` SD41310. ``decimals`` and ``label`` are for writing only.
+    ``direction`` is 0 (both), 1 or -1: the travel direction of the input axis in which the table acts. ``enabled`` is
+    SD41300, ``weight`` SD41310. ``decimals`` and ``label`` are for writing only.
     """
 
     input_axis: int

@@ -178,8 +178,8 @@ def _plain_indices(text: str) -> tuple[str, ...]:
 class LinearTable:
     """An equidistant table in exact decimal numbers (mm): nodes ``start + n step`` up to ``last``.
 
-    ``values`` has one number per node. The control interpolates linearly between nodes and holds the end values outside;
-    a ``modulo`` table repeats with the period ``last - start`` (K3-2013, p. 237, 242, 248).
+    ``values`` has one number per node. The control interpolates linearly between nodes and holds the end values
+    outside; a ``modulo`` table repeats with the period ``last - start`` (K3-2013, p. 237, 242, 248).
     """
 
     start_mm: Decimal
@@ -352,9 +352,9 @@ def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
 # Files from real SINUMERIK controls: start-up archives, punched files and sub-programs not written by this program.
 #
 # An archive is a chain of files. Each is preceded by NUL bytes with the name ``_N_NC_CEC_INI`` in the binary form
-# (``.arc``), or by a line ``%_N_NC_CEC_INI`` in the text form. The tables are in its initialisation files; part programs
-# that write the same variables have no effect and are skipped. If a file contains only one part, that part is read,
-# whether or not it is a program.
+# (``.arc``), or by a line ``%_N_NC_CEC_INI`` in the text form. The tables are in its initialisation files; part
+# programs that write the same variables have no effect and are skipped. If a file contains only one part, that part is
+# read, whether or not it is a program.
 #
 # Nothing that could change a table is skipped: a line of a table that is not understood is an error with its number.
 # Everything else is counted and reported in one line.

@@ -1,4 +1,4 @@
-"""TwinCAT CNC axis lists (``twincat-lists``): leadscrew, cross and plane tables of the axes, their text and lookup."""
+"""TwinCAT CNC axis lists (``twincat-lists``): leadscrew, cross and plane tables of the axes, file text and lookup."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import CompgenWarning, InputError
 
-# Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables as the control keeps them, and their lookup.
+# Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables as stored on the control, and their lookup.
 #
-# Numbers stay in the unit of the files, 0.1 um (``unit 1``). Source: Beckhoff TF5200 "Axis compensation" (308687883,
+# Numbers are in the unit of the files, 0.1 um (``unit 1``). Source: Beckhoff TF5200 "Axis compensation" (308687883,
 # 308709003, 15327290891) and its parameters P-COMP-00004 ... P-COMP-00033.
 
 
-# Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables, their lookup, and reading them.
+# Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables, lookup and reader.
 
 #: 0.1 um in mm.
 MM_PER_UNIT = 1e-4
@@ -48,9 +48,9 @@ MM_PER_UNIT = 1e-4
 
 @dataclass(frozen=True)
 class LeadscrewTable:
-    """``kw.ssfk``: values over the axis' own position, ``neg`` for negative travel (None: one table for both).
+    """``kw.ssfk``: values over the position of the same axis, ``neg`` for negative travel (None: one table for both).
 
-    ``setpoints`` (n,) ascend; ``interval`` is their distance, or 0 if each is in the file. All in 0.1 um.
+    ``setpoints`` (n,) ascend; ``interval`` is their spacing, or 0 if the file lists each of them. All in 0.1 um.
     """
 
     setpoints: FloatArray
@@ -59,7 +59,7 @@ class LeadscrewTable:
     interval: float = 0.0
 
     def at(self, along: FloatArray, direction: FloatArray) -> FloatArray:
-        """Value at positions (n,) reached in directions (n,) (+1, -1, 0: unknown, the mean), end values held outside."""
+        """Value at positions (n,) reached in directions (n,) (+1, -1; 0: unknown, mean), end values held outside."""
         pos = np.interp(along, self.setpoints, self.pos)
         if self.neg is None:
             return pos
@@ -84,7 +84,7 @@ class CrossTable:
 class PlaneTable:
     """``kw.crosscomp2`` of a slave axis: values [j, i] with i along ``masters[0]`` and j along ``masters[1]``, 0.1 um.
 
-    ``starts`` are the positions of i = 0 and j = 0; both axes have the distance ``interval``.
+    ``starts`` are the positions of i = 0 and j = 0; ``interval`` is the spacing along both axes.
     """
 
     masters: tuple[int, int]
@@ -99,7 +99,7 @@ class PlaneTable:
         )
 
     def at(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Value at positions (n,) of both masters: bilinear between four corners, values of the margin held outside."""
+        """Value at positions (n,) of both masters: bilinear between four corners, boundary values held outside."""
         (i, u), (j, v) = (
             _cell(along, start, self.interval, count)
             for along, start, count in zip((first, second), self.starts, self.values.shape[::-1], strict=True)
@@ -118,7 +118,7 @@ def _cell(along: FloatArray, start: float, interval: float, count: int) -> tuple
 
 @dataclass(frozen=True)
 class AxisList:
-    """The tables in the list of one axis, which is the slave of ``cross`` and ``plane``."""
+    """The tables in the list of one axis, the slave of ``cross`` and ``plane``."""
 
     screw: LeadscrewTable | None = None
     cross: CrossTable | None = None
@@ -126,7 +126,7 @@ class AxisList:
 
     @property
     def numbers(self) -> FloatArray:
-        """Every position and value of the tables, shape (n,)."""
+        """All positions and values of the tables, shape (n,)."""
         parts: list[FloatArray | None] = [np.zeros(1)]
         if self.screw is not None:
             parts += [self.screw.setpoints, self.screw.pos, self.screw.neg]
@@ -146,7 +146,7 @@ class TwincatTables:
 
 @dataclass(frozen=True)
 class PointLimits:
-    """Largest number of points of each kind of table; builds without P-COMP-00059 ... 61 have the defaults."""
+    """Maximum number of points for each kind of table; builds without P-COMP-00059 ... 61 have the defaults."""
 
     ssfk: int = setting(whole(2, 100_000), 1500)
     crosscomp: int = setting(whole(2, 100_000), 1001)
@@ -154,14 +154,14 @@ class PointLimits:
 
 
 def point_counts(item: AxisList) -> dict[str, int]:
-    """Return the number of points of each table of a list, by its structure (``ssfk``, ``crosscomp``, ``crosscomp2``)."""
+    """Return the number of points of each table in a list, by structure (``ssfk``, ``crosscomp``, ``crosscomp2``)."""
     counts = {} if item.screw is None else {"ssfk": len(item.screw.setpoints)}
     counts |= {} if item.cross is None else {"crosscomp": len(item.cross.setpoints)}
     return counts | ({} if item.plane is None else {"crosscomp2": item.plane.values.size})
 
 
 def list_usage(name: str, item: AxisList, most: PointLimits) -> list[Usage]:
-    """Return the points of one list (``name``: the axis) against what the control takes."""
+    """Return the points of one list (``name``: the axis) against the limits of the control."""
     return [
         Usage(f"points of kw.{kind} of {name}", used, getattr(most, kind), "points")
         for kind, used in point_counts(item).items()
@@ -169,7 +169,7 @@ def list_usage(name: str, item: AxisList, most: PointLimits) -> list[Usage]:
 
 
 def spans_mm(item: AxisList, axis: int) -> list[tuple[str, int, FloatArray]]:
-    """Return (structure, axis of the argument, its positions in mm) of every table in the list of ``axis``."""
+    """Return (structure, input axis, positions in mm) for every table in the list of ``axis``."""
     found: list[tuple[str, int, FloatArray]] = []
     if item.screw is not None:
         found.append(("kw.ssfk", axis, item.screw.setpoints * MM_PER_UNIT))
@@ -184,7 +184,7 @@ def spans_mm(item: AxisList, axis: int) -> list[tuple[str, int, FloatArray]]:
 
 
 def stored_sums(item: AxisList, axis: int, position_mm: FloatArray, approach: FloatArray) -> tuple[FloatArray, ...]:
-    """Return what ``ssfk`` and what the cross and plane tables of an axis hold at positions (n, 3), each (n,), mm."""
+    """Return the value of ``ssfk`` and the sum of cross and plane tables at positions (n, 3), each (n,), mm."""
     along = np.asarray(position_mm) / MM_PER_UNIT
     screw, cross = np.zeros(len(along)), np.zeros(len(along))
     if item.screw is not None:
@@ -198,7 +198,7 @@ def stored_sums(item: AxisList, axis: int, position_mm: FloatArray, approach: Fl
 
 
 def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> FloatArray:
-    """Return positions (n,) in whole units of 0.1 um that still cover the travel where they did."""
+    """Round positions (n,) to whole units of 0.1 um, outwards at the ends of the travel to keep it covered."""
     low, high = (end / MM_PER_UNIT for end in machine.axes[axis].range_mm)
     units = np.rint(positions_mm / MM_PER_UNIT)
     units[0] = min(units[0], np.floor(low + 1e-3)) if positions_mm[0] <= machine.axes[axis].range_mm[0] else units[0]
@@ -208,9 +208,9 @@ def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> Flo
     return np.unique(units)
 
 
-# Reading the axis lists of the TwinCAT CNC (``achskw*.lis``): one ``key value`` a line, strictly.
+# Strict reader of the axis lists of the TwinCAT CNC (``achskw*.lis``): one ``key value`` per line.
 #
-# ``#`` starts a comment line, ``/* ... */`` a comment behind a value. Key grammar::
+# ``#`` starts a comment line, ``/* ... */`` is a comment after a value. Key grammar::
 #
 #     kopf.achs_nr | kopf.log_achs_name | kw.<structure>.<parameter> | kw.<structure>.table[i].<parameter>
 #     kw.crosscomp2.table[j][i].correction            j: second master
@@ -219,7 +219,7 @@ def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> Flo
 _SPACED_INDEX = re.compile(r"\[\s{0,9}([0-9]{1,6})\s{0,9}\]")
 _KEY = re.compile(r"([a-z0-9_]{1,20})\.([a-z0-9_.]{1,60})((?:\[[0-9]{1,6}\]){0,2})(?:\.([a-z0-9_]{1,30}))?")
 _SWITCHES = ("max_points", "manual_activation")
-#: Parameters of each structure, those of its table with the number of their indices.
+#: Parameters of each structure; in ``_TABLES`` those of its table, with the number of their indices.
 _KNOWN: dict[str, tuple[str, ...]] = {
     "kopf": ("achs_nr", "log_achs_nr", "log_achs_name"),
     "kw.ssfk": ("unit", "interval", "kw_startpos", "kw_nr_max", "bilateral", "modulo", *_SWITCHES),
@@ -266,7 +266,7 @@ class _Body:
         return self.value(f"{structure}.{name}", entry)
 
     def value(self, label: str, entry: _Entry) -> float:
-        """Return the number of an entry, or the error that says why it is none."""
+        """Return the number of an entry, or raise the error that says why it is not a number."""
         number = float(fixed_point(self.source, entry.line, entry.value, label))
         if abs(number) > 2.0**53:
             raise self.source.fail(f"{label}: {number:g} is beyond the whole numbers of the control", entry.line)
@@ -285,7 +285,7 @@ class _Body:
         return self.source.fail(f"{structure}.{name}: {message}", entry.line if entry else None)
 
     def axis(self, structure: str, name: str) -> int:
-        """Return the axis 0..2 that a logical axis number means."""
+        """Return the axis 0..2 with the logical axis number of a parameter."""
         number = self.whole(structure, name, 0, 65535)
         if number not in self.logical_axes:
             known = ", ".join(map(str, self.logical_axes))
@@ -293,7 +293,7 @@ class _Body:
         return self.logical_axes.index(number)
 
     def column(self, structure: str, name: str, shape: tuple[int, ...]) -> FloatArray:
-        """Return a column of the table of a structure with every index from 0 on, shape ``shape``."""
+        """Return a column of a structure's table, all indices from 0, shape ``shape``."""
         entries = self.tables.get((structure, name), {})
         result = np.zeros(shape)
         for index, entry in entries.items():
@@ -320,9 +320,9 @@ def parse_axis_list(
 ) -> tuple[int | None, AxisList]:
     """Return the axis (0..2) of a list and its tables; InputError with file and line for anything malformed.
 
-    ``increment_mm`` are the encoder increments of the axes for lists with ``unit 0``. With ``foreign`` the list is that of
-    another program: comments hold any character, reserved entries and other structures are passed over, and the axis is
-    None where the machine file does not have it.
+    ``increment_mm`` are the encoder increments of the axes for lists with ``unit 0``. With ``foreign`` the list comes
+    from another program: comments may contain any character, reserved entries and other structures are skipped, and the
+    axis is None if the machine file does not have it.
     """
     if foreign is not None:
         source = SourceFile(source.path, source.text.encode("ascii", "replace").decode().replace("\0", "?"))
@@ -364,7 +364,7 @@ _MASTERS = {"kw.crosscomp": ("master_ax_nr",), "kw.crosscomp2": ("master1_ax_nr"
 
 
 def _is_apart(body: _Body, structure: str, name: str) -> bool:
-    """Whether a logical axis number is none of the machine file's."""
+    """Whether a logical axis number is not in the machine file."""
     return body.whole(structure, name, 0, 65535) not in body.logical_axes
 
 
@@ -397,7 +397,7 @@ def _take(body: _Body, line: int, code: str) -> None:
 
 
 def _idle(head: str, name: str) -> str:
-    """What an entry of another program's list is that has no bearing on the three tables; empty if it has."""
+    """Describe an entry of another program's list that does not affect the three tables; empty if it does."""
     if head in _TABLES:
         return f"reserved entries of {head}" if _RESERVED.fullmatch(name) else ""
     return "" if head == "kopf" and name in _KNOWN["kopf"] else f"entries of {head}"
@@ -410,7 +410,7 @@ def _unknown(body: _Body, line: int, key: str) -> InputError:
 
 
 def _values(body: _Body, structure: str, axis: int, values: FloatArray) -> FloatArray:
-    """Values of a table in 0.1 um: ``unit`` 1 as they are, 0 in encoder increments of the axis; positions are not concerned."""
+    """Convert table values to 0.1 um: ``unit`` 1 unchanged, 0 from encoder increments; positions are not affected."""
     if body.whole(structure, "unit", 0, 1) == 1 or not np.any(values):
         return values
     length_mm = body.increment_mm[axis]
@@ -501,7 +501,7 @@ def _axis_name(value: Any) -> str:
 
 @accepts({"enum": list(_PLANES)})
 def plane_masters(value: Any) -> tuple[int, int] | None:
-    """The first and second master of a plane by their letters, e.g. "XZ"; None for "none"."""
+    """First and second master of a plane from their letters, e.g. "XZ"; None for "none"."""
     if not isinstance(value, str) or value not in _PLANES:
         raise ValueError(f"expected two different letters, first and second master: {', '.join(_PLANES)}")
     return _PLANES[value]
@@ -511,7 +511,7 @@ def plane_masters(value: Any) -> tuple[int, int] | None:
 class TwincatSettings:
     """``[controllers.twincat-lists]`` of a machine file.
 
-    ``planes`` are the masters (first, second) of the plane of each slave, None: no plane, ``"auto"``: chosen.
+    ``planes``: masters (first, second) of the plane of each slave, None: no plane, ``"auto"``: chosen automatically.
     """
 
     logical_axes: tuple[int, int, int] = axis_setting(
@@ -558,22 +558,22 @@ class TwincatSettings:
 
     @property
     def screw_factor(self) -> float:
-        """What the control adds per stored ``ssfk`` value: -1 or +1."""
+        """Factor with which the control adds a stored ``ssfk`` value: -1 or +1."""
         return -1.0 if self.ssfk_sign == "error" else 1.0
 
     @property
     def cross_factor(self) -> float:
-        """What the control adds per stored cross or plane value: +1 or -1."""
+        """Factor with which the control adds a stored cross or plane value: +1 or -1."""
         return 1.0 if self.cross_sign == "correction" else -1.0
 
 
-# What TwinCAT axis lists can hold: which table of a slave axis takes which function, and the numbers of the tables.
+# Allocation of the TwinCAT axis lists: which table of a slave axis contains which function, and the table values.
 #
-# A slave has one leadscrew table, one cross table (one master) and one plane (two masters; one of them may be the slave).
-# The plane takes the products function-of-one-axis times lever-of-another that matter most.
+# A slave has one leadscrew table, one cross table (one master) and one plane (two masters; one may be the slave). The
+# plane contains the largest products (function of one axis) x (lever of another).
 
 
-#: A function or product that moves the slave by less than this (rms) needs no table.
+#: A function or product that moves the slave by less than this (rms) does not need a table.
 NOTHING_MM = 0.02 * MM_PER_UM
 
 
@@ -590,7 +590,7 @@ def _units(nodes_mm: FloatArray) -> FloatArray:
 # ``twincat-lists``: compensation value lists of the TwinCAT CNC axes (TF5200): leadscrew, cross and plane tables.
 #
 # Source: Beckhoff TF5200 "Axis compensation" and "Axis compensation parameters" (P-COMP-00001 ... 00061). The sign of
-# cross and plane tables is stated nowhere in public; it is the setting ``cross_sign``.
+# cross and plane tables is not publicly documented; it is the setting ``cross_sign``.
 
 
 _LARGEST_SGN32 = 2.0**31 - 1
@@ -609,12 +609,12 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         return [continued(term, self.machine.axes[term.axis or 0].range_mm) for term in terms]
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> TwincatTables:
-        """Return the tables in 0.1 um, signs as the control stores them."""
+        """Return the tables in 0.1 um, with the signs stored on the control."""
         # cross and plane tables of zeros are left out
         return TwincatTables({slave: self._list_of(slave, basis, values) for slave in range(3)})
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Only the reversal of an axis along itself goes into tables."""
+        """Return the reversals that go into tables: only those of an axis along itself."""
         return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
 
     def with_reversal(self, tables: TwincatTables, reversal: ReversalCurves) -> TwincatTables:
@@ -637,7 +637,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         return TwincatTables(lists)
 
     def context(self, tables: TwincatTables) -> dict[str, Any]:
-        """Return the lists with their numbers, the signs with a worked number, and what must be set."""
+        """Return the lists with their numbers, the sign conventions with an example, and the parameters to set."""
         return {
             "sign_statement": f"{self._screw_statement()} {self._cross_statement()}",
             "screw_statement": self._screw_statement(),
@@ -663,7 +663,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         return self._parsed(files, None)
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[TwincatTables, list[str]]:
-        """Read lists of a real control: reserved entries and other structures are passed over, other axes kept apart."""
+        """Read lists from a real control: reserved entries and other structures are skipped, other axes are noted."""
         foreign = Findings()
         tables = self._parsed(files, foreign)
         if not any(item != AxisList() for item in tables.lists.values()):
@@ -687,8 +687,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
     def emulate(self, tables: TwincatTables, points: Points) -> FloatArray:
         """Return the sum of all tables of each axis with the signs of the settings.
 
-        A bilateral leadscrew table needs the last direction of travel; where that is unknown the mean of both is
-        taken, and a CompgenWarning says so.
+        A bilateral leadscrew table needs the last direction of travel; if that is unknown, the mean of both directions
+        is used and a CompgenWarning is issued.
         """
         unknown = np.zeros_like(points.position_mm)
         approach = unknown if points.approach is None else points.approach
@@ -705,7 +705,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         return result + 0.0
 
     def violations(self, tables: TwincatTables) -> list[str]:
-        """Return tables with too many points, numbers that do not fit, travel that is not covered, missing lists."""
+        """Return tables with too many points, numbers that do not fit, travel not covered, missing lists."""
         settings = self.settings
         found = [
             f"no list of axis {AXES[axis]} ({settings.logical_axes[axis]}) was given"
@@ -731,7 +731,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         return found
 
     def usage(self, tables: TwincatTables) -> list[Usage]:
-        """Return the points of every table against what the control takes."""
+        """Return the points of every table against the limits of the control."""
         return [
             use
             for axis, item in sorted(tables.lists.items())
@@ -739,17 +739,17 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         ]
 
     def table_nodes_mm(self, tables: TwincatTables) -> tuple[FloatArray, ...]:
-        """Return the nodes of all tables by the axis that they depend on."""
+        """Return the nodes of all tables by input axis."""
         return nodes_by_axis(
             (over, nodes) for axis, item in tables.lists.items() for _, over, nodes in spans_mm(item, axis)
         )
 
     def resolution_mm(self) -> float:
-        """Half of the last digit of the three tables that act on one axis."""
+        """Half of the last digit of each of the three tables that act on one axis."""
         return 3 * 0.5 * 10.0**-self.settings.digits * MM_PER_UNIT
 
     def _masters_for(self, slave: int, errors: ErrorTable) -> tuple[int, tuple[int, int] | None]:
-        """Return the master of the cross table and those of the plane: the pair whose products need it most."""
+        """Return the master of the cross table and those of the plane: the pair with the largest products."""
         machine = self.machine
         probe = [np.linspace(*axis.range_mm, 41) for axis in machine.axes]
         others = [axis for axis in range(3) if axis != slave]
@@ -761,14 +761,14 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             captured: dict[tuple[int, int], float] = {}
             for term in product_terms(machine, errors, probe, (0.5 * (machine.lower_mm + machine.upper_mm)).tolist()):
                 if term.carrier[0].output == slave:
-                    # rms over the volume without what functions of one axis hold of the product
+                    # rms over the volume of the product, without the part that functions of one axis can represent
                     length = machine.axes[term.carrier[0].lever or 0].length_mm
                     size = float(np.std(term.start)) * length / math.sqrt(12.0)
                     captured[_masters(term)] = captured.get(_masters(term), 0.0) + size**2
             plane = max(captured, key=lambda pair: captured[pair], default=None)
             if plane is None or captured[plane] <= NOTHING_MM**2:
                 plane = (others[0], others[1]) if min(sizes) > NOTHING_MM else None
-        # the cross table takes the axis that the plane leaves out, else the one with the larger function
+        # the cross table uses the axis that the plane leaves out, else the axis with the larger function
         free = [axis for axis in others if plane is not None and axis not in plane]
         return free[0] if free else others[int(np.argmax(sizes))], plane
 
@@ -787,7 +787,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             found += one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(slave, axis)], lever_origin_mm=origin)
         if plane is None:
             return found
-        # one distance for both masters, within the control's limit
+        # one spacing for both masters, within the limit of the control
         points = settings.most.crosscomp2
         grids = [
             equidistant_grid(
@@ -829,7 +829,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         )
         plane = None
         if plane_terms:
-            # first and second master are as the machine file has them, else in the order X, Y, Z
+            # first and second master as in the machine file, else in the order X, Y, Z
             stated = self.settings.planes[slave]
             axes = {axis for term in plane_terms for axis in (term.axis, term.carrier[0].lever) if axis is not None}
             masters = stated if isinstance(stated, tuple) else sorted(axes if len(axes) == 2 else {*axes, cross.master})
@@ -839,7 +839,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             second, first = np.meshgrid(lines[1] * MM_PER_UNIT, lines[0] * MM_PER_UNIT, indexing="ij")
             position_mm = np.zeros((first.size, 3))
             position_mm[:, one], position_mm[:, other] = first.ravel(), second.ravel()
-            total = np.zeros(first.size)  # between nodes it is bilinear, as each of the terms is
+            total = np.zeros(first.size)  # bilinear between nodes, like each of the terms
             for term in plane_terms:
                 carrier = term.carrier_field(position_mm, np.zeros(3))[:, term.carrier[0].output]
                 total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
@@ -857,7 +857,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         )
 
     def _rounded(self, values_mm: FloatArray) -> FloatArray:
-        """Return values in 0.1 um as they are written."""
+        """Return values in 0.1 um, rounded as written to the file."""
         return np.round(np.asarray(values_mm) / MM_PER_UNIT, self.settings.digits) + 0.0
 
     def _screw_statement(self) -> str:
@@ -932,7 +932,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             "cross": None,
             "plane": None,
         }
-        # entries that the template writes, by which a cut file is noticed
+        # number of entries that the template writes; it reveals a truncated file
         entries = 2
         if (screw := item.screw) is not None:
             context["screw"] = {
