@@ -49,21 +49,21 @@ from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid
 
-# Records of three-dimensional compensation data as a file punched from the user's own control shows them.
+# Records of three-dimensional compensation data as in a file punched from the user's control.
 #
-# No public document describes that file. What can be told from a sample is taken over: how records look, and in which
-# number the first point has. In which order the points come cannot be told; ``order`` in the machine file says it.
+# No public document describes that file. What a sample shows is used: the form of the records and the
+# number of the first point. The order of the points cannot be seen; ``order`` in the machine file states it.
 
 
 #: Parameters of the function: axes, points per axis, number of the reference point, magnification, interval.
 PARAMETERS = range(10800, 10815)
-#: Words of a record behind its number and type word, and what such a file does with the three values of a point.
+#: Words of a record after its number and type word, and how such a file stores the three values of a point.
 FORMS = {"APAPAP": "axis words", "XYZ": "axis letters", "P": "a record per value"}
 
 
 @dataclass(frozen=True)
 class VolumeStyle:
-    """Style of the records, one of :data:`FORMS`, number of the first record, whether the file has parameters too."""
+    """Style of the records, one of :data:`FORMS`, number of the first record, whether there are parameters too."""
 
     style: FanucStyle
     form: str
@@ -90,7 +90,7 @@ class VolumeStyle:
 
 
 def read_volume_style(path: Path) -> VolumeStyle:
-    """Return the style of punched three-dimensional data; InputError with the line for what is not understood."""
+    """Return the style of punched three-dimensional data; InputError with the line of anything not understood."""
     return volume_style_of(punched_file(path))
 
 
@@ -118,10 +118,10 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
 
 
 def parted(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
-    """Split records into parameters 10800 ... 10814 and data, whose numbers may run through those as well.
+    """Split records into parameters 10800 ... 10814 and data, whose numbers may include that range.
 
-    A record of type Q1 is a parameter, one of type Q0 is data. Without type words a number of that range is data if
-    the records of the numbers before and behind the range are there too.
+    A record of type Q1 is a parameter, one of type Q0 is data. Without type words, a number in that range is data if
+    the file also contains records numbered just before and just after the range.
     """
     numbers = {record.number for record in records}
     through = {PARAMETERS[0] - 1, PARAMETERS[-1] + 1} <= numbers
@@ -134,7 +134,7 @@ def parted(records: Sequence[Record]) -> tuple[list[Record], list[Record]]:
 
 
 def form_of(record: Record) -> str:
-    """Return which of :data:`FORMS` a record has; InputError for another one."""
+    """Return which of :data:`FORMS` a record has; InputError if none."""
     _, words = type_word(record, record.words())
     form = "".join(letter for letter, _ in words)
     if form not in FORMS:
@@ -144,12 +144,12 @@ def form_of(record: Record) -> str:
     return form
 
 
-# Settings of ``[controllers.fanuc-3d]``: counts, the grid and its limits, the style of the user's own control.
+# Settings of ``[controllers.fanuc-3d]``: counts, the grid and its limits, the file style of the user's control.
 
 
 @dataclass(frozen=True, kw_only=True)
 class VolumeSettings(FanucSettings):
-    """Settings of three-dimensional error compensation; ``sample`` is None if no file of the user's control was given."""
+    """Settings of three-dimensional error compensation; ``sample`` is None without a file of the user's control."""
 
     sample: VolumeStyle | None = file_setting(
         read_volume_style,
@@ -188,7 +188,7 @@ class VolumeSettings(FanucSettings):
 
 
 COLUMNS = "point,x_mm,y_mm,z_mm,x_counts,y_counts,z_counts"
-#: No table is as long as this, nor any value beyond this.
+#: No table is this long, and no value this large.
 MOST_CHARACTERS, MOST_ROWS, MOST_VALUE = 8_000_000, 50_000, 1_000_000
 _ROW = re.compile(
     r"(\d{1,6}),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?),(-?\d{1,6}(?:\.\d{1,6})?)((?:,-?\d{1,7}){3})"
@@ -198,7 +198,7 @@ _KEY = re.compile(r"#\s{0,9}([a-z_]{1,40})\s{0,9}=\s{0,9}([^\s].{0,300})")
 
 @dataclass(frozen=True)
 class VolumeTable:
-    """``counts`` (nx, ny, nz, 3) at the vertices of three grids in machine coordinates; one count per ``magnification``."""
+    """``counts`` (nx, ny, nz, 3) at the grid vertices in machine coordinates; one count per ``magnification``."""
 
     grids: tuple[EquidistantGrid, ...]
     counts: NDArray[np.int64]
@@ -223,11 +223,11 @@ class VolumeTable:
 
     @property
     def step_mm(self) -> FloatArray:
-        """Distances of the vertices, shape (3,)."""
+        """Spacing of the vertices, shape (3,)."""
         return np.array([float(grid.step) for grid in self.grids])
 
     def numbered(self, order: Sequence[int]) -> Iterator[tuple[int, tuple[int, int, int]]]:
-        """Yield (point number, vertex index) in the order of the numbers."""
+        """Yield (point number, vertex index) in order of point number."""
         shape = tuple(self.counts.shape[axis] for axis in order)
         for number in range(int(np.prod(shape))):
             index, rest = [0, 0, 0], number
@@ -280,7 +280,7 @@ def _row(file: SourceFile, text: str, line: int) -> Row:
     return int(found[1]), (x, y, z), (p, q, r), line
 
 
-# What the templates of three-dimensional compensation show: vertices, plan, what to set, worked numbers.
+# Template content for three-dimensional compensation: vertices, plan, what to set, worked example.
 
 
 MEANINGS = ("axis", "vertices along", "number of the reference vertex of", "magnification of", "interval of, mm,")
@@ -292,8 +292,8 @@ def _place(table: VolumeTable, index: tuple[int, int, int]) -> str:
 
 # FANUC three-dimensional error compensation: a grid of vertices over X, Y, Z with trilinear interpolation.
 #
-# The formula is documented, the file is not: the grid is written as a neutral CSV and as a JSON plan, and as records only
-# in the style of a file that was punched from the user's own control. See ``templates/fanuc-3d/format.toml``.
+# The formula is documented, the file is not: the grid is written as neutral CSV and JSON plan, and as records only
+# in the style of a file punched from the user's control. See ``templates/fanuc-3d/format.toml``.
 
 
 class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
@@ -314,9 +314,9 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return settings
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return curves of one axis, alone and times the coordinate of another; a trilinear grid holds them exactly.
+        """Return curves of one axis, alone and times the coordinate of another; a trilinear grid fits them exactly.
 
-        Their nodes are the vertices. All vanish at the reference point, one of the vertices.
+        Their nodes are the vertices. All are zero at the reference point, one of the vertices.
         """
         machine = self.machine
         nodes = [
@@ -339,7 +339,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> VolumeTable:
         """Round the field at every vertex.
 
-        Trilinear interpolation is a weighted mean of the corners of a box, so that no point is off by more than a
+        Trilinear interpolation is a weighted mean of the corners of a box, so no point is off by more than a
         vertex: half a count. No other whole numbers stay within half a count at every vertex.
         """
         nodes = [next(term.nodes_mm for term in basis if term.axis == axis) for axis in range(3)]
@@ -352,7 +352,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         counts = np.floor(self.settings.sign * field / count_mm + 0.5).astype(np.int64)
         shape = (len(nodes[0]), len(nodes[1]), len(nodes[2]), 3)
         grids = []
-        for axis, nodes_mm in enumerate(nodes):  # in exact decimals, the reference point one of the vertices
+        for axis, nodes_mm in enumerate(nodes):  # in exact decimals; the reference point is one of the vertices
             length = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9)))
             step = (length / (len(nodes_mm) - 1)).quantize(STEP_QUANTUM)
             reference = self.machine.reference_point_mm[axis]
@@ -361,7 +361,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return VolumeTable(tuple(grids), counts.reshape(shape), self.settings.magnification)
 
     def context(self, tables: VolumeTable) -> dict[str, Any]:
-        """Return the vertices, the plan point number -> values, what to set, and the statement of the sign."""
+        """Return the vertices, the plan point number -> values, what to set, and the sign statement."""
         settings = self.settings
         vertices = [(number, index, tables.counts[index].tolist()) for number, index in tables.numbered(settings.order)]
         parameters = self._parameters(tables)
@@ -417,7 +417,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> VolumeTable:
-        """Read the neutral CSV; records beside it in the style of the control must hold the same; a plan is passed over."""
+        """Read the neutral CSV; records in the control's style must contain the same values; a plan is skipped."""
         texts = [file for file in files if file.path.suffix.lower() == ".csv"]
         punched = [file for file in files if file.path.suffix.lower() not in (".csv", ".json")]
         if len(texts) > 1:
@@ -438,13 +438,13 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return table
 
     def emulate(self, tables: VolumeTable, points: Points) -> FloatArray:
-        """Return sign * count * trilinear value, that of the grid's surface outside."""
+        """Return sign * count * trilinear value; outside, the value at the grid's surface."""
         count_mm = np.array(tables.magnification) * self.settings.count_mm(0) / self.settings.magnification[0]
         value = trilinear(tables.counts.astype(np.float64), tables.start_mm, tables.step_mm, points.position_mm)
         return np.asarray(self.settings.sign * count_mm * value)
 
     def violations(self, tables: VolumeTable) -> list[str]:
-        """Return values out of range, too many vertices, and travel that the grid leaves out."""
+        """Return values out of range, too many vertices, and travel that the grid does not cover."""
         settings = self.settings
         messages = []
         for axis, grid in enumerate(tables.grids):
@@ -473,7 +473,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return nodes_by_axis((axis, grid.nodes_mm) for axis, grid in enumerate(tables.grids))
 
     def usage(self, tables: VolumeTable) -> list[Usage]:
-        """Return values and vertices against their limits; none of these is stated by a public document."""
+        """Return values and vertices against their limits, none of which is stated in a public document."""
         settings = self.settings
         total = int(np.prod(tables.counts.shape[:3]))
         found = [Usage("vertices", total, settings.most_in_all, "points", stated=False)]
@@ -532,7 +532,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return table
 
     def _read_records(self, file: SourceFile, beside: VolumeTable | None) -> VolumeTable:
-        """Read records in the style of the control; the grid is that of parameters 10803 ... 10814, else of the CSV."""
+        """Read records in the control's style; the grid is from parameters 10803 ... 10814, else from the CSV."""
         own, data = parted(list(read_records(file)))
         parameters: dict[int, tuple[str, Record]] = {}
         for record in own:
@@ -557,7 +557,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return VolumeTable(shape.grids, counts, shape.magnification)
 
     def _frame(self, file: SourceFile, parameters: dict[int, tuple[str, Record]]) -> VolumeTable:
-        """Empty table of the grid that the parameters describe."""
+        """Empty table for the grid described by the parameters."""
         missing = [str(number) for number in PARAMETERS if number not in parameters]
         if missing:
             raise file.fail(f"parameter {', '.join(missing)} is missing")
@@ -581,7 +581,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return VolumeTable(tuple(grids), counts, tuple(magnification))
 
     def _values(self, file: SourceFile, data: Sequence[Record]) -> list[list[int]]:
-        """Three values of each point, in the order of the records' numbers."""
+        """Three values of each point, in order of record number."""
         settings = self.settings
         found: list[list[int]] = []
         before: Record | None = None
@@ -624,7 +624,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return dict(zip(PARAMETERS, texts, strict=True))
 
     def _punched(self, parameters: dict[int, str], values: list[list[int]]) -> Punched | None:
-        """Text in the style of the sample, None without one."""
+        """Text in the style of the sample, None without a sample."""
         sample = self.settings.sample
         if sample is None:
             return None
@@ -660,7 +660,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         return found
 
     def _check(self, table: VolumeTable) -> dict[str, Any]:
-        """A trial: one value at the farthest vertex of each axis from the reference vertex, what must be seen there."""
+        """Trial: one value at the vertex of each axis farthest from the reference vertex, and what to expect there."""
         counts = 10
         last = (table.counts.shape[0] - 1, 0, 0)
         numbers = {index: number for number, index in table.numbered(self.settings.order)}

@@ -1,4 +1,4 @@
-"""FANUC stored pitch error compensation (``fanuc-pitch``): positioning in whole increments per section of travel."""
+"""FANUC stored pitch error compensation (``fanuc-pitch``): positioning as whole increments per section of travel."""
 
 from __future__ import annotations
 
@@ -48,22 +48,22 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning
 
-# Section length of pitch compensation: the widest one that loses nothing and keeps every increment small enough.
+# Section length of pitch compensation: the widest without loss that keeps every increment small enough.
 
 
-#: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
+#: Factor by which the final curve may be steeper than the estimate: angular errors are spread over the volume.
 STEEPER = 1.1
-#: Loss by interpolation, in counts, that the rounding to whole counts hides.
+#: Interpolation loss, in counts, hidden by rounding to whole counts.
 NEGLIGIBLE_COUNTS = 0.05
 
 
 def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int) -> EquidistantGrid:
-    """Return the section ends of an axis, the reference point among them.
+    """Return the section ends of an axis, including the reference point.
 
-    Points that the sample of the control shows are kept: their section ends are taken as they are. The user's interval
-    is taken as it is. Otherwise the fewest sections are taken with which linear interpolation of the requested correction
-    loses nothing that matters and every increment, with a margin, stays within the limit (one count with a staircase),
-    as far as the point numbers of this axis and the least interval permit.
+    Points in the sample from the control keep their section ends. The user's interval
+    is used as it is. Otherwise the fewest sections for which linear interpolation of the requested correction
+    has no significant loss and every increment, with a margin, stays within the limit (one count with a staircase),
+    as far as the axis' point numbers and the least interval permit.
     """
     kept = settings.kept[axis]
     if kept is not None:
@@ -75,7 +75,7 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
     if asked_mm is not None:
         return equidistant_grid(machine, errors, axis, most=most, step_mm=asked_mm, anchor=True)
     nodes_mm = curve_nodes_mm(machine, errors, axis, most)
-    # its own positioning error, and angular errors as they act in the middle of the volume
+    # its positioning error, and the effect of angular errors at mid-volume
     (term,) = one_dimensional_terms(machine, errors, [nodes_mm] * 3, [(axis, axis)])
     wanted_mm = term.start
     loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm(axis))
@@ -96,7 +96,7 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
 def _grids(
     machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int, most: int
 ) -> list[EquidistantGrid]:
-    """Possible section ends by their number; the widest sections alone if none keeps within ``most``."""
+    """Possible section ends, by number of sections; only the widest sections if none stays within ``most``."""
     common = common_step(machine, errors, axis, anchor=True)
     steps = {_step_mm(machine, settings, axis, intervals) for intervals in range(1, most)}
     parts = [common / part for part in range(1, 11)]
@@ -114,7 +114,7 @@ def _grids(
 
 
 def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: int) -> float:
-    """Travel over ``intervals``, rounded up to what can be written, not below the least interval."""
+    """Travel over ``intervals``, rounded up to a writable value, not below the least interval."""
     quantum = settings.interval_quantum_mm
     length = max(machine.axes[axis].length_mm / intervals, settings.least_interval_mm)
     steps = Decimal(repr(round(length, 9))) / quantum
@@ -122,18 +122,18 @@ def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: in
 
 
 def _extended(position_mm: FloatArray, nodes_mm: FloatArray, value: FloatArray) -> FloatArray:
-    """Interpolate linearly at positions (m,), the first and the last piece prolonged beyond the nodes (n,)."""
+    """Interpolate linearly at positions (m,), extrapolating the first and last segments beyond the nodes (n,)."""
     inner = np.interp(position_mm, nodes_mm, value)
     below = np.minimum(position_mm - nodes_mm[0], 0.0) * (value[1] - value[0]) / (nodes_mm[1] - nodes_mm[0])
     above = np.maximum(position_mm - nodes_mm[-1], 0.0) * (value[-1] - value[-2]) / (nodes_mm[-1] - nodes_mm[-2])
     return np.asarray(inner + below + above, dtype=np.float64)
 
 
-# From requested curves to the numbers of stored pitch error compensation: best whole numbers, and a place for each block.
+# From requested curves to stored pitch error compensation: best whole numbers, and point numbers for each block.
 #
 # Bi-directional: with the reversal B (position reached in positive minus in negative direction) the tool is at +B/2
-# after positive travel, so the correction is the mean one minus B/2 there, and plus B/2 after negative travel. The curve of
-# the direction of the reference return is zero at the reference point, the other one has parameter 3627 there.
+# after positive travel, so the correction is the mean minus B/2 there, and plus B/2 after negative travel. The curve of
+# the direction of the reference return is zero at the reference point; the other has the value of parameter 3627 there.
 
 
 Span = tuple[int, int]
@@ -147,7 +147,7 @@ def reference_node(machine: Machine, axis: int, nodes_mm: FloatArray) -> int:
 def _block(
     machine: Machine, settings: PitchSettings, axis: int, wanted: RequestedPitch, reversal: ReversalCurves | None
 ) -> tuple[PitchBlock, list[PitchShortfall]]:
-    """Table of one axis with numbers from 0, and what the limit of the steps costs it."""
+    """Table of one axis with numbers from 0, and what the step limit costs it."""
     nodes_mm = wanted.nodes_mm
     below = reference_node(machine, axis, nodes_mm)
     half = np.zeros(len(nodes_mm))
@@ -180,7 +180,7 @@ def _block(
 
 
 def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool) -> tuple[int, ...]:
-    """Numbers as stored; unless the sample has other points, the reference number is among them without travel below it."""
+    """Numbers as stored; without travel below it, the reference number is added unless the sample's points differ."""
     if settings.total:
         return tuple(int(value) for value in best.counts)
     steps = np.diff(best.counts, prepend=[0]) if below == 0 and not keep else np.diff(best.counts)
@@ -188,9 +188,9 @@ def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool)
 
 
 def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> list[PitchBlock | None]:
-    """Give every block its numbers: those of the sample, those that the user fixed, else the lowest that are free.
+    """Give every block its numbers: from the sample, as fixed by the user, or else the lowest free ones.
 
-    Numbers that the sample shows in use by another axis are never taken; InputError where fixed ones would be.
+    Numbers used by another axis in the sample are never taken; InputError if the user fixed such numbers.
     """
     sample, kept = settings.sample, settings.kept
     taken: list[Span] = [*settings.reserved, *(span for _, span in sample.others(0))]
@@ -217,9 +217,9 @@ def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> lis
 
 
 def pitch_points(machine: Machine) -> tuple[PointGrid | None, ...]:
-    """Return the points that every fanuc-pitch export of this machine file gives X, Y and Z; None where errors decide.
+    """Return the points given to X, Y and Z in every fanuc-pitch export of this machine file; None if errors decide.
 
-    Points are known whatever the errors are where a sample shows them, or interval and first number are stated; the first
+    Points do not depend on the errors if a sample shows them, or if interval and first number are stated; the first
     number follows if the intervals of all axes are stated.
     """
     if "fanuc-pitch" not in machine.controllers:
@@ -240,7 +240,7 @@ def pitch_points(machine: Machine) -> tuple[PointGrid | None, ...]:
     )
 
 
-# What the templates of stored pitch error compensation show: records, plan, parameters to set, worked numbers.
+# Template content for stored pitch error compensation: records, plan, parameters to set, worked example.
 
 
 MEANINGS = (
@@ -255,7 +255,7 @@ MEANINGS = (
 
 
 def _change(sample: Sample, parameter: int, axis: int, text: str) -> str:
-    """A parameter with its value, and that of the sample if it is another one."""
+    """A parameter with its value, and the sample's value if different."""
     old = sample.parameters.get((parameter, axis))
     same = old is None or Decimal(old[0]) == Decimal(text)
     return f"{parameter} = {text}" if same else f"{parameter} = {text} (sample: {old[0] if old else ''})"
@@ -263,11 +263,11 @@ def _change(sample: Sample, parameter: int, axis: int, text: str) -> str:
 
 # FANUC stored pitch error compensation: positioning of X, Y and Z, whole-number increments per section of travel.
 #
-# What the control is taken to do, and how sure that is, is in ``templates/fanuc-pitch/format.toml``.
+# What the control is assumed to do, and how certain that is: see ``templates/fanuc-pitch/format.toml``.
 
 
 class FanucPitch(Controller[PitchSettings, PitchTables]):
-    """Tables X(x), Y(y), Z(z) as numbers of counts, zero at the reference point."""
+    """Tables X(x), Y(y), Z(z) in counts, zero at the reference point."""
 
     name = "fanuc-pitch"
     settings_class = PitchSettings
@@ -282,7 +282,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return read_pitch_settings(machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return one table per axis whose nodes are the section ends, the reference point one of them."""
+        """Return one table per axis whose nodes are the section ends, including the reference point."""
         nodes = [pitch_grid(self.machine, self.settings, errors, axis).nodes_mm for axis in range(3)]
         return one_dimensional_terms(self.machine, errors, nodes, [(axis, axis) for axis in range(3)], anchored=True)
 
@@ -305,11 +305,11 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return ReversalCurves(along if self.settings.bidirectional else {})
 
     def with_reversal(self, tables: PitchTables, reversal: ReversalCurves) -> PitchTables:
-        """Return the tables of both directions, each the best whole numbers for its own curve."""
+        """Return the tables of both directions, each with the best whole numbers for its curve."""
         return self._tables_of(tables.wanted, reversal)
 
     def context(self, tables: PitchTables) -> dict[str, Any]:
-        """Return the context beyond the common one; ``plan`` holds point number -> value for a binary transfer."""
+        """Return the context beyond the common one; ``plan`` maps point number -> value for a binary transfer."""
         settings = self.settings
         present = [(axis, block) for axis, block in enumerate(tables.blocks) if block is not None]
         separate = settings.sample.points_style is not None
@@ -343,11 +343,11 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> PitchTables:
-        """Read parameters 3620 ... 3624 and the points they name; a ``.json`` plan is passed over."""
+        """Read parameters 3620 ... 3624 and their points; a ``.json`` plan is skipped."""
         return parse_pitch(self.settings, files)
 
     def emulate(self, tables: PitchTables, points: Points) -> FloatArray:
-        """Return sign * count * A at each point, A held beyond the first and the last section end."""
+        """Return sign * count * A at each point, A constant beyond the first and last section ends."""
         added = np.zeros((len(points), 3))
         unknown = []
         for axis, block in enumerate(tables.blocks):
@@ -358,7 +358,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             curves = block.curves(self.settings.reference_return[axis])
             if self.settings.interpolation == "linear":
                 up, down = (np.interp(along, block.curve_mm, curve) for curve in curves)
-            else:  # a section's value is put out at its beginning: A[n] for ((n-1-ref) d, (n-ref) d]
+            else:  # a section's value is output at its start: A[n] for ((n-1-ref) d, (n-ref) d]
                 section = np.ceil(along / float(block.interval_mm) - 1e-9) + block.reference
                 inside = np.clip(section, block.curve_numbers[0], block.last).astype(np.int64)
                 up, down = (curve[inside - block.curve_numbers[0]].astype(np.float64) for curve in curves)
@@ -375,7 +375,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return added
 
     def violations(self, tables: PitchTables) -> list[str]:
-        """Return broken limits: change per section, 16 bits, point numbers, overlaps, interval, travel left out."""
+        """Return exceeded limits: change per section, 16 bits, point numbers, overlaps, interval, uncovered travel."""
         return pitch_violations(self.machine, self.settings, tables)
 
     def table_nodes_mm(self, tables: PitchTables) -> tuple[FloatArray, ...]:
@@ -411,17 +411,17 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return pitch_usage(self.settings, tables)
 
     def keeping_others(self, tables: PitchTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
-        """Return ``style_from`` with these files if they show points of other axes."""
+        """Return ``style_from`` with these files if they contain points of other axes."""
         return as_sample(self.machine, files, ("fanuc-pitch", "fanuc-straightness")) if tables.others else {}
 
     def resolution_mm(self) -> float:
-        """Return half a count: the bound of :mod:`compgen.controls.shared.integers` where the limit does not bind."""
+        """Return half a count: the bound of :mod:`compgen.controls.shared.integers` where the limit is not active."""
         return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
 
     def _tables_of(
         self, wanted: Sequence[RequestedPitch | None], reversal: ReversalCurves | None = None
     ) -> PitchTables:
-        """Return the best whole tables for requested curves, with the reversal of each axis along itself, and their numbers."""
+        """Return the best whole tables for requested curves, each with its reversal along itself, and their numbers."""
         blocks: list[PitchBlock | None] = [None, None, None]
         shortfalls: list[PitchShortfall] = []
         for axis, curve in enumerate(wanted):
@@ -430,7 +430,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 shortfalls += limited
         placed = _placed(self.settings, blocks)
         numbered = []
-        for item in shortfalls:  # their sections count from 0, those of the control from the first point number
+        for item in shortfalls:  # their sections count from 0, the control's from the first point number
             numbers = placed[item.axis].curve_numbers  # type: ignore[union-attr]
             numbered.append(replace(item, sections=tuple(int(numbers[k + 1]) for k in item.sections)))
         return PitchTables(tuple(placed), shortfalls=tuple(numbered), wanted=tuple(wanted))
@@ -438,7 +438,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def _values_of(self, block: PitchBlock) -> dict[int, str]:
         """Parameter number -> value as text for one axis."""
         settings, whole = self.settings, self.settings.style.whole
-        # without a decimal point the interval counts in the unit that the machine file states
+        # without a decimal point the interval is in the unit stated in the machine file
         unit = Decimal(1) if settings.style.real_point else settings.interval_quantum_mm
         found = dict(
             zip(
@@ -468,7 +468,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return records
 
     def _punched(self, present: list[tuple[int, PitchBlock]]) -> Punched:
-        """Text of the file in its style: parameters by number unless they have a file of their own, points by number."""
+        """Text of the file in its style: parameters by number unless they have a separate file, points by number."""
         style, separate = self.settings.style, self.settings.sample.points_style
         points = [
             (separate or style).point(*pair) for pair in sorted(pair for _, block in present for pair in block.points())
@@ -556,7 +556,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return rows + (self._directional_rows(present) if settings.bidirectional else [])
 
     def _directional_rows(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:
-        """Reference return as the tables take it, and backlash, which the tables of both directions hold already."""
+        """Reference return as the tables assume it, and backlash, which tables of both directions already include."""
         settings = self.settings
         rows = []
         for axis, _ in present:
@@ -639,7 +639,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return found
 
     def _summary(self, axis: int, block: PitchBlock) -> dict[str, Any]:
-        """One axis in numbers, for preflight: where its table lies and how large its values are."""
+        """One axis in numbers, for preflight: where its table is and how large its values are."""
         curves = block.curves(self.settings.reference_return[axis])
         ends_mm = self.machine.reference_point_mm[axis] + block.curve_mm
         return {
@@ -658,7 +658,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         }
 
     def _check(self, axis: int, block: PitchBlock) -> dict[str, Any]:
-        """A trial of one section next to the reference point: which number to set, and what a laser must then read."""
+        """Trial of one section next to the reference point: which number to set, and the laser reading to expect."""
         settings = self.settings
         upper = block.last > block.reference
         start_mm = self.machine.reference_point_mm[axis] - (0.0 if upper else float(block.interval_mm))

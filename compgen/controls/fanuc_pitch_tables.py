@@ -45,10 +45,10 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import InputError
 
-# Settings of ``[controllers.fanuc-pitch]``: what the control counts in, how its files look, which numbers are free.
+# Settings of ``[controllers.fanuc-pitch]``: the control's counts, its file style, the free numbers.
 
 
-#: Smallest step of the interval (parameter 3624) when it is written with a decimal point.
+#: Smallest step of the interval (parameter 3624) if written with a decimal point.
 INTERVAL_QUANTUM_MM = Decimal("0.001")
 
 
@@ -68,8 +68,8 @@ def _spans(value: Any) -> tuple[tuple[int, int], ...]:
 class PitchSettings(PunchedSettings):
     """Settings of stored pitch error compensation.
 
-    Number 0 is left out by default: axes without a table have 3620 ... 3622 = 0 and would take part in its value. ``kept``
-    are the compensation points of X, Y, Z that the sample shows and that are kept; None: there are none, or the machine
+    Number 0 is not used by default: axes without a table have 3620 ... 3622 = 0 and would also use its value. ``kept``
+    are the compensation points of X, Y, Z in the sample that are kept; None: there are none, or the machine
     file states others.
     """
 
@@ -140,39 +140,39 @@ class PitchSettings(PunchedSettings):
 
     @property
     def magnifications(self) -> tuple[int, ...]:
-        """Magnification of X, Y, Z: that of the machine file, else that of the sample where it has one, else 1."""
+        """Magnification of X, Y, Z: from the machine file, else from the sample if it has one, else 1."""
         shown = [self.sample.axes.get(number) for number in self.axis_numbers]
         return tuple(self.magnification or (axis.magnification if axis else 0) or 1 for axis in shown)
 
     @property
     def total(self) -> bool:
-        """Whether a value is the sum up to its point."""
+        """Whether a value is the sum up to its point (total value)."""
         return self.value_type == "total"
 
     def count_mm(self, axis: int) -> float:
-        """One count of the table that is written for an axis 0..2, mm."""
+        """One count of the table written for an axis 0..2, mm."""
         return self.magnifications[axis] * self.detection_unit_um * MM_PER_UM
 
     @property
     def interval_quantum_mm(self) -> Decimal:
-        """Step of the interval as it is written, mm."""
+        """Step of the interval as written, mm."""
         if not self.style.real_point:
             return Decimal(repr(self.interval_unit_mm))
         return max(INTERVAL_QUANTUM_MM, Decimal(1).scaleb(-(self.style.decimals or 3)))
 
     @property
     def least_interval_mm(self) -> float:
-        """Shortest section at the fastest feed, mm (0 if the feed is not given)."""
+        """Shortest section at the fastest feed, mm (0 if no feed is given)."""
         return 0.0 if self.max_feed_mm_min is None else self.max_feed_mm_min / 7500.0
 
 
 def read_pitch_settings(machine: Machine) -> PitchSettings:
-    """Read and check ``[controllers.fanuc-pitch]``; every key has a default but ``interval_unit_mm`` (see there)."""
+    """Read and check ``[controllers.fanuc-pitch]``; every key except ``interval_unit_mm`` (see there) has a default."""
     section = machine.controller_settings("fanuc-pitch")
     settings = take_punched(PitchSettings, section)
     settings.finish(section)
     shown = settings.sample.values
-    # a sample that holds all points, from 0 on without a gap, says how many the control has
+    # a sample containing all points from 0 on without a gap shows how many the control has
     last = len(shown) - 1 if sorted(shown) == list(range(len(shown))) else 0
     settings = toml_files.unless_stated(settings, section, last_number=max(settings.last_number, last))
     settings = replace(settings, kept=_kept(settings))
@@ -181,7 +181,7 @@ def read_pitch_settings(machine: Machine) -> PitchSettings:
 
 
 def _kept(settings: PitchSettings) -> tuple[PointGrid | None, ...]:
-    """Compensation points of X, Y, Z in the sample, where the machine file does not state another interval or number."""
+    """Compensation points of X, Y, Z in the sample, unless the machine file states another interval or number."""
     found: list[PointGrid | None] = []
     for k, number in enumerate(settings.axis_numbers):
         axis, interval_mm, first = settings.sample.axes.get(number), settings.interval_mm[k], settings.first_numbers[k]
@@ -240,9 +240,9 @@ def _check_together(section: toml_files.Section, settings: PitchSettings) -> Non
             raise section.fail("interval_mm", message)
 
 
-# Numbers of stored pitch error compensation: reading them from text, the curve they mean, the limits they must keep.
+# Numbers of stored pitch error compensation: reading them from text, the curve they represent, their limits.
 #
-# Section n is ((n - 1 - ref) d, (n - ref) d] from the reference point, d the interval (parameter 3624), ref the number
+# Section n is ((n - 1 - ref) d, (n - ref) d] from the reference point; d: interval (parameter 3624), ref: number
 # of the reference point (3620). With incremental values v the cumulative curve A is zero at the reference point and
 # A[n] = A[n-1] + v[n]; with total values A[n] is stored. One count is magnification (3623) times detection unit.
 
@@ -252,7 +252,7 @@ REFERENCE, FARTHEST_NEGATIVE, FARTHEST_POSITIVE, MAGNIFICATION, INTERVAL = PARAM
 PER_TURN, NEGATIVE_FIRST, AT_REFERENCE = 3625, 3626, 3627
 #: Bit 0: a table for each direction of travel.
 DIRECTIONS = 3605
-#: Total values travel as 16-bit numbers.
+#: Total values are transferred as 16-bit numbers.
 MOST_TOTAL = 32767
 
 
@@ -260,12 +260,12 @@ MOST_TOTAL = 32767
 class PitchBlock:
     """The table of one axis.
 
-    ``values`` are the numbers as stored, for the point numbers ``first`` ... ``last``, shape (n,); ``total`` tells
-    how they count; ``reference`` is the number of the reference point.
+    ``values`` are the numbers as stored, for point numbers ``first`` ... ``last``, shape (n,); ``total`` tells
+    whether they are total values; ``reference`` is the number of the reference point.
 
-    Bi-directional: ``values`` act in travel in positive direction, ``negative`` (as many, from the number
-    ``negative_first``, parameter 3626) in negative direction; ``at_reference`` (3627) is what the curve of the direction
-    against the reference return has at the reference point, where the other one is zero.
+    Bi-directional: ``values`` act during travel in positive direction, ``negative`` (as many, from number
+    ``negative_first``, parameter 3626) in negative direction; ``at_reference`` (3627) is the value at the reference
+    point of the curve for the direction opposite to the reference return; the other curve is zero there.
     """
 
     reference: int
@@ -280,7 +280,7 @@ class PitchBlock:
 
     @property
     def last(self) -> int:
-        """Farthest number on the positive side."""
+        """Number farthest on the positive side."""
         return self.first + len(self.values) - 1
 
     @property
@@ -299,7 +299,7 @@ class PitchBlock:
         return self._sums(self.values)
 
     def points(self) -> list[tuple[int, int]]:
-        """Return all (point number, value) of the axis, those for travel in negative direction behind the others."""
+        """Return all (point number, value) of the axis, those for travel in negative direction last."""
         found = [(self.first + k, value) for k, value in enumerate(self.values)]
         return found + [(self.negative_first + k, value) for k, value in enumerate(self.negative)]
 
@@ -325,7 +325,7 @@ class PitchBlock:
 
 @dataclass(frozen=True)
 class PitchShortfall:
-    """What the limit of the change per section costs an axis: how far the best table misses, and where it is full."""
+    """Effect of the limit of the change per section on an axis: deviation of the best table, where it is reached."""
 
     axis: int
     missed_counts: float
@@ -334,7 +334,7 @@ class PitchShortfall:
 
 @dataclass(frozen=True)
 class RequestedPitch:
-    """Wanted curve of one axis: ``counts`` (n,), real numbers, at section ends ``nodes_mm`` (n,) in machine coordinates."""
+    """Requested curve of one axis: real ``counts`` (n,) at section ends ``nodes_mm`` (n,), machine coordinates."""
 
     nodes_mm: FloatArray
     counts: FloatArray
@@ -342,11 +342,11 @@ class RequestedPitch:
 
 @dataclass(frozen=True)
 class PitchTables:
-    """Tables of X, Y, Z (None: the axis has none); ``others`` holds (axis number, first, last) of further axes.
+    """Tables of X, Y, Z (None: the axis has none); ``others`` contains (axis number, first, last) of other axes.
 
-    ``turns`` holds (axis number, sum of the values over a revolution) of rotary axes among these. ``shortfalls`` and
-    ``wanted`` are known of tables that were built; tables read from text do not say what was requested, but what ``remarks``
-    there are on the reading.
+    ``turns`` contains (axis number, sum of the values over a revolution) for rotary ones of these. ``shortfalls`` and
+    ``wanted`` are known only for tables that were built: text does not tell what was requested. ``remarks`` are
+    those from reading text.
     """
 
     blocks: tuple[PitchBlock | None, ...]
@@ -361,11 +361,11 @@ PointRecords = dict[int, list[Record]]
 
 
 def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTables:
-    """Read the tables from FANUC text; files that end in ``.json`` (the plan beside them) are left out.
+    """Read the tables from FANUC text; ``.json`` files (the plan) are ignored.
 
-    Parameters that have nothing to do with compensation are passed over, the points of other axes are kept apart.
-    InputError, with file and line, for a missing or doubled parameter of an axis or point of its block, for a cut file,
-    for an inch machine, for a table of each direction that the machine file does not have, and for anything unreadable.
+    Parameters unrelated to compensation are skipped; points of other axes are kept apart.
+    InputError, with file and line, for a missing or duplicate parameter or point of an axis, a truncated file,
+    an inch machine, direction-dependent tables not in the machine file, and for anything unreadable.
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
@@ -374,7 +374,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     base, known = settings.number_base, (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
     for record in (record for file in texts for record in read_records(file)):
         kind = type_word(record, record.words())[0]
-        # a parameter may have the number of a point: what it is shows when the points of a block are looked at
+        # a parameter may have the number of a point: this is resolved when the points of a block are read
         if 0 <= record.number - base <= MOST_NUMBER and kind != 1:
             points.setdefault(record.number - base, []).append(record)
         elif record.number not in known:
@@ -393,7 +393,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
 
 
 def _remarks(settings: PitchSettings, found: PunchedRecords, others: Sequence[tuple[int, int, int]]) -> tuple[str, ...]:
-    """Say what was assumed of the unit, which axes are kept apart, and how many records were passed over."""
+    """Say which unit was assumed, which axes are kept apart, and how many records were skipped."""
     said = [found.unit_remark(settings.detection_unit_um)]
     for axis, first, last in others:
         said.append(
@@ -421,7 +421,7 @@ def _block(
 ) -> PitchBlock | None:
     number = settings.axis_numbers[axis]
     bits, record = parameters.get((DIRECTIONS, number), ("", None))
-    if record is not None and bits.endswith("1") != settings.bidirectional:  # half of the tables would be read wrongly
+    if record is not None and bits.endswith("1") != settings.bidirectional:  # half of the tables would be misread
         word = "true" if bits.endswith("1") else "false"
         raise record.fail(
             f"bit 0 of {AXES[axis]} (A{number}) is {bits[-1:]}: set bidirectional = {word} in [controllers.fanuc-pitch] to "
@@ -466,9 +466,9 @@ def _block(
 
 
 def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points: PointRecords) -> tuple[int, ...]:
-    """Values of the points from ``span[0]`` to ``span[1]``, each of which must be there once.
+    """Values of the points from ``span[0]`` to ``span[1]``, each of which must occur once.
 
-    A record is pitch data if it is of type Q0, or without type and axis word; a parameter of the same number has them.
+    A record is pitch data if it is of type Q0, or has no type and axis words; a parameter of that number has them.
     """
     values, absent = [], []
     for number in range(span[0], span[1] + 1):
@@ -493,11 +493,11 @@ def _values(settings: PitchSettings, span: tuple[int, int], who: Record, points:
 def _other_axes(
     settings: PitchSettings, parameters: Parameters, points: PointRecords
 ) -> tuple[tuple[tuple[int, int, int], ...], tuple[tuple[int, int], ...]]:
-    """Blocks of axes other than X, Y, Z that are switched on (magnification above zero), and sums over a revolution.
+    """Active blocks (magnification above zero) of axes other than X, Y, Z, and sums over a revolution.
 
-    A sum is that of a rotary axis whose numbers span its travel per revolution (3625). Source: Series 0i-PB parameter
-    manual B-63980EN/01, p. 100: the numbers go from the reference point's to it plus travel per revolution over interval;
-    the values behind the first must sum to zero.
+    Sums are given for rotary axes whose numbers span the travel per revolution (3625). Source: Series 0i-PB parameter
+    manual B-63980EN/01, p. 100: the numbers run from the reference point's to that + travel per revolution / interval;
+    the values after the first must sum to zero.
     """
     others, turns = [], []
     for axis in sorted({axis for _, axis in parameters} - set(settings.axis_numbers)):
@@ -515,15 +515,15 @@ def _other_axes(
     return tuple(others), tuple(turns)
 
 
-# Limits of stored pitch error compensation: what tables break, how much of each limit they use.
+# Limits of stored pitch error compensation: which ones the tables exceed, and how much of each they use.
 
 
-#: A table that misses by more counts than this because its steps are limited is not acceptable.
+#: A table that deviates by more counts than this because of the step limit is not acceptable.
 MOST_MISSED = 1.0
 
 
 def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTables) -> list[str]:
-    """Return every limit that the tables break, and travel that they leave out, in words."""
+    """Return, in words, every limit that the tables exceed and any travel they do not cover."""
     messages = []
     for axis, block in enumerate(tables.blocks):
         if block is None:
@@ -555,7 +555,7 @@ def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTab
 
 
 def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
-    """Say that the limit of the change per section keeps a table from what was requested, and what helps."""
+    """Say that the limit on the change per section keeps a table from reaching the request, and what helps."""
     numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
     return (
         f"{AXES[shortfall.axis]}: the requested curve is too steep, the limit is {settings.increment_limit} counts per "

@@ -1,4 +1,4 @@
-"""FANUC parameter and compensation data files: their records, how they are written, and what a punched sample shows."""
+"""FANUC parameter and compensation data files: their records, their style, and what a punched sample shows."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from compgen.errors import InputError
 # Records of FANUC parameter and pitch data files: ``%``, blocks ``N... A... P...``, ``%``.
 #
 # The grammar is that of the Series 15i (parameter manual B-63330EN, board manual B-63322EN-2); a type word ``Q``, white
-# space between words, ``(comments)``, ``;`` as printed block end, LF and CR LF are taken as well.
+# space between words, ``(comments)``, ``;`` as printed block end, LF and CR LF are accepted too.
 
 
-#: No parameter file of a control is anywhere near this long.
+#: No parameter file of a control is nearly this long.
 MOST_CHARACTERS = 4_000_000
-#: Nor are there more numbers than this.
+#: No parameter file has this many blocks.
 MOST_BLOCKS = 100_000
-#: Nor is any block as long as this: 99 axes with 20 characters each.
+#: No block is this long: 99 axes with 20 characters each.
 MOST_IN_BLOCK = 2000
 
 _COMMENT = re.compile(r"\([^()]*\)")
@@ -38,7 +38,7 @@ _WORD = re.compile(r"[ \t]*([A-Z])([+-]?(?:\d{1,12}(?:\.\d{0,12})?|\.\d{1,12}))(
 
 @dataclass(frozen=True)
 class Record:
-    """One block of a file: its number (of so many digits, perhaps filled with zeros), and the text behind it."""
+    """One block of a file: its number (with its digits, perhaps zero-padded), and the text after it."""
 
     number: int
     rest: str
@@ -52,7 +52,7 @@ class Record:
         return self.file.fail(f"N{self.number:05d}: {message}", self.line)
 
     def words(self) -> list[tuple[str, str]]:
-        """Return the words behind the number as (letter, number as text)."""
+        """Return the words after the number as (letter, number as text)."""
         text, found, at = self.rest.rstrip(), [], 0
         while at < len(text):
             word = _WORD.match(text, at)
@@ -65,7 +65,7 @@ class Record:
         return found
 
     def whole(self, text: str, low: int, high: int) -> int:
-        """Return ``text`` as a whole number within limits (a decimal point with nothing behind it is harmless)."""
+        """Return ``text`` as a whole number within limits (a trailing decimal point is harmless)."""
         value = Decimal(text)
         if value != value.to_integral_value() or not low <= value <= high:
             raise self.fail(f"{text} is given; expected a whole number from {low} to {high}")
@@ -73,7 +73,7 @@ class Record:
 
 
 def read_records(file: SourceFile) -> Iterator[Record]:
-    """Yield the records between pairs of ``%``; InputError for anything else, and for a missing last ``%``."""
+    """Yield the records between pairs of ``%``; InputError for anything else and for a missing final ``%``."""
     check_size(file, MOST_CHARACTERS)
     lines = file.text.split("\n" if "\n" in file.text else "\r")
     inside, marks, blocks = False, 0, 0
@@ -109,7 +109,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
 
 
 def type_word(record: Record, words: Sequence[tuple[str, str]]) -> tuple[int | None, list[tuple[str, str]]]:
-    """Return the type word ``Q`` (0 pitch data, 1 parameter, None if there is none) and the other words."""
+    """Return the type word ``Q`` (0 pitch data, 1 parameter, None if absent) and the other words."""
     for place in (0, -1):
         if words and words[place][0] == "Q":
             others = list(words)
@@ -143,21 +143,21 @@ class FanucStyle:
 
     Parameters
     ----------
-    eol, block_end, space : line end, what is before it (``;`` or nothing), what is between words.
+    eol, block_end, space : line end, what precedes it (``;`` or nothing), what separates words.
     mark : first and last line.
-    digits, point_digits : digits of the N words of parameters and of compensation points, filled with zeros.
-    q_word, q_last : type word Q1 (parameter) or Q0 (pitch data), behind the other words if ``q_last``.
+    digits, point_digits : digits of the N words of parameters and of compensation points, zero-padded.
+    q_word, q_last : type word Q1 (parameter) or Q0 (pitch data), after the other words if ``q_last``.
     value_first : the value word comes before its axis word.
     axes_together : all axes of a parameter in one record.
-    real_letter, real_point, decimals : value word of lengths, whether it has a decimal point, digits behind it (None: as
-        few as needed, but one).
-    whole_point, plus, zeros : whole numbers end with a point, have a plus sign, are filled with zeros to so many digits.
+    real_letter, real_point, decimals : value word of lengths, whether it has a decimal point, decimals (None: as
+        few as needed, at least one).
+    whole_point, plus, zeros : whole numbers end with a point, have a plus sign, are zero-padded to so many digits.
     number_base : record number of compensation point 0.
-    points_first, containers : points before parameters; 1, or 2: each in a pair of ``%`` of its own.
-    header, footer : lines behind the first ``%`` and before the last one.
+    points_first, containers : points before parameters; 1, or 2: each in a separate pair of ``%``.
+    header, footer : lines after the first ``%`` and before the last one.
     last_eol : whether a line end follows the last ``%``.
     even : a blank makes the number of characters of a record even.
-    path : path of the control that parameters without axis belong to, written as a word L; 0: no such word.
+    path : path of parameters without axis, written as a word L; 0: no such word.
     """
 
     eol: str = "\n"
@@ -186,12 +186,12 @@ class FanucStyle:
     path: int = 0
 
     def whole(self, value: int) -> str:
-        """Return a whole number as it is written."""
+        """Return a whole number as written in the file."""
         sign = "-" if value < 0 else "+" if self.plus else ""
         return f"{sign}{abs(value):0{max(self.zeros, 1)}d}{'.' if self.whole_point else ''}"
 
     def length(self, value: Decimal) -> str:
-        """Return a length, in the unit of the file, as it is written."""
+        """Return a length, in the unit of the file, as written in the file."""
         if not self.real_point:
             return str(int(value))
         if self.decimals is not None and self.decimals >= 2:
@@ -236,33 +236,33 @@ class FanucStyle:
 
 @dataclass(frozen=True)
 class Punched:
-    """Text of a file for the templates, line ends and white space and all."""
+    """Text of a file for the templates, including line ends and white space."""
 
     text: str
 
 
-# What files that were punched from the user's own control show: their style, and the points of every axis.
+# What files punched from the user's control show: their style, and the points of every axis.
 #
-# No public document shows a file of a 0i-F or 30i, so such a sample is the best description of the style that it reads. It
-# also says which compensation points each axis has; those of other axes must never be written over.
+# No public document shows a file of a 0i-F or 30i, so a sample is the best description of the style that it reads. It
+# also says which compensation points each axis has; those of other axes must never be overwritten.
 
 
-#: Parameters whose values are whole numbers, and the one that is a length.
+#: Parameters with whole-number values, and the one that is a length.
 WHOLE_PARAMETERS, LENGTH_PARAMETER = (3620, 3621, 3622, 3623, 3626, 3627), 3624
-#: What the sample may say of an axis: how its table works, its points. Of a path: unit of the machine, total values,
+#: What the sample may contain for an axis: how its table works, its points. For a path: machine unit, total values,
 #: straightness.
 AXIS_PARAMETERS = (3605, *range(3620, 3628))
 UNIT_PARAMETER, TOTAL_PARAMETER, STRAIGHTNESS_PARAMETERS = 1001, 3602, range(5700, 5800)
-#: Largest compensation point number, and value of a point, that is read at all.
+#: Largest compensation point number, and largest value of a point, accepted when reading.
 MOST_NUMBER, MOST_VALUE = 9999, 10_000_000
-#: Line ends of controls; LF CR CR is the end of block in ISO code.
+#: Line ends of controls; LF CR CR is end of block in ISO code.
 LINE_ENDS = {"\n\r\r": "LF CR CR", "\r\n": "CR LF", "\n": "LF", "\r": "CR"}
 
-#: Comments may be in any language; they are followed with ? for characters that are not ASCII.
+#: Comments may be in any language; they are copied with ? for non-ASCII characters.
 _COMMENT_BYTES, _NOT_ASCII = re.compile(rb"\([^()\r\n]*\)"), re.compile(rb"[\x80-\xff]+")
 
 Span = tuple[int, int]
-#: (number, axis number) -> value as text and the record that it is in.
+#: (number, axis number) -> value as text and its record.
 Parameters = dict[tuple[int, int], tuple[str, Record]]
 
 
@@ -285,10 +285,10 @@ class PointGrid:
 
 @dataclass(frozen=True)
 class AxisPoints:
-    """What the sample says of one controlled axis.
+    """What the sample shows for one controlled axis.
 
-    ``grid`` are its compensation points (of a rotary axis in degrees), ``magnification`` is parameter 3623,
-    ``negative_first`` the first number for travel in negative direction, None unless 3605#0 is set. ``record`` is 3621.
+    ``grid`` are its compensation points (in degrees for a rotary axis), ``magnification`` is parameter 3623,
+    ``negative_first`` the first number for negative travel (None unless 3605#0 is set). ``record`` is 3621.
     """
 
     number: int
@@ -299,7 +299,7 @@ class AxisPoints:
 
     @property
     def spans(self) -> tuple[Span, ...]:
-        """Blocks (first, last) of point numbers that the axis uses, the number of its reference point among them."""
+        """Blocks (first, last) of point numbers that the axis uses, including its reference point."""
         low, high = min(self.grid.first, self.grid.reference), max(self.grid.last, self.grid.reference)
         if self.negative_first is None:
             return ((low, high),)
@@ -308,16 +308,16 @@ class AxisPoints:
 
 @dataclass(frozen=True)
 class Sample:
-    """What punched files of the user's control show; without any it is empty, with the default style.
+    """What punched files of the user's control show; empty, with the default style, if there are none.
 
     Parameters
     ----------
-    style : how records are written; ``points_style`` is that of the file of the points if they have one of their own.
-    notes : in words what was taken from the sample.
-    axes : compensation points by controlled axis number, of all axes that have some, also those that are switched off.
+    style : how records are written; ``points_style`` is the style of the points file if that is separate.
+    notes : what was taken from the sample, in words.
+    axes : compensation points by controlled axis number, of all axes that have any, including those switched off.
     parameters : (number, axis number) -> (value as text, record) of the parameters that compensation needs.
     values : compensation point number -> value.
-    common : parameters of the path, 1001, 3602 and from 5700 to 5799, number -> (value as text, record).
+    common : path parameters 1001, 3602 and 5700 to 5799, number -> (value as text, record).
     """
 
     style: FanucStyle = FanucStyle()
@@ -330,15 +330,15 @@ class Sample:
 
     @property
     def shows_points(self) -> bool:
-        """Whether the sample says which points the axes have: some parameter 3621."""
+        """Whether the sample shows the points of the axes: it has a parameter 3621."""
         return any(number == 3621 for number, _ in self.parameters)
 
     def others(self, number: int) -> list[tuple[AxisPoints, Span]]:
-        """Return the blocks of every axis but ``number``."""
+        """Return the blocks of every axis except ``number``."""
         return [(axis, span) for key, axis in self.axes.items() if key != number for span in axis.spans]
 
     def check_free(self, number: int, name: str, first: int, last: int) -> None:
-        """Raise InputError if the points ``first`` to ``last`` of an axis are in use by another axis of the sample."""
+        """Raise InputError if the points ``first`` to ``last`` of an axis are used by another axis in the sample."""
         for axis, (low, high) in self.others(number):
             if first <= high and last >= low:
                 raise axis.record.fail(
@@ -347,7 +347,7 @@ class Sample:
                 )
 
     def bits(self, parameter: int, number: int) -> str | None:
-        """Return a parameter of the bit type of an axis as eight binary digits, bit 7 first; None if it is not there."""
+        """Return a parameter of the bit type of an axis as eight binary digits, bit 7 first; None if absent."""
         found = self.parameters.get((parameter, number))
         if found is None:
             return None
@@ -356,7 +356,7 @@ class Sample:
         return found[0]
 
 
-# Settings that the FANUC controls share.
+# Settings shared by the FANUC controls.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,7 +379,7 @@ class FanucSettings:
         return 1 if self.stores == "correction" else -1
 
     def finish(self, section: toml_files.Section) -> None:
-        """Raise InputError if two axes have the same number, or for a key of the section that is not known."""
+        """Raise InputError if two axes have the same number, or if the section has an unknown key."""
         if len(set(self.axis_numbers)) < 3:
             raise section.fail("axis_numbers", f"{self.axis_numbers} gives two axes the same number")
         section.finish()
@@ -387,10 +387,10 @@ class FanucSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class PunchedSettings(FanucSettings):
-    """Settings of controls whose files follow what was punched from the user's own control.
+    """Settings of controls whose files follow the style of files punched from the user's control.
 
-    The keys of the style take precedence over the style of the punched files; ``sample`` has both together. ``path`` is
-    the path of the control whose parameters count, where there are several (word L).
+    Style keys take precedence over the style of the punched files; ``sample`` combines both. ``path`` is
+    the path whose parameters apply if the control has several (word L).
     """
 
     style_from: tuple[Path, ...] = file_setting(
@@ -420,7 +420,7 @@ P = TypeVar("P", bound=PunchedSettings)
 
 
 def take_punched(kind: type[P], section: toml_files.Section, **given: Any) -> P:
-    """Take the settings of a ``kind``, and what its punched files show; see :func:`sample_of` for errors."""
+    """Read the settings of a ``kind``, and what its punched files show; see :func:`sample_of` for errors."""
     settings = toml_files.take_settings(kind, section, **given)
     sample = sample_of([punched_file(path) for path in settings.style_from], settings.path)
     shown = {key: getattr(sample.style, key) for key in ("q_word", "real_point", "number_base")}
@@ -447,16 +447,16 @@ def take_punched(kind: type[P], section: toml_files.Section, **given: Any) -> P:
 
 
 def as_sample(machine: Machine, files: Sequence[Path], names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return ``style_from`` with punched files for each of the controls ``names``; the plan beside them is left out."""
+    """Return ``style_from`` with punched files for each of the controls ``names``; the plan is left out."""
     texts = [str(path.resolve()) for path in files if path.suffix.lower() != ".json"]
     return {name: {"style_from": texts} for name in names if "style_from" not in machine.controller_settings(name)}
 
 
 def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
-    """Return what punched files show but for the points of the axes, which need the unit of lengths.
+    """Return what punched files show, except the points of the axes, which need the length unit.
 
-    InputError with the line for whatever is not understood, for a style that changes within a file, and for a machine
-    whose unit is the inch.
+    InputError with the line of anything not understood, for a style that changes within a file, and for a machine
+    in inches.
     """
     if not files:
         return Sample()
@@ -495,7 +495,7 @@ def sample_of(files: Sequence[SourceFile], path: int = 1) -> Sample:
 
 
 class PunchedRecords:
-    """Records of punched files sorted by what they are: parameters of axes, of a path, compensation points."""
+    """Records of punched files by kind: axis parameters, path parameters, compensation points."""
 
     def __init__(self, path: int) -> None:
         self.path = path
@@ -505,7 +505,7 @@ class PunchedRecords:
         self.passed_over = 0
 
     def take(self, record: Record, is_point: bool) -> None:
-        """Sort a record in; one that says nothing of compensation is counted."""
+        """Sort in a record; one unrelated to compensation is counted."""
         if is_point:
             words = type_word(record, record.words())[1]
             self.points += [(words[0][1], record)] if words else []
@@ -529,7 +529,7 @@ class PunchedRecords:
         into[key] = text, record
 
     def unit_remark(self, detection_unit_um: float) -> str:
-        """Say which unit the machine is taken to have."""
+        """Say which unit the machine is assumed to have."""
         known = UNIT_PARAMETER in self.common
         unit = "metric by 1001#0 (INM)" if known else "taken to be metric, 1001#0 (INM) is not in the file"
         return (
@@ -538,12 +538,12 @@ class PunchedRecords:
         )
 
     def passed_over_remark(self, kind: str) -> str:
-        """Count the records that were passed over."""
+        """Count the records that were skipped."""
         records = "1 record" if self.passed_over == 1 else f"{self.passed_over} records"
         return f"passed over: {records} that cannot change a {kind} table"
 
     def check_metric(self) -> None:
-        """Refuse a machine whose least command increment is in inch (1001#0, INM)."""
+        """Reject a machine whose least command increment is in inch (1001#0, INM)."""
         found = self.common.get(UNIT_PARAMETER)
         if found is not None and found[0][-1:] == "1":
             raise found[1].fail(
@@ -553,7 +553,7 @@ class PunchedRecords:
 
 
 def check_increments(common: Mapping[int, tuple[str, Record]]) -> None:
-    """Refuse a control whose pitch data are total values (3602#0, APE) where increments are read or written."""
+    """Reject a control whose pitch data are total values (3602#0, APE) where increments are read or written."""
     text, record = common.get(TOTAL_PARAMETER, ("0", None))
     if record is not None and text.endswith("1"):
         raise record.fail(
@@ -563,7 +563,7 @@ def check_increments(common: Mapping[int, tuple[str, Record]]) -> None:
 
 
 def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
-    """Compensation points of each axis that has some: an interval, or a number that is not 0."""
+    """Compensation points of each axis that has any: an interval, or a number other than 0."""
     found = {}
     for axis in sorted({axis for _, axis in parameters}):
         entries = [parameters.get((number, axis)) for number in (3620, 3621, 3622)]
@@ -595,7 +595,7 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
 
 
 def length_of(record: Record, text: str, unit_mm: float) -> Decimal:
-    """Return an interval in mm: a number with a decimal point is in mm, one without counts in ``unit_mm``."""
+    """Return an interval in mm: a number with a decimal point is in mm, one without is in units of ``unit_mm``."""
     value = Decimal(text) if "." in text else Decimal(text) * Decimal(repr(unit_mm))
     if not 0 < value < 100000:
         raise record.fail(f"the interval {value} mm is not possible; it is the positive length of a section")
@@ -603,7 +603,7 @@ def length_of(record: Record, text: str, unit_mm: float) -> Decimal:
 
 
 def path_value(record: Record, path: int) -> str | None:
-    """Return the value of a parameter of a path: ``P2``, or that of the word ``L`` before it (``L1P0L2P3``).
+    """Return the value of a parameter of a path: ``P2``, or the one after its word ``L`` (``L1P0L2P3``).
 
     None if the record has no value for this path.
     """
@@ -621,7 +621,7 @@ def path_value(record: Record, path: int) -> str | None:
 
 
 def punched_file(path: Path) -> SourceFile:
-    """Read a punched file with its line ends as they are; InputError for bytes outside comments that are not ASCII."""
+    """Read a punched file, keeping its line ends; InputError for non-ASCII bytes outside comments."""
     content = _COMMENT_BYTES.sub(lambda found: _NOT_ASCII.sub(b"?", found[0]), read_bytes(path))
     try:
         return SourceFile(path, content.decode("ascii"))
@@ -633,7 +633,7 @@ def punched_file(path: Path) -> SourceFile:
 
 
 def style_of(file: SourceFile) -> tuple[FanucStyle, tuple[str, ...]]:
-    """Return the style of a punched file's text, and in words what was taken from it; InputError as :func:`sample_of`."""
+    """Return the style of a punched file's text and what was taken from it, in words; errors: :func:`sample_of`."""
     records = list(read_records(file))
     points = [record for record in records if is_point(record)]
     others = [record for record in records if not is_point(record)]
@@ -667,7 +667,7 @@ def _is_pitch_parameter(record: Record) -> bool:
 
 
 def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Record]) -> FanucStyle:
-    """Line ends, order, comments before the first and behind the last record."""
+    """Line ends, order, comments before the first and after the last record."""
     text = file.text
     eol = next((end for end in LINE_ENDS if end in text), "\n")
     pieces = text.split(eol)
@@ -695,7 +695,7 @@ def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Recor
 
 
 def spacing_of(style: FanucStyle, records: Sequence[Record]) -> FanucStyle:
-    """White space and type words, which must be alike in all records."""
+    """White space and type words, which must be the same in all records."""
     first = records[0]
     words = first.words()
     if not words:
@@ -712,7 +712,7 @@ def spacing_of(style: FanucStyle, records: Sequence[Record]) -> FanucStyle:
 
 
 def width_of(records: Sequence[Record], usual: int) -> int:
-    """Digits of the N words: those of filled numbers, else 1; ``usual`` if there are no records."""
+    """Digits of the N words: from zero-padded numbers, else 1; ``usual`` if there are no records."""
     filled = [record for record in records if record.filled]
     if not records:
         return usual
@@ -727,7 +727,7 @@ def width_of(records: Sequence[Record], usual: int) -> int:
 
 
 def whole_numbers_of(style: FanucStyle, texts: Sequence[str]) -> FanucStyle:
-    """How whole numbers are written: with a point behind them, a plus sign, filled with zeros."""
+    """How whole numbers are written: with a trailing point, a plus sign, zero-padded."""
     padded = [text.lstrip("+-").rstrip(".") for text in texts]
     return replace(
         style,
@@ -761,7 +761,7 @@ def _parameter_style(style: FanucStyle, records: Sequence[Record]) -> FanucStyle
 
 
 def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]) -> tuple[str, ...]:
-    """Say in words what the sample showed, and what it did not show."""
+    """State what the sample showed, and what it did not show."""
     type_words = ("Q1 and Q0" + (" behind the other words" if style.q_last else "")) if style.q_word else "none"
     found = [
         f"line end {LINE_ENDS[style.eol]}" + (f", {style.block_end} before it" if style.block_end else ""),

@@ -1,4 +1,4 @@
-"""FANUC straightness compensation (``fanuc-straightness``): one axis shifted over another, four knots per polyline."""
+"""FANUC straightness compensation (``fanuc-straightness``): one axis as a function of another, four knots each."""
 
 from __future__ import annotations
 
@@ -48,13 +48,13 @@ from compgen.errors import InputError
 # Settings of ``[controllers.fanuc-straightness]``: what is compensated, the point numbers, the style of the file.
 
 
-#: Sections of a travel where the user does not say which compensation points the control has.
+#: Number of sections of a travel if the user does not state the compensation points of the control.
 SECTIONS = 100
 
 
 @toml_files.accepts(toml_files.array_schema({"enum": list(ACROSS)}, 1))
 def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
-    """A list of at most three tables such as ``"Y(x)"``, each moving axis once."""
+    """A list of at most three tables such as ``"Y(x)"``, with each moving axis used once."""
     if not isinstance(value, list) or not value or any(item not in [*ACROSS] for item in value):
         raise ValueError(f"expected a list of {', '.join(map(repr, ACROSS))}")
     found = tuple(ACROSS[item] for item in value)
@@ -83,9 +83,9 @@ _points = toml_files.accepts(toml_files.table_schema(dict.fromkeys(AXES, _OF_AXI
 class StraightnessSettings(PunchedSettings):
     """Settings of straightness compensation.
 
-    ``grids`` are the compensation points of X, Y, Z; None where the sample shows that the axis has none. ``stated`` tells
-    which of them the user or the sample gave, ``of_pitch`` which are those of ``[controllers.fanuc-pitch]``; the others are
-    assumed. ``pairs`` are (compensated axis, moving axis), 0..2; None: the best ones are chosen.
+    ``grids`` are the compensation points of X, Y, Z; None if the sample shows that the axis has none. ``stated`` tells
+    which the user or the sample gives, ``of_pitch`` which come from ``[controllers.fanuc-pitch]``; the others are
+    assumed. ``pairs`` are (compensated axis, moving axis), 0..2; None: the best are chosen.
     """
 
     path: int = setting(whole(1, 99), 1, meaning="path of the control whose parameters count, where they have a word L")
@@ -115,7 +115,7 @@ class StraightnessSettings(PunchedSettings):
 
 
 def read_straightness_settings(machine: Machine) -> StraightnessSettings:
-    """Read and check ``[controllers.fanuc-straightness]``; every key has a default, if need be that of fanuc-pitch."""
+    """Read and check ``[controllers.fanuc-straightness]``; every key has a default, if necessary from fanuc-pitch."""
     section = machine.controller_settings("fanuc-straightness")
     points = section.section("points", required=False)
     settings = take_punched(StraightnessSettings, section, grids=(None, None, None))
@@ -140,10 +140,10 @@ def read_straightness_settings(machine: Machine) -> StraightnessSettings:
 
 
 def _with_points(machine: Machine, settings: StraightnessSettings, points: toml_files.Section) -> StraightnessSettings:
-    """Compensation points of X, Y, Z: stated ones, those of the sample, of ``[controllers.fanuc-pitch]``, else assumed ones.
+    """Compensation points of X, Y, Z: as stated, from the sample, from ``[controllers.fanuc-pitch]``, or else assumed.
 
-    The numbers belong to pitch error compensation as well: with a sample no others than its own are written, and assumed
-    ones are never written beside the tables.
+    Pitch error compensation uses these numbers too: with a sample only its numbers are written, and assumed
+    ones are never written with the tables.
     """
     sample, pitch = settings.sample, pitch_points(machine)
     grids: list[PointGrid | None] = []
@@ -189,7 +189,7 @@ def _grid(section: toml_files.Section) -> PointGrid:
 
 
 def default_grid(machine: Machine, settings: StraightnessSettings, axis: int, free: int) -> PointGrid:
-    """Return points over the whole travel, about a hundredth of it apart, with numbers from ``free`` on."""
+    """Return points over the whole travel, about 1/100 of it apart, numbered from ``free`` on."""
     quantum = Decimal("0.001") if settings.style.real_point else Decimal(repr(settings.interval_unit_mm))
     low, high = machine.axes[axis].range_mm
     reference = machine.reference_point_mm[axis]
@@ -199,16 +199,16 @@ def default_grid(machine: Machine, settings: StraightnessSettings, axis: int, fr
     return PointGrid(free + below, free, free + below + above, step)
 
 
-# Numbers of straightness compensation: reading them from text, the polyline that they mean, their limits.
+# Numbers of straightness compensation: reading them from text, the polyline they represent, their limits.
 #
 # Entry k = 0, 1, 2 has the moving axis in parameter 5711 + k, the compensated axis in 5721 + k, four point numbers
-# a < b < c < d from 5731 + 10 k on and four amounts from 5761 + 10 k on. Points are compensation points of the moving axis
-# (3620 ... 3622, 3624). Between a, b, c, d the amount is linear, outside it is zero.
+# a < b < c < d from 5731 + 10 k on and four amounts from 5761 + 10 k on. Points are those of the moving axis
+# (3620 ... 3622, 3624). The amount is linear between a, b, c, d and zero outside.
 
 
 ENTRIES = range(3)
 MOVING, COMPENSATED, POINTS, AMOUNTS = 5711, 5721, 5731, 5761
-#: Further moving axes, which controls with more entries have.
+#: Additional moving axes on controls with more entries.
 FURTHER_MOVING = range(5714, 5721)
 #: Reference, first, last number and interval of the compensation points.
 GRID_PARAMETERS = (3620, 3621, 3622, 3624)
@@ -224,7 +224,7 @@ def entry_numbers(entry: int) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class StraightTable:
-    """One entry: ``compensated`` and ``moving`` axis (0..2), point numbers and amounts (4 each), the points' grid."""
+    """One entry: ``compensated`` and ``moving`` axis (0..2), point numbers and amounts (4 each), grid of the points."""
 
     compensated: int
     moving: int
@@ -251,20 +251,20 @@ class StraightTable:
 
 @dataclass(frozen=True)
 class StraightTables:
-    """The entries in use, in their order; ``remarks`` say what reading them assumed and kept apart."""
+    """The entries in use, in order; ``remarks`` state what was assumed and kept apart when reading them."""
 
     entries: tuple[StraightTable, ...]
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
-# The best polyline of four knots for a curve: all pairs of inner knots are tried, the ends are given.
+# The best polyline of four knots for a curve: all pairs of inner knots are tried; the ends are given.
 #
 # With knots p < q of a segment and the hat functions h0, h1 on it, weighted sums over the samples of h0^2, h0 h1, h1^2, h0 y
 # and h1 y follow from running sums of w, w x, w x^2, w y and w x y. For each pair of inner knots the normal matrix of the
-# four knot values is tridiagonal; its elimination gives by how much the squared deviation falls.
+# four knot values is tridiagonal; its elimination gives the decrease of the squared deviation.
 
 
-#: Keeps a pivot from zero where a segment holds a single sample.
+#: Keeps a pivot from zero if a segment contains a single sample.
 TINY = 1e-12
 
 
@@ -280,12 +280,12 @@ class Polyline:
 def best_polyline(
     candidates_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray
 ) -> Polyline:
-    """Return the polyline with knots at the first, the last and two further candidates that fits samples best.
+    """Return the polyline with knots at the first, the last and two other candidates that best fits the samples.
 
     Parameters
     ----------
     candidates_mm : allowed knots (m,), ascending, at least four.
-    position_mm, wanted, weight : samples (n,) within the candidates, ascending, the candidates among them.
+    position_mm, wanted, weight : samples (n,) within the candidates, ascending, including the candidates.
     """
     if len(candidates_mm) < 4:
         raise ValueError("at least four candidates are needed")
@@ -301,7 +301,7 @@ def best_polyline(
 def _gain_of_inner_knots(
     candidates: FloatArray, position: FloatArray, wanted: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """How much the squared deviation falls with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
+    """Decrease of the squared deviation with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
     # sums of h0^2, h0 h1, h1^2, h0 y, h1 y over the samples of each segment from candidate p to q, (m, m), only p < q
     middle = 0.5 * (candidates[0] + candidates[-1])
     x, y = position - middle, wanted
@@ -309,7 +309,7 @@ def _gain_of_inner_knots(
     moments = np.array([weight, weight * x, weight * x**2, weight * y, weight * x * y])
     running = np.hstack([np.zeros((5, 1)), np.cumsum(moments, axis=1)])
     cut = np.searchsorted(position, candidates - 1e-9)
-    cut[-1] = len(position)  # the last segment holds its end, the others do not
+    cut[-1] = len(position)  # the last segment includes its end, the others do not
     s0, s1, s2, t0, t1 = running[:, cut][:, None, :] - running[:, cut][:, :, None]
     length = np.where(at[None, :] > at[:, None], at[None, :] - at[:, None], 1.0)
     first = at[:, None]
@@ -335,13 +335,13 @@ def _gain_of_inner_knots(
     return np.where(allowed, gain, -np.inf)
 
 
-# FANUC straightness compensation: one axis shifted as a function of another, a polyline of four knots each.
+# FANUC straightness compensation: one axis corrected as a function of another, by a polyline of four knots.
 #
-# What the control is taken to do, and how little of it is settled, is in ``templates/fanuc-straightness/format.toml``.
+# What the control is assumed to do, and how little of it is certain: see ``templates/fanuc-straightness/format.toml``.
 
 
 class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
-    """Up to three tables such as Y(x), each moving axis once; zero at the reference point but for the rounding."""
+    """Up to three tables such as Y(x), each moving axis once; zero at the reference point except for rounding."""
 
     name = "fanuc-straightness"
     settings_class = StraightnessSettings
@@ -382,7 +382,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return StraightTables(tuple(sorted(entries, key=lambda entry: entry.moving)))
 
     def context(self, tables: StraightTables) -> dict[str, Any]:
-        """Return the records, the plan parameter -> value, what to set, and the statement of the sign."""
+        """Return the records, the plan parameter -> value, what to set, and the sign statement."""
         settings = self.settings
         common = self._common(tables)
         grids = self._point_grid_parameters(tables, settings.stated)
@@ -411,9 +411,9 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> StraightTables:
-        """Read the entries from FANUC text; files that end in ``.json`` (the plan beside them) are left out.
+        """Read the entries from FANUC text; ``.json`` files (the plan) are ignored.
 
-        Entries of other axes are kept apart; a fourth moving axis, which is not understood, is refused with its line.
+        Entries of other axes are kept apart; a fourth moving axis, which is not supported, is rejected with its line.
         """
         texts = [file for file in files if file.path.suffix.lower() != ".json"]
         if not texts:
@@ -464,7 +464,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return added
 
     def violations(self, tables: StraightTables) -> list[str]:
-        """Return amounts beyond their range, and travel that the knots leave out."""
+        """Return amounts beyond their range, and travel not covered by the knots."""
         settings = self.settings
         messages = []
         for entry in tables.entries:
@@ -515,9 +515,9 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return 0.5 * self.settings.count_mm * tables
 
     def _free_entries(self) -> tuple[list[int], set[int]]:
-        """Return the entries 0 ... 2 that the sample leaves free, and the moving axes 0 ... 2 that it uses for other axes.
+        """Return the entries 0 ... 2 that are free in the sample, and the moving axes 0 ... 2 it uses for other axes.
 
-        An entry that has an axis other than X, Y, Z as moving or compensated axis is never written over.
+        An entry whose moving or compensated axis is not X, Y or Z is never overwritten.
         """
         settings = self.settings
         free, taken = [], set()
@@ -589,7 +589,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return PointGrid(reference, first, last, length_of(record, text, settings.interval_unit_mm))
 
     def _common(self, tables: StraightTables) -> dict[int, int]:
-        """Parameter number -> value of the entries; one of X, Y, Z in the sample that is no longer used gets 0."""
+        """Parameter number -> value of the entries; an entry of X, Y, Z in the sample that is no longer used gets 0."""
         found: dict[int, int] = {}
         free, _ = self._free_entries()
         for k, entry in zip(free, tables.entries, strict=False):
@@ -640,7 +640,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
     def _point_grid_parameters(
         self, tables: StraightTables, chosen: Sequence[bool]
     ) -> dict[int, list[tuple[int, str]]]:
-        """Parameters 3620 ... of the ``chosen`` ones of the moving axes: number -> (axis number, value as text)."""
+        """Parameters 3620 ... of the ``chosen`` moving axes: number -> (axis number, value as text)."""
         style = self.settings.style
         entries = [entry for entry in tables.entries if chosen[entry.moving]]
         found: dict[int, list[tuple[int, str]]] = {number: [] for number in GRID_PARAMETERS} if entries else {}
@@ -754,7 +754,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         }
 
     def _check(self, tables: StraightTables) -> dict[str, Any]:
-        """A trial of one entry: all amounts 0 but one, and what the compensated axis must do there."""
+        """Trial of one entry: all amounts 0 except one, and what the compensated axis must do there."""
         counts, place, entry = 10, self._free_entries()[0][0], tables.entries[0]
         amounts = entry_numbers(place)[6:]
         return {
@@ -769,7 +769,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         }
 
     def _candidates_mm(self, axis: int) -> FloatArray:
-        """Positions of the compensation points that may be knots: those within the travel, and one beyond either end."""
+        """Positions of the compensation points that may be knots: those within the travel and one beyond each end."""
         grid = self.settings.grids[axis]
         assert grid is not None
         numbers = range(grid.first, grid.last + 1)
@@ -788,7 +788,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         position = np.unique(np.concatenate([position, 0.5 * (position[1:] + position[:-1])]).round(9))
         position = position[(position >= candidates[0] - 1e-9) & (position <= candidates[-1] + 1e-9)]
         (term,) = one_dimensional_terms(self.machine, errors, [position] * 3, [(output, axis)], anchored=False)
-        # the length that each sample stands for; more within the work zone, almost nothing beyond the travel
+        # the length that each sample represents; more within the work zone, nearly 0 beyond the travel
         half = 0.5 * np.diff(position)
         weight = np.concatenate([half, [0.0]]) + np.concatenate([[0.0], half])
         low, high = self.machine.axes[axis].range_mm
@@ -800,7 +800,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         return best_polyline(candidates, position, term.start, weight)
 
     def _chosen(self, errors: ErrorTable) -> tuple[tuple[int, int], ...]:
-        """Return the pairs of the settings, else for each moving axis the one that takes away most, by mean square."""
+        """Return the pairs of the settings, else for each moving axis the one that removes most, by mean square."""
         settings = self.settings
         free, taken = self._free_entries()
         possible = [axis for axis in range(3) if settings.grids[axis] is not None and axis not in taken]
@@ -815,7 +815,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             )
         if settings.pairs is not None:
             return settings.pairs
-        # mean square over the travel that the polyline of each pair takes away, a constant apart
+        # mean square over the travel removed by the polyline of each pair, without a constant
         gain: dict[tuple[int, int], float] = {}
         for axis, output in product(possible, range(3)):
             if output != axis:

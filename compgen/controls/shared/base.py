@@ -1,4 +1,4 @@
-"""What every control has in common: a basis of tables, text that is built, parsed and emulated, transfer plans."""
+"""What every control has in common: a basis of tables, building, parsing and emulating their text, transfer plans."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from compgen.data.machine import Machine
 from compgen.errors import InputError
 from compgen.kinematics.first_order import factor
 
-# What every control has in common: a basis of tables, and text that is built, parsed and emulated.
+# What every control has in common: a basis of tables, and building, parsing and emulating their text.
 #
 # A control is described by its **basis**: a list of :class:`Term`, each one table (a curve over one axis, or a
-# constant) times a carrier field. The stage ``export`` finds the table values whose correction field comes closest to
+# constant) times a carrier field. The export step finds the table values whose correction field comes closest to
 # the required one; the control turns them into its own numbers, parses them back from text, and emulates what it does.
 
 
@@ -32,10 +32,10 @@ Tables = TypeVar("Tables")
 
 @dataclass(frozen=True)
 class Monomial:
-    """A carrier: ``sign`` times (factor minus ``origin_mm``) on axis ``output``.
+    """Carrier: ``sign`` times (factor minus ``origin_mm``) on axis ``output``.
 
-    ``lever`` as in :class:`compgen.kinematics.first_order.Coefficient`: None for the factor 1, 0..2 an axis coordinate,
-    3..5 the tool offset.
+    ``lever``: as in :class:`compgen.kinematics.first_order.Coefficient`: None for factor 1, 0..2 an axis coordinate,
+    3..5 a component of the tool offset.
     """
 
     output: int
@@ -54,11 +54,11 @@ class Term:
     axis : 0..2, or None for a constant.
     nodes_mm : positions of the values, shape (n,); a constant has one (any) position.
     carrier : the correction in mm is the value times the sum of these monomials.
-    start : natural values, shape (n,); kept in directions that the required correction does not determine.
+    start : natural values, shape (n,); kept where the required correction does not determine the values.
     zero_at_mm : position where the interpolated value must be zero, or None.
-    keep_mm : positions where the value should stay at its start as far as the required correction leaves a choice (a
-        line may be in a straightness or in a squareness); this keeps the zeros of the fitted curves.
-    zeros_mm : positions of nodes whose values are zero to the last digit, as in ``start``.
+    keep_mm : positions where the value should keep its start value where the required correction leaves a choice (a
+        line can go into a straightness or a squareness); this preserves the zeros of the fitted curves.
+    zeros_mm : positions of nodes whose values are exactly zero, as in ``start``.
     """
 
     name: str
@@ -92,7 +92,7 @@ class Term:
 
 @dataclass(frozen=True)
 class SourceFile:
-    """One file that is to be parsed as controller data: its path and its text."""
+    """A file to be parsed as controller data: its path and its text."""
 
     path: Path
     text: str
@@ -104,7 +104,7 @@ class SourceFile:
 
 @dataclass(frozen=True)
 class Usage:
-    """How much of one limit is used, in ``unit``: ``used`` of ``allowed``; ``stated`` is False for a usual default."""
+    """Use of one limit, in ``unit``: ``used`` of ``allowed``; ``stated`` is False for a typical default."""
 
     name: str
     used: float
@@ -114,40 +114,40 @@ class Usage:
 
     @property
     def share(self) -> float:
-        """Used part of the limit, 1 where it is reached."""
+        """Used share of the limit; 1 when it is reached."""
         return self.used / self.allowed if self.allowed else float(self.used > 0)
 
 
 class Controller(ABC, Generic[Settings, Tables]):
-    """One control: everything that is particular to its files and to what it does with them.
+    """One control: everything specific to its files and what it does with them.
 
     An instance is the control of one machine: it has read its section ``[controllers.<name>]`` of the machine file.
-    Corrections are in mm, what the control ADDS to the commanded position, shape (n, 3); the sign convention of the
-    stored numbers is the control's own affair and lives in its ``build``, ``parse`` and ``emulate``.
+    Corrections are in mm: what the control ADDS to the commanded position, shape (n, 3); the sign convention of the
+    stored numbers depends on the control and is handled in its ``build``, ``parse`` and ``emulate``.
 
     Parameters
     ----------
     machine : the machine.
-    settings : None: those of the machine file; else the control as it would be with these.
+    settings : None: read from the machine file; otherwise used instead of those.
     """
 
-    #: Name on the command line, and of its folder below ``templates/``.
+    #: Name on the command line and of the folder in ``templates/``.
     name: str
-    #: Dataclass of the settings; its fields say key, check, default and meaning (``compgen.data.toml_files.setting``).
+    #: Settings dataclass; its fields declare key, check, default and meaning (``compgen.data.toml_files.setting``).
     settings_class: type[Settings]
-    #: True if a table is zero at the reference point by nature, so that a constant offset cannot be corrected.
+    #: True if every table is zero at the reference point by definition: a constant offset cannot be corrected.
     anchored: bool = False
-    #: True if tables may act in one direction of travel only, so that a reversal goes into them.
+    #: True if tables may act in one direction of travel only and can thus contain a reversal.
     bidirectional: bool = False
-    #: True if tables are looked up where the axes are, after the correction, and not at the command.
+    #: True if tables are looked up at the actual (corrected) axis positions, not at the command.
     at_axes: bool = False
     #: True if the correction is not the sum of the tables: the control moves the chain by finite rotations.
     finite_rotations: bool = False
-    #: True if a plan for a binary transfer (``plan`` of the context, a ``.json`` file) is written beside the text.
+    #: True if a plan for a binary transfer (``plan`` of the context, a ``.json`` file) is also written.
     has_plan: bool = False
-    #: Folder with the sub-folder of templates of a plug-in's control; None: the shipped templates.
+    #: Folder containing the template sub-folder of a plug-in control; None: the shipped templates.
     templates: Path | None = None
-    #: Setting that names a file of the user's own control to follow: "style_from", "template_from", or None.
+    #: Setting that names a file from the user's control to follow: "style_from", "template_from", or None.
     sample_setting: str | None = None
 
     def __init__(self, machine: Machine, settings: Settings | None = None) -> None:
@@ -156,9 +156,9 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     @classmethod
     def read_settings(cls, machine: Machine) -> Settings:
-        """Read ``[controllers.<name>]`` of the machine file; InputError for what is missing, unknown or wrong.
+        """Read ``[controllers.<name>]`` of the machine file; InputError for missing, unknown or wrong keys.
 
-        The settings are those that the fields of ``settings_class`` declare.
+        The keys are the fields declared in ``settings_class``.
         """
         section = cls.settings_section(machine)
         settings = cls.check_settings(toml_files.take_settings(cls.settings_class, section), section, machine)
@@ -167,16 +167,16 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     @classmethod
     def settings_section(cls, machine: Machine) -> toml_files.Section:
-        """Return the section of the machine file that the settings are read from."""
+        """Return the section of the machine file from which the settings are read."""
         return machine.controller_settings(cls.name)
 
     @classmethod
     def check_settings(cls, settings: Settings, section: toml_files.Section, machine: Machine) -> Settings:
-        """Check what depends on several keys or on the machine; return the settings with the defaults that do."""
+        """Check what depends on several keys or on the machine; return the settings with such defaults filled in."""
         return settings
 
     def missing(self) -> InputError | None:
-        """Return the error of a setting that an export needs and reading does not; ``build`` raises it. None: complete."""
+        """Return the error for a setting needed for export but not for reading; ``build`` raises it. None: complete."""
         return None
 
     @abstractmethod
@@ -184,9 +184,9 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return the tables that the control would get for these errors, in correction space (mm added per unit)."""
 
     def basis_of(self, errors: ErrorTable, tables: Tables) -> list[Term]:
-        """Return the basis that parsed tables are judged by: that of these errors.
+        """Return the basis for judging parsed tables: by default the basis for these errors.
 
-        A control with room for some of its tables only may take what the given tables hold, where that is as good.
+        A control that has room for only some of its tables may use those in ``tables`` if they are as good.
         """
         return self.basis(errors)
 
@@ -200,14 +200,14 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     @abstractmethod
     def parse(self, files: Sequence[SourceFile]) -> Tables:
-        """Read the control's numbers back from text; InputError with file and line for anything malformed."""
+        """Read the control's numbers back from text; InputError with file and line if malformed."""
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[Tables, list[str]] | None:
-        """Read files that this program did not write (an archive of a control): the tables that act, and remarks.
+        """Read files not written by this program (an archive of a control): the active tables, and remarks.
 
-        The text may hold any character. What has no bearing on a table is passed over and counted in the remarks, tables of
-        axes that the machine file lacks are named there; what could change a table and is not understood is an
-        InputError with its line. None (the default): this control has no reader but the strict :meth:`parse`.
+        The text may contain any character. Content unrelated to tables is skipped and counted in the remarks; tables of
+        axes not in the machine file are named there. Anything not understood that could change a table is an
+        InputError with its line. None (the default): this control has only the strict reader :meth:`parse`.
         """
         return None
 
@@ -217,25 +217,25 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     @abstractmethod
     def violations(self, tables: Tables) -> list[str]:
-        """Return every limit of the control that the tables break, and travel that they do not cover, in words."""
+        """Return, in words, every limit of the control that the tables exceed and any travel they do not cover."""
 
     def contradictions(self, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
-        """Return where files that are not needed to read the tables (a plan for their transfer) say something else."""
+        """Return where files not needed to read the tables (a transfer plan) contradict them."""
         return plan_contradictions(files, lambda: self.context(tables)["plan"]) if self.has_plan else []
 
     def remarks(self, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
-        """Return what reading these files assumed, passed over, or kept apart (tables of other axes), in words.
+        """Return, in words, what was assumed, skipped or kept apart (tables of other axes) when reading these files.
 
-        For a person who reads the backup of a control. Lines that could change a table and are not understood are not
-        a remark: ``parse`` refuses them. The default are the ``remarks`` of the tables, if they have any.
+        For someone reading the backup of a control. Lines not understood that could change a table are not
+        remarks: ``parse`` rejects them. The default is the ``remarks`` of the tables, if any.
         """
         return list(getattr(tables, "remarks", ()))
 
     def keeping_others(self, tables: Tables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
-        """Return settings with which an export keeps what these files of the user's control hold of other axes.
+        """Return settings that make an export keep the data of other axes in these files of the user's control.
 
-        By the name of a control and the key of its section. Empty if nothing is there to be kept, or the settings see
-        to it already.
+        Keyed by control name and section key. Empty if there is nothing to keep, or the settings already
+        ensure it.
         """
         return {}
 
@@ -244,40 +244,40 @@ class Controller(ABC, Generic[Settings, Tables]):
         """Return the largest correction error that rounding to the format's quantum may cause on one axis, mm."""
 
     def anchor_mm(self) -> FloatArray:
-        """Return where the tables of an ``anchored`` control are zero by nature, shape (3,): the reference point."""
+        """Return where tables of an ``anchored`` control are zero by definition, shape (3,): the reference point."""
         return np.array(self.machine.reference_point_mm, dtype=np.float64)
 
     def table_nodes_mm(self, tables: Tables) -> tuple[FloatArray, ...]:
-        """Return the positions of X, Y and Z at which parsed tables have a node, ascending, also outside the travel.
+        """Return the node positions of parsed tables in X, Y and Z, ascending, including those outside the travel.
 
-        An axis over which there is no table has none. The default knows none at all.
+        An axis without a table has none. The default returns none at all.
         """
         return (np.zeros(0), np.zeros(0), np.zeros(0))
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return the part of a reversal that goes into tables of one direction; ``with_reversal`` gets just this."""
+        """Return the part of a reversal that goes into direction-dependent tables; ``with_reversal`` gets only this."""
         return reversal if self.bidirectional else ReversalCurves({})
 
     def with_reversal(self, tables: Tables, reversal: ReversalCurves) -> Tables:
-        """Return the tables with the reversal in them; only for controls that are ``bidirectional``."""
+        """Return the tables including the reversal; only for ``bidirectional`` controls."""
         raise TypeError(f"{self.name} has no tables of one direction")
 
     def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
-        """Return the control's backlash parameters (name, value, meaning) for a reversal that no table holds."""
+        """Return the control's backlash parameters (name, value, meaning) for a reversal that is in no table."""
         return []
 
     def left_out(self, errors: ErrorTable) -> list[str]:
-        """Return what of these errors the tables could hold but have no room for, in words with what stays in um."""
+        """Return, in words, the errors for which the tables have no room, with the remaining error in um."""
         return []
 
     def reservations(self, tables: Tables) -> list[str]:
-        """Return what the verdict must say of tables that break no limit: what is inferred, missing or not known."""
+        """Return what the verdict must state about tables within all limits: what is inferred, missing or unknown."""
         return []
 
     def other_readings(self, tables: Tables) -> dict[str, Self]:
-        """Return the control with other settings that may be true of the same tables, by what it then does, in words.
+        """Return the control with other settings that may apply to the same tables, keyed by what it then does.
 
-        Only where no document settles the reading: the check program gets a point that tells them apart.
+        Only where no document settles the interpretation: the check program gets a point that distinguishes them.
         """
         return {}
 
@@ -290,7 +290,7 @@ AnyController = Controller[Any, Any]
 
 
 def nodes_by_axis(nodes_mm: Iterable[tuple[int, FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the union of table nodes for X, Y and Z, ascending, from pairs (axis, positions in mm)."""
+    """Return the union of the table nodes of X, Y and Z, ascending, from pairs (axis, positions in mm)."""
     found: list[list[FloatArray]] = [[np.zeros(0)], [np.zeros(0)], [np.zeros(0)]]
     for axis, positions in nodes_mm:
         found[axis].append(np.asarray(positions, dtype=np.float64))
@@ -299,42 +299,42 @@ def nodes_by_axis(nodes_mm: Iterable[tuple[int, FloatArray]]) -> tuple[FloatArra
 
 
 def travel_of(points: Points, axis: int) -> FloatArray:
-    """Return the direction of the last travel of an axis at each point, +1 or -1, 0 where it is not known: shape (n,)."""
+    """Return the direction of the last travel of an axis at each point: +1, -1, or 0 if unknown; shape (n,)."""
     return np.zeros(len(points)) if points.approach is None else np.sign(points.approach[:, axis])
 
 
 def by_travel(travel: FloatArray, positive: FloatArray, negative: FloatArray) -> FloatArray:
-    """Return the value after positive or negative travel (n,), the mean of both where the direction is not known."""
+    """Return the value after positive or negative travel (n,), the mean of both if the direction is unknown."""
     return np.select([travel > 0, travel < 0], [positive, negative], 0.5 * (positive + negative))
 
 
 def parameter_row(name: str, value: str, meaning: str) -> dict[str, str]:
-    """Return a parameter of the control with the value that the tables need, as the templates and reports show it."""
+    """Return a control parameter with the value that the tables need, as shown in templates and reports."""
     return {"name": name, "value": value, "meaning": meaning}
 
 
 def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: float, what: str) -> list[str]:
-    """Return a message if a table from ``first_mm`` to ``last_mm`` leaves a part of the axis' travel uncovered."""
+    """Return a message if a table from ``first_mm`` to ``last_mm`` leaves part of the axis travel uncovered."""
     low, high = machine.axes[axis].range_mm
     if first_mm <= low + 1e-6 and last_mm >= high - 1e-6:
         return []
     return [f"{what} covers {first_mm:g} ... {last_mm:g} mm of {'XYZ'[axis]}, the travel is {low:g} ... {high:g} mm"]
 
 
-# Plans for a binary transfer (``*.plan.json``) in addition to the text of a control: both must hold the same numbers.
+# Plans for a binary transfer (``*.plan.json``) in addition to the control's text: both must contain the same numbers.
 
 
 def plan_contradictions(files: Sequence[SourceFile], expected: Callable[[], Mapping[str, Any]]) -> list[str]:
-    """Say where a ``.json`` file differs from the plan that the tables in the text exported with it make.
+    """Say where a ``.json`` file differs from the plan made from the tables in the text exported with it.
 
     Parameters
     ----------
-    files : all files of one export; without a plan among them nothing is compared.
-    expected : gives the plan of the parsed tables, by the keys of the file; other keys of the file are notes.
+    files : all files of one export; nothing is compared if none is a plan.
+    expected : returns the plan of the parsed tables, by the keys of the file; other keys of the file are notes.
 
     Returns
     -------
-    One sentence for each plan that cannot be used: no JSON, no object, or the first number that differs, with its place.
+    One sentence for each unusable plan: not JSON, not an object, or the first number that differs, with its place.
     """
     plans = [file for file in files if file.path.suffix.lower() == ".json"]
     wanted = json.loads(json.dumps(dict(expected()))) if plans else {}

@@ -1,4 +1,4 @@
-"""Node positions for tables, as few as hold the error curves within a loss, and interpolation in regular grids."""
+"""Fewest table nodes that represent the error curves within a given loss, and interpolation in regular grids."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.kinematics.first_order import coefficients
 
-# The fewest nodes of a polyline that stays within a tolerance of curves: a shortest path over candidate nodes.
+# Fewest nodes of a polyline that stays within tolerance of the curves: a shortest path over candidate nodes.
 
 
 def fewest_nodes(
     position_mm: FloatArray, values: FloatArray, tolerances: FloatArray, required: Sequence[int] = ()
 ) -> list[int]:
-    """Return the indices of the fewest candidates whose polylines hold every curve, ends included.
+    """Return the indices of the fewest candidates whose polylines fit every curve within tolerance, ends included.
 
     Parameters
     ----------
     position_mm : candidates (n,), ascending.
-    values : curves at the candidates, shape (k, n); between them they are straight.
+    values : curves at the candidates, shape (k, n), linear in between.
     tolerances : largest deviation of each curve at the candidates, shape (k,).
     required : indices that must be nodes.
 
-    Among the smallest sets that with the least sum of squared deviations (in tolerances) is taken. Exact: dynamic
-    programming over all pairs; a pair is allowed if the line between the two passes all candidates in between.
+    Of the smallest sets, the one with the least sum of squared deviations (in tolerances) is used. Exact: dynamic
+    programming over all pairs; a pair is allowed if its line is within tolerance at all candidates in between.
     """
     count = len(position_mm)
     scaled = np.asarray(values, dtype=np.float64) / np.asarray(tolerances, dtype=np.float64)[:, None]
-    best = np.full((count, 2), np.inf)  # number of pieces, sum of squares; of the part up to the node
+    best = np.full((count, 2), np.inf)  # number of pieces and sum of squares up to the node
     best[0], before = 0.0, np.zeros(count, dtype=np.int64)
     stops = sorted({*required, count - 1})
     for first in range(count - 1):
         stop = next(index for index in stops if index > first)
-        # for the lines to every later candidate: whether all between lie within 1, sum of squares
+        # for the line to every later candidate: whether all in between are within 1; sum of squares
         along = position_mm[first + 1 : stop + 1] - position_mm[first]
         rise = scaled[:, first + 1 : stop + 1] - scaled[:, first : first + 1]
         slope = rise / along
@@ -66,30 +66,30 @@ def fewest_nodes(
     return path[::-1]
 
 
-# Node positions for tables: as few as hold the error curves within a requested loss, equidistant where a control demands it.
+# Node positions for tables: the fewest that meet the requested loss, equidistant where a control requires it.
 
 
-#: Loss by interpolation between table nodes that is not worth another node, as a displacement of the tool.
+#: Interpolation loss between table nodes that does not justify another node, as a tool displacement.
 NEGLIGIBLE_LOSS_MM = 0.05 * MM_PER_UM
-#: A loss of this share of the standard uncertainty of a curve is not worth another node either ...
+#: Nor does a loss of this share of the standard uncertainty of a curve ...
 UNCERTAINTY_SHARE = 0.1
-#: ... as far as it does not exceed this share of the curve's range.
+#: ... provided that it does not exceed this share of the curve's range.
 RANGE_SHARE = 0.02
-#: A table is not refined beyond this many intervals, whatever the control could take.
+#: A table is not refined beyond this many intervals, whatever the control allows.
 MOST_INTERVALS = 400
-#: Every number of intervals is tried up to this one, then 5 % more each.
+#: Every number of intervals up to this one is tried, then steps of 5 %.
 EVERY_COUNT = 60
-#: Where no grid reaches the requested loss: the coarsest is taken that loses at most this much more than the best.
+#: If no grid meets the requested loss: the coarsest that loses at most this much more than the best.
 NEARLY_BEST = 1.25
-#: Where a bent curve is looked at within an interval; no simple fractions, which refined nodes would hit.
+#: Where a curved function is checked within an interval; not simple fractions, which refined nodes would hit.
 BETWEEN = np.array([0.13, 0.29, 0.41, 0.53, 0.67, 0.79, 0.91])
-#: Steps are whole multiples of this.
+#: Steps are integer multiples of this.
 STEP_QUANTUM = Decimal("0.0001")
 
 
 @dataclass(frozen=True)
 class EquidistantGrid:
-    """Equidistant nodes ``start + k step``, k = 0 ... count - 1, in exact decimal numbers (mm)."""
+    """Equidistant nodes ``start + k step``, k = 0 ... count - 1, as exact decimals (mm)."""
 
     start: Decimal
     step: Decimal
@@ -109,13 +109,13 @@ class EquidistantGrid:
 def loss_setting(
     meaning: str = "loss by interpolation between nodes, um at the tool, that is worth no further node",
 ) -> Any:
-    """Declare ``loss_um``: the loss by interpolation, as a displacement of the tool, that is worth no further node; in mm."""
+    """Declare ``loss_um``: the interpolation loss, as a tool displacement, not worth another node; in mm."""
     default = NEGLIGIBLE_LOSS_MM / MM_PER_UM
     return toml_files.setting(toml_files.positive, key="loss_um", unit=MM_PER_UM, stated=default, meaning=meaning)
 
 
 def curve_nodes_mm(machine: Machine, errors: ErrorTable, axis: int, most: int = 1000) -> FloatArray:
-    """Return the union of the positions of all curves of an axis within its travel, the travel ends included."""
+    """Return the union of the positions of all curves of an axis within its travel, including the travel ends."""
     low, high = machine.axes[axis].range_mm
     curves = [curve for name, curve in errors.curves.items() if error_named(name).axis == axis]
     positions = np.concatenate([[low, high], *(curve.position_mm for curve in curves)])
@@ -126,7 +126,7 @@ def curve_nodes_mm(machine: Machine, errors: ErrorTable, axis: int, most: int = 
 def uneven_nodes_mm(
     machine: Machine, errors: ErrorTable, axis: int, *, loss_mm: float = NEGLIGIBLE_LOSS_MM, most: int = 1000
 ) -> FloatArray:
-    """Return the fewest nodes, taken from those of the curves, with which no curve of the axis loses what matters.
+    """Return the fewest of the curves' nodes with which no curve of the axis loses anything significant.
 
     Travel ends are nodes, and so is the reference point if a curve has a node there.
     """
@@ -156,14 +156,14 @@ def equidistant_grid(
 
     Parameters
     ----------
-    machine, errors, axis : whose travel and curves are to be held.
-    most : largest number of nodes that the control takes.
-    step_mm : a step that the user asks for; otherwise the widest one that loses nothing that matters.
+    machine, errors, axis : the travel to cover and the curves to represent.
+    most : largest number of nodes that the control accepts.
+    step_mm : the step requested by the user; otherwise the widest one without significant loss.
     anchor : True if the reference point must be a node.
-    loss_mm : loss by interpolation, as a displacement of the tool, that is worth no further node; a tenth of the
-        standard uncertainty of a curve is not either.
-    output : only curves that move this axis count; default all.
-    products : False if the control multiplies curves with levers itself, so that only the curves have to be held.
+    loss_mm : interpolation loss, as a tool displacement, that does not justify another node; nor does a tenth of the
+        standard uncertainty of a curve.
+    output : only curves that move this axis count; default: all.
+    products : False if the control multiplies curves with levers itself: only the curves have to be represented.
     """
     low, high = machine.axes[axis].range_mm
     if step_mm is not None:
@@ -180,22 +180,22 @@ def equidistant_grid(
 
 
 def nearly_best(tried: Sequence[tuple[float, EquidistantGrid]]) -> EquidistantGrid | None:
-    """Return the first of grids with their losses, coarsest first, that loses hardly more than the best one."""
+    """Return the first grid (coarsest first, with its loss) that loses hardly more than the best one."""
     enough = NEARLY_BEST * min((loss for loss, _ in tried), default=0.0)
     return next((grid for loss, grid in tried if loss <= enough), None)
 
 
 def worth_mm(errors: ErrorTable, axis: int, loss_mm: float, output: int | None = None) -> float:
-    """Return the loss that is worth no further node: as requested, or what the uncertainty of the error makes idle.
+    """Return the loss that does not justify another node: as requested, or hidden by the uncertainty of the error.
 
-    The error is that of ``output`` over ``axis``, by default positioning.
+    The error is the displacement of ``output`` over ``axis``, by default positioning.
     """
     curve = errors.curves.get(f"E{AXES[axis if output is None else output]}{AXES[axis]}")
     return loss_mm if curve is None else max(loss_mm, _idle_loss(curve))
 
 
 def _idle_loss(curve: Curve) -> float:
-    """Loss of a curve, in its own unit, that its uncertainty hides; 0 if that is not known."""
+    """Loss of a curve, in its unit, that is hidden by its uncertainty; 0 if that is unknown."""
     if not np.all(np.isfinite(curve.u)):
         return 0.0
     return min(UNCERTAINTY_SHARE * float(np.sqrt(np.mean(curve.u**2))), RANGE_SHARE * float(np.ptp(curve.value)))
@@ -204,7 +204,7 @@ def _idle_loss(curve: Curve) -> float:
 def _curves_of(
     errors: ErrorTable, axis: int, machine: Machine | None = None, output: int | None = None
 ) -> Iterator[tuple[str, Curve]]:
-    """Curves over an axis, those only that move the axis ``output`` if one is given."""
+    """Curves over an axis; if ``output`` is given, only those that move this axis."""
     moving = None
     if machine is not None and output is not None:
         parts = coefficients(machine.chain, machine.squareness_reference)
@@ -216,10 +216,10 @@ def _curves_of(
 
 @dataclass(frozen=True)
 class _Held:
-    """A curve that tables have to hold to within ``tolerance`` (mm or rad); with ``bent`` also curve times position.
+    """A curve that tables must fit to within ``tolerance`` (mm or rad); with ``bent`` also curve times position.
 
-    An angular error whose lever holds its own axis' travel acts as curve times position, which is bent between the
-    nodes of the curve; it is looked at there as well, to within ``bent_tolerance`` mm.
+    An angular error whose lever contains the travel of its axis acts as curve times position, not linear between
+    the nodes; it is checked there too, to within ``bent_tolerance`` mm.
     """
 
     curve: Curve
@@ -238,7 +238,7 @@ class _Held:
         return cls(curve, max(loss_mm / lever_mm, u), bent, max(loss_mm, u * lever_mm))
 
     def loss(self, nodes_mm: FloatArray) -> float:
-        """Largest loss by interpolation between the nodes, 1 where it is just tolerated."""
+        """Largest interpolation loss between the nodes; 1 is just tolerated."""
         curve, at_nodes = self.curve, self.curve.at(nodes_mm)
         loss = _missed(nodes_mm, curve.position_mm, at_nodes, curve.value) / self.tolerance
         if not self.bent:
@@ -254,7 +254,7 @@ def _missed(nodes_mm: FloatArray, where_mm: FloatArray, at_nodes: FloatArray, wa
 
 
 def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, most: int) -> list[EquidistantGrid]:
-    """Grids within ``most`` nodes by their number: even parts of the travel, and steps that hit the curves' nodes."""
+    """Grids of at most ``most`` nodes, by number: equal parts of the travel, and steps that hit the curves' nodes."""
     low, high = machine.axes[axis].range_mm
     length = Decimal(repr(high)) - Decimal(repr(low))
     counts = list(range(1, EVERY_COUNT + 1))
@@ -269,7 +269,7 @@ def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, m
 
 
 def common_step(machine: Machine, errors: ErrorTable, axis: int, *, anchor: bool) -> Decimal:
-    """Widest step with which the nodes of all curves, the travel ends and the origin of the grid are nodes."""
+    """Widest step for which all curve nodes, the travel ends and the grid origin are nodes."""
     origin = machine.reference_point_mm[axis] if anchor else machine.axes[axis].range_mm[0]
     distances = np.abs(curve_nodes_mm(machine, errors, axis) - origin) / float(STEP_QUANTUM)
     return max(1, math.gcd(*np.rint(distances).astype(np.int64).tolist())) * STEP_QUANTUM
@@ -287,13 +287,13 @@ def _grid(machine: Machine, axis: int, step: Decimal, anchor: bool) -> Equidista
     return EquidistantGrid(origin - below * step, step, below + above + 1)
 
 
-# Trilinear interpolation in a regular grid of boxes, as three-dimensional error compensation does it.
+# Trilinear interpolation in a regular grid of boxes, as in three-dimensional error compensation.
 #
-# FANUC, additional manual A-79351E, sheet 3/13: inside a box each component is the sum over its eight corners of the
-# corner's value times (1 - x) or x, (1 - y) or y, (1 - z) or z, with the ratios x, y, z = 0 ... 1 within the box.
+# FANUC, additional manual A-79351E, sheet 3/13: in a box, each component is the sum over the eight corners of the
+# corner's value times (1 - x) or x, (1 - y) or y, (1 - z) or z, with x, y, z = 0 ... 1 the position within the box.
 
 
-#: Corner (x, y, z) of C1 ... C8 in FANUC's formula: round the lower face, then round the upper one.
+#: Corner (x, y, z) of C1 ... C8 in FANUC's formula: around the lower face, then the upper one.
 FANUC_CORNERS: tuple[tuple[int, int, int], ...] = (
     (0, 0, 0),
     (1, 0, 0),
@@ -320,7 +320,7 @@ def box_of_corners(corners: FloatArray) -> FloatArray:
 
 
 def _cells(ratio: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Cell number and share within it for ratios (n,) that count in cells from the first vertex; clamped."""
+    """Cell number and fraction within it for positions (n,) in cells from the first vertex; clamped."""
     inside = np.clip(ratio, 0.0, count - 1)
     cell = np.minimum(np.floor(inside), max(count - 2, 0))
     return cell, inside - cell
@@ -332,9 +332,9 @@ def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, p
     Parameters
     ----------
     vertices : values (nx, ny, nz, k) in any unit; index [i, j, l] is at ``start_mm + (i, j, l) step_mm``. An
-        axis with a single vertex is constant along itself.
-    start_mm, step_mm : position of vertex [0, 0, 0] and the (positive) distances, shape (3,), mm.
-    position_mm : shape (n, 3), mm; outside the grid the value of its surface holds (clamped).
+        axis with a single vertex is constant along that axis.
+    start_mm, step_mm : position of vertex [0, 0, 0] and the (positive) spacings, shape (3,), mm.
+    position_mm : shape (n, 3), mm; outside the grid the value at its surface applies (clamped).
 
     Returns
     -------
@@ -354,12 +354,12 @@ def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, p
     return result
 
 
-# Values over a grid of axis positions with uneven distances, and reading one from rows in any order.
+# Values over a grid of axis positions with uneven spacing, and reading it from rows in any order.
 
 
 @dataclass(frozen=True)
 class ParameterGrid:
-    """One parameter over a grid of axis positions, linear between nodes, end values held outside.
+    """One parameter over a grid of axis positions, linear between nodes, constant outside.
 
     Parameters
     ----------
@@ -373,7 +373,7 @@ class ParameterGrid:
     values: FloatArray
 
     def at(self, position_mm: FloatArray) -> FloatArray:
-        """Value at axis positions (n, 3), shape (n,): multilinear between the 2^k nodes around each position."""
+        """Values at axis positions (n, 3), shape (n,): multilinear between the 2^k nodes around each position."""
         result = np.zeros(len(position_mm))
         cells = [_cell(nodes, position_mm[:, axis]) for axis, nodes in zip(self.axes, self.nodes_mm, strict=True)]
         for corner in product((0, 1), repeat=len(cells)):
@@ -386,7 +386,7 @@ class ParameterGrid:
 
 
 def _cell(nodes_mm: FloatArray, along_mm: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
-    """Index of the node before and after each position, and the share of the one after; clamped outside."""
+    """Index of the node before and after each position, and the weight of the one after; clamped outside."""
     if len(nodes_mm) == 1:
         zero = np.zeros(len(along_mm), dtype=np.intp)
         return zero, zero, np.zeros(len(along_mm))
@@ -398,9 +398,9 @@ def _cell(nodes_mm: FloatArray, along_mm: FloatArray) -> tuple[np.ndarray, np.nd
 def grid_order(
     source: SourceFile, lines: list[int], arguments: list[FloatArray]
 ) -> tuple[tuple[FloatArray, ...], np.ndarray]:
-    """Return the nodes (ascending) of each argument, and the order that sorts the rows into the grid's C order.
+    """Return the nodes (ascending) of each argument, and the permutation that sorts the rows into C order of the grid.
 
-    Raises InputError with the line for a position that is given twice, and if positions of the grid are missing.
+    Raises InputError with the line for a duplicate position, and if grid positions are missing.
     """
     if not arguments:
         if len(lines) > 1:

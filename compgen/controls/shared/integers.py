@@ -1,17 +1,17 @@
 """The best whole numbers for a table: dynamic programming over the cumulative curve.
 
-A table of counts A_k at nodes x_k acts as the polyline through them. Wanted is a curve whose projection onto polylines
-with these nodes is v (in counts). As the projection is orthogonal, every table misses the wanted curve by what the
+A table of counts A_k at nodes x_k acts as the polyline through them. Let v (in counts) be the projection of the
+requested curve onto polylines with these nodes. It is orthogonal, so every table deviates by what the
 projection misses plus
 
     J(A) = integral of w (polyline of A - v)^2 = sum over sections d^T G d,   d = A - v at both ends of a section,
 
-so that J alone decides. Sought are whole numbers with A = 0 at the reference node and steps of at most ``limit``.
+so J alone decides. We look for whole numbers with A = 0 at the reference node and steps of at most ``limit``.
 
-**Bound.** If no step of v exceeds the limit, nor does any step of the rounded v, because floor(a + m + 1/2) =
-floor(a + 1/2) + m for whole m and rounding is monotone. So tables exist that stay within half a count at every node, and
-hence, as a polyline, everywhere; among them that with the smallest J is taken. Where the limit binds on one side of the
-reference node, none exists there, and J alone is minimised on that side.
+**Bound.** If no step of v exceeds the limit, neither does any step of the rounded v, because floor(a + m + 1/2) =
+floor(a + 1/2) + m for whole m and rounding is monotone. So there are tables within half a count at every node and
+hence, as polylines, everywhere; the one with the smallest J is taken. Where the limit is active on one side of the
+reference node, there is none, and J alone is minimised on that side.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ from compgen.data.machine import Machine
 
 IntArray = NDArray[np.int64]
 
-#: Largest deviation at a node in counts that rounding needs.
+#: Largest rounding deviation at a node, in counts.
 HALF = 0.5
 #: Rounding noise of numbers in counts.
 NOISE = 1e-9
-#: Weight of what lies beyond the travel, so that nodes out there continue the curve.
+#: Weight beyond the travel, so that nodes there continue the curve.
 BEYOND = 1e-6
 
 
 @dataclass(frozen=True)
 class IntegerCurve:
-    """Whole numbers at the nodes of a table, and how well they do.
+    """Whole numbers at the nodes of a table, and how well they fit.
 
     Parameters
     ----------
     counts : cumulative curve A, shape (n,), zero at the reference node.
-    rms, largest : deviation of the polyline from the wanted one, in counts: weighted over the axis, and the largest.
-    limited : whether the limit of the steps keeps the table from staying within half a count.
-    full_sections : with ``limited``, the sections (0 is the first) whose step is as large as the limit.
+    rms, largest : deviation of the polyline from the requested one, in counts: weighted over the axis, and maximum.
+    limited : whether the step limit prevents the table from staying within half a count.
+    full_sections : with ``limited``, the sections (0 is the first) whose step equals the limit.
     """
 
     counts: IntArray
@@ -63,7 +63,7 @@ def section_weights(
 ) -> FloatArray:
     """Return G of every section as (n-1, 3): the integrals of h0^2, h0 h1, h1^2 with the two hat functions h, in mm.
 
-    The weight is 1 within ``range_mm``, ``zone_weight`` in the zone, and almost nothing beyond the range.
+    The weight is 1 within ``range_mm``, ``zone_weight`` in the zone, and nearly 0 beyond the range.
     """
     zone = () if zone_mm is None else zone_mm
     cuts = np.unique(np.clip([*nodes_mm, *range_mm, *zone], nodes_mm[0], nodes_mm[-1]))
@@ -88,10 +88,10 @@ def travel_weights(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatAr
 def nearest_polyline(
     nodes_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray, reference: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Project a curve that is given at any positions (m,) onto polylines that are zero at node ``reference``.
+    """Project a curve given at any positions (m,) onto polylines that are zero at node ``reference``.
 
     Returns the values (n,) at the nodes and G (n-1, 3) of the sections, both with the weights (m,) of the positions.
-    Every section needs weighted positions enough to determine its ends.
+    Every section needs enough weighted positions to determine its ends.
     """
     matrix = hat_matrix(nodes_mm, position_mm)
     left, share = hat_entries(nodes_mm, position_mm)
@@ -113,7 +113,7 @@ def best_integers(wanted: FloatArray, sections: FloatArray, reference: int, limi
     wanted : values v (n,) of the polyline at the nodes in counts, zero at the reference node.
     sections : G of the sections, shape (n-1, 3), from :func:`section_weights` or :func:`nearest_polyline`.
     reference : index of the node where the table is zero.
-    limit : largest step between neighbours in counts, or None.
+    limit : largest step between neighbouring nodes in counts, or None.
     """
     counts = np.zeros(len(wanted), dtype=np.int64)
     right, limited_right = _side(wanted[reference:], sections[reference:], limit)
@@ -132,7 +132,7 @@ def best_integers(wanted: FloatArray, sections: FloatArray, reference: int, limi
 
 
 def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[IntArray, bool]:
-    """Return the best counts (n,) from the reference node (first, count 0) outwards, and whether the limit binds."""
+    """Return the best counts (n,) from the reference node (first, count 0) outwards, and if the limit is active."""
     low = np.ceil(wanted - HALF - NOISE).astype(np.int64)
     high = np.floor(wanted + HALF + NOISE).astype(np.int64)
     low[0] = high[0] = 0
@@ -142,8 +142,8 @@ def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[
         return found, False
     # Windows that provably hold the best counts: with the real-valued curve u that a solver finds within the limit, and
     # any table A at least as good as the rounded one R, convexity gives (A-u)^T M (A-u) <= J(R) - J(u) + gap, with gap
-    # the most that the gradient at u could still gain over all curves within the limit. Both sections of a node hold at
-    # least their smallest eigenvalue of it.
+    # the most that the gradient at u could still gain over all curves within the limit. Both sections of a node add
+    # at least their smallest eigenvalue to M.
     curve, gap = _reachable(wanted, sections, limit)
     rounded = np.floor(curve + 0.5).astype(np.int64)
     rounded[0] = 0
@@ -160,7 +160,7 @@ def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[
         low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
         high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
     best = _cheapest(wanted, sections, low, high, limit)
-    assert best is not None  # the windows hold the rounded curve from which they were made
+    assert best is not None  # the windows contain the rounded curve from which they were made
     return best, True
 
 
@@ -174,7 +174,7 @@ def _square(deviation: FloatArray, sections: FloatArray) -> float:
 def _cheapest(
     wanted: FloatArray, sections: FloatArray, low: IntArray, high: IntArray, limit: int | None
 ) -> IntArray | None:
-    """Return the counts within ``low`` ... ``high`` (n,) of smallest J, or None if the limit leaves none."""
+    """Return the counts within ``low`` ... ``high`` (n,) with the smallest J, or None if the limit allows none."""
     cost, choices = np.zeros(high[0] - low[0] + 1), []
     for k in range(1, len(wanted)):
         reach = limit if limit is not None else int(max(high[k] - low[k - 1], high[k - 1] - low[k], 0))
@@ -199,7 +199,7 @@ def _cheapest(
 
 
 def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:
-    """Return a real-valued curve (n,) of small J with steps within the limit, and how much is certainly left."""
+    """Return a real-valued curve (n,) of small J with steps within the limit, and a bound on the remaining gain."""
     import osqp  # imported here: slow to load, and only steep curves need it
     from scipy.sparse import csc_matrix, dia_matrix
 
@@ -222,7 +222,7 @@ def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[Fl
 
 
 def lowest_free(taken: Sequence[tuple[int, int]], start: int, count: int) -> int:
-    """Return the lowest first number, from ``start`` on, of ``count`` numbers that meet no taken block.
+    """Return the lowest first number, from ``start`` on, of ``count`` numbers that overlap no used block.
 
     >>> lowest_free([(5, 9), (12, 12)], 1, 4), lowest_free([(5, 9), (12, 12)], 1, 5)
     (1, 13)

@@ -1,7 +1,7 @@
 """Scanning the text files of controls: lines, numbers, and whether a file is complete.
 
-Text of any size and content must end in an :class:`InputError` with its line, never in a long wait: sizes are checked
-first, and every pattern has an upper bound for what it repeats.
+Bad text of any size must lead to an :class:`InputError` with its line, never to a long wait: sizes are checked
+first, and every repetition in a pattern has an upper bound.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from compgen.controls.shared.base import SourceFile
 from compgen.data.messages import one_line
 
 MOST_LINES = 200_000
-#: What is quoted of a wrong word.
+#: Number of characters quoted from a wrong word.
 SHOWN = 40
 
 
 @dataclass
 class Findings:
-    """What was read in files of another program in addition to the tables, for a few lines of summary.
+    """What files of another program contain in addition to the tables, for a short summary.
 
-    ``counts`` are by what was passed over, ``apart`` the tables of axes that the machine file lacks, ``notes`` what else the
+    ``counts`` are by what was skipped, ``apart`` the tables of axes not in the machine file, ``notes`` what else the
     user should know.
     """
 
@@ -33,11 +33,11 @@ class Findings:
     notes: list[str] = field(default_factory=list)
 
     def count(self, what: str, number: int = 1) -> None:
-        """Count something that was passed over or filled in."""
+        """Count something that was skipped or filled in."""
         self.counts[what] = self.counts.get(what, 0) + number
 
     def statements(self) -> list[str]:
-        """Return the summary in at most one line of each kind."""
+        """Return the summary with at most one line of each kind."""
         passed = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
         found = [f"passed over or filled in: {passed}"] if passed else []
         if self.apart:
@@ -46,9 +46,9 @@ class Findings:
 
 
 def number_pattern(before: int = 40, behind: int = 40, exponent: int = 0) -> re.Pattern[str]:
-    """Return the pattern of a decimal number with at most so many digits before and behind its point.
+    """Return the pattern of a decimal number with at most so many digits before and after the point.
 
-    ``exponent`` is how many digits an exponent may have; 0: there is none.
+    ``exponent`` is the number of digits an exponent may have; 0: no exponent.
     """
     power = rf"(?:[eE][+-]?[0-9]{{1,{exponent}}})?" if exponent else ""
     return re.compile(rf"[+-]?(?:[0-9]{{1,{before}}}(?:\.[0-9]{{0,{behind}}})?|\.[0-9]{{1,{behind}}}){power}")
@@ -60,7 +60,7 @@ _DECLARED = re.compile(r"(?://|#|;)\s{0,9}(?:records|entries|tables):\s{0,9}([0-
 
 
 def check_size(source: SourceFile, most: int) -> None:
-    """Refuse a text that is longer than any file of its kind."""
+    """Reject a text that is longer than any file of its kind."""
     if len(source.text) > most:
         raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}", 1)
 
@@ -72,10 +72,10 @@ def _check_lines(source: SourceFile) -> None:
 
 
 def plain_lines(source: SourceFile, most: int, longest: int) -> list[str]:
-    """Return all lines without their ends (LF, CRLF or CR).
+    """Return all lines without line ends (LF, CRLF or CR).
 
-    InputError for more than ``most`` characters or :data:`MOST_LINES`, a line of more than ``longest`` characters, and any
-    character, also in a comment, that is neither printable ASCII nor a tab.
+    InputError for more than ``most`` characters or :data:`MOST_LINES`, a line longer than ``longest``, and any
+    character, even in a comment, that is neither printable ASCII nor a tab.
     """
     check_size(source, most)
     _check_lines(source)
@@ -91,9 +91,9 @@ def plain_lines(source: SourceFile, most: int, longest: int) -> list[str]:
 
 
 def content_lines(source: SourceFile, comment: str = "//", longest: int = 4000) -> list[tuple[int, str]]:
-    """Return the lines of a file without comments and blank lines, with their numbers; InputError for garbage.
+    """Return the lines of a file without comments and blank lines, with their line numbers; InputError for garbage.
 
-    A comment may hold any character.
+    A comment may contain any character.
     """
     _check_lines(source)
     found = []
@@ -111,7 +111,7 @@ def content_lines(source: SourceFile, comment: str = "//", longest: int = 4000) 
 
 
 def floating(source: SourceFile, line: int, word: str, what: str, pattern: re.Pattern[str] = FLOATING) -> float:
-    """Return a word as a finite number, with or without an exponent; InputError says why it is none.
+    """Return a word as a finite number, with or without an exponent; InputError says why it is not one.
 
     ``what`` names the number in the message.
     """
@@ -142,7 +142,7 @@ def uses_exponent(words: Iterable[str]) -> bool:
 
 
 def check_complete(source: SourceFile, count: int, what: str = "records") -> None:
-    """Refuse a cut file: one that declares its ``records`` in a comment must hold them and end with a line end."""
+    """Reject a truncated file: if a comment declares its ``records``, it must contain them and end with a line end."""
     declared = next((found for line in source.text.split("\n") if (found := _DECLARED.match(line[:200].strip()))), None)
     if declared is None:
         return

@@ -23,7 +23,7 @@ def one_dimensional_name(output: int, axis: int) -> str:
     return f"{AXES[output]}({AXES[axis].lower()})"
 
 
-#: (output, base axis) of the tables of one axis as a function of another, by their names.
+#: (output, base axis) of the tables of one axis as a function of another, by table name.
 ACROSS = {
     one_dimensional_name(output, base): (output, base) for base in range(3) for output in range(3) if output != base
 }
@@ -47,12 +47,12 @@ def one_dimensional_terms(
 
     Parameters
     ----------
-    machine, errors : the start values are minus the errors that act so: straightness and positioning, squareness as
-        a line, own-travel and tool levers, and angular errors at ``lever_origin_mm``.
+    machine, errors : start values are minus the errors with this effect: straightness and positioning, squareness as
+        a line, levers of the axis itself and of the tool, and angular errors at ``lever_origin_mm``.
     nodes_mm : table nodes of the three axes.
-    pairs : (output, axis) of the wanted tables.
+    pairs : (output, axis) of the requested tables.
     anchored : True if the tables are zero at the reference point.
-    lever_origin_mm : where angular errors count as one-dimensional; default the middle of the travel.
+    lever_origin_mm : where angular errors are taken as one-dimensional; default: mid-travel.
     """
     middle = 0.5 * (machine.lower_mm + machine.upper_mm)
     origin = np.asarray(middle if lever_origin_mm is None else lever_origin_mm, dtype=np.float64)
@@ -69,7 +69,7 @@ def one_dimensional_terms(
                 lever: FloatArray | float = 1.0
                 if part.lever is not None and part.lever >= 3:
                     lever = machine.tool_offset_mm[part.lever - 3]
-                elif part.lever is not None:  # the travel of the axis itself, or the fixed place of another one
+                elif part.lever is not None:  # the travel of the axis itself, or the fixed position of another one
                     lever = nodes_mm[axis] if part.lever == axis else float(origin[part.lever])
                 start -= part.sign * errors.curves[part.error].at(nodes_mm[axis]) * lever
         reference = machine.reference_point_mm[axis] if anchored else None
@@ -92,9 +92,9 @@ def one_dimensional_terms(
 def product_terms(
     machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray], lever_origin_mm: Sequence[float]
 ) -> list[Term]:
-    """Return the terms function-of-one-axis times lever-of-another that the chain's angular errors need.
+    """Return the terms (function of one axis times lever of another) that the chain's angular errors need.
 
-    The lever counts from ``lever_origin_mm``; values are rotations in rad, start is minus the sum of the errors.
+    Levers are measured from ``lever_origin_mm``; values are rotations in rad, start is minus the sum of the errors.
     """
     found: dict[tuple[int, int, int], FloatArray] = {}
     for part in coefficients(machine.chain, machine.squareness_reference):
@@ -121,7 +121,7 @@ def product_terms(
 def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
     """Return one term per error for controls that evaluate E = C P themselves in the convention of ISO 230-1.
 
-    Values are the errors (mm, rad); the carrier is minus the column of C. The controls know X as the only squareness
+    Values are the errors (mm, rad); the carrier is minus the column of C. These controls know X as the only squareness
     reference: for a machine with reference Y the squareness EC0Y is taken as the slope of EYX, with EC0Y = 0.
     """
     carriers: dict[str, list[Monomial]] = {}
@@ -144,7 +144,7 @@ def error_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatAr
             start = start - fold * nodes
         straightness = error_named(name).is_straightness
         keep_mm = _kept_mm(machine, axis, straightness=straightness)
-        # a straightness that is zero at both ends: its line is in the squareness, which the control has
+        # a straightness that is zero at both ends: its slope is in the squareness, which the control has
         at_ends = straightness and set(SQUARENESS_NAMES) <= names and len(nodes) >= 3
         at_ends = at_ends and np.max(np.abs(start[[0, -1]])) <= ZERO_END_MM
         zeros_mm = (float(nodes[0]), float(nodes[-1])) if at_ends else ()
@@ -160,10 +160,10 @@ def _kept_mm(machine: Machine, axis: int, *, straightness: bool) -> tuple[float,
 
 
 def continued(term: Term, range_mm: tuple[float, float]) -> Term:
-    """Return a term whose start goes straight on at a node far beyond the travel, as the synthesis makes values do.
+    """Return a term whose start is extrapolated linearly to a node far beyond the travel, like synthesised values.
 
-    Curves are constant outside their positions, so that a start taken from them bends there. A node counts as far out
-    if less than half of its interval lies within the travel (``LEAST_SHARE`` of ``compgen.tables.synthesis``).
+    Curves are constant outside their positions, so a start taken from them has a kink there. A node is far out
+    if less than half of its interval is within the travel (``LEAST_SHARE`` of ``compgen.tables.synthesis``).
     """
     nodes, start = term.nodes_mm, np.array(term.start)
     if len(nodes) < 3:
