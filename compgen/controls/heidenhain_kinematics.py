@@ -310,7 +310,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         return [list(row) for row in zip(*columns, strict=True)]
 
     def _chain_rows(self, tables: DraftTables) -> list[list[str]]:
-        """Cells DOC, KEY, AXIS, COORD, COMPTAB from the tool to the workpiece; errors come before their axis (p. 680)."""
+        """Cells DOC, KEY, AXIS, COORD, COMPTAB from tool to workpiece; errors come before their axis (p. 680)."""
         settings = self.settings
         rows = []
         for axis in (*reversed(self.machine.chain.tool_side), *self.machine.chain.workpiece_side):

@@ -117,7 +117,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
 
     @classmethod
     def check_settings(cls, settings: CecSettings, section: Section, machine: Machine) -> CecSettings:
-        """Fill in what follows from the model; ``mult_mode`` is mandatory where products are stated."""
+        """Complete the settings from the model; ``mult_mode`` is mandatory if ``products`` is true."""
         return checked_cec_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
@@ -247,7 +247,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         return foreign_cec_tables(given, self.machine, self.settings, findings), findings.statements()
 
     def emulate(self, tables: CecTables, points: Points) -> FloatArray:
-        """Return what the control adds: the clipped sum of the tables, subtracted or added as ``sign`` says.
+        """Return what the control adds: the clipped sum of the tables, subtracted or added according to ``sign``.
 
         A table with DIRECTION 1 or -1 acts where the last motion of its input axis (``points.approach``) has that
         sign. Where the approach is unknown (0 or None) the table does not act, and a CompgenWarning is issued: the

@@ -25,7 +25,7 @@ from compgen.kinematics.many_points import volume_sample, volumetric_error
 
 # SINUMERIK CEC tables: the sum of a set, and angular errors as products of two tables.
 #
-# Sources: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245, 248, 249, 252 (boring mill example).
+# Source: SINUMERIK 840D sl / 828D Extended Functions, chapter K3, 03/2013, p. 245, 248, 249, 252 (boring mill example).
 # A table whose MULT_BY_TABLE names another table adds the product of both interpolated values to its output axis. The
 # available documents do not say whether the direct terms of both tables stay; the modes S1 to S4 are the four readings.
 #
@@ -365,7 +365,7 @@ _NAMED_FROM_MM = 0.01 * MM_PER_UM
 
 @dataclass(frozen=True)
 class Choice:
-    """Terms that the tables can hold, and the others.
+    """Terms that fit in the tables, and the rest.
 
     Parameters
     ----------
@@ -385,7 +385,7 @@ class Choice:
     given: tuple[Term, ...] = ()
 
     def statements(self) -> list[str]:
-        """Say what is left out, largest first; nothing if there is room for everything."""
+        """Say what is left out, largest first; empty if everything fits."""
         if not self.dropped:
             return []
         return [

@@ -67,11 +67,11 @@ class SiemensEec(Controller[EecSettings, EecTables]):
 
     @classmethod
     def check_settings(cls, settings: EecSettings, section: Section, machine: Machine) -> EecSettings:
-        """Fill in what follows from the model, and the measuring systems used for position control."""
+        """Complete the settings from the model, and set the measuring systems used for position control."""
         return checked_encoder_settings(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node."""
+        """Return the terms X(x), Y(y), Z(z), zero at the reference point, which is a node of each."""
         return eec_terms(self.machine, self.settings, errors)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> EecTables:

@@ -491,7 +491,7 @@ def cec_usage(machine: Machine, tables: CecMap, settings: CecSettings) -> list[U
 Sums = Sequence[tuple[float, tuple[float, float, float]]]
 
 
-#: A jump of an axis at switch-on below this is not worth a warning.
+#: Smallest jump of an axis at switch-on that gives a warning.
 NOTICEABLE_JUMP_MM = 5e-4
 
 

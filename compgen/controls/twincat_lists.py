@@ -219,7 +219,7 @@ def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> Flo
 _SPACED_INDEX = re.compile(r"\[\s{0,9}([0-9]{1,6})\s{0,9}\]")
 _KEY = re.compile(r"([a-z0-9_]{1,20})\.([a-z0-9_.]{1,60})((?:\[[0-9]{1,6}\]){0,2})(?:\.([a-z0-9_]{1,30}))?")
 _SWITCHES = ("max_points", "manual_activation")
-#: Parameters of each structure; in ``_TABLES`` those of its table, with the number of their indices.
+#: Parameters of each structure; ``_TABLES`` has the parameters of its table and how many indices they have.
 _KNOWN: dict[str, tuple[str, ...]] = {
     "kopf": ("achs_nr", "log_achs_nr", "log_achs_name"),
     "kw.ssfk": ("unit", "interval", "kw_startpos", "kw_nr_max", "bilateral", "modulo", *_SWITCHES),
