@@ -1,4 +1,4 @@
-"""The effects that a machine file switches on: ``[effects.NAME]`` with parameters and settings by name.
+"""The effects enabled in a machine file: ``[effects.NAME]`` with parameters and settings by name.
 
     [effects.backlash_X]
     c_um = 4.1
@@ -6,8 +6,8 @@
     c_um_per_k = 2.7
     reference_c = 21.5
 
-:func:`active_effects` reads the sections, :func:`effects_reversal` and :func:`advice_of_effects` say what of them tables can
-hold and what not.
+:func:`active_effects` reads the sections; :func:`effects_reversal` returns what tables can contain of the effects,
+:func:`advice_of_effects` what they cannot.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class ActiveEffect:
         return self.effect.card.name
 
     def change_mm(self, readings: Readings) -> FloatArray | None:
-        """What the effect adds to each reading, (n,), mm; None where the readings lack a covariate."""
+        """What the effect adds to each reading, (n,), mm; None if the readings lack a covariate."""
         columns = self.effect.columns(readings)
         return None if columns is None else columns @ self.values
 
     def displacement_mm(self, readings: Readings) -> FloatArray | None:
-        """How the effect moves the tip, (n, 3), mm; None if it does not, or where a covariate is missing."""
+        """Displacement of the tip by the effect, (n, 3), mm; None if it does not move the tip or lacks a covariate."""
         if not isinstance(self.effect, DisplacementEffect):
             return None
         moved = self.effect.displacement(readings)
@@ -74,7 +74,7 @@ def active_effects(machine: Machine) -> tuple[ActiveEffect, ...]:
     Raises
     ------
     InputError
-        with file, line and key for an effect, a parameter or a setting that is not known, or that is missing.
+        with file, line and key, for an effect, a parameter or a setting that is unknown or missing.
     """
     if not machine.effects:
         return ()
@@ -88,7 +88,7 @@ def active_effects(machine: Machine) -> tuple[ActiveEffect, ...]:
 
 
 def dead_path_stations(keys: Iterable[str]) -> list[str]:
-    """Return the names of the stations in the parameters of a dead path."""
+    """Return the station names in the parameters of a dead path."""
     return [match.group(1) for key in keys if (match := _DEAD_PATH_KEY.fullmatch(key))]
 
 
@@ -115,7 +115,7 @@ def _degree(value: Any) -> int:
     return toml_files.whole(1, 12)(int(value) if isinstance(value, float) and value.is_integer() else value)
 
 
-#: Checks of settings that may not be any number.
+#: Checks of settings that accept only some numbers.
 _SETTING_CHECKS: Mapping[str, Callable[[Any], float]] = {"degree": _degree}
 
 
@@ -140,7 +140,7 @@ def keys_schema(effect: Effect, **more: toml_files.Schema) -> dict[str, Any]:
 
 
 def station_pattern(name: str) -> str:
-    """Return the pattern of a name in which :data:`ANY_STATION` is the name of a station."""
+    """Return the regular expression of a name in which :data:`ANY_STATION` is the name of a station."""
     return "^" + re.escape(name).replace(re.escape(ANY_STATION), ".+") + "$"
 
 
@@ -153,9 +153,9 @@ def effects_schema() -> dict[str, Any]:
 
 
 def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, FloatArray]:
-    """Take settings and parameters of an effect from a section; return it with its settings, and the values in SI.
+    """Read settings and parameters of an effect from a section; return it with its settings, and the values in SI.
 
-    Parameters that are not given are zero, but one has to be.
+    Parameters that are not given are zero; at least one must be given.
     """
     settings: dict[str, float] = {}
     for setting in effect.card.settings:
@@ -178,7 +178,7 @@ def read_values(effect: Effect, section: toml_files.Section) -> tuple[Effect, Fl
 
 
 def displacement_of(effects: Sequence[ActiveEffect], readings: Readings) -> tuple[FloatArray, list[str]]:
-    """Return how effects move the tip, (n, 3), mm, and the names of those for which the readings lack a covariate."""
+    """Return the displacement of the tip by effects, (n, 3), mm, and the names of effects that lack a covariate."""
     total, missing = np.zeros((len(readings), 3)), []
     for active in effects:
         moved = active.displacement_mm(readings)
@@ -192,8 +192,8 @@ def displacement_of(effects: Sequence[ActiveEffect], readings: Readings) -> tupl
 def section_text(effect: Effect, readings: Readings, values: FloatArray) -> str:
     """Return the ``[effects.NAME]`` section of a machine file for parameters in SI units (k,).
 
-    Settings that follow from the readings (the mean temperature) are written with them, so that the section means the
-    same for other readings.
+    Settings that follow from the readings (the mean temperature) are written too: the section then means the same for
+    other readings.
     """
     name = effect.card.name
     quoted = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else f'"{name}"'
@@ -205,7 +205,7 @@ def section_text(effect: Effect, readings: Readings, values: FloatArray) -> str:
     return "\n".join(lines) + "\n"
 
 
-# What a control can carry of the effects of a machine file: reversal in tables, the rest as advice.
+# What a control can compensate of the effects of a machine file: reversal in tables, the rest as advice.
 
 
 #: Positions of a reversal that varies along the stroke.
@@ -223,10 +223,10 @@ ADVICE = {
 
 
 def effects_reversal(machine: Machine, only: Container[str] | None = None) -> ReversalCurves | None:
-    """Return the reversal of the backlash and lost motion of a machine file; None if it has neither.
+    """Return the reversal due to the backlash and lost motion of a machine file; None if it has neither.
 
-    ``only`` takes effects of some names. The effects move the tip by c dir; the reversal value of ISO 230-2 is the
-    difference of both directions, 2 c.
+    ``only`` selects effects by name. The effects move the tip by c dir; the reversal value of ISO 230-2 is the
+    difference between the two directions, 2 c.
     """
     curves: dict[tuple[int, int], Curve] = {}
     for active in active_effects(machine):
@@ -250,7 +250,7 @@ def _curve(machine: Machine, active: ActiveEffect) -> Curve:
 
 
 def added(first: Curve | None, second: Curve) -> Curve:
-    """Sum of two curves at the positions of both; a curve of one position is constant."""
+    """Sum of two curves at the positions of both; a curve with one position is constant."""
     if first is None:
         return second
     many = [curve.position_mm for curve in (first, second) if len(curve.position_mm) > 1]
@@ -267,7 +267,7 @@ def _u_at(curve: Curve, position_mm: FloatArray) -> FloatArray:
 def with_effects_reversal(
     machine: Machine, found: ReversalCurves | None, taken_out: Container[str]
 ) -> ReversalCurves | None:
-    """Return a reversal found in readings together with those effects of the machine file that were ``taken_out``."""
+    """Return a reversal found in readings plus those effects of the machine file that were ``taken_out``."""
     own = effects_reversal(machine, taken_out)
     if own is None or found is None:
         return found or own
@@ -278,7 +278,7 @@ def with_effects_reversal(
 
 
 def advice_of_effects(machine: Machine) -> list[str]:
-    """Return what the user has to set for effects of the machine file that no table holds, one sentence each."""
+    """Return what the user has to set for effects of the machine file that no table covers, one sentence each."""
     found = []
     for active in active_effects(machine):
         if isinstance(active.effect, Backlash | LostMotion):

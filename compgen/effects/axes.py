@@ -1,6 +1,6 @@
-"""Effects of single axes: heat, backlash, lost motion, periodic errors, lag, cosine error; changes within a session of runs.
+"""Effects of single axes: heat, backlash, lost motion, periodic errors, lag, cosine error; changes during axis runs.
 
-The card of a class is a template: ``{A}`` and ``{a}`` are replaced by the letter of the axis.
+The card of a class is a template: ``{A}`` and ``{a}`` are replaced by the axis letter.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from compgen.effects.base import (
 )
 from compgen.effects.readings import Readings, legendre, velocity_mm_s
 
-# Growth of the scale of an axis with its temperature, about the point where the scale is fixed.
+# Thermal expansion of an axis scale, about the point where the scale is fixed.
 
 
 class ThermalScale(SingleAxisEffect):
@@ -48,7 +48,7 @@ class ThermalScale(SingleAxisEffect):
     )
 
     def candidates(self, readings: Readings) -> Sequence[float]:
-        """Where scales are fixed: at the reference point, in the middle, at either end, at zero of the axis."""
+        """Usual fixed points of scales: reference point, middle, either end, axis zero."""
         low, high = readings.machine.axes[self.axis].range_mm
         reference = readings.machine.reference_point_mm[self.axis]
         return list(dict.fromkeys((reference, 0.5 * (low + high), low, high, 0.0)))
@@ -65,7 +65,7 @@ class ThermalScale(SingleAxisEffect):
         return along(self.axis, (readings.position_mm[:, self.axis] - self.used(readings)["fixed_mm"]) * warm)
 
 
-# Displacement of the tool by a warm spindle or column, proportional to the temperature of the spindle.
+# Displacement of the tool by a warm spindle or column, proportional to the spindle temperature.
 
 
 class SpindleGrowth(SingleAxisEffect):
@@ -90,7 +90,7 @@ class SpindleGrowth(SingleAxisEffect):
         return None if warm is None else along(self.axis, warm)
 
 
-# Backlash: an axis stays behind by half its play, to the other side after each reversal.
+# Backlash: an axis lags by half its play, on the other side after each reversal.
 
 
 class Backlash(SingleAxisEffect):
@@ -108,13 +108,13 @@ class Backlash(SingleAxisEffect):
     )
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Unit displacement along the axis, signed by the last direction of travel."""
+        """Unit displacement along the axis, with the sign of the last direction of travel."""
         if readings.approach is None or not np.any(readings.approach[:, self.axis]):
             return None
         return along(self.axis, readings.approach[:, self.axis])
 
 
-# Lost motion that varies along the stroke: worn screws, wind-up that grows with the free length.
+# Lost motion that varies along the travel: worn screws, wind-up that grows with the free length.
 
 
 class LostMotion(SingleAxisEffect):
@@ -135,7 +135,7 @@ class LostMotion(SingleAxisEffect):
     )
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """First and second Legendre polynomial, signed by the last direction of travel."""
+        """First and second Legendre polynomial, with the sign of the last direction of travel."""
         if readings.approach is None or not np.any(readings.approach[:, self.axis]):
             return None
         shape = legendre(readings.normalised(self.axis), range(1, 3))
@@ -145,7 +145,7 @@ class LostMotion(SingleAxisEffect):
 # Periodic errors of a screw or an encoder: first and second harmonic of the pitch.
 
 
-#: Nominal leads of ball screws in mm (ISO 3408-2, table 1, and usual ones besides): tried where no pitch is known.
+#: Nominal leads of ball screws in mm (ISO 3408-2, table 1, and other common ones): tried if no pitch is known.
 LEADS_MM = (4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 12.5, 15.0, 16.0, 20.0, 24.0, 25.0, 30.0, 32.0, 40.0, 50.0)
 
 
@@ -173,11 +173,11 @@ class Periodic(SingleAxisEffect):
     )
 
     def pitch_mm(self, machine: Machine) -> float | None:
-        """Pitch in mm: the setting, else that of the machine file; None if neither is known."""
+        """Pitch in mm: from the setting, else from the machine file; None if neither is known."""
         return self.settings.get("pitch_mm", machine.axes[self.axis].screw_pitch_mm)
 
     def candidates(self, readings: Readings) -> Sequence[float]:
-        """Usual leads, where the machine file does not give the pitch."""
+        """Common leads, if the machine file does not give the pitch."""
         if self.pitch_mm(readings.machine) is not None:
             return ()
         return [lead for lead in LEADS_MM if lead < readings.machine.axes[self.axis].length_mm / 6.0]
@@ -188,7 +188,7 @@ class Periodic(SingleAxisEffect):
         return {} if pitch_mm is None else {"pitch_mm": pitch_mm}
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Sine and cosine of the angle of the screw and of twice that angle."""
+        """Sine and cosine of the screw angle and of twice that angle."""
         pitch_mm = self.pitch_mm(readings.machine)
         if pitch_mm is None:
             return None
@@ -197,7 +197,7 @@ class Periodic(SingleAxisEffect):
         return along(self.axis, np.column_stack(waves))
 
 
-# Servo lag: the axis follows its command a time behind it, by more the faster it moves.
+# Servo lag: the axis follows its command with a time delay, so its error grows with velocity.
 
 
 class ServoLag(SingleAxisEffect):
@@ -222,7 +222,7 @@ class ServoLag(SingleAxisEffect):
         return along(self.axis, velocity[:, self.axis])
 
 
-# Cosine error: a scale or a beam that leans against the axis measures too long a way.
+# Cosine error: a scale or a beam misaligned with the axis measures too long a distance.
 
 
 class CosineError(SingleAxisEffect):
@@ -244,9 +244,9 @@ class CosineError(SingleAxisEffect):
         return along(self.axis, -readings.position_mm[:, self.axis])
 
 
-# What changes within a session of axis runs: drift, a step, a bad run, disturbed readings, an axis that has not settled.
+# Changes during a session of axis runs: drift, a step, a bad run, disturbed readings, an axis that has not settled.
 #
-# Time is ``time_s`` where it was logged, else the number of the reading in the order of time.
+# Time is ``time_s`` if it was logged, else the number of the reading in chronological order.
 
 #: Number of time constants that are tried.
 STEPS = 64
@@ -261,7 +261,7 @@ _WINDOW = (
 
 
 def time_of(readings: Readings) -> FloatArray:
-    """Time in s, else the number of the reading in the order of time, else that of the row, (n,)."""
+    """Time in s, else the number of the reading in chronological order, else the row number, (n,)."""
     for name in ("time_s", "order"):
         logged = readings.covariate(name)
         if logged is not None and np.ptp(logged) > 0.0:
@@ -270,13 +270,13 @@ def time_of(readings: Readings) -> FloatArray:
 
 
 def number_of(readings: Readings) -> FloatArray:
-    """Number of each reading in the order of time, else its time, (n,)."""
+    """Number of each reading in chronological order, else its time, (n,)."""
     number = readings.covariate("order")
     return time_of(readings) if number is None else number
 
 
 class WarmupDrift(Effect):
-    """d = c (1 - exp(-(t - t0) / tau)); t is the time, or the number of the reading where no time was logged."""
+    """d = c (1 - exp(-(t - t0) / tau)); t is the time, or the number of the reading if no time was logged."""
 
     def __init__(self) -> None:
         self.card = Card(
@@ -310,7 +310,7 @@ class WarmupDrift(Effect):
         return {"start": float(time_of(readings).min()), **self.settings}
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """Share of the drift that has come; None without a time constant."""
+        """Fraction of the drift reached; None without a time constant."""
         if "tau" not in self.settings or not len(readings):
             return None
         since = time_of(readings) - self.used(readings)["start"]
@@ -344,7 +344,7 @@ class LinearDrift(Effect):
         return {"start": float(time.min()), "span": float(np.ptp(time)), **self.settings}
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """Share of the span that has passed; None for readings of one time."""
+        """Fraction of the span elapsed; None if all readings have the same time."""
         if not len(readings) or np.ptp(time_of(readings)) == 0.0:
             return None
         used = self.used(readings)
@@ -370,7 +370,7 @@ class StepBetweenRuns(Effect):
         )
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """One from the step on; None where it is not placed."""
+        """One from the step on; None if the step has no position."""
         if "at" not in self.settings:
             return None
         return np.asarray((number_of(readings) >= self.settings["at"])[:, None] * 1.0)
@@ -380,7 +380,7 @@ class _Window(Effect):
     """d = c from the reading ``first`` to the reading ``last``."""
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """One within the window; None where it is not placed."""
+        """One within the window; None if the window has no position."""
         if not {"first", "last"} <= self.settings.keys():
             return None
         number = number_of(readings)
@@ -389,7 +389,7 @@ class _Window(Effect):
 
 
 class BadRun(_Window):
-    """One run, or one way of it, that is off against all others."""
+    """One run, or one direction of it, that deviates from all others."""
 
     def __init__(self) -> None:
         self.card = Card(
@@ -407,7 +407,7 @@ class BadRun(_Window):
 
 
 class DisturbedReadings(_Window):
-    """A short burst of readings that are off."""
+    """A short burst of deviating readings."""
 
     def __init__(self) -> None:
         self.card = Card(
@@ -425,7 +425,7 @@ class DisturbedReadings(_Window):
 
 
 class Settling(DisplacementEffect):
-    """d_a = c dir_a exp(-dwell / tau): the axis creeps on after it has stopped; readings with a short dwell are early."""
+    """d_a = c dir_a exp(-dwell / tau): the axis creeps after stopping; readings after a short dwell are too early."""
 
     def __init__(self, axis: int) -> None:
         letter = AXES[axis]
@@ -445,12 +445,12 @@ class Settling(DisplacementEffect):
         )
 
     def positions(self, readings: Readings) -> Sequence[float]:
-        """Time constants, if dwells differ."""
+        """Time constants, if dwell times differ."""
         dwell = readings.covariate("dwell_s")
         return () if "tau_s" in self.settings or dwell is None or np.ptp(dwell) == 0.0 else SETTLING_S
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """What is still missing, signed by the direction of travel; None without dwells or a time constant."""
+        """Remaining creep, with the sign of the direction of travel; None without dwell times or a time constant."""
         dwell = readings.covariate("dwell_s")
         if dwell is None or readings.approach is None or "tau_s" not in self.settings:
             return None

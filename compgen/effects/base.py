@@ -1,7 +1,7 @@
-"""What an effect of the catalogue is: an equation, what it depends on, its parameters, and what it may be confused with.
+"""Definition of an effect of the catalogue: equation, covariates, parameters, and effects it may be confused with.
 
-An effect is linear in its parameters once its settings (the time of a step, a pitch) are chosen. It knows one thing:
-how much each reading changes per unit of each parameter.
+An effect is linear in its parameters once its settings (the time of a step, a pitch) are chosen. It knows only how much
+each reading changes per unit of each parameter.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.effects.readings import Readings
 
-#: Placeholder for the name of a station where the catalogue is listed without a measurement.
+#: Placeholder for a station name when the catalogue is listed without a measurement.
 ANY_STATION = "<station>"
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter: ``name`` ends in its unit (``c_um``); ``si_per_unit`` leads to mm, rad, K, s.
+    """One parameter: ``name`` ends in its unit (``c_um``); ``si_per_unit`` converts to mm, rad, K, s.
 
-    ``plausible`` is the largest size, in the unit of the name, that the effect has on real machines.
+    ``plausible`` is the largest magnitude on real machines, in the unit of the name.
     """
 
     name: str
@@ -38,9 +38,9 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Setting:
-    """A number that an effect is not linear in: the time of a step, a pitch, the temperature that counts as zero.
+    """A number in which an effect is not linear: the time of a step, a pitch, the reference temperature.
 
-    ``needed`` says that nothing takes its place where it is not given; the mean of the covariate ``mean_of`` does.
+    ``needed``: there is no default. ``mean_of``: the default is the mean of this covariate.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Setting:
 
 
 def reference_of(covariate: str) -> Setting:
-    """Return the setting of the temperature at which an effect is zero."""
+    """Return the setting for the temperature at which an effect is zero."""
     return Setting(
         "reference_c", "temperature that counts as zero; default: the mean of the readings", mean_of=covariate
     )
@@ -63,17 +63,17 @@ class Card:
     Parameters
     ----------
     name : e.g. ``"backlash_X"``.
-    title : in words.
+    title : name in words.
     equation : the equation, as text.
     source : where it comes from.
-    covariates : columns that it needs.
+    covariates : required columns.
     parameters : its free parameters.
     aliases : effects that data may confuse with it.
-    breaker : the smallest further measurement that separates them.
-    kinds : the kinds of readings in which it can show; ``noise`` for what is found in the residuals alone.
-    settings : numbers that it is not linear in; a machine file may give them.
-    scan : the setting that the data are searched for, empty if there is none.
-    slow : whether it changes with time or temperature only slowly, so that drifting noise resembles it.
+    breaker : the smallest additional measurement that separates them.
+    kinds : the kinds of readings in which it can show; ``noise`` if it shows only in the residuals.
+    settings : numbers in which it is not linear; a machine file may give them.
+    scan : the setting that is searched for in the data, empty if there is none.
+    slow : whether it changes only slowly with time or temperature, so drifting noise resembles it.
     """
 
     name: str
@@ -90,7 +90,7 @@ class Card:
     slow: bool = False
 
     def named(self, **words: str) -> Card:
-        """Return the card with ``words`` for their names in braces, in all of its texts."""
+        """Return the card with names in braces replaced by ``words`` in all its texts."""
 
         def said(value: Any) -> Any:
             if isinstance(value, str):
@@ -105,21 +105,21 @@ class Card:
 
 
 class Effect(ABC):
-    """One effect of the catalogue; ``settings`` holds those that are chosen."""
+    """One effect of the catalogue; ``settings`` contains the chosen ones."""
 
     card: Card
     settings: Mapping[str, float] = MappingProxyType({})
 
     @abstractmethod
     def columns(self, readings: Readings) -> FloatArray | None:
-        """Change of every reading in mm per SI unit of every parameter, (n, k); None where a covariate is missing."""
+        """Change of every reading in mm per SI unit of every parameter, (n, k); None if a covariate is missing."""
 
     def positions(self, readings: Readings) -> Sequence[float]:
-        """Scan positions (e.g. times of a step) that the data leave open; empty if there is nothing to scan."""
+        """Scan positions (e.g. times of a step) to be tried; empty if there is nothing to scan."""
         return () if self.card.scan in self.settings else self.candidates(readings)
 
     def candidates(self, readings: Readings) -> Sequence[float]:
-        """Scan positions where the setting is not chosen."""
+        """Scan positions if the setting is not chosen."""
         return ()
 
     def at(self, position: float) -> Self:
@@ -135,11 +135,11 @@ class Effect(ABC):
         return chosen
 
     def used(self, readings: Readings) -> dict[str, float]:
-        """Settings that hold for these readings, chosen or following from them: what a machine file has to keep."""
+        """Settings for these readings, chosen or derived from them: what a machine file has to contain."""
         return {**self.defaults(readings), **self.settings}
 
     def defaults(self, readings: Readings) -> dict[str, float]:
-        """Settings that follow from the readings: the mean of a covariate where it counts as zero."""
+        """Settings derived from the readings: the mean of a covariate as its zero."""
         means = (
             (setting.name, readings.covariate(setting.mean_of)) for setting in self.card.settings if setting.mean_of
         )
@@ -151,16 +151,16 @@ class DisplacementEffect(Effect):
 
     @abstractmethod
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Displacement of the tip in mm per SI unit of every parameter, (n, 3, k); None where a covariate is missing."""
+        """Displacement of the tip in mm per SI unit of every parameter, (n, 3, k); None if a covariate is missing."""
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """Contract the displacement with the direction of each reading."""
+        """Project the displacement on the direction of each reading."""
         moved = self.displacement(readings)
         return None if moved is None else np.asarray(np.einsum("nd,ndk->nk", readings.direction, moved))
 
 
 class SingleAxisEffect(DisplacementEffect):
-    """An effect of one axis; its ``template`` is its card with ``{A}`` and ``{a}`` for the letter of the axis."""
+    """An effect of one axis; its ``template`` is its card with ``{A}`` and ``{a}`` for the axis letter."""
 
     template: ClassVar[Card]
 
@@ -186,34 +186,34 @@ def along(axis: int, columns: FloatArray) -> FloatArray:
 
 
 class Family(ABC):
-    """Effects of one equation: one for each axis, station or channel."""
+    """Effects with the same equation: one for each axis, station or channel."""
 
     name: str
 
     @abstractmethod
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """Return the effects of this family; ``stations`` are the names of the stations of the measurement."""
+        """Return the effects of this family; ``stations`` are the station names of the measurement."""
 
 
 class Single(Family):
-    """A family of one; ``make`` returns it."""
+    """A family with one effect; ``make`` returns it."""
 
     def __init__(self, name: str, make: Callable[[], Effect]) -> None:
         self.name, self._make = name, make
 
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """The one effect."""
+        """The only effect."""
         return [self._make()]
 
 
 class PerName(Family):
-    """One effect for each of some fixed names (of errors, of classes); ``make`` takes the name."""
+    """One effect for each of several fixed names (of errors, of classes); ``make`` takes the name."""
 
     def __init__(self, name: str, names: Sequence[str], make: Callable[[str], Effect]) -> None:
         self.name, self._names, self._make = name, tuple(names), make
 
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """Those of the names, in their order."""
+        """The effects of the names, in their order."""
         return [self._make(name) for name in self._names]
 
 
@@ -231,7 +231,7 @@ class PerStation(Family):
         self.name, self._make = name, make
 
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """Those of the stations."""
+        """The effects of the stations."""
         return [self._make(station) for station in stations]
 
 
@@ -242,5 +242,5 @@ class AllStations(Family):
         self.name, self._make = name, make
 
     def members(self, stations: Sequence[str]) -> Sequence[Effect]:
-        """The one effect; none without stations."""
+        """The only effect; none without stations."""
         return [self._make(tuple(stations))] if stations else []

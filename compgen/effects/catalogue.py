@@ -1,7 +1,7 @@
-"""The catalogue of effects: every family, advice, and which effects readings can tell apart.
+"""The catalogue of effects: all families, advice, and which effects readings can separate.
 
-:func:`catalogue` lists the effects, :func:`what_to_do` says what helps against each, and :func:`visible_parts` what a set of
-readings shows of each effect besides the geometric errors.
+:func:`catalogue` lists the effects, :func:`what_to_do` gives the remedy for each, and :func:`visible_parts` what a set
+of readings shows of each effect in addition to the geometric errors.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from compgen.effects.structure import (
     ToolOffsetError,
 )
 
-# The registry of the catalogue: every family of effects in the order in which it is listed.
+# The registry of the catalogue: every family of effects, in listing order.
 
 
 _BUILT_IN: tuple[Family, ...] = (
@@ -100,12 +100,12 @@ _BUILT_IN: tuple[Family, ...] = (
     ListedEffects("sixdof", sixdof_cards()),
 )
 
-#: Every family by its name; plug-ins add to it.
+#: Every family by name; plug-ins add to it.
 FAMILIES: dict[str, Family] = {family.name: family for family in _BUILT_IN}
 
 
 def catalogue(stations: Sequence[str] = ()) -> dict[str, Effect]:
-    """Return every effect by its name; those of single stations for ``stations``."""
+    """Return every effect by name; effects of single stations for ``stations``."""
     members = [effect for family in FAMILIES.values() for effect in family.members(stations)]
     return {effect.card.name: effect for effect in members}
 
@@ -115,17 +115,17 @@ def listed() -> dict[str, Effect]:
     return catalogue((ANY_STATION,))
 
 
-# What a family of effects of a plug-in must be; said when it is registered.
+# Requirements on a plug-in's family of effects, checked when it is registered.
 
 
 def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
-    """A family, or its class: its members are effects with complete cards, whose names are free."""
+    """Check a family, or its class: its members must be effects with complete cards and unused names."""
     family = thing() if isinstance(thing, type) and issubclass(thing, Family) else thing
     if not isinstance(family, Family):
         return thing, [f"{type(thing).__name__} is not a compgen.effects.Family"]
     try:
         members = list(family.members((ANY_STATION,)))
-    except Exception as error:  # code of others
+    except Exception as error:  # third-party code
         return family, [f"its members cannot be listed: {type(error).__name__}: {error}"]
     taken = set(listed())
     problems = [] if members else ["it has no members"]
@@ -144,7 +144,7 @@ def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
     return family, problems
 
 
-# What to do about each effect of the catalogue, a sentence for the person at the machine.
+# What to do about each effect of the catalogue: one sentence for the machine operator.
 
 
 #: By family: the name of the effect without the axis, station or error at its end.
@@ -210,7 +210,7 @@ WHAT_TO_DO = {
 
 
 def what_to_do(card: Card) -> str:
-    """Return what to do about an effect; for one of a plug-in without such a sentence, what to measure next."""
+    """Return what to do about an effect; for a plug-in's effect without such a sentence, what to measure next."""
     name = card.name
     while name:
         if name in WHAT_TO_DO:
@@ -219,17 +219,17 @@ def what_to_do(card: Card) -> str:
     return f"measure next: {card.breaker}" if card.breaker else "measure again, every line at least twice"
 
 
-# What a set of readings can see of each effect: the part that errors, stations and dead lengths cannot imitate.
+# What a set of readings shows of each effect: the part that errors, stations and dead lengths cannot imitate.
 #
 # For the base Jacobian J and the columns G of an effect, the visible part is (I - Q Q') G with Q an orthonormal basis of J
-# (Frisch-Waugh-Lovell). Everything here follows from the Gram matrix of [J, G1, G2, ...], which can be summed up in pieces.
+# (Frisch-Waugh-Lovell). All follows from the Gram matrix of [J, G1, G2, ...], which can be summed over blocks of data.
 
 
 #: Eigenvalue of a Gram matrix with unit diagonal below which a direction counts as absent.
 ZERO = 1e-10
-#: Visible share of a direction, squared, below which it is left out of comparisons.
+#: Visible fraction of a direction, squared, below which it is excluded from comparisons.
 SEEN = 1e-4
-#: An effect whose visible fraction is below this can not be confirmed.
+#: An effect whose visible fraction is below this cannot be confirmed.
 INVISIBLE = 0.05
 #: Canonical correlation above which two effects cannot be told apart in practice.
 ALIKE = 0.9
@@ -241,9 +241,9 @@ class VisiblePart:
 
     Parameters
     ----------
-    fraction : root mean square over its directions of the share that is left after projection, 0 ... 1.
-    least, most : share of the least and of the most visible direction.
-    basis : orthonormal visible directions in terms of all columns of effects, (columns, r).
+    fraction : root mean square over its directions of the fraction left after projection, 0 ... 1.
+    least, most : fraction of the least and of the most visible direction.
+    basis : orthonormal visible directions in terms of all effect columns, (columns, r).
     """
 
     fraction: float
@@ -254,7 +254,7 @@ class VisiblePart:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two effects that look alike: largest canonical correlation, and how many directions exceed 0.9 of how many."""
+    """Two similar effects: largest canonical correlation, number of directions above 0.9, number of directions."""
 
     names: tuple[str, str]
     correlation: float
@@ -263,7 +263,7 @@ class Pair:
 
 
 def projected_gram(gram: FloatArray, base: int) -> FloatArray:
-    """Gram matrix of the effects' columns less what the first ``base`` columns can imitate."""
+    """Gram matrix of the effects' columns minus what the first ``base`` columns can imitate."""
     scale = np.sqrt(np.maximum(np.diagonal(gram), np.finfo(float).tiny))
     unit = gram / scale[:, None] / scale
     values, vectors = np.linalg.eigh(unit[:base, :base])
@@ -300,7 +300,7 @@ def _part(own: FloatArray, seen: FloatArray, where: slice) -> VisiblePart:
 
 
 def alike_pairs(gram: FloatArray, base: int, parts: Mapping[str, VisiblePart]) -> list[Pair]:
-    """Return the pairs of visible effects with a canonical correlation above 0.9, the most alike first."""
+    """Return the pairs of visible effects with a canonical correlation above 0.9, the most similar first."""
     seen = projected_gram(gram, base)
     names = [name for name, part in parts.items() if part.basis.shape[1]]
     found = []
@@ -315,7 +315,7 @@ def alike_pairs(gram: FloatArray, base: int, parts: Mapping[str, VisiblePart]) -
 
 
 def separating(first: Card, second: Card) -> str:
-    """The smallest further measurement that separates two effects, from the card that names the other one."""
+    """The smallest additional measurement that separates two effects, from the card that names the other one."""
     for card, other in ((first, second), (second, first)):
         if any(other.name.startswith(alias) for alias in card.aliases) and card.breaker:
             return card.breaker

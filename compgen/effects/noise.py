@@ -1,4 +1,4 @@
-"""What shows in the noise of the readings, not in their mean: found by tests of the residuals, without columns."""
+"""Effects that show in the noise of the readings, not in their mean: found by tests of the residuals, no columns."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from compgen.effects.readings import Readings
 
 
 class NoiseClass(Effect):
-    """A class of noise; it has a card and no columns."""
+    """A class of noise; it has a card but no columns."""
 
     def __init__(self, card: Card) -> None:
         self.card = card
@@ -27,7 +27,7 @@ def _card(name: str, title: str, equation: str, covariates: tuple[str, ...], bre
 
 
 def noise_cards() -> list[Card]:
-    """Cards of the classes of noise."""
+    """Cards of the noise classes."""
     cards = [
         _card(
             "outliers", "Gross errors of single readings", "readings far outside the rest", (), "measure these again"
@@ -69,11 +69,11 @@ def noise_cards() -> list[Card]:
 
 
 class ListedEffects(Family):
-    """Effects that are listed and have no columns: classes of noise, and what shows in the signals of an instrument alone."""
+    """Listed effects without columns: noise classes, and what shows only in the signals of an instrument."""
 
     def __init__(self, name: str, cards: Sequence[Card]) -> None:
         self.name, self._cards = name, tuple(cards)
 
     def members(self, stations: object) -> list[Effect]:
-        """One for each card."""
+        """One effect per card."""
         return [NoiseClass(card) for card in self._cards]

@@ -1,6 +1,6 @@
-"""Effects of tracers and lasers on the lengths themselves, and the list of those of the six-DOF instrument.
+"""Effects of tracers and lasers on the measured lengths, and the list of effects of the six-DOF instrument.
 
-Effects on lengths give the change of each reading; they do not move the tool tip.
+Effects on lengths change each reading; they do not move the tool tip.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from compgen.data.names import MM_PER_UM, SECONDS_PER_HOUR
 from compgen.effects.base import Card, Effect, Parameter, Setting, reference_of, vector_parameters
 from compgen.effects.readings import Readings, step_times_s
 
-# Lengths that follow the air temperature: a wavelength that was not compensated, or compensated wrongly.
+# Lengths that follow the air temperature: a wavelength that was not, or wrongly, compensated.
 
 
 class RefractiveIndex(Effect):
@@ -41,7 +41,7 @@ class RefractiveIndex(Effect):
         return None if warm is None else (readings.range_mm * warm)[:, None]
 
 
-# Dead path of the interferometers: a part of the beam in air that no compensation reaches.
+# Dead path of the interferometers: a part of the beam path in air that is not compensated.
 
 
 class DeadPath(Effect):
@@ -67,14 +67,14 @@ class DeadPath(Effect):
         )
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """The air temperature, a column for each station."""
+        """The air temperature, one column per station."""
         warm = readings.temperature_k("ambient", self.settings.get("reference_c"))
         if warm is None:
             return None
         return np.column_stack([np.where(readings.is_from(name), warm, 0.0) for name in self.stations])
 
 
-# A scale error of the lengths that all stations share: the wavelength of the laser, a wrong pressure.
+# A scale error of the lengths, common to all stations: laser wavelength, a wrong air pressure.
 
 
 class LaserScale(Effect):
@@ -97,11 +97,11 @@ class LaserScale(Effect):
         return readings.range_mm[:, None]
 
 
-# A tracer that moves steadily while it measures.
+# A tracer that moves at constant velocity while it measures.
 
 
 class StationEffect(Effect):
-    """An effect on the lengths of one station; its ``template`` is its card with ``{station}`` for the name."""
+    """An effect on the lengths of one station; its ``template`` is its card with ``{station}`` for the station name."""
 
     template: ClassVar[Card]
 
@@ -138,7 +138,7 @@ class StationDrift(StationEffect):
         return np.asarray(-readings.direction * since_s[:, None])
 
 
-# A step in the lengths of one station: a beam that was broken and found again with other counts.
+# A step in the lengths of one station: an interrupted beam that was re-acquired with a different count.
 
 
 class LengthStep(StationEffect):
@@ -164,7 +164,7 @@ class LengthStep(StationEffect):
         return step_times_s(readings, readings.is_from(self.station))
 
     def columns(self, readings: Readings) -> FloatArray | None:
-        """1 for the readings of the station after the step; None without a time of the step."""
+        """1 for the station's readings after the step; None without a step time."""
         own, time_s = readings.is_from(self.station), readings.covariate("time_s")
         if "time_s" not in self.settings or time_s is None or not own.any():
             return None
@@ -201,7 +201,7 @@ class TracerRunout(StationEffect):
         return np.asarray(own[:, None] * np.column_stack(waves))
 
 
-# A target whose reflection depends on the angle at which the beam comes in.
+# A target whose reflection depends on the angle of incidence of the beam.
 
 
 class TargetAngle(Effect):
@@ -228,7 +228,7 @@ class TargetAngle(Effect):
         return np.column_stack([vertical**2, vertical**3])
 
 
-# Effects of the six-DOF laser instrument; what the data of one axis can tell of them is found from its signals.
+# Effects of the six-DOF laser instrument; what the data of one axis show of them is found from its signals.
 
 
 SOURCE = "Jia et al. 2022, section 4; docs/conventions.md"

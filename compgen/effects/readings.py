@@ -1,4 +1,4 @@
-"""What effects act on: readings, the motion before each one, Legendre polynomials over the travel."""
+"""Input of the effects: readings, the motion before each one, Legendre polynomials over the travel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, SECONDS_PER_MIN
 from compgen.kinematics.first_order import tool_of
 
-# Scalar readings of the tool tip along known directions: what every effect of the catalogue acts on.
+# Scalar readings of the tool tip along known directions, on which every effect of the catalogue acts.
 #
 # Tracer lengths, measured deviations and axis runs differ in what a reading is, not in what moves the tip. A reading
 # changes by ``direction . displacement``; a length also has a station and a range.
@@ -27,22 +27,22 @@ Kind = Literal["lengths", "deviations", "axis"]
 
 @dataclass(frozen=True)
 class Readings:
-    """n scalar readings, with everything that an effect may depend on.
+    """n scalar readings, with everything an effect may depend on.
 
     Parameters
     ----------
     machine : the machine.
-    kind : what a reading is: a tracer length, one component of a deviation, or a reading of an axis run.
+    kind : type of the readings: tracer lengths, components of deviations, or readings of axis runs.
     position_mm : commanded positions, (n, 3).
-    direction : unit vectors (n, 3); a displacement d of the tip in the workpiece frame raises the reading by
+    direction : unit vectors (n, 3); a displacement d of the tip in the workpiece frame increases the reading by
         ``direction . d`` to first order.
     tool_mm : tool offset, (n, 3).
     stations : names of the stations; empty if there are none.
     station : index into ``stations``, (n,); zeros if there are none.
     range_mm : distance of the tip from the station, (n,); zeros if there is no station.
-    approach : last direction of travel of each axis, +1, -1, 0 where it is not known, (n, 3); None if none is known.
-    covariates : further numbers by column name (``time_s``, ``feed_mm_min``, ``load_kg``, ``temp_<name>_c``), each (n,).
-    labels : whole numbers by column name (line, repeat, block, setup, run, pose), each (n,).
+    approach : last direction of travel of each axis, +1, -1, 0 if unknown, (n, 3); None if none is known.
+    covariates : other values by column name (``time_s``, ``feed_mm_min``, ``load_kg``, ``temp_<name>_c``), each (n,).
+    labels : integers by column name (line, repeat, block, setup, run, pose), each (n,).
     """
 
     machine: Machine
@@ -62,7 +62,7 @@ class Readings:
         return len(self.direction)
 
     def part(self, rows: NDArray[np.int64]) -> Readings:
-        """Return some of the readings; all stations keep their number."""
+        """Return some of the readings; all stations keep their index."""
         return replace(
             self,
             position_mm=self.position_mm[rows],
@@ -81,7 +81,7 @@ class Readings:
         return None if logged is None or not np.isfinite(logged).all() else logged
 
     def temperature_k(self, name: str, reference_c: float | None = None) -> FloatArray | None:
-        """Temperature of channel ``temp_<name>_c`` less ``reference_c``, (n,); default: less its mean.
+        """Temperature of channel ``temp_<name>_c`` minus ``reference_c``, (n,); default: minus its mean.
 
         None if it was not logged for every reading, or if it never changed and no reference is given.
         """
@@ -103,7 +103,7 @@ class Readings:
 
 
 def readings_of_lengths(machine: Machine, lengths: Lengths, station_mm: FloatArray, tip_mm: FloatArray) -> Readings:
-    """Return tracer readings; ``station_mm`` and ``tip_mm`` (n, 3) are station and tip of each reading."""
+    """Return tracer readings; ``station_mm`` and ``tip_mm`` (n, 3) are station and tip position of each reading."""
     line_mm = tip_mm - station_mm
     range_mm = np.linalg.norm(line_mm, axis=1)
     return Readings(
@@ -143,7 +143,7 @@ def readings_of_deviations(machine: Machine, deviations: Deviations) -> Readings
 
 
 def readings_of_points(machine: Machine, points: Points) -> Readings:
-    """Return commanded points as readings, one each, for effects that move the tip; their direction is Z."""
+    """Return commanded points as readings, one each, for effects that move the tip; the direction is Z."""
     count = len(points)
     setup = points.covariates.get("setup")
     return Readings(
@@ -161,14 +161,14 @@ def readings_of_points(machine: Machine, points: Points) -> Readings:
     )
 
 
-# How the machine moved before each reading: runs, their beginnings, and the velocity of each axis.
+# Machine motion before each reading: runs, their starts, and the velocity of each axis.
 
 
-#: Labels whose change begins a new run of the machine.
+#: Labels whose change starts a new run of the machine.
 RUN_LABELS = ("block", "setup", "run", "line", "repeat")
 #: An axis that moves by less than this between two stops is at rest, mm.
 REST_MM = 1e-6
-#: Most scan positions in time.
+#: Largest number of scan positions in time.
 MOST_TIMES = 200
 
 
@@ -178,16 +178,16 @@ def run_of(readings: Readings) -> NDArray[np.int64] | None:
     if not present:
         return None
     run = np.zeros(len(readings), dtype=np.int64)
-    for label in present:  # one label after the other: many times faster than np.unique of rows, with the same numbers
+    for label in present:  # one label after another: many times faster than np.unique over rows, with the same numbers
         own = np.unique(label, return_inverse=True)[1]
         run = np.unique(run * (int(own.max(initial=0)) + 1) + own, return_inverse=True)[1].astype(np.int64)
     return run
 
 
 def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> list[float]:
-    """Times between runs at which something may have changed, at most 200; between stops if there is one run only.
+    """Times between runs at which something may have changed, at most 200; between stops if there is only one run.
 
-    ``rows`` (n,) takes some of the readings.
+    ``rows`` (n,) selects readings.
     """
     time_s = readings.covariate("time_s")
     if time_s is None:
@@ -209,9 +209,9 @@ def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> l
 def velocity_mm_s(readings: Readings) -> FloatArray | None:
     """Velocity of each axis on the way to each reading in mm/s, (n, 3): feed times the direction of the last motion.
 
-    The motion is that from the stop before in the same run; for the first stop of a run that to the next one. An axis
-    at rest has none. Its sign is that of the last approach where this is logged. Without runs and times: approach times
-    feed. None without a feed, or where nothing tells the direction.
+    The motion is from the previous stop in the same run; for the first stop of a run, to the next one. An axis at rest
+    has none. Its sign is the sign of the last approach if this is logged. Without runs and times: approach times feed.
+    None without a feed, or if the direction is unknown.
     """
     feed = readings.covariate("feed_mm_min")
     if feed is None:
@@ -219,7 +219,7 @@ def velocity_mm_s(readings: Readings) -> FloatArray | None:
     if run_of(readings) is None and readings.covariate("time_s") is None:
         moved = readings.approach
         return None if moved is None else np.asarray(moved * feed[:, None] / SECONDS_PER_MIN)
-    # motion from the stop before to each reading in mm, (n, 3); zero where it is the only stop of its run
+    # motion from the previous stop to each reading in mm, (n, 3); zero for the only stop of a run
     run, time_s = run_of(readings), readings.covariate("time_s")
     component = readings.direction.argmax(axis=1) if readings.kind == "deviations" else readings.station
     row = np.arange(len(readings))
@@ -231,7 +231,7 @@ def velocity_mm_s(readings: Readings) -> FloatArray | None:
     moving = np.flatnonzero((np.abs(steps).max(axis=1, initial=0.0) > REST_MM) & (np.diff(ordered) == 0))
     motion = np.zeros((len(readings), 3))
     if len(moving):
-        # the last motion before a reading, which one repeated at a stop keeps; before the first motion of a run that one
+        # the last motion before a reading, kept for repeated readings at a stop; before the first motion of a run: this
         last = np.searchsorted(moving, row, side="left") - 1
         before = (last >= 0) & (ordered[moving[np.maximum(last, 0)]] == ordered)
         taken = moving[np.minimum(np.where(before, last, last + 1), len(moving) - 1)]

@@ -1,6 +1,6 @@
 """Effects of the structure: angular errors, squareness, signs, bending, sag, droop, deflection, jumps, tool offset.
 
-Each class states its equation, its card and its displacement of the tool tip per unit of every parameter.
+Each class gives its equation, its card and its displacement of the tool tip per unit of every parameter.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from compgen.effects.base import Card, DisplacementEffect, Parameter, Setting, a
 from compgen.effects.readings import Readings, legendre, step_times_s
 from compgen.kinematics.first_order import Coefficient, c_matrix, coefficients, modelled_errors
 
-# Curves of angular errors: a polynomial over the travel of the axis, of a degree that is searched for.
+# Curves of angular errors: a polynomial over the axis travel, of a degree that is searched for.
 
 
 #: The nine angular errors.
 ANGULAR_NAMES = tuple(name for name in CURVE_NAMES if error_named(name).kind == "angular")
-#: Degrees of the curve that are tried, and the one of a card.
+#: Degrees of the curve that are tried, and the degree shown on a card.
 DEGREES = tuple(float(degree) for degree in range(1, 7))
 USUAL_DEGREE = 3
 
 
 class CurveEffect(DisplacementEffect):
-    """An effect of one angular error as sum of p_k P_k(s_a), k from ``lowest`` to the degree.
+    """An effect of one angular error as the sum of p_k P_k(s_a), k from ``lowest`` to the degree.
 
-    Its ``template`` is its card with ``{name}`` for the error, ``{A}`` and ``{a}`` for the letter of its axis.
+    Its ``template`` is its card with ``{name}`` for the error, ``{A}`` and ``{a}`` for its axis letter.
     """
 
     template: ClassVar[Card]
@@ -57,7 +57,7 @@ class CurveEffect(DisplacementEffect):
         """Whether the effect can show in these readings."""
 
     def with_settings(self, settings: Mapping[str, float]) -> Self:
-        """Return the effect with a curve of the given degree."""
+        """Return the effect with the curve's degree as given."""
         chosen = super().with_settings(settings)
         degree = int(chosen.settings.get("degree", USUAL_DEGREE))
         chosen.card = replace(self.card, parameters=self._parameters(degree))
@@ -77,7 +77,7 @@ class CurveEffect(DisplacementEffect):
         return legendre(readings.normalised(self.error.axis), range(self.lowest, degree + 1))
 
 
-# Angular errors that the model of one tool leaves out: they show with a second tool offset.
+# Angular errors that the model for a single tool omits: they show with a second tool offset.
 
 
 class Lever(CurveEffect):
@@ -99,19 +99,19 @@ class Lever(CurveEffect):
     )
 
     def acts(self, readings: Readings) -> bool:
-        """Whether the machine's model leaves the error out, and tools of different offset were used."""
+        """Whether the machine's model omits the error and tools of different offset were used."""
         spread = np.ptp(readings.tool_mm, axis=0).max(initial=0.0)
         return bool(spread > 1e-6) and self.error.name not in modelled_errors(readings.machine)
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Column of C times the polynomials; with a fixed degree also for one tool, as a machine file may ask."""
+        """Column of C times the polynomials; with a fixed degree also for one tool, as a machine file may request."""
         if "degree" not in self.settings and not self.acts(readings):
             return None
         arm = c_matrix(readings.machine, readings.position_mm, readings.tool_mm)[:, :, ERROR_INDEX[self.error.name]]
         return np.asarray(arm[:, :, None] * self.polynomials(readings)[:, None, :])
 
 
-# A squareness error that the machine's model leaves out.
+# A squareness error that the machine's model omits.
 
 
 class Squareness(DisplacementEffect):
@@ -132,20 +132,20 @@ class Squareness(DisplacementEffect):
         )
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Column of C; None where the base model contains the error."""
+        """Column of C; None if the base model contains the error."""
         if self.error in modelled_errors(readings.machine):
             return None
         column = c_matrix(readings.machine, readings.position_mm, readings.tool_mm)[:, :, ERROR_INDEX[self.error]]
         return column[:, :, None]
 
 
-# A sign that the model has wrong: one of the products of an angular error acts the other way round.
+# A wrong sign in the model: one of the products of an angular error acts in the opposite direction.
 
 
 def flipped_product(machine: Machine, name: str) -> Coefficient | None:
-    """Product of an angular error whose sign can be told from the data: the last of two with travels of other axes.
+    """Product of an angular error whose sign the data determine: the last of two with travels of other axes.
 
-    If the error acts by one product only, its sign is the sign of the curve, and nothing can be wrong about it.
+    If the error acts through only one product, its sign is the sign of the curve and cannot be wrong.
     """
     axis = error_named(name).axis
     terms = [
@@ -157,7 +157,7 @@ def flipped_product(machine: Machine, name: str) -> Coefficient | None:
 
 
 class SignError(CurveEffect):
-    """d_o = q f(p_a): the product that should have been taken the other way, f = -2 times the error's curve."""
+    """d_o = q f(p_a): the product that should have the opposite sign, f = -2 times the error's curve."""
 
     lowest = 1
     template = Card(
@@ -175,18 +175,18 @@ class SignError(CurveEffect):
     )
 
     def acts(self, readings: Readings) -> bool:
-        """Whether the error acts by a product whose sign the data can tell."""
+        """Whether the error acts through a product whose sign the data determine."""
         return flipped_product(readings.machine, self.error.name) is not None
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Travel of the lever axis times the polynomials, with the sign of the product; None without such a product."""
+        """Lever axis travel times the polynomials, with the sign of the product; None without such a product."""
         term = flipped_product(readings.machine, self.error.name)
         if term is None or term.lever is None:
             return None
         return along(term.output, -term.sign * readings.position_mm[:, [term.lever]] * self.polynomials(readings))
 
 
-# Sag of a gantry's beam under its carriage, different along the bed.
+# Sag of a gantry beam under its carriage, varying along the bed.
 
 
 X, Y, Z = 0, 1, 2
@@ -225,7 +225,7 @@ CHANNELS = ("temp_column_front_c", "temp_column_rear_c")
 
 
 class ColumnBending(DisplacementEffect):
-    """d_Y = c G (z - z0)^2, G the temperature of the front less that of the rear, less its reference."""
+    """d_Y = c G (z - z0)^2, G the temperature of the front minus that of the rear, minus its reference."""
 
     card = Card(
         name="column_bending",
@@ -269,7 +269,7 @@ class ColumnBending(DisplacementEffect):
         return along(Y, (gradient - used["reference_k"]) * lever_mm**2)
 
 
-# Droop of a ram that leans out further along Z, different along Y.
+# Droop of a ram with increasing overhang along Z, varying along Y.
 
 
 class RamDroop(DisplacementEffect):
@@ -296,7 +296,7 @@ class RamDroop(DisplacementEffect):
         return along(Y, height * legendre(readings.normalised(Y), range(1, 3)))
 
 
-# Deflection of the table or bed under the mass of the workpiece.
+# Deflection of the table or bed under the workpiece mass.
 
 
 class LoadDeflection(DisplacementEffect):
@@ -319,7 +319,7 @@ class LoadDeflection(DisplacementEffect):
     )
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Load times 1 and second Legendre polynomials along X and Y; None where the load is not known or never there."""
+        """Load times 1 and second Legendre polynomials along X and Y; None if the load is unknown or always zero."""
         load = readings.covariate("load_kg")
         if load is None or not np.any(load):
             return None
@@ -327,7 +327,7 @@ class LoadDeflection(DisplacementEffect):
         return along(Z, load[:, None] * np.column_stack([np.ones(len(readings)), *bend]))
 
 
-# A jump of the workpiece against the tool that all stations see at once: the table, a clamp, a bumped spindle.
+# A jump of the workpiece relative to the tool, seen by all stations at once: the table, a clamp, a spindle collision.
 
 
 class MachineJump(DisplacementEffect):
@@ -352,18 +352,18 @@ class MachineJump(DisplacementEffect):
         return step_times_s(readings)
 
     def displacement(self, readings: Readings) -> FloatArray | None:
-        """Unit vectors after the jump; None without a time of the jump."""
+        """Unit vectors after the jump; None without a jump time."""
         time_s = readings.covariate("time_s")
         if "time_s" not in self.settings or time_s is None:
             return None
         return np.asarray((time_s >= self.settings["time_s"])[:, None, None] * np.eye(3))
 
 
-# A tool or target offset that is not what the file says, in one set-up.
+# A tool or target offset that differs from the file, in one set-up.
 
 
 def tool_setups(readings: Readings) -> NDArray[np.int64]:
-    """Set-up of every reading, (n,): its label, else the number of its tool offset, from 1 in order of size."""
+    """Set-up of every reading, (n,): its label, else the number of its tool offset, from 1 in sorted order."""
     label = readings.labels.get("setup")
     if label is not None and np.any(label != label[0]):
         return label
