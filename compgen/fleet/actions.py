@@ -1,7 +1,7 @@
 """What a person does: approve, reject, roll back, adopt tables, process a stored measurement again.
 
-Each action is stored first; then the machine's files are updated and the notification is sent. ``clock`` gives the time of
-a simulated factory; None: the time of the computer or the database.
+Each action is stored first; then the machine's files are updated and the notification is sent. ``clock`` gives the time
+of a simulated factory; None: the time of the computer or the database.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
 def carried_out(
     job: Job, name: str, decide: Callable[[Store, MachineRecord], DecisionRecord], clock: Clock | None = None
 ) -> DecisionRecord:
-    """Make a decision about a machine, a function of :mod:`compgen.fleet.decisions`, then update the machine's files."""
+    """Make a decision about a machine with a function of :mod:`compgen.fleet.decisions`, then update its files."""
     machine_job = job.machine(name)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)

@@ -40,8 +40,8 @@ from compgen.kinematics.many_points import full_grid, volumetric_error
 Known = tuple[ErrorTable, Covariance | None]
 #: Points along each axis of the grid on which the change is evaluated.
 POINTS = 6
-#: A change equals a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by at
-#: most the second share if it contains the field once, within the third: then a drift of another shape was added.
+#: A change equals a field if it differs from it by at most the first share of the field (rms) beyond the noise, or by
+#: at most the second share if it contains the field once, within the third: then a drift of another shape was added.
 ALIKE, DRIFTED, ONCE = 0.25, 0.5, 0.1
 #: Lower probabilities are reported as this one: the number of independent directions is known only roughly.
 LEAST_P = 1e-9
@@ -51,8 +51,8 @@ LEAST_P = 1e-9
 class Change:
     """Change of the machine over its volume, rigid motion removed, um.
 
-    ``expected_rms_um`` is the rms due to the uncertainties alone; ``p_value`` the probability of at least this change if
-    the machine had not changed.
+    ``expected_rms_um`` is the rms due to the uncertainties alone; ``p_value`` the probability of at least this change
+    if the machine had not changed.
     """
 
     rms_um: float
@@ -75,9 +75,10 @@ class Change:
 class Likeness:
     """A change that equals plus or minus a known field, both over the volume without rigid motion.
 
-    ``field`` is the key of the field, ``sign`` +1 or -1, ``correlation`` the correlation of the two, ``size`` the factor
-    with which the field fits the change best. ``p_value``: the probability that a change drawn uniformly from all changes
-    of at most twice the size of the field comes as close to any of the fields that were tried, each with its sign.
+    ``field`` is the key of the field, ``sign`` +1 or -1, ``correlation`` the correlation of the two, ``size`` the
+    factor with which the field fits the change best. ``p_value``: the probability that a change drawn uniformly from
+    all changes of at most twice the size of the field comes as close to any of the fields that were tried, each with
+    its sign.
     """
 
     field: str
@@ -151,8 +152,8 @@ def likeness(
 def _directions(machine: Machine, errors: ErrorTable, position_mm: FloatArray, motion: SmallMotion) -> float:
     """Number of independent directions that low-order changes of the errors span over the volume.
 
-    Each error may change by its value (squareness), or by a line and a bow; nearly equal fields count once: n^2 over the
-    sum of the squared eigenvalues of their correlation matrix (participation ratio), at least 1.
+    Each error may change by its value (squareness), or by a line and a bow; nearly equal fields count once: n^2 over
+    the sum of the squared eigenvalues of their correlation matrix (participation ratio), at least 1.
     """
     layout = covariance_of_values(errors, np.diag(errors.uncertainties()))
     design = error_design(machine, layout, position_mm).reshape(3 * len(position_mm), -1)
@@ -217,7 +218,8 @@ def volume_points(machine: Machine) -> FloatArray:
 #
 # Two different error tables may describe the same machine (:mod:`compgen.kinematics.gauge`). Every calibration is
 # therefore brought into one gauge first: along the gauge directions the curves are made as small as possible. Constants
-# vanish, and slopes that a squareness error can also express become part of it. The map is linear, also for covariances.
+# vanish, and slopes that a squareness error can also express become part of it. The map is linear, so it
+# also transforms the covariances.
 #
 # A curve is monitored by two figures of its best-fit parabola: ``line``, the change of its straight part from the first
 # to the last node, and ``bow``, the height of the middle above the ends. A squareness error has one figure, ``value``.

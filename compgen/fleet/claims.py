@@ -87,7 +87,7 @@ class _InHand:
 
 @cache
 def _in_hand(_store_url: str, _process: int) -> _InHand:
-    """Return the only object for a store and this process, as for engines (:func:`compgen.fleet.database.engine_of`)."""
+    """Return the only object for a store and this process; see :func:`compgen.fleet.database.engine_of`."""
     return _InHand()
 
 
@@ -275,7 +275,7 @@ def _alive(owner: str) -> bool | None:
 
 
 def _process_space() -> str:
-    """Identify the process numbering that this process belongs to: boot and namespace; "-" if the system cannot tell."""
+    """Identify the numbering that this process's id belongs to: boot and namespace; "-" if the system cannot tell."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot}:{os.readlink('/proc/self/ns/pid')}".replace("/", "_")

@@ -1,8 +1,8 @@
 """The database below the store: schema, connections, upgrades, contents of files by SHA-256.
 
-Rows are only added (triggers refuse a change); the state follows from the last rows. Times are UTC. File contents are kept
-compressed in ``blobs`` by their SHA-256, each once. The store is an SQLite file, or PostgreSQL by URL; an old store is
-upgraded when it is opened.
+Rows are only added (triggers refuse a change); the state follows from the last rows. Times are UTC. File contents are
+kept compressed in ``blobs`` by their SHA-256, each once. The store is an SQLite file, or PostgreSQL by URL; an old
+store is upgraded when it is opened.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class UtcTime(sa.types.TypeDecorator[datetime]):
 
 
 class PlainText(sa.types.TypeDecorator[str]):
-    """Text that every database accepts: PostgreSQL refuses NUL, and none accepts the lone surrogates of non-UTF-8 names."""
+    """Text for every database: PostgreSQL refuses NUL, and none accepts the lone surrogates of non-UTF-8 names."""
 
     impl = sa.Text
     cache_ok = True

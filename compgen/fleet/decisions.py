@@ -1,7 +1,7 @@
 """Decisions in the store: approve, reject, roll back a set of tables; exclude a measurement from the drift.
 
-Each decision adds one row with who, when and why; nothing else makes tables active. The files are updated from the store
-(:func:`compgen.fleet.publish.publish`): a decision counts as soon as it is in the store.
+Each decision adds one row with who, when and why; nothing else makes tables active. The files are updated from the
+store (:func:`compgen.fleet.publish.publish`): a decision counts as soon as it is in the store.
 """
 
 from __future__ import annotations

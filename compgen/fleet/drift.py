@@ -1,6 +1,6 @@
 """Drift of one machine from its calibrations: trends, steps, forecasts, in figures and in sentences.
 
-See ``docs/drift.md``; :mod:`compgen.fleet.change` compares calibrations, :mod:`compgen.fleet.drift` fits and forecasts.
+See ``docs/drift.md``; :mod:`compgen.fleet.change` compares calibrations, this module fits and forecasts.
 """
 
 from __future__ import annotations
@@ -36,36 +36,36 @@ from compgen.fleet.records import MachineRecord, active_of
 from compgen.fleet.store import Store
 from compgen.identify.covariance import error_design
 
-# Trend of one figure over time: weighted regression, a random walk on top, temperature, and sudden steps.
+# Trend of one figure over time: weighted regression plus a random walk, temperature and sudden steps.
 #
 # The model of readings y_i with known standard uncertainty u_i at times t_i (days) is
 #
 #     y_i = level + slope t_i + c (T_i - T_ref) + sum of steps before t_i + w(t_i) + e_i,
 #
 # where w is a random walk with variance q per day, w(t_1) = 0. Level, slope, c and steps have flat priors; q is zero with
-# a probability of one quarter and otherwise spread evenly in its logarithm, and is integrated over with its restricted likelihood
-# (Patterson & Thompson 1971, Biometrika 58). Without the walk this is the weighted least-squares line.
+# a prior probability of one quarter and otherwise uniform in its logarithm, and is integrated out with its restricted
+# likelihood (Patterson & Thompson 1971, Biometrika 58). Without the walk this is the weighted least-squares line.
 #
-# A step is sought together with the line: for each gap between measurements its size is estimated together with everything else,
-# with q weighed as if the step was there, so that a crash is not taken for a restless machine and a slow drift not for a
-# crash. The error probability counts every gap (and every figure) that was looked at: Bonferroni.
+# Steps are fitted together with the line: for each gap between measurements the step is estimated jointly with all
+# other parameters, and q is weighted as if the step were present. A crash is then not mistaken for a random walk, nor a
+# slow drift for a crash. The error probability is corrected for every gap (and every figure) tested: Bonferroni.
 
 
 # Trend of one figure over time: regression, random walk, steps; forecast of the first exit from its tolerance.
 
-#: Standard deviations of the random walk over the whole history that are weighed, as multiples of the median u.
+#: Standard deviations of the random walk over the whole history that are tried, as multiples of the median u.
 WALKS = (0.3, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 #: Prior probability that there is no random walk.
 NO_WALK = 0.25
-#: Temperatures that vary by less say nothing about their effect, K.
+#: Temperatures that vary by less than this do not show their effect, K.
 LEAST_RANGE_K = 0.5
-#: Most steps that are sought in one series.
+#: Largest number of steps searched for in one series.
 MOST_STEPS = 3
 
 
 @dataclass(frozen=True)
 class TimeSeries:
-    """Readings of one figure: ``days``, ``value``, ``u`` (n,); ``temperature_k`` (n,) from its reference, or None."""
+    """Readings of one figure: ``days``, ``value``, ``u`` (n,); ``temperature_k`` (n,) above its reference, or None."""
 
     days: FloatArray
     value: FloatArray
@@ -75,7 +75,7 @@ class TimeSeries:
 
 @dataclass(frozen=True)
 class DriftStep:
-    """A sudden change between reading ``after`` - 1 and ``after``; ``p_value`` counts everything that was looked at."""
+    """A sudden change between reading ``after`` - 1 and ``after``; ``p_value`` is corrected for all tests."""
 
     after: int
     size: float
@@ -87,8 +87,8 @@ class DriftStep:
 class Component:
     """The trend for one size of the random walk: its share, variance per day, and the state at the last reading.
 
-    ``coefficients`` and ``covariance`` are those of level, slope, temperature and steps; ``level``, ``slope`` at the last
-    reading (reference temperature, walk included) have the joint covariance ``state_covariance`` (2, 2).
+    ``coefficients`` (level, slope, temperature, steps) have the covariance ``covariance``. ``state`` is level and slope
+    at the last reading (reference temperature, walk included), with joint covariance ``state_covariance`` (2, 2).
     """
 
     share: float
@@ -101,7 +101,7 @@ class Component:
 
 @dataclass(frozen=True)
 class Trend:
-    """Trend of a series: the steps that were found and the components of the random walk."""
+    """Trend of a series: the steps found and the components of the random walk."""
 
     series: TimeSeries
     steps: tuple[DriftStep, ...]
@@ -137,7 +137,7 @@ class Trend:
 
 
 def regressors(series: TimeSeries, steps: Sequence[int] = ()) -> FloatArray:
-    """Columns level, slope, temperature and steps, (n, p); the level is that at the last reading."""
+    """Columns level, slope, temperature and steps, (n, p); the level is the value at the last reading."""
     columns = [np.ones(len(series.days)), series.days - series.days[-1]]
     if series.temperature_k is not None:
         columns.append(series.temperature_k)
@@ -146,12 +146,12 @@ def regressors(series: TimeSeries, steps: Sequence[int] = ()) -> FloatArray:
 
 
 def _before(series: TimeSeries, after: int) -> FloatArray:
-    """Minus one before the step, so that the level is that after it."""
+    """Column with -1 before the step and 0 after it: the level is the value after the step."""
     return np.where(np.arange(len(series.days)) < after, -1.0, 0.0)
 
 
 def usable_temperature(days: FloatArray, temperature_c: FloatArray) -> bool:
-    """Whether temperatures (n,) vary enough, and otherwise than linearly in time, to show their effect."""
+    """Whether temperatures (n,) vary enough about a straight line in time to show their effect."""
     if len(days) < 5 or not np.isfinite(temperature_c).all():
         return False
     line = np.polyval(np.polyfit(days, temperature_c, 1), days)
@@ -164,8 +164,8 @@ def fit_trend(series: TimeSeries, *, walk: bool = True, looks: int = 1, level: f
     Parameters
     ----------
     series : the readings.
-    walk : whether a random walk is weighed; without it the line holds exactly.
-    looks : number of series that are searched for steps, for their error probability.
+    walk : whether a random walk is considered; without it the figure follows the line exactly.
+    looks : number of series that are searched for steps, to correct the error probability of the steps.
     level : error probability below which a step counts.
     """
     if len(series.days) < regressors(series).shape[1] + 1 or np.ptp(series.days) <= 0.0:
@@ -190,7 +190,7 @@ def fit_trend(series: TimeSeries, *, walk: bool = True, looks: int = 1, level: f
 
 
 def _walks(series: TimeSeries, walk: bool) -> list[tuple[float, float]]:
-    """Variances per day that are weighed, with their prior probabilities."""
+    """Variances per day that are tried, with their prior probabilities."""
     if not walk:
         return [(0.0, 1.0)]
     scale = float(np.median(series.u)) ** 2 / float(np.ptp(series.days))
@@ -207,7 +207,7 @@ Rest = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def _component(series: TimeSeries, design: FloatArray, q: float) -> tuple[float, Rest]:
-    """Logarithm of the restricted likelihood, and coefficients with the state at the last reading for one q."""
+    """Logarithm of the restricted likelihood for one q; coefficients and state at the last reading with covariances."""
     spread = _spread(series, q)
     root = np.linalg.cholesky(spread)
     columns, target = np.linalg.solve(root, design), np.linalg.solve(root, series.value)
@@ -229,7 +229,7 @@ def _component(series: TimeSeries, design: FloatArray, q: float) -> tuple[float,
 
 
 def _next_step(series: TimeSeries, known: Sequence[int], walk: bool, looks: int) -> DriftStep | None:
-    """Return the most significant step that is not known yet; None where none can be told from the rest."""
+    """Return the most significant step that is not known yet; None if none can be separated from the other terms."""
     base = regressors(series, known)
     count, unknowns = base.shape[0], base.shape[1] + 1
     gaps = [k for k in range(1, count) if k not in known and series.days[k] > series.days[k - 1]]
@@ -242,7 +242,7 @@ def _next_step(series: TimeSeries, known: Sequence[int], walk: bool, looks: int)
     share = log + np.log([[prior] for _, prior in walks])
     share = np.exp(share - share.max(axis=0))
     share /= share.sum(axis=0)
-    # what the readings scatter more than u and the walk say makes the step less certain
+    # scatter of the readings beyond u and the walk makes the step less certain
     freedom = count - unknowns
     inflated = u * np.sqrt(np.maximum(1.0, square / freedom))
     ratio = np.where(np.isfinite(inflated), np.abs(size) / inflated, 0.0)
@@ -257,7 +257,7 @@ def _next_step(series: TimeSeries, known: Sequence[int], walk: bool, looks: int)
 def _with_column(
     series: TimeSeries, base: FloatArray, columns: FloatArray, q: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Restricted likelihoods, coefficients, their u and sums of squares left when each of ``columns`` joins, (m,)."""
+    """Log restricted likelihood, coefficient, u and residual sum of squares with each of ``columns`` added, (m,)."""
     root = np.linalg.cholesky(_spread(series, q))
     white = np.linalg.solve(root, np.column_stack([base, columns, series.value]))
     width = base.shape[1]
@@ -274,19 +274,19 @@ def _with_column(
     return np.nan_to_num(log - 0.5 * left, nan=-1e300), np.nan_to_num(size), u, left
 
 
-# When a figure leaves its tolerance: the distribution of the first exit, drawn from the trend and its uncertainty.
+# When a figure leaves its tolerance: distribution of the first exit, sampled from the trend and its uncertainty.
 
 
-#: Paths that are drawn, and times at which each is looked at.
+#: Number of paths drawn, and of times at which each is evaluated.
 PATHS, TIMES = 2000, 300
 SEED = 20260101
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """First exit from the tolerance, in days after the last reading; infinite for later than ``horizon_days``.
+    """First exit from the tolerance, in days after the last reading; infinite if later than ``horizon_days``.
 
-    ``outside_now`` is the probability that it is outside already; ``within_horizon`` that it leaves by the horizon.
+    ``outside_now`` is the probability that it is already outside; ``within_horizon`` that it leaves by the horizon.
     """
 
     median_days: float
@@ -298,7 +298,7 @@ class Forecast:
     horizon_days: float
 
     def summary(self) -> dict[str, Any]:
-        """Return the fields by name; None for later than the horizon."""
+        """Return the fields by name; times after the horizon are None."""
         days = {"median_days": self.median_days, "low_days": self.low_days, "high_days": self.high_days}
         return {
             **{name: value if np.isfinite(value) else None for name, value in days.items()},
@@ -309,7 +309,7 @@ class Forecast:
         }
 
     def words(self, name: str) -> str:
-        """Say it in one sentence, e.g. ``EC0Y leaves tolerance in about 7 weeks, 95 % 5-11``."""
+        """State it in one sentence, e.g. ``EC0Y leaves tolerance in about 7 weeks, 95 % 5-11``."""
         percent = f"{100.0 * self.confidence:g} %"
         if self.outside_now > 0.5:
             return f"{name} is outside its tolerance already (probability {self.outside_now:.2f})"
@@ -345,14 +345,14 @@ def forecast(
     Parameters
     ----------
     trend : of the figure.
-    reference : value that the active tables take out (or 0).
+    reference : value that the active tables compensate (or 0).
     tolerance : in the unit of the figure, positive.
     horizon_days : later exits count as infinitely late.
-    confidence : of the interval, which leaves equal shares on both sides.
+    confidence : of the interval, with equal tails on both sides.
     """
     days = exit_grid(horizon_days)
     exits = []
-    for k, part in enumerate(trend.components):  # the number of exits drawn of each follows its share
+    for k, part in enumerate(trend.components):  # the number of exits drawn from each follows its share
         generator = np.random.default_rng([SEED, k])
         count = max(int(round(PATHS * part.share)), 1)
         values, vectors = np.linalg.eigh(part.state_covariance)
@@ -367,12 +367,12 @@ def forecast(
 
 
 def exit_grid(horizon_days: float) -> FloatArray:
-    """Times at which paths are looked at, closer together at the beginning."""
+    """Times at which paths are evaluated, closer together at the beginning."""
     return np.asarray(horizon_days * np.linspace(0.0, 1.0, TIMES) ** 1.5)
 
 
 def forecast_of(exits_days: FloatArray, horizon_days: float, confidence: float) -> Forecast:
-    """Return the forecast of drawn exits; infinite ones come after the horizon."""
+    """Return the forecast from drawn exits; infinite exits are after the horizon."""
     ordered = np.sort(exits_days)
     tail = (1.0 - confidence) / 2.0
     low, median, high = (ordered[min(int(p * len(ordered)), len(ordered) - 1)] for p in (tail, 0.5, 1.0 - tail))
@@ -394,10 +394,10 @@ def first_exit(path: FloatArray, tolerance: float, days: FloatArray) -> FloatArr
     return np.where(never, np.inf, np.where(first == 0, 0.0, at))
 
 
-# When the error over the volume leaves its tolerance: one line through the whole field, with its joint covariance.
+# When the error over the volume leaves its tolerance: one line fitted to the whole field, with its joint covariance.
 
 
-#: Fields that are drawn.
+#: Number of fields drawn.
 DRAWS = 1000
 
 
@@ -408,15 +408,16 @@ def volume_forecast(
     temperature_k: FloatArray | None,
     limits: tuple[float, float, float],
 ) -> Forecast | None:
-    """Forecast when the rms of E over the volume, minus what the active tables take out, exceeds the tolerance.
+    """Forecast when the rms of E over the volume, minus what the active tables compensate, exceeds the tolerance.
 
-    Level and slope of all error values come from one weighted line with the same weights for each; the scatter about
-    it, where it is more than the uncertainties say, widens the result. A random walk is not weighed here. None for too
-    few calibrations.
+    Level and slope of all error values come from one weighted line with the same weights for all; scatter about the
+    line beyond the uncertainties widens the result. A random walk is not considered here. None for too few
+    calibrations.
 
     Parameters
     ----------
-    data, reference, steps, temperature_k : calibrations, which one the tables hold, steps and temperatures of the trends.
+    data, reference, steps, temperature_k : calibrations, the one that the tables compensate, the trends' steps and
+        temperatures.
     limits : tolerance in mm, horizon in days, confidence.
     """
     tolerance, horizon_days, confidence = limits
@@ -425,7 +426,7 @@ def volume_forecast(
         return None
     state = pull[:2] @ data.value
     field = _field(data)
-    # factor, at least 1, by which the field scatters more about its line than the uncertainties say
+    # factor, at least 1: observed scatter of the field about its line over the scatter expected from the uncertainties
     left = np.eye(len(root)) - design @ pull
     seen = float(np.sum((root[:, None] * ((left @ data.value) @ field.T)) ** 2))
     spread = np.array([np.sum((field @ factor) ** 2) for factor in data.factor])
@@ -452,8 +453,8 @@ def _noise(
 ) -> tuple[float, float, float]:
     """What noise adds to the square of a drawn field: parts constant, linear (half) and quadratic in time.
 
-    A drawn square holds the variance twice, once from the estimate and once from the draw. The reading that the tables
-    took out has noise which is real, and which the estimate shares by its weight.
+    A drawn square contains the variance twice, from the estimate and from the draw. The noise of the calibration that
+    the tables compensate is real, and enters the estimate with that calibration's weight.
     """
     spread = np.array([np.sum((field @ factor) ** 2) for factor in data.factor])
     parts = [excess**2 * float(np.sum(pull[i] * pull[j] * spread)) for i, j in ((0, 0), (0, 1), (1, 1))]
@@ -464,7 +465,7 @@ def _noise(
 def _regression(
     data: Aligned, steps: Sequence[int], temperature_k: FloatArray | None
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
-    """Weights (n,), matrix (p, n) that makes the coefficients from the readings, and the design (n, p)."""
+    """Weights (n,), matrix (p, n) from the readings to the coefficients, and the design (n, p)."""
     size = np.array([np.linalg.norm(factor) for factor in data.factor])
     series = TimeSeries(data.days, np.zeros(len(size)), size, temperature_k)
     design = regressors(series, steps)
@@ -475,7 +476,7 @@ def _regression(
 
 
 def _field(data: Aligned) -> FloatArray:
-    """E at the points of the volume without rigid motion, by the error values, (3 n, k)."""
+    """Matrix (3 n, k) from the error values to E at the points of the volume, without rigid motion."""
     position_mm = volume_points(data.machine)
     design = error_design(data.machine, data.field_covariance(0), position_mm)
     return small_motion(position_mm).taken_out(design.reshape(3 * len(position_mm), -1))
@@ -486,7 +487,7 @@ DAYS_A_MONTH = 30.4375
 
 
 def interval_of(value: float, u: float, confidence: float) -> tuple[float, float]:
-    """Return the ends of the interval that holds the truth with this confidence."""
+    """Return the ends of the interval that contains the true value with this confidence."""
     reach = float(norm.ppf(0.5 + 0.5 * confidence)) * u
     return value - reach, value + reach
 
@@ -497,7 +498,7 @@ def moment_of(iso: str) -> str:
 
 
 def sentences(drift: Drift) -> list[str]:
-    """Say what matters in words; every figure is given with its interval."""
+    """State in words what matters; every figure is given with its interval."""
     level = 1.0 - drift.settings.confidence
     warm = following_temperature(drift)
     logged = drift.temperature_c
@@ -518,7 +519,7 @@ def sentences(drift: Drift) -> list[str]:
 
 
 def outlook(drift: Drift) -> tuple[str, str]:
-    """Say what moves most certainly, and what leaves its tolerance first; each empty if there is nothing to say."""
+    """State what changes most significantly, and what leaves its tolerance first; each is empty if there is nothing."""
     level = 1.0 - drift.settings.confidence
     moving = sorted((item for item in drift.figures if item.p_value < level), key=lambda item: item.p_value)
     told = ""
@@ -542,7 +543,7 @@ def outlook(drift: Drift) -> tuple[str, str]:
 
 
 def following_temperature(drift: Drift) -> set[str]:
-    """Return the figures that follow the temperature significantly, all that were looked at counted."""
+    """Return the figures that follow the temperature significantly, corrected for all figures tested."""
     found = {}
     for item in drift.figures:
         if item.trend is not None and item.trend.per_kelvin is not None:
@@ -563,7 +564,7 @@ def _steps(drift: Drift) -> list[str]:
 
 
 def _with_interval(drift: Drift, figure: MonitoredFigure, value: float, u: float) -> str:
-    """Say a figure with its interval, e.g. ``+1.50 urad (95 % +1.20 to +1.80)``."""
+    """State a figure with its interval, e.g. ``+1.50 urad (95 % +1.20 to +1.80)``."""
     confidence = drift.settings.confidence
     scale = figure.scale
     low, high = interval_of(value, u, confidence)
@@ -572,12 +573,12 @@ def _with_interval(drift: Drift, figure: MonitoredFigure, value: float, u: float
 
 @dataclass(frozen=True)
 class DriftSettings:
-    """What the drift is judged by.
+    """Settings for judging the drift.
 
     Parameters
     ----------
     tolerances : by error name, mm or rad, and ``volume`` for the rms over the volume, mm.
-    reference : number of the calibration that the active tables take out; the first if nothing says so.
+    reference : number of the calibration that the active tables compensate; the first if unknown.
     walk : whether a random walk is considered in addition to the line.
     confidence : of intervals and of what counts as significant.
     horizon_days : how far forecasts look.
@@ -592,9 +593,9 @@ class DriftSettings:
 
 @dataclass(frozen=True)
 class FigureDrift:
-    """Trend of one figure; None for too few calibrations. ``reference`` is what the active tables take out.
+    """Trend of one figure; None for too few calibrations. ``reference`` is the value that the active tables compensate.
 
-    ``adjusted`` is the error probability of the slope, all figures counted.
+    ``adjusted`` is the error probability of the slope, corrected for all figures.
     """
 
     figure: MonitoredFigure
@@ -607,13 +608,13 @@ class FigureDrift:
 
     @property
     def p_value(self) -> float:
-        """Error probability of what is most certain about it, its slope or one of its steps; all figures counted."""
+        """Error probability of its slope or one of its steps, whichever is lowest; corrected for all figures."""
         steps = () if self.trend is None else self.trend.steps
         return min([self.adjusted, *(step.p_value for step in steps)])
 
     @property
     def limits(self) -> tuple[float, ...]:
-        """Lower and upper limit of the tolerance about what the active tables take out, mm or rad; none without one."""
+        """Lower and upper tolerance limits about ``reference``, mm or rad; empty without a tolerance."""
         return () if self.tolerance is None else (self.reference - self.tolerance, self.reference + self.tolerance)
 
     def line(self) -> tuple[FloatArray, FloatArray]:
@@ -622,7 +623,7 @@ class FigureDrift:
         days, slope = self.series.days, self.trend.slope[0]
         now = sum(part.share * part.state[0] for part in self.trend.components)
         corners = [(float(k), day) for k, day in enumerate(days)]
-        for step in self.trend.steps:  # between readings after - 1 and after, just before and just behind the step
+        for step in self.trend.steps:  # between readings after - 1 and after: just before and just after the step
             middle = 0.5 * (days[step.after - 1] + days[step.after])
             corners += [(step.after - 0.6, middle), (step.after - 0.4, middle)]
         order, places = (np.array(part) for part in zip(*sorted(corners), strict=True))
@@ -632,7 +633,7 @@ class FigureDrift:
         return places, values
 
     def summary(self, times: Sequence[str], confidence: float) -> dict[str, Any]:
-        """Return value, trend and forecast by name, in um or urad and days; ``times`` are those of the calibrations."""
+        """Return value, trend and forecast by name, in um or urad and days; ``times`` are the calibrations' times."""
         scale = self.figure.scale
         found: dict[str, Any] = {
             "figure": self.figure.name,
@@ -678,7 +679,7 @@ class FigureDrift:
 
 @dataclass(frozen=True)
 class Drift:
-    """Everything that is known about the drift of one machine; ``gaps`` are the steps by the calibration after them."""
+    """Everything known about the drift of one machine; ``gaps`` are the steps by the calibration after them."""
 
     machine: str
     times: tuple[str, ...]
@@ -703,11 +704,11 @@ class Drift:
         return dict(sorted(found.items()))
 
     def sentences(self) -> list[str]:
-        """Say what matters in words."""
+        """State in words what matters."""
         return sentences(self)
 
     def outlook(self) -> tuple[str, str]:
-        """Say what moves and when the first tolerance is left, each in a few words; empty for nothing and no tolerance."""
+        """State briefly what changes and when the first tolerance is exceeded; each is empty if there is nothing."""
         return outlook(self)
 
     def summary(self) -> dict[str, Any]:
@@ -733,7 +734,7 @@ class Drift:
 
 
 def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings) -> Drift:
-    """Return the drift of a machine of the store; the calibration behind its active tables is the reference."""
+    """Return the drift of a machine in the store; the calibration behind its active tables is the reference."""
     (history, ids, model), tables, left_out = store.together(
         lambda: (calibrations_of(store, machine), store.tables(machine, figures=False), excluded(store, machine))
     )
@@ -752,10 +753,10 @@ def drift_report(
 
     Parameters
     ----------
-    machine : as the newest calibration has it.
+    machine : as in the newest calibration.
     history : at least one calibration; trends need three, with temperatures five.
     settings : tolerances, reference, confidence; by default :class:`DriftSettings`.
-    name : of the machine in reports; default that of its file.
+    name : of the machine in reports; default: the name in its file.
     """
     chosen = settings or DriftSettings()
     if not history:

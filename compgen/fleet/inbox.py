@@ -171,7 +171,7 @@ def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> lis
 
 
 def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
-    """Whether a matching file in another machine's inbox or a sub-folder has one of these contents (except empty ones)."""
+    """Whether a matching file in another machine's inbox or a sub-folder has one of these non-empty contents."""
     searched = {(len(content), sha256_of(content)) for content in contents if content}
     held = found_in(other, {size for size, _ in searched}) if other.held is None else other.held
     return not searched.isdisjoint(held)
@@ -189,7 +189,7 @@ def found_in(other: OtherInbox, sizes: Container[int]) -> frozenset[tuple[int, s
 
 
 def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
-    """Return path and size of the matching regular files in an inbox and its sub-folders, as far as they can be read."""
+    """Return path and size of matching regular files in an inbox and its sub-folders, as far as they can be read."""
     found = []
     with contextlib.suppress(OSError):
         entries = sorted(box.inbox.iterdir())

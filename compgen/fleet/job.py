@@ -1,10 +1,10 @@
 """The job file ``recal.toml``: which machines are recalibrated, from which files, when and by which rules.
 
-Schedules come first, then the file itself (each key is declared once, with its check, default and meaning, as a field of
-:class:`Policy` or :class:`MachineJob`; reader, ``volcomp recal add`` and documentation take it from there), then what is
-made from a job: an added machine, and the files of the system's own scheduler.
+Schedules come first, then the file itself, then what is made from a job: an added machine, and the files for the
+system's scheduler. Each key is declared once, with its check, default and meaning, as a field of :class:`Policy` or
+:class:`MachineJob`, for the reader, ``volcomp recal add`` and the documentation.
 
-``volcomp recal --help`` loads this module, so what needs numpy is imported where it is used.
+``volcomp recal --help`` loads this module, so imports that need numpy are made where they are used.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from compgen.errors import InputError
 
 # --- schedules -----------------------------------------------------------------------------------------------------
 #
-# An expression means what it means to cron: Sunday is 0 or 7; where both the day of the month and the day of the week
-# are restricted, a day fits that fits either of them. Times are local.
+# Expressions mean the same as in cron: Sunday is 0 or 7; if both the day of the month and the day of the week are
+# restricted, a day needs to match only one of them. Times are local.
 
 MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 DAYS = ("sun", "mon", "tue", "wed", "thu", "fri", "sat")
@@ -40,7 +40,7 @@ MACROS = {
     "@monthly": "0 0 1 * *",
     "@yearly": "0 0 1 1 *",
 }
-#: Field: lowest and highest number, first number of its names, names.
+#: Fields: lowest and highest number, number of the first name, names.
 FIELDS = (
     ("minute", 0, 59, ()),
     ("hour", 0, 23, ()),
@@ -52,7 +52,7 @@ FIELDS = (
 
 @dataclass(frozen=True)
 class Cron:
-    """A cron expression: the numbers that fit each field; Sunday is 0. ``any_day``, ``any_weekday``: the field is ``*``."""
+    """A cron expression: numbers that match each field; Sunday is 0. ``any_day``, ``any_weekday``: field is ``*``."""
 
     expression: str
     minutes: tuple[int, ...]
@@ -66,7 +66,7 @@ class Cron:
 
 @dataclass(frozen=True)
 class Every:
-    """Every so many minutes."""
+    """An interval in minutes."""
 
     minutes: int
 
@@ -123,7 +123,7 @@ def _number(word: str, number: int) -> int:
 
 
 def systemd_lines(schedule: Schedule) -> list[str]:
-    """Return the lines of a systemd timer that mean the schedule."""
+    """Return the schedule as lines of a systemd timer."""
     if isinstance(schedule, Every):
         return ["OnBootSec=1min", f"OnUnitActiveSec={schedule.minutes}min"]
     clock = f"{_comma_separated_numbers(schedule.hours, 24)}:{_comma_separated_numbers(schedule.minutes, 60)}:00"
@@ -132,7 +132,7 @@ def systemd_lines(schedule: Schedule) -> list[str]:
     by_day, by_weekday = f"*-{months}-{days} {clock}", f"{weekdays} *-{months}-* {clock}"
     if schedule.any_weekday and len(schedule.weekdays) == 7:
         return [f"OnCalendar={by_day}"]
-    if schedule.any_day or schedule.any_weekday:  # cron: only if neither begins with * does one of them suffice
+    if schedule.any_day or schedule.any_weekday:  # cron: one match suffices only if neither begins with *
         return [f"OnCalendar={weekdays} *-{months}-{days} {clock}"]
     return [f"OnCalendar={by_day}", f"OnCalendar={by_weekday}"]
 
@@ -156,9 +156,9 @@ def cron_expression(schedule: Schedule) -> str | None:
 # --- the job file --------------------------------------------------------------------------------------------------
 
 PATTERNS = ("*.lengths.csv", "*.deviations.csv", "*.sixdof.csv")
-#: The store where a job file names none.
+#: The store if a job file does not name one.
 STORE = "recal.sqlite"
-#: How often a watch looks at its job file, s.
+#: How often a watch checks its job file, s.
 WATCH_POLL_S = 2.0
 MACHINE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -197,7 +197,7 @@ def _patterns(value: Any) -> tuple[str, ...]:
     {"anyOf": [{"type": "string", "pattern": r"\S"}, toml_files.array_schema({"type": "string", "minLength": 1}, 1)]}
 )
 def command_words(value: Any) -> tuple[str, ...]:
-    """Return a command as its words: a list, or one text that is split as a shell does."""
+    """Return a command as its words, from a list or from one text that is split as in a shell."""
     words = shlex.split(value) if isinstance(value, str) else value
     if not isinstance(words, list) or not words or not all(isinstance(word, str) and word for word in words):
         raise ValueError("expected a command, as a list of its words")
@@ -217,7 +217,7 @@ _IDENTIFY: Mapping[str, Callable[[Any], Any]] = {
     "temperature": toml_files.flag,
     "small_deviations": toml_files.flag,
 }
-#: Keys of ``[tolerances]``: the error, or "volume", and the size of its unit in mm or rad.
+#: Keys of ``[tolerances]``: the error or "volume", and its unit in mm or rad.
 _TOLERANCES: Mapping[str, tuple[str, float]] = {
     f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES
 } | {"volume_um": ("volume", MM_PER_UM)}
@@ -225,7 +225,7 @@ _TOLERANCES: Mapping[str, tuple[str, float]] = {
 
 @dataclass(frozen=True)
 class Policy:
-    """What new tables must fulfil to be proposed; lengths in um. None: no limit."""
+    """Requirements for new tables to be proposed; lengths in um. None: no limit."""
 
     max_age_days: float | None = setting(
         toml_files.positive, 30.0, meaning="The measurement is older than this, in days, when it is judged."
@@ -271,7 +271,7 @@ class Policy:
 class OtherInbox:
     """The inbox of another machine of the job file, for files that came for both.
 
-    ``held`` are size and SHA-256 of what was found in it, for a process that does not see it; None: it is looked into.
+    ``held`` contains size and SHA-256 of the files found in it, for a process that cannot read it; None: it is read.
     """
 
     name: str
@@ -284,11 +284,11 @@ class OtherInbox:
 class MachineJob:
     """How one machine is recalibrated; the fields up to ``policy`` are the keys of its section, paths are absolute.
 
-    ``measured_with`` says what was active while the machine was measured: the tables that were active then ("active")
-    or none ("bare"); a measurement file may say otherwise for itself. ``schedule`` is also what ``every_minutes`` of the
-    file says. ``tolerances`` are those of the drift, mm or rad, by error or "volume". ``others`` are the machines whose
-    inbox is the same, or holds a file of this one's as well (:func:`compgen.fleet.inbox.with_twins`). Where
-    the files that the settings name are copies (:class:`compgen.fleet.runner.Parcel`), ``settings`` is the hash of the
+    ``measured_with`` says what was active while the machine was measured: the tables active at that time ("active") or
+    none ("bare"); a measurement file may override it for itself. ``schedule`` is also set by ``every_minutes`` of the
+    file. ``tolerances`` are for the drift, mm or rad, by error or "volume". ``others`` are the machines with the same
+    inbox, or whose inbox also contains one of this machine's files (:func:`compgen.fleet.inbox.with_twins`). If the
+    files that the settings name are copies (:class:`compgen.fleet.runner.Parcel`), ``settings`` is the hash of the
     settings, and ``original`` the machine file.
     """
 
@@ -359,9 +359,9 @@ class MachineJob:
     original: Path | None = field(default=None, compare=False, repr=False)
 
     def settings_sha256(self, known: Container[str] = ()) -> str:
-        """Return the SHA-256 of everything but the measurement that a result depends on; InputError for a wrong machine.
+        """Return the SHA-256 of all that a result depends on, except the measurement; InputError for a wrong machine.
 
-        Where it is one of ``known``, something was processed with these settings, and the machine file is not checked.
+        If it is one of ``known``, something was processed with these settings, and the machine file is not checked.
         """
         if self.settings:
             return self.settings
@@ -374,7 +374,7 @@ class MachineJob:
         digests = [sha256_of(read_bytes(path)) for path in files if path is not None]
         own = {"controllers": self.controllers, "measured_with": self.measured_with, "identify": dict(self.identify)}
         rules = {"policy": asdict(self.policy), "unverified": self.allow_unverified, "templates": str(self.templates)}
-        if self.max_minutes != MachineJob.max_minutes:  # who allows more time wants what took too long tried again
+        if self.max_minutes != MachineJob.max_minutes:  # with more time, what took too long is tried again
             rules["max_minutes"] = self.max_minutes
         found = sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
         if known and found not in known:
@@ -391,25 +391,25 @@ class Job:
     machines: Mapping[str, MachineJob]
 
     def with_notify(self, command: tuple[str, ...]) -> Job:
-        """Return the job with this notification command for all machines; an empty one changes nothing."""
+        """Return the job with this notification command for all machines; an empty command changes nothing."""
         if not command:
             return self
         return replace(self, machines={name: replace(item, notify=command) for name, item in self.machines.items()})
 
     def machine(self, name: str) -> MachineJob:
-        """Return one machine; InputError names the nearest if there is none of that name."""
+        """Return one machine; InputError with the most similar name if it does not exist."""
         if name not in self.machines:
             raise InputError(f"there is no machine {name!r}; {nearest(name, self.machines)}", file=self.path)
         return self.machines[name]
 
 
 def read_job(path: str | Path) -> Job:
-    """Read a job file strictly; InputError with file, line and key for whatever is unknown, missing or impossible."""
+    """Read a job file strictly; InputError with file, line and key for anything unknown, missing or impossible."""
     return job_of(toml_files.read_toml(path), Path(path).absolute())
 
 
 def job_of_text(text: str, path: Path) -> Job:
-    """Return the job that ``text`` would be as the file ``path``; errors as :func:`read_job` has them."""
+    """Return the job that ``text`` would be as the file ``path``; errors as for :func:`read_job`."""
     import tomllib
 
     try:
@@ -431,7 +431,7 @@ def job_schema() -> dict[str, Any]:
         "additionalProperties": keys,
     }
     defaults = {**keys, "description": "Default keys of all machines."}
-    # what a machine needs may also be among the defaults
+    # keys that a machine needs may also be given as defaults
     needed = [
         {
             "anyOf": [
@@ -446,7 +446,7 @@ def job_schema() -> dict[str, Any]:
 
 
 def job_of(root: Section, path: Path) -> Job:
-    """Read the root of a job file as :func:`read_job` does."""
+    """Read the root section of a job file, as for :func:`read_job`."""
     folder = path.parent
     store = root.take("store", toml_files.text_of_path, STORE)
     defaults = root.section("defaults", required=False)
@@ -456,12 +456,12 @@ def job_of(root: Section, path: Path) -> Job:
         if not MACHINE_NAME.fullmatch(name):
             raise every.fail(name, "is not a name: letters, digits, '.', '_' and '-', at most 64, are allowed")
         machines[name] = _machine(name, every.section(name).again(defaults=defaults), folder)
-    if not machines:  # the defaults are checked before there is one
+    if not machines:  # the defaults are checked before there is a machine
         required = dict.fromkeys((item.name for item in fields(MachineJob) if item.metadata.get("required")), "")
         keys = Section({}, path=path, defaults=defaults)
         take_settings(MachineJob, keys, name="", **_mappings(keys), **required)
     root.finish()
-    # folders out may not be the same or lie in each other, whatever links and ".." lead there
+    # output folders may not be equal or nested, also not through links and ".."
     real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
     known = {path: name for name, path in reversed(real.items())}
     for name, out in real.items():
@@ -511,7 +511,7 @@ def _machine(name: str, keys: Section, folder: Path) -> MachineJob:
 
 
 def _schedule(job: MachineJob, keys: Section) -> Schedule | None:
-    """When, from either key; a machine's own key of the two counts more than the other one of the defaults."""
+    """The schedule from either key; a key given for the machine overrides the other key in the defaults."""
     own = {"every_minutes", "schedule"} & set(keys.data)
     if job.every_minutes is None or (job.schedule is not None and own == {"schedule"}):
         return job.schedule
@@ -530,7 +530,7 @@ def _mappings(keys: Section) -> dict[str, Mapping[str, Any]]:
     found: dict[str, Any] = {name: section.take(name, check, None) for name, check in _IDENTIFY.items()}
     section.finish()
     found["temperature"] = found["temperature"] is not False
-    found["small_deviations"] = found["small_deviations"] or None  # so that the hash stays
+    found["small_deviations"] = found["small_deviations"] or None  # keeps the hash unchanged
     return {"tolerances": tolerances, "identify": {name: item for name, item in found.items() if item is not None}}
 
 
@@ -543,12 +543,12 @@ def add_machine(path: Path, name: str, keys: Mapping[str, Any]) -> MachineJob:
     Raises
     ------
     InputError
-        for a machine that is there already, a machine file that does not load, a value that the job file refuses.
+        for a machine that already exists, a machine file that does not load, or a value that the job file refuses.
     """
     before = read_text(path) if path.exists() else ""
     if before and name in job_of_text(before, path).machines:
         raise InputError(f"has a machine {name!r} already; edit it there", file=path)
-    # texts, numbers and lists of texts: JSON's escapes are TOML's as well
+    # texts, numbers and lists of texts: JSON's escapes are also valid in TOML
     lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
     head = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
     gap = "" if not before else "\n" if before.endswith("\n") else "\n\n"
@@ -600,10 +600,10 @@ WantedBy=timers.target
 
 
 def units(job: Job, program: str) -> Mapping[str, str]:
-    """Return the files by which a scheduler of the system drives ``volcomp recal run``: texts by name.
+    """Return the files for the system's scheduler to run ``volcomp recal run``: texts by file name.
 
     They are systemd services and timers and the lines of a crontab. Machines with the same schedule share one timer; a
-    machine without one is looked at every hour. ``program`` is the path of the ``compgen`` command.
+    machine without a schedule is checked every hour. ``program`` is the path of the ``compgen`` command.
     """
     groups: dict[Schedule, list[str]] = {}
     for name, machine in job.machines.items():
@@ -629,7 +629,7 @@ def units(job: Job, program: str) -> Mapping[str, str]:
 
 
 def _command_lines(job: Job, words: Sequence[str]) -> str:
-    """Say where and what to run; words are quoted as systemd reads them."""
+    """Return where and what to run; words are quoted for systemd."""
     command = []
     for word in words:
         text = _escaped(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")

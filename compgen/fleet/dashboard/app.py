@@ -1,7 +1,7 @@
-"""The web application: what the pages share, pages that only read, login and decisions, and what every request goes through.
+"""The web application: what the pages share, read-only pages, login and decisions, and checks of every request.
 
-Places in the address are numbers, never names of files. What may change something is checked before any page sees it: host,
-method, origin, session, token (:func:`_begin_request`).
+Parts of the address are numbers, never file names. A request that may change something is checked before any page sees
+it: host, method, origin, session, token (:func:`_begin_request`).
 """
 
 from __future__ import annotations
@@ -69,13 +69,13 @@ from compgen.fleet.status import STATUSES, audit_page, fleet, fleet_page, machin
 from compgen.fleet.store import Store, open_store
 from compgen.resources import data_folder
 
-#: Longest reason, characters.
+#: Maximum length of a reason, characters.
 LONGEST_REASON = 1000
 
 
 @dataclass(frozen=True)
 class Service:
-    """Everything that lives as long as the server."""
+    """Everything that exists as long as the server runs."""
 
     settings: DashboardSettings
     store: Store
@@ -116,13 +116,13 @@ def make_service(settings: DashboardSettings, store: Store, clock: Callable[[], 
     )
 
 
-# --- pages that only read ------------------------------------------------------------------------------------------
+# --- read-only pages -----------------------------------------------------------------------------------------------
 
 reading_pages = Blueprint("reading", __name__)
 #: How long the page of a machine waits for the drift, s.
 A_MOMENT_S = 0.2
 NUMBER = "number(max=2147483647)"
-#: Text of a kept page where the name and the token of the reader belong; nobody can guess it.
+#: Placeholders in a cached page for the reader's name and token; nobody can guess them.
 PLACES = {name: f"{name}-{secrets.token_hex(16)}" for name in ("user", "csrf")}
 
 
@@ -133,7 +133,7 @@ class PlaceNumber(IntegerConverter):
 
 
 def the_service() -> Service:
-    """Return what the application of this request shares."""
+    """Return what is shared by the pages of this application."""
     found: Service = current_app.extensions["compgen"]
     return found
 
@@ -145,7 +145,7 @@ def the_machine(machine_id: int) -> MachineRecord:
 
 
 def kept(view: Callable[..., str]) -> Callable[..., str]:
-    """Make a page once for all readers with the same rights, as long as nothing changes that it shows."""
+    """Make a page once for all readers with the same rights, until something that it shows changes."""
 
     @functools.wraps(view)
     def wrapper(**arguments: int) -> str:
@@ -170,7 +170,7 @@ def kept(view: Callable[..., str]) -> Callable[..., str]:
 
 
 def page_url(**arguments: Any) -> str:
-    """Return the address of the fleet page with these choices."""
+    """Return the address of the fleet page with these selections."""
     return "/?" + urlencode({key: value for key, value in arguments.items() if value})
 
 
@@ -195,7 +195,7 @@ def overview() -> str:
 @reading_pages.get(f"/machines/<{NUMBER}:machine_id>")
 @kept
 def machine(machine_id: int) -> str:
-    """Show one machine's history; what its drift says, if that is known by now."""
+    """Show one machine's history, and its drift if already known."""
     service, found = the_service(), the_machine(machine_id)
     sentences, problem = None, ""
     try:
@@ -211,7 +211,7 @@ def machine(machine_id: int) -> str:
 @reading_pages.get(f"/machines/<{NUMBER}:machine_id>/drift")
 @kept
 def drift(machine_id: int) -> str:
-    """Show which errors changed, which drift, and when they leave their tolerance."""
+    """Show which errors changed, which drift, and when they exceed their tolerance."""
     found = the_machine(machine_id)
     try:
         known = the_service().drift_of(found)
@@ -226,7 +226,7 @@ def drift(machine_id: int) -> str:
 
 @reading_pages.get(f"/machines/<{NUMBER}:machine_id>/recheck")
 def recheck(machine_id: int) -> str:
-    """Show the fewest points at which a requested change of one error would be seen."""
+    """Show the smallest set of points that would reveal a requested change of one error."""
     found, service = the_machine(machine_id), the_service()
     page: dict[str, Any] = {"machine": found, "waiting": False, "problem": "", "start": None, "plan": None}
     try:
@@ -242,7 +242,7 @@ def recheck(machine_id: int) -> str:
 
 @reading_pages.get(f"/machines/<{NUMBER}:machine_id>/recheck.points.csv")
 def recheck_points(machine_id: int) -> Response:
-    """Send the points of a re-check as a points file; 409 for one that cannot be, 503 while it is worked out."""
+    """Send the points of a re-check as a points file; 409 if it is not possible, 503 while it is being calculated."""
     found, service = the_machine(machine_id), the_service()
     start = basis(service.store, found)
     change, _ = requested_change(request.args, start, service.job.tolerances(found.name))
@@ -256,7 +256,7 @@ def recheck_points(machine_id: int) -> Response:
 @reading_pages.get(f"/machines/<{NUMBER}:machine_id>/tables/<{NUMBER}:version>")
 @kept
 def table(machine_id: int, version: int) -> str:
-    """Show before and after of one set of tables."""
+    """Show one set of tables, before and after."""
     service, found = the_service(), the_machine(machine_id)
     record = find_table(service.store, found, version)
     if record is None:
@@ -285,7 +285,7 @@ def _download(content: bytes, name: str) -> Response:
 @reading_pages.get("/audit")
 @kept
 def audit() -> str:
-    """Show who decided what, when and why, the newest first."""
+    """Show who decided what, when and why, newest first."""
     people = request.args.get("who") == "people"
     page = audit_page(the_service().store, _page_number(), people=people)
     return render_template("audit.html", page=page, people=people)
@@ -293,7 +293,7 @@ def audit() -> str:
 
 @reading_pages.get("/metrics")
 def metrics() -> Response:
-    """Show the metrics; where reading needs a login, to whoever shows the token."""
+    """Show the metrics; if reading needs a login, only with the token."""
     settings = the_service().settings
     if settings.private or settings.metrics_token:
         shown = request.headers.get("Authorization", "")
@@ -304,7 +304,7 @@ def metrics() -> Response:
 
 @reading_pages.get("/healthz")
 def health() -> tuple[Response, int]:
-    """Say whether the store can be read, and is still the file that was opened."""
+    """Report whether the store can be read and is still the file that was opened."""
     store = the_service().store
     try:
         store.version()
@@ -324,7 +324,7 @@ def style() -> Response:
 # --- login, logout, decisions --------------------------------------------------------------------------------------
 
 signing_pages = Blueprint("signing", __name__)
-#: Pages to which a login may lead back.
+#: Pages that a login may return to.
 BACK = re.compile(r"/(audit|machines/[0-9]{1,10}(/tables/[0-9]{1,10})?)?")
 
 
@@ -349,7 +349,7 @@ def _form(problem: str, code: int, name: str = "") -> Response:
 
 @signing_pages.post("/login")
 def log_in() -> BaseResponse:
-    """Check name and password; a new session begins whatever the browser brought along."""
+    """Check name and password; a new session always begins, whatever the browser sent."""
     service = the_service()
     if service.users is None:
         abort(404, "This dashboard only reads; there is nothing to log in for.")
@@ -361,7 +361,7 @@ def log_in() -> BaseResponse:
     wait_s = service.limit.wait_s(address, name)
     if wait_s > 0.0:
         return _refused(name, address, wait_s)
-    stamp = service.users.stamp(name)  # before the check: a password that changes meanwhile ends the session
+    stamp = service.users.stamp(name)  # before the check: a password changed meanwhile ends the session
     if not service.users.verify(name, password) or stamp is None:
         service.metrics.logins.labels("wrong").inc()
         logs.warning("login refused", user=name, address=address)
@@ -416,7 +416,7 @@ def roll_back(machine_id: int) -> BaseResponse:
 
 
 def _decision_request() -> dict[str, Any]:
-    """Return who decides and why, and as ``seen`` the version that was active on the page, 0 for none."""
+    """Return who decides and why, and as ``seen`` the version shown as active on the page, 0 for none."""
     text = request.form.get("reason", "")
     reason = " ".join("".join(char if char.isprintable() else " " for char in text).split())
     if len(reason) > LONGEST_REASON:
@@ -426,7 +426,7 @@ def _decision_request() -> dict[str, Any]:
 
 
 def _whole(field: str, problem: str) -> int:
-    """Return a whole number of the form; InputError with the problem if it is none."""
+    """Return a whole number from the form; InputError with the problem if it is not one."""
     text = request.form.get(field, "")
     if not re.fullmatch(r"[0-9]{1,9}", text):
         raise InputError(problem)
@@ -434,7 +434,7 @@ def _whole(field: str, problem: str) -> int:
 
 
 def _allowed(machine_id: int) -> MachineRecord:
-    """Return the machine if decisions are allowed here; session, origin and token were checked before."""
+    """Return the machine if decisions are allowed here; session, origin and token have been checked."""
     if not the_service().settings.decide:
         abort(403, "This dashboard only reads.")
     if not the_service().may_decide(g.session.user):
@@ -445,13 +445,13 @@ def _allowed(machine_id: int) -> MachineRecord:
 def _decided(
     machine: MachineRecord, kind: str, decide: Callable[[Store, MachineRecord], DecisionRecord]
 ) -> BaseResponse:
-    """Decide as ``volcomp recal`` does; where there is a job file, the files of the machine follow, or the page says why not."""
+    """Decide as ``volcomp recal`` does; with a job file the machine's files are updated, or the page says why not."""
     service, user = the_service(), g.session.user
     try:
         if service.settings.job is None:
             decide(service.store, machine)
         else:
-            service.store.version()  # StoreError if the file is another one by now, before a new one is opened by name
+            service.store.version()  # StoreError if the file was replaced, before a new one is opened
             actions.carried_out(read_job(service.settings.job), machine.name, decide)
     except NotPublishedError as error:
         logs.error("files do not follow", machine=machine.name, problem=str(error))
@@ -462,13 +462,13 @@ def _decided(
     return redirect(f"/machines/{machine.id}", code=303)
 
 
-# --- what every request goes through, the pages for errors ---------------------------------------------------------
+# --- checks of every request, error pages --------------------------------------------------------------------------
 
-#: Largest body of a request, bytes, and parts of a form.
+#: Largest body of a request, bytes, and largest number of parts of a form.
 LARGEST_BODY, MOST_PARTS = 16_384, 20
 #: Methods that change nothing.
 SAFE = ("GET", "HEAD", "OPTIONS")
-#: Pages that show nothing of the store, so that they need no login.
+#: Pages that need no login: they show nothing from the store (the metrics then need their token).
 OPEN_PAGES = ("signing.login", "signing.log_in", "reading.style", "reading.health", "reading.metrics")
 
 
@@ -480,13 +480,13 @@ def make_app(
     Parameters
     ----------
     settings : see :class:`Settings`; checked here.
-    store : an open store; without one that of the settings is opened.
+    store : an open store; default: the store of the settings is opened.
     clock : seconds; for tests of sessions and limits.
 
     Raises
     ------
     InputError, StoreError
-        for settings that are not safe, and a store that cannot be opened.
+        for unsafe settings, or a store that cannot be opened.
     """
     check_settings(settings)
     folder = data_folder("templates") / "_serve"
@@ -518,7 +518,7 @@ def make_app(
 
 
 def _begin_request() -> BaseResponse | None:
-    """Check host, method, login and, for what may change something, origin and token; in this order, before any page."""
+    """Check host, method, login and, for requests that may change something, origin and token, before any page."""
     g.began, g.session = time.perf_counter(), None
     service = the_service()
     service.background.began()
@@ -527,7 +527,7 @@ def _begin_request() -> BaseResponse | None:
     token = request.cookies.get(cookie_name(service.settings, "session"))
     g.session = service.sessions.find(token) if service.users is not None else None
     if g.session is not None and service.users is not None and service.users.stamp(g.session.user) != g.session.stamp:
-        service.sessions.end(token)  # the user is gone or has another password now
+        service.sessions.end(token)  # the user was removed or has a new password
         g.session = None
     if request.method not in SAFE:
         check_origin(request, service.settings)
@@ -558,7 +558,7 @@ def _context() -> dict[str, Any]:
 
 
 def _finish(response: Response) -> Response:
-    """Headers, counters, one line of log; nothing of a form or a cookie goes there."""
+    """Add headers, count, log one line; the log contains nothing from forms or cookies."""
     service = the_service()
     service.background.ended()
     seconds = time.perf_counter() - g.get("began", time.perf_counter())
@@ -597,7 +597,7 @@ def _http_error(error: HTTPException) -> Response | tuple[str, int] | HTTPExcept
 
 
 def _program_error(error: CompgenError) -> tuple[str, int]:
-    """Show what the program itself says: a decision that cannot be made, a store that cannot be reached."""
+    """Show the program's message: a decision that cannot be made, a store that cannot be reached."""
     if isinstance(error, StoreError):
         logs.error("store", problem=str(error))
         text = "The store is not available at the moment; see the log."
@@ -614,7 +614,7 @@ def _unexpected(error: Exception) -> tuple[str, int]:
 
 
 def _ago(time: datetime | None) -> str:
-    """Say in days how long ago a time is."""
+    """Say in days how long ago a time was."""
     if time is None:
         return ""
     days = (datetime.now(UTC) - time).days
@@ -622,9 +622,9 @@ def _ago(time: datetime | None) -> str:
 
 
 def _figure(value: float | None, digits: int = 2, sign: str = "") -> str:
-    """Return a number with fixed digits, a dash for one that is not known; no minus before a zero.
+    """Return a number with fixed digits, a dash if it is unknown; zero has no minus sign.
 
-    With ``sign`` "+" every number has its sign.
+    With ``sign`` "+" every number has a sign.
     """
     if value is None or value != value:
         return "\N{EN DASH}"

@@ -1,7 +1,7 @@
-"""What is kept between requests: figures that take more than a moment, and pages as long as nothing changes.
+"""What is kept between requests: figures that take time to calculate, and pages until something changes.
 
-Figures (drift, shortest re-check) are worked out one at a time in a background thread: nobody can keep all
-processors busy by asking. Whoever asks waits a little and is told to come again.
+Figures (drift, shortest re-check) are calculated one at a time in a background thread: nobody can keep all processors
+busy with requests. A request waits briefly and is then told to try again.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ from compgen.fleet.records import IdentificationRecord, MachineRecord, Requested
 from compgen.fleet.store import Store, counting
 from compgen.plan import PlannedStations
 
-#: Results that stay in memory, and questions that may wait for their turn.
+#: Results that stay in memory, and requests that may wait for their turn.
 MOST, WAITING = 300, 20
-#: Pieces of work that may wait for an idle moment.
+#: Tasks that may wait for an idle moment.
 MOST_LATER = 2000
-#: After so long without a request they begin, and after so long in any case, s.
+#: Such a task starts after this time without a request, and after this time in any case, s.
 REST_S, AT_LATEST_S = 2.0, 30.0
 #: How long a request waits for a result, s.
 PATIENCE_S = 0.7
-#: Pages that are kept; how long one is shown that says how long ago something was, and one that waits for figures, s.
+#: Pages kept; how long a complete page is shown (it says how long ago things were), and one that waits for figures, s.
 PAGES, SHOWN_S, WAITING_SHOWN_S = 200, 60.0, 1.0
 
 
 class NotReadyError(Exception):
-    """The figures are being worked out; ask again in a moment."""
+    """The figures are being calculated; ask again in a moment."""
 
 
 class Background:
-    """Results by a key that says everything they depend on."""
+    """Results by a key that contains everything they depend on."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="figures")
@@ -62,12 +62,12 @@ class Background:
         self._requests, self._last = 0, time.monotonic()
 
     def get(self, key: Hashable, work: Callable[[], Any], patience_s: float | None = None) -> Any:
-        """Return what ``work`` gives, or raise what it raises.
+        """Return the result of ``work``, or raise its error.
 
         Raises
         ------
         NotReadyError
-            if that takes longer than ``patience_s`` (None: :data:`PATIENCE_S`), or too many questions wait.
+            if that takes longer than ``patience_s`` (None: :data:`PATIENCE_S`), or too many requests are waiting.
         """
         with self._lock:
             future = self._known.get(key)
@@ -84,14 +84,14 @@ class Background:
         except InputError:
             raise
         except Exception:
-            with self._lock:  # what may pass by itself is tried again by the next question
+            with self._lock:  # the problem may be temporary: the next request tries again
                 self._known.pop(key, None)
             raise
 
     def later(self, key: Hashable, work: Callable[[], None]) -> None:
-        """Do ``work``, which keeps its result itself, when nobody asks for anything; once while it is still to be done.
+        """Do ``work``, which stores its result itself, when the server is idle; it is queued once.
 
-        It begins :data:`REST_S` after the last request, or after :data:`AT_LATEST_S` on a server that never rests.
+        It starts :data:`REST_S` after the last request, or after :data:`AT_LATEST_S` on a server that is never idle.
         """
         with self._lock:
             if len(self._idle) < MOST_LATER:
@@ -101,17 +101,17 @@ class Background:
                 threading.Thread(target=self._work_at_rest, name="figures at rest", daemon=True).start()
 
     def began(self) -> None:
-        """Say that a request came."""
+        """Note that a request arrived."""
         with self._lock:
             self._requests += 1
 
     def ended(self) -> None:
-        """Say that a request was answered."""
+        """Note that a request was answered."""
         with self._lock:
             self._requests, self._last = max(0, self._requests - 1), time.monotonic()
 
     def _work_at_rest(self) -> None:
-        """Do what waits for an idle moment, one piece after the other, until nothing is left."""
+        """Do the tasks that wait for an idle moment, one after the other, until none is left."""
         since = time.monotonic()
         while True:
             with self._lock:
@@ -130,12 +130,12 @@ class Background:
             except RuntimeError:  # the server stops
                 return
             error = future.exception()
-            if error is not None:  # it is asked for again; the page of that machine says what is wrong
+            if error is not None:  # it will be requested again; the page of that machine shows the problem
                 logs.warning("figures not worked out", problem=f"{type(error).__name__}: {error}")
             since = time.monotonic()
 
     def _forget(self) -> None:
-        """Drop what was not asked for longest; what is being worked out stays."""
+        """Drop the least recently requested results; keep what is being calculated."""
         for key in [key for key, item in self._known.items() if item.done()][: max(0, len(self._known) - MOST)]:
             del self._known[key]
 
@@ -153,7 +153,7 @@ class _Page:
 class Pages:
     """Pages by address, each made once for every state of what it shows.
 
-    ``state`` tells it; every request asks, so that a page is never older than what could be read then.
+    Every request calls ``state``, so a page is never older than the data at that time.
     """
 
     def __init__(self, state: Callable[[], Hashable]) -> None:
@@ -161,7 +161,7 @@ class Pages:
         self._pages: OrderedDict[Hashable, _Page] = OrderedDict()
 
     def get(self, key: Hashable, make: Callable[[], tuple[str, bool]]) -> str:
-        """Return the page; ``make`` gives its text, and whether it is complete: if not, it is made again soon."""
+        """Return the page; ``make`` returns its text and whether it is complete: if not, it is soon made again."""
         state = self._state()
         with self._lock:
             page = self._pages.setdefault(key, _Page())
@@ -177,14 +177,14 @@ class Pages:
 
 # --- drift ---------------------------------------------------------------------------------------------------------
 
-#: Figures that are drawn at most, the most significant first.
+#: Largest number of figures drawn, the most significant first.
 DRAWN = 12
 MACHINES = database.machines
 
 
 @dataclass(frozen=True)
 class ChangeRow:
-    """Change of one error where it changed most: since the last and since the first calibration, with intervals."""
+    """Change of one error where it changed most, since the last and since the first calibration, with intervals."""
 
     error: str
     unit: str
@@ -194,9 +194,9 @@ class ChangeRow:
 
 @dataclass(frozen=True)
 class TrendRow:
-    """Trend of one figure: change a month with expanded uncertainty, adjusted error probability, steps, forecast.
+    """Trend of one figure: change per month with expanded uncertainty, adjusted error probability, steps, forecast.
 
-    ``significant``: whether its slope or a step of it is beyond the uncertainty, all figures counted.
+    ``significant``: whether its slope or one of its steps exceeds the uncertainty, corrected for all figures.
     """
 
     name: str
@@ -212,7 +212,7 @@ class TrendRow:
 
 
 class JobFile:
-    """The job file as it is now; read again when it changed."""
+    """The current job file; read again when it has changed."""
 
     def __init__(self, path: Path | None) -> None:
         self._path, self._lock = path, threading.Lock()
@@ -220,14 +220,14 @@ class JobFile:
         self._job: Job | None = None
 
     def state(self) -> tuple[int, int] | None:
-        """Return what changes when the file is written, None where there is none."""
+        """Return what changes when the file is written, None if there is no file."""
         if self._path is None or not self._path.is_file():
             return None
         stat = self._path.stat()
         return stat.st_mtime_ns, stat.st_size
 
     def tolerances(self, machine: str) -> Mapping[str, float]:
-        """Return the tolerances of a machine, mm and rad, by error; none without a job file or such a machine."""
+        """Return the tolerances of a machine, mm and rad, by error; empty without a job file or such a machine."""
         state = self.state()
         if self._path is None or state is None:
             return {}
@@ -239,14 +239,14 @@ class JobFile:
 
 
 class DriftCache:
-    """Drifts of machines, worked out in the background."""
+    """Drifts of machines, calculated in the background."""
 
     def __init__(self, store: Store, background: Background, job: JobFile) -> None:
         self._store, self._background, self._job = store, background, job
         self._outlooks: dict[int, tuple[Hashable, tuple[str, str]]] = {}
 
     def __call__(self, machine: MachineRecord, patience_s: float | None = None) -> Drift:
-        """Return the drift; InputError where there are no errors with uncertainties, NotReadyError while it is made."""
+        """Return the drift; InputError if no errors have uncertainties, NotReadyError while it is being calculated."""
         states = self._store.read(lambda c: c.execute(state_query().where(MACHINES.c.id == machine.id)).all())
         tolerances = self._job.tolerances(machine.name)
         key = ("drift", machine.id, tuple(states[0])[1:] if states else (), tuple(sorted(tolerances.items())))
@@ -255,9 +255,9 @@ class DriftCache:
         return found
 
     def outlooks(self, machines: Sequence[MachineRecord]) -> dict[int, tuple[str, str]]:
-        """Return what moves and when a tolerance is left, by the id of the machine; those that are known by now.
+        """Return by machine id, as far as known, what changes and when a tolerance is exceeded.
 
-        The others are worked out one after the other while the server has nothing else to do.
+        The others are calculated one after the other while the server is idle.
         """
         rows = self._store.read(lambda connection: connection.execute(state_query()).all())
         states = {row[0]: tuple(row)[1:] for row in rows}
@@ -274,7 +274,7 @@ class DriftCache:
 
     def _look(self, machine: MachineRecord, tolerances: Mapping[str, float], key: Hashable) -> None:
         if self._outlooks.get(machine.id, (None,))[0] == key:
-            return  # two pages asked for it
+            return  # two pages requested it
         try:
             said = drift_of_store(self._store, machine, DriftSettings(tolerances)).outlook()
         except InputError:  # no calibrations with uncertainties
@@ -283,7 +283,7 @@ class DriftCache:
 
 
 def state_query() -> sa.Select[Any]:
-    """Everything of the store that the drift of a machine depends on: id, last decision, identification, exclusion."""
+    """Everything in the store that a machine's drift depends on: id, last decision, identification, exclusion."""
     decisions, made, events = database.decisions, database.identifications, database.events
     newest = [
         sa.select(sa.func.max(decisions.c.sequence)).where(decisions.c.machine_id == MACHINES.c.id),
@@ -294,7 +294,7 @@ def state_query() -> sa.Select[Any]:
 
 
 def change_rows(drift: Drift) -> Sequence[ChangeRow]:
-    """Return largest change, expanded uncertainty and adjusted error probability of every error, in units of files."""
+    """Return each error's largest change, expanded uncertainty, adjusted error probability, in the units of files."""
     last, first = (
         {
             item.error: (item.largest / scale, COVERAGE * item.u / scale, item.adjusted)
@@ -308,7 +308,7 @@ def change_rows(drift: Drift) -> Sequence[ChangeRow]:
 
 
 def trend_rows(drift: Drift) -> Sequence[TrendRow]:
-    """Return the trends, the most significant first, in units of files and months."""
+    """Return the trends, most significant first, in the units of files and months."""
     level, found = 1.0 - drift.settings.confidence, []
     for item in sorted(drift.figures, key=lambda item: item.p_value):
         if item.trend is None:
@@ -336,9 +336,9 @@ def trend_rows(drift: Drift) -> Sequence[TrendRow]:
 
 
 def drift_charts(drift: Drift) -> Sequence[Chart]:
-    """Draw the volume against what the active tables take out, temperatures, and the figures that matter.
+    """Draw the volume relative to what the active tables compensate, temperatures, and the important figures.
 
-    Those are the ones that drift, have a step or follow the temperature beyond the uncertainty, and those with a tolerance.
+    Important figures drift, have a step or follow the temperature beyond the uncertainty, or have a tolerance.
     """
     times = [datetime.fromisoformat(text) for text in drift.times]
     seconds, marks = [time.timestamp() for time in times], time_ticks(times)
@@ -371,15 +371,15 @@ def drift_charts(drift: Drift) -> Sequence[Chart]:
 
 # --- shortest re-check ---------------------------------------------------------------------------------------------
 
-#: Without a tolerance the page asks for a change of this size first, um or urad.
+#: Size of the change that the page first requests if there is no tolerance, um or urad.
 FIRST_CHANGE = 10.0
-#: Largest change that may be asked for, um or urad.
+#: Largest change that may be requested, um or urad.
 LARGEST = 10_000.0
 
 
 @dataclass(frozen=True)
 class Basis:
-    """What a re-check starts from: the newest calibration that says where its tracers were, and what it identified."""
+    """Starting point of a re-check: the newest calibration with known tracer positions, and what it identified."""
 
     identification: IdentificationRecord
     stations: PlannedStations
@@ -387,7 +387,7 @@ class Basis:
 
 
 def basis(store: Store, machine: MachineRecord) -> Basis:
-    """Return it; InputError if no calibration of the machine was measured with tracers."""
+    """Return the starting point; InputError if no calibration of the machine was measured with tracers."""
     for item in reversed(counting(store, machine)):
         stations = stations_of(item.summary)
         errors = [str(name) for name in item.summary.get("identified", ())]
@@ -398,7 +398,7 @@ def basis(store: Store, machine: MachineRecord) -> Basis:
 
 
 def stations_of(summary: Mapping[str, Any]) -> PlannedStations | None:
-    """Return the stations of an identification; None if there are none. Beam breaks add no passes."""
+    """Return the stations of an identification; None if it has none. Beam breaks do not add passes."""
     listed = [item for item in summary.get("stations") or () if not item.get("segment")]
     places = {str(item["station"]): item["position_mm"] for item in listed}
     if not places:
@@ -411,7 +411,7 @@ def stations_of(summary: Mapping[str, Any]) -> PlannedStations | None:
 def requested_change(
     given: Mapping[str, str], start: Basis, tolerances: Mapping[str, float]
 ) -> tuple[RequestedChange, str]:
-    """Return error and change that the address asks for, with defaults; and the change in the unit of files as text."""
+    """Return the requested error and change, with defaults, and the change as text in the unit of files."""
     name = given.get("error") or next((item for item in start.errors if item in tolerances), start.errors[0])
     if name not in start.errors:
         raise InputError("choose an error that the last calibration identified")
@@ -427,13 +427,13 @@ def requested_change(
 
 
 class RecheckCache:
-    """Re-checks, worked out in the background."""
+    """Re-checks, calculated in the background."""
 
     def __init__(self, store: Store, background: Background) -> None:
         self._store, self._background = store, background
 
     def __call__(self, start: Basis, request: RequestedChange) -> Recheck:
-        """Return the re-check; InputError for one that cannot be, NotReadyError while it is worked out."""
+        """Return the re-check; InputError if it is not possible, NotReadyError while it is being calculated."""
         key = ("recheck", start.identification.id, request)
 
         def work() -> Recheck:

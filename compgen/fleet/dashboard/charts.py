@@ -1,4 +1,4 @@
-"""Charts and figures of one machine: errors over time, and proposed against active tables."""
+"""Charts and figures of one machine: errors over time, and proposed compared with active tables."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from compgen.fleet.records import (
 )
 from compgen.fleet.store import Store, at_one_moment, counting
 
-# --- geometry: plain numbers that a template turns into SVG; colours are those of the style sheet --------------------
+# --- geometry: plain numbers that a template turns into SVG; colours come from the style sheet -----------------------
 
 #: Size of a chart and its margins (left, right, top, bottom), px.
 WIDTH, HEIGHT = 620.0, 200.0
@@ -41,7 +41,7 @@ MARGINS = (64.0, 16.0, 12.0, 30.0)
 
 @dataclass(frozen=True)
 class ChartSeries:
-    """One line: x, y and, where known, the half width of the interval around y (nan where it is not known).
+    """One line: x, y and the half width of the interval about y (nan if unknown).
 
     ``marked``: whether its points are drawn.
     """
@@ -65,9 +65,9 @@ class Mark:
 
 @dataclass(frozen=True)
 class Chart:
-    """Everything in px: ticks as (place, text), lines as the text of ``points``, marks with their intervals.
+    """Everything in px: ticks as (position, text), lines as text for ``points``, marks with their intervals.
 
-    ``left_out`` are points that do not count, at the edge if they lie outside the scale.
+    ``left_out`` are points that do not count; they are drawn at the edge if outside the scale.
     """
 
     title: str
@@ -89,10 +89,10 @@ def chart(
     x_ticks: Sequence[tuple[float, str]] | None = None,
     left_out: ChartSeries | None = None,
 ) -> Chart | None:
-    """Return the chart of some lines; None if there is no point to draw.
+    """Return a chart of lines; None if there is no point to draw.
 
-    ``x_ticks`` are places and texts below the axis; without them round numbers are chosen. The scale of y does not reach
-    for points that are ``left_out``.
+    ``x_ticks`` are positions and texts below the axis; by default round numbers. Points that are ``left_out`` do not
+    extend the y scale.
     """
     kept = [_finite(item) for item in series]
     xs = [x for item in kept for x in item.x]
@@ -106,7 +106,7 @@ def chart(
     across = _Scale(min(xs), max(xs), MARGINS[0] + 8, WIDTH - MARGINS[1] - 8)
     up = _Scale(low, high, HEIGHT - MARGINS[3], MARGINS[2])
     outside = []
-    for mark in [] if grey is None else _line(grey, across, up)[2]:  # those beyond the scale go to its edge
+    for mark in [] if grey is None else _line(grey, across, up)[2]:  # points beyond the scale go to its edge
         y = min(max(mark.y, MARGINS[2]), HEIGHT - MARGINS[3])
         outside.append(mark if y == mark.y else Mark(mark.x, y, None, None))
     if x_ticks is None:
@@ -122,7 +122,7 @@ def chart(
 
 
 class _Scale:
-    """Linear map from values to px; values that are all the same are drawn in the middle."""
+    """Linear map from values to px; if all values are equal, they are drawn in the middle."""
 
     def __init__(self, low: float, high: float, start: float, end: float) -> None:
         self.low, self.span, self.start, self.end = low, high - low, start, end
@@ -149,16 +149,16 @@ def _line(item: ChartSeries, across: _Scale, up: _Scale) -> tuple[str, str, list
 
 # --- one machine over time -----------------------------------------------------------------------------------------
 
-#: Measurements that the charts go back, and rows that a page shows of what grows for ever.
+#: Number of measurements in the charts, and of rows that a page shows of ever-growing lists.
 CHARTED, LISTED = 60, 200
 
 
 @dataclass(frozen=True)
 class ErrorHistory:
-    """One error over the measurements: chart, newest value, change since the one before and since the first.
+    """One error over the measurements: chart, newest value, change since the previous and since the first value.
 
     Values and expanded uncertainties in ``unit``; for an error that is a function of position the value is its largest
-    minus its smallest value, without an uncertainty.
+    minus its smallest value, without uncertainty.
     """
 
     name: str
@@ -172,7 +172,7 @@ class ErrorHistory:
 
     @property
     def direction(self) -> str:
-        """How the newest value lies to the first, in a word."""
+        """The newest value compared with the first, in one word."""
         if self.since_first is None or self.since_first == 0.0:
             return "unchanged"
         return "up" if self.since_first > 0.0 else "down"
@@ -180,7 +180,7 @@ class ErrorHistory:
 
 @dataclass(frozen=True)
 class History:
-    """Everything that the page of a machine shows, newest first; charts run from old to new."""
+    """Everything that a machine's page shows, newest first; charts run from old to new."""
 
     machine: MachineRecord
     active: TableRecord | None
@@ -206,7 +206,7 @@ class History:
 
 @at_one_moment
 def history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> History:
-    """Collect the history of a machine, as it is at one moment."""
+    """Collect the history of a machine at one moment."""
     tables = store.tables(machine)
     measurements = store.measurements(machine)
     failures = [attempt for attempt in store.attempts(machine) if attempt.outcome == "failed"]
@@ -227,9 +227,9 @@ def history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> Hist
 def trends(
     errors_of: ErrorCache, identifications: Sequence[IdentificationRecord], left_out: Collection[int] = ()
 ) -> list[ErrorHistory]:
-    """Return the squareness errors and the span of every curve over time, as far as they were identified.
+    """Return the squareness errors and the span of every curve over time, where identified.
 
-    Measurements whose ids are ``left_out`` are drawn, but do not count.
+    Measurements with ids in ``left_out`` are drawn, but do not count.
     """
     found = [(item.measured_at, errors_of(item), item.measurement_id in left_out) for item in identifications]
     counted = [(at, table) for at, table, out in found if not out]
@@ -262,7 +262,7 @@ def _trend(
 
 
 def _figures(name: str, found: Sequence[tuple[datetime, ErrorTable]]) -> list[tuple[datetime, float, float]]:
-    """Return time, value and expanded uncertainty of an error, in units of files, from those tables that have it."""
+    """Return time, value and expanded uncertainty of an error, in the units of files, from the tables that have it."""
     unit, rows = error_named(name).si_per_unit, []
     for at, table in found:
         if name in table.squareness:
@@ -285,7 +285,7 @@ def _temperatures(measurements: Sequence[MeasurementRecord]) -> Chart | None:
 
 
 def time_ticks(times: Sequence[datetime], most: int = 4) -> list[tuple[float, str]]:
-    """Return days, evenly over the time, as (seconds, text); times of less than a day show the minute."""
+    """Return days, evenly spaced in time, as (seconds, text); if they span at most two days, with hour and minute."""
     if not times:
         return []
     first, last = min(times), max(times)
@@ -296,7 +296,7 @@ def time_ticks(times: Sequence[datetime], most: int = 4) -> list[tuple[float, st
 
 
 class ErrorCache:
-    """Errors of identifications, which never change; those that were asked for last stay in memory."""
+    """Errors of identifications, which never change; the most recently requested stay in memory."""
 
     def __init__(self, store: Store, most: int = 5000) -> None:
         self._store, self._most, self._lock = store, most, threading.Lock()
@@ -319,7 +319,7 @@ class ErrorCache:
 
 # --- one set of tables: figures of the judgement, errors, text of the files, before and after ------------------------
 
-#: Figures of the volume that are compared, and their names.
+#: Figures of the volume to compare, and their names.
 FIGURES = {
     "rms_um": "rms of the error vector",
     "p95_um": "95 % of the points stay below",
@@ -328,15 +328,15 @@ FIGURES = {
     "v_y_um": "range in Y",
     "v_z_um": "range in Z",
 }
-#: Curves that are drawn, lines of a difference and bytes of a file that are looked at.
+#: Limits: curves drawn, lines of a difference, bytes of a compared file.
 DRAWN, DIFF_LINES, DIFF_BYTES = 6, 400, 400_000
 
 
 @dataclass(frozen=True)
 class VolumeComparison:
-    """Error of one control in the volume, um: rows of (name, without tables, with the active ones, with these).
+    """Error of one control in the volume, um: rows of (name, without tables, with the active tables, with these).
 
-    Without ``volumetric`` the figures hold the effect of the measured errors alone.
+    Without ``volumetric`` the figures contain only the effect of the measured errors.
     """
 
     controller: str
@@ -347,7 +347,7 @@ class VolumeComparison:
     volumetric: bool = True
 
     def bars(self, *values: float | None) -> list[float]:
-        """Return the lengths of bars for some figures, the longest 200 px."""
+        """Return the lengths of bars for these figures, the longest 200 px."""
         known = [value for value in values if value is not None]
         largest = max(known, default=0.0) or 1.0
         return [round(200.0 * value / largest, 1) for value in known]
@@ -355,7 +355,7 @@ class VolumeComparison:
 
 @dataclass(frozen=True)
 class FileView:
-    """One file of the tables: its number in the set, contents' hash and size, difference to the active file."""
+    """One file of the tables: its number in the set, hash and size of its contents, difference from the active file."""
 
     number: int
     file: StoredTableFile
@@ -371,7 +371,7 @@ class FileView:
 
 @dataclass(frozen=True)
 class ErrorComparison:
-    """One error, identified now and behind the active tables, in ``unit``; ``expanded`` belongs to the change."""
+    """One error, as identified now and for the active tables, in ``unit``; ``expanded`` belongs to the change."""
 
     name: str
     unit: str
@@ -392,7 +392,7 @@ class ErrorComparison:
 
 @dataclass(frozen=True)
 class Proposal:
-    """Everything that the page of one set of tables shows."""
+    """Everything that the page of a set of tables shows."""
 
     machine: MachineRecord
     table: TableRecord
@@ -414,7 +414,7 @@ def find_table(store: Store, machine: MachineRecord, version: int) -> TableRecor
 
 @at_one_moment
 def proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table: TableRecord) -> Proposal:
-    """Collect what a person needs to decide on a set of tables, as it is at one moment."""
+    """Collect what a person needs to decide on a set of tables, at one moment."""
     identification = store.identification(table.identification_id)
     active = active_of(store.tables(machine))
     behind = None if active is None or active.id == table.id else store.identification(active.identification_id)
@@ -436,7 +436,7 @@ def proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table:
 
 
 def comparisons(table: TableRecord) -> list[VolumeComparison]:
-    """Return for each control what the volume's error is without tables, with the active ones and with these."""
+    """Return for each control the error of the volume without tables, with the active tables and with these."""
     results, remaining = _mapping(table.summary.get("result")), _mapping(table.summary.get("remaining"))
     moved = _mapping(table.summary.get("correction"))
     return [
@@ -490,7 +490,7 @@ def _squareness(now: ErrorTable, before: ErrorTable | None) -> list[ErrorCompari
 
 
 def _curves(now: ErrorTable, before: ErrorTable | None) -> list[Chart]:
-    """Draw the curves that changed most, or without earlier ones the largest: linear errors, then angles."""
+    """Draw the curves that changed most, or the largest if there are no earlier ones: linear, then angular errors."""
     old = {} if before is None else before.curves
 
     def change(name: str) -> float:
@@ -513,7 +513,7 @@ def _curves(now: ErrorTable, before: ErrorTable | None) -> list[Chart]:
 
 
 def file_views(store: Store, table: TableRecord, active: TableRecord | None) -> list[FileView]:
-    """Return the files of a set of tables with what differs from the active file of the same control and name."""
+    """Return the files of a set of tables and their differences from the active file of the same control and name."""
     others: dict[tuple[str, str], bytes] = {}
     if active is not None and active.id != table.id:
         others = {(file.controller, file.name): file.content for file in store.table_files(active)}

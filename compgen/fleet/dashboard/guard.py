@@ -1,9 +1,9 @@
 """Protection of the dashboard: host names, origin, headers, sessions, rate limit of logins.
 
-The sessions are our own and not those of Flask-Login and Flask-WTF, which keep them in a signed cookie of the browser: a
-copy of such a cookie is still good after the user logged out, logged in again or rested too long, and a key would have to be
-kept. Here the browser holds a random token and the server its hash, so a restart logs everybody out. The limit counts a try
-before its password is looked at and takes the right one back, which the windows of Flask-Limiter cannot.
+Flask-Login and Flask-WTF are not used for sessions because they keep them in a signed browser cookie: a copy of the
+cookie remains valid after the user logged out, logged in again or was idle too long, and a key would have to be stored.
+Here the browser has a random token and the server its hash, so a restart logs everybody out. The limit counts an
+attempt before its password is checked and takes a successful one back, which the windows of Flask-Limiter cannot do.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from compgen.fleet.dashboard.settings import DashboardSettings
 
 HOST = re.compile(r"(?P<name>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+)(:(?P<port>[0-9]{1,5}))?")
 METHODS = ("GET", "HEAD", "OPTIONS", "POST")
-#: No script at all, nothing from elsewhere, no frame around the pages.
+#: No scripts, nothing from other sites, no frames around the pages.
 POLICY = (
     "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
@@ -34,7 +34,7 @@ HEADERS = {
     "Content-Security-Policy": POLICY,
     "X-Frame-Options": "DENY",
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "same-origin",  # with no-referrer browsers would send forms with "Origin: null"
+    "Referrer-Policy": "same-origin",  # with no-referrer, browsers send forms with "Origin: null"
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Permissions-Policy": "camera=(), geolocation=(), microphone=(), payment=(), usb=()",
@@ -43,27 +43,27 @@ HEADERS = {
 
 
 class Misdirected(HTTPException):
-    """The request calls the server by a name that is not its own."""
+    """The request uses a host name that is not one of the server's."""
 
     code = 421
     description = "This server is not known by that name; --name adds one."
 
 
 def check_host(request: Request, settings: DashboardSettings) -> None:
-    """Refuse names that are not ours: a foreign page that points its name at this computer (DNS rebinding)."""
+    """Refuse other host names: a foreign page may point its name at this computer (DNS rebinding)."""
     found = HOST.fullmatch(request.headers.get("Host", ""))
     if found is None or found["name"].lower() not in settings.host_names:
         raise Misdirected
 
 
 def check_method(request: Request) -> None:
-    """Refuse methods that no page knows, before anything else of the request is looked at."""
+    """Refuse methods that no page supports, before anything else in the request is checked."""
     if request.method not in METHODS:
         raise MethodNotAllowed(METHODS)
 
 
 def check_origin(request: Request, settings: DashboardSettings) -> None:
-    """Refuse a request that would change something unless it comes from our own pages."""
+    """Refuse a request that would change something unless it comes from the dashboard's pages."""
     own = f"{settings.scheme}://{request.headers.get('Host', '')}"
     origin = request.headers.get("Origin")
     if origin is None:
@@ -74,7 +74,7 @@ def check_origin(request: Request, settings: DashboardSettings) -> None:
 
 
 def add_headers(response: Response, settings: DashboardSettings) -> None:
-    """Put the security headers on an answer."""
+    """Add the security headers to a response."""
     for name, value in HEADERS.items():
         response.headers[name] = value
     if settings.tls:
@@ -82,7 +82,7 @@ def add_headers(response: Response, settings: DashboardSettings) -> None:
 
 
 def cookie_name(settings: DashboardSettings, name: str) -> str:
-    """Return the name of a cookie; over HTTPS one that browsers tie to this host."""
+    """Return the name of a cookie; over HTTPS a name that browsers bind to this host."""
     return f"__Host-compgen-{name}" if settings.tls else f"compgen-{settings.port}-{name}"
 
 
@@ -101,13 +101,13 @@ Clock = Callable[[], float]
 
 #: A session ends after this time without a request, and after this time in any case, s.
 IDLE_S, LONGEST_S = 1800.0, 12 * 3600.0
-#: Sessions at the same time; the one that rested longest gives way.
+#: Largest number of sessions; the one idle for longest is ended for a new one.
 MOST = 1000
 
 
 @dataclass
 class LoginSession:
-    """One user who is logged in; ``stamp`` changes with the password, ``messages`` wait for the next page."""
+    """One logged-in user; ``stamp`` changes with the password, ``messages`` wait for the next page."""
 
     user: str
     stamp: str
@@ -125,7 +125,7 @@ class Sessions:
         self._sessions: dict[str, LoginSession] = {}
 
     def begin(self, user: str, stamp: str) -> str:
-        """Begin a session and return its token, which is always a new one."""
+        """Begin a session and return its token, which is always new."""
         token, now = secrets.token_urlsafe(32), self._clock()
         with self._lock:
             self._forget_old(now)
@@ -135,7 +135,7 @@ class Sessions:
         return token
 
     def find(self, token: str | None) -> LoginSession | None:
-        """Return the session of a token and count it as used; None for one that is unknown or over."""
+        """Return the session of a token and mark it as used; None if it is unknown or has ended."""
         if not token:
             return None
         now = self._clock()
@@ -147,7 +147,7 @@ class Sessions:
             return session
 
     def end(self, token: str | None) -> None:
-        """End the session of a token, if there is one."""
+        """End the session of a token, if it exists."""
         with self._lock:
             self._sessions.pop(_key(token or ""), None)
 
@@ -163,13 +163,13 @@ class Sessions:
 
 
 class LoginTokens:
-    """Ties the login form to the browser that asked for it, before there is a session."""
+    """Bind the login form to the browser that requested it, before there is a session."""
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(32)
 
     def issue(self) -> tuple[str, str]:
-        """Return a new cookie and the field of the form that belongs to it."""
+        """Return a new cookie and the form field that belongs to it."""
         cookie = secrets.token_urlsafe(24)
         return cookie, self._field(cookie)
 
@@ -182,7 +182,7 @@ class LoginTokens:
 
 
 def same(first: str, second: str) -> bool:
-    """Compare two secrets in a time that says nothing about them."""
+    """Compare two secrets in a time that reveals nothing about them."""
     return hmac.compare_digest(first.encode("utf-8", "replace"), second.encode("utf-8", "replace"))
 
 
@@ -192,21 +192,21 @@ def _key(token: str) -> str:
 
 # --- rate limit of logins ------------------------------------------------------------------------------------------
 
-#: Time in which tries are counted, s.
+#: Time window in which attempts are counted, s.
 WINDOW_S = 300.0
-#: Tries that fail in one window: for one name from one address, for one address, for one name, for all together.
+#: Failed attempts allowed in a window: for one name from one address, for one address, for one name, in total.
 PAIR, ADDRESS, NAME, ALL = 5, 20, 20, 200
 
 
 class LoginLimit:
-    """Counts tries; a try counts before its password is looked at, so that tries at the same time count too."""
+    """Count attempts, each before its password is checked: simultaneous attempts count too."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         self._clock, self._lock = clock, threading.Lock()
         self._tries: dict[tuple[str, ...], deque[float]] = {}
 
     def wait_s(self, address: str, name: str) -> float:
-        """Count a try and return 0, or return how long to wait, s, and count nothing."""
+        """Count an attempt and return 0, or return how long to wait, s, and count nothing."""
         now = self._clock()
         with self._lock:
             self._forget(now)
@@ -221,7 +221,7 @@ class LoginLimit:
             return wait_s
 
     def succeeded(self, address: str, name: str) -> None:
-        """Take back the try that was right, and forget the earlier ones of this name from this address."""
+        """Take back the successful attempt, and forget earlier ones of this name from this address."""
         pair, *others = _keys(address, name)
         with self._lock:
             self._tries.pop(pair, None)

@@ -29,13 +29,13 @@ STATES: tuple[TableState, ...] = get_args(TableState)
 
 
 class FleetCollector(Collector):
-    """Looks into the store when the metrics are read; a store that cannot be reached is one of them."""
+    """Read the store when the metrics are read; one metric says whether the store can be reached."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def describe(self) -> list[Any]:
-        """Return nothing: the store is not asked before somebody reads the metrics."""
+        """Return nothing: the store is not read before somebody reads the metrics."""
         return []
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
@@ -141,7 +141,7 @@ class WatchMetrics(_Metrics):
 
 
 class _Threads(ThreadingMixIn, WSGIServer):
-    """A thread for each request, so that a slow reader keeps nobody else waiting."""
+    """A thread for each request: a slow reader keeps nobody else waiting."""
 
     daemon_threads = True
 
@@ -150,17 +150,17 @@ class _Quiet(WSGIRequestHandler):
     timeout = 10
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing: whoever reads metrics comes every few seconds."""
+        """Log nothing: metrics are read every few seconds."""
 
 
 def start_metrics(text: Callable[[], bytes], port: int, host: str = "127.0.0.1") -> tuple[int, Callable[[], None]]:
-    """Serve metrics at ``/metrics`` in a thread of their own.
+    """Serve metrics at ``/metrics`` in a separate thread.
 
-    The server of ``prometheus_client`` answers whatever name it is called by (DNS rebinding); this one does not.
+    The server of ``prometheus_client`` answers requests for any host name (DNS rebinding); this one does not.
 
     Returns
     -------
-    The port (which the system chose if ``port`` is 0) and what stops it.
+    The port (chosen by the system if ``port`` is 0) and a function that stops the server.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def start_metrics(text: Callable[[], bytes], port: int, host: str = "127.0.0.1")
             return say("404 Not Found", b"metrics are at /metrics\n")
         try:
             return say("200 OK", text(), CONTENT_TYPE)
-        except Exception as error:  # whatever it is, the recalibration goes on
+        except Exception as error:  # the recalibration continues after any error
             logs.error("metrics", problem=f"{type(error).__name__}: {error}")
             return say("500 Internal Server Error", b"the log says more\n")
 

@@ -1,4 +1,4 @@
-"""The HTTP server of the dashboard; whoever sends a request byte by byte does not keep others out (slow loris)."""
+"""The HTTP server of the dashboard; clients that send a request byte by byte do not block others (slow loris)."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from compgen.fleet import logs
 from compgen.fleet.dashboard.app import make_app
 from compgen.fleet.dashboard.settings import DashboardSettings
 
-#: A request must be complete this long after its first byte, s.
+#: A request must be complete within this time after its first byte, s.
 REQUEST_S = 20.0
-#: While the connections are at their limit, those without a request end after this time, s.
+#: At the limit of connections, those without a request end after this time, s.
 CROWDED_S = 2.0
 
 
 class TimedChannel(HTTPChannel):  # type: ignore[misc]
-    """A connection that ends when its request takes too long; asked by the server's loop about once a second."""
+    """A connection that ends when its request takes too long; checked by the server's loop about once a second."""
 
     began: float | None = None
 
     def readable(self) -> bool:
-        """Say whether more may be read; note when a request began, and end what takes too long."""
+        """Return whether more may be read; note when a request began, and end a request that takes too long."""
         now = time.time()
         if self.request is None or self.requests:
             self.began = None
@@ -43,7 +43,7 @@ class TimedChannel(HTTPChannel):  # type: ignore[misc]
 
 
 def bounded(server: Any) -> Any:
-    """Return the server with connections that end in time."""
+    """Return the server with connections that have a time limit."""
     for each in [*getattr(server, "map", {}).values(), server]:
         if hasattr(each, "channel_class"):
             each.channel_class = TimedChannel
@@ -51,14 +51,14 @@ def bounded(server: Any) -> Any:
 
 
 THREADS, LARGEST_BODY, LARGEST_HEADERS = 8, 65_536, 65_536
-#: Connections at the same time; so many that patient ones do not keep others out, see :mod:`compgen.fleet.dashboard.server`.
+#: Largest number of connections; so many that slow ones do not block others.
 CONNECTIONS = 1000
-#: Bytes of an answer that may wait for a slow reader, so that none keeps a thread.
+#: Bytes of a response that may wait for a slow reader: none occupies a thread.
 WAITING_BYTES = 2**30
 
 
 def make_server(settings: DashboardSettings) -> Any:
-    """Return a server that listens; InputError if the address cannot be used."""
+    """Return a listening server; InputError if the address cannot be used."""
     import waitress  # type: ignore[import-untyped]  # shipped without type information
 
     app = make_app(settings)
@@ -84,7 +84,7 @@ def make_server(settings: DashboardSettings) -> Any:
 
 
 def run(settings: DashboardSettings) -> None:
-    """Serve until SIGTERM or SIGINT; requests that are being answered are finished."""
+    """Serve until SIGTERM or SIGINT; requests in progress are completed."""
     server = make_server(settings)
     logger = logging.getLogger("waitress")
     logger.setLevel(logging.WARNING)
@@ -103,7 +103,7 @@ def run(settings: DashboardSettings) -> None:
 
 
 class _Logged(logging.Handler):
-    """Puts what the server library says into our logs, so that all lines have one form."""
+    """Write the server library's messages to our logs: all lines have the same form."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log one message."""

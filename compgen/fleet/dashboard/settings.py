@@ -1,4 +1,7 @@
-"""Settings of the dashboard; ``volcomp serve --help`` loads this module, so what needs a library is imported where it is used."""
+"""Settings of the dashboard.
+
+``volcomp serve --help`` loads this module, so libraries are imported where they are used.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from compgen.data.files import read_text
 from compgen.data.toml_files import option
 from compgen.errors import InputError
 
-#: Names under which a browser of this computer reaches the dashboard.
+#: Host names by which a browser on this computer reaches the dashboard.
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9A-Fa-f:.]+\]")
 
@@ -45,17 +48,17 @@ class DashboardSettings:
 
     @property
     def scheme(self) -> str:
-        """How browsers speak to it."""
+        """URL scheme that browsers use."""
         return "https" if self.tls else "http"
 
     @property
     def login(self) -> bool:
-        """Whether there is anything to log in for."""
+        """Whether anything needs a login."""
         return self.decide or self.private
 
     @property
     def host_names(self) -> frozenset[str]:
-        """Names that a request may call it by, in lower case."""
+        """Host names that a request may use, in lower case."""
         listens = () if is_any(self.host) else (f"[{self.host}]" if ":" in self.host else self.host,)
         return frozenset(name.lower() for name in (*LOCAL_NAMES, *listens, *self.names))
 
@@ -69,7 +72,7 @@ def is_any(host: str) -> bool:
 
 
 def is_local(host: str) -> bool:
-    """Whether only this computer reaches ``host``."""
+    """Whether only this computer can reach ``host``."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -77,7 +80,7 @@ def is_local(host: str) -> bool:
 
 
 def check_settings(settings: DashboardSettings) -> DashboardSettings:
-    """Return the settings; InputError where they would send passwords over a network in the clear, or miss something."""
+    """Return the settings; InputError if they are incomplete or would send unencrypted passwords over a network."""
     if settings.login and not is_local(settings.host) and not settings.tls:
         raise InputError(
             f"passwords would go to {settings.host} in the clear; keep --host 127.0.0.1 and put a proxy with HTTPS in "
@@ -95,7 +98,7 @@ def check_settings(settings: DashboardSettings) -> DashboardSettings:
 
 
 def read_token(path: str | Path) -> str:
-    """Return the token of the metrics from its file; InputError for one that could be guessed."""
+    """Return the metrics token from its file; InputError if it could be guessed."""
     token = read_text(path).strip()
     if len(token) < 16 or not token.isascii():
         raise InputError("expected a token of at least 16 ASCII characters", file=path)
@@ -103,7 +106,7 @@ def read_token(path: str | Path) -> str:
 
 
 def default_users(store_url: str) -> Path | None:
-    """Return the file of users that belongs to a store: next to an SQLite file; None for a store on a server."""
+    """Return the users file of a store: next to an SQLite file; None for a store on a server."""
     from compgen.fleet.database import sqlite_path
 
     path = sqlite_path(store_url)

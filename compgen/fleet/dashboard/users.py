@@ -1,7 +1,7 @@
-"""The users of the dashboard: names, passwords, and who only reads, in a file.
+"""The users of the dashboard: names, passwords and read-only users, in a file.
 
-The store never forgets anything and is copied into backups, but a password that was changed must be gone: so users have a
-file of their own.
+The store never deletes anything and is copied into backups, but an old password must disappear: users therefore have a
+separate file.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from compgen.fleet.records import AUTOMATIC
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 SHORTEST, LONGEST = 12, 256
-#: Hashes that are worked out at the same time; each takes 64 MiB.
+#: Largest number of hashes calculated at the same time; each takes 64 MiB.
 AT_ONCE = 2
 
 
 class Users:
-    """The file of users; it is read again at every question, so that a change counts at once."""
+    """The users file; it is read again for every query, so a change takes effect at once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -44,12 +44,12 @@ class Users:
         return sorted(self._read()[0])
 
     def stamp(self, name: str) -> str | None:
-        """Return what changes when the user's password does; None for an unknown user."""
+        """Return what changes with the user's password; None for an unknown user."""
         found = self._read()[0].get(name)
         return None if found is None else sha256_of(found.encode())
 
     def may_decide(self, name: str) -> bool:
-        """Whether the user is there and more than a reader."""
+        """Whether the user exists and is not just a reader."""
         users, readers = self._read()
         return name in users and name not in readers
 
@@ -66,9 +66,9 @@ class Users:
         return right and found is not None
 
     def add(self, name: str, password: str, *, reader: bool = False) -> bool:
-        """Add a user or change password and rights; return whether the user is new. InputError for what cannot be taken.
+        """Add a user or change password and rights; return whether the user is new. InputError for invalid values.
 
-        A ``reader`` sees what needs a login and decides nothing.
+        A ``reader`` sees what needs a login, but cannot decide.
         """
         check_name(name)
         check_password(name, password)
@@ -82,7 +82,7 @@ class Users:
         return new
 
     def remove(self, name: str) -> None:
-        """Remove a user, whose sessions end at once; InputError if there is none."""
+        """Remove a user, whose sessions end at once; InputError for an unknown user."""
         users, readers = self._read()
         if name not in users:
             raise InputError(f"has no user {name!r}", file=self.path)
@@ -90,7 +90,7 @@ class Users:
         self._write(users, readers - {name})
 
     def _read(self) -> tuple[dict[str, str], frozenset[str]]:
-        """Return the hashes by name, and who only reads."""
+        """Return the hashes by name, and the read-only users."""
         try:
             with self.path.open(encoding="utf-8") as stream:
                 if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
@@ -111,7 +111,7 @@ class Users:
         return users, frozenset(readers)
 
     def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:
-        """Replace the file in one step; only its owner may read it."""
+        """Replace the file atomically; only its owner may read it."""
         text = json.dumps({"users": dict(sorted(users.items())), "readers": sorted(readers)}, indent=2) + "\n"
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,12 +132,12 @@ class Users:
 
 @cache
 def _nobody() -> str:
-    """Return a hash that is compared with where there is no user."""
+    """Return a hash to compare with if the user does not exist."""
     return PasswordHasher().hash(secrets.token_urlsafe())
 
 
 def check_name(name: str) -> None:
-    """Raise InputError unless ``name`` can be that of a user."""
+    """Raise InputError unless ``name`` is a valid user name."""
     if not NAME.fullmatch(name):
         raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
     if name.lower() == AUTOMATIC:
@@ -145,7 +145,7 @@ def check_name(name: str) -> None:
 
 
 def check_password(name: str, password: str) -> None:
-    """Raise InputError for a password that is too short, too long, or the name."""
+    """Raise InputError for a password that is too short, too long, or equal to the name."""
     if not SHORTEST <= len(password) <= LONGEST:
         raise InputError(f"a password has {SHORTEST} to {LONGEST} characters; this one has {len(password)}")
     if name.lower() in password.lower() or len(set(password)) < 5:
@@ -155,5 +155,5 @@ def check_password(name: str, password: str) -> None:
 
 
 def _normal(password: str) -> str:
-    """One form for letters that keyboards write in several ways."""
+    """Return a common form for letters that keyboards encode in several ways."""
     return unicodedata.normalize("NFC", password)
