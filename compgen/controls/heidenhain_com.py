@@ -347,7 +347,7 @@ def _kind(file: SourceFile, table: TextTable) -> str:
 # Data for the templates of HEIDENHAIN tables: cells in their fields, parameters to set, worked examples, warnings.
 
 
-#: Totals reported for older controls, without a document as source.
+#: Totals reported for older controls; no document confirms them.
 USUAL_TOTAL, USUAL_TABLES = 640, 10
 POSITION_DECIMALS = 4
 

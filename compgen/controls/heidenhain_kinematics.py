@@ -145,7 +145,7 @@ def _entries(table: TextTable, column: str) -> tuple[Decimal, ...]:
 #
 # Source: iTNC 530 HSCI technical manual (07.2013), p. 666-686, 722. For a linear axis X the columns are C1 EXX, C2 EYX,
 # C3 EZX, C4 EAX, C5 EBX, C6 ECX; rows ``Trans`` of the kinematics table refer to them in the column COMPTAB. Points
-# that no document settles are in ``templates/heidenhain-kinematics/format.toml``; the machine builder integrates it.
+# that no document settles: see ``templates/heidenhain-kinematics/format.toml``; the machine builder must integrate it.
 
 
 class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):

@@ -36,7 +36,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.toml_files import Section
 
-#: Sections of the machine file that describe the same control: they supply the keys that its section does not state.
+#: Sections of the machine file that describe the same control: they supply keys missing in the section of this one.
 OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
 #: Keys that both kinds of tables have, with separate values: the keys of the encoder tables have this prefix.
 PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")

@@ -352,7 +352,7 @@ def axis_of(item: Assignment, name: str, axis_names: Sequence[str]) -> int:
 # Files from real SINUMERIK controls: start-up archives, punched files and sub-programs not written by this program.
 #
 # An archive is a chain of files. Each is preceded by NUL bytes with the name ``_N_NC_CEC_INI`` in the binary form
-# (``.arc``), or by a line ``%_N_NC_CEC_INI`` in the text form. The tables are in its initialisation files; part
+# (``.arc``), or by a line ``%_N_NC_CEC_INI`` in the text form. The tables are in the initialisation files; part
 # programs that write the same variables have no effect and are skipped. If a file contains only one part, that part is
 # read, whether or not it is a program.
 #
