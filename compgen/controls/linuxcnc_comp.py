@@ -38,15 +38,15 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import InputError
 
-# Text that LinuxCNC reads: lines one by one, so that garbage of any size fails at its first wrong line; numbers; units.
+# Text for LinuxCNC: lines one by one, so garbage of any size fails at the first wrong line; numbers; units.
 
 
-#: A number as C reads it with %lf, less hexadecimal digits, ``inf`` and ``nan``.
+#: A number as read by C with %lf, except hexadecimal digits, ``inf`` and ``nan``.
 _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
 _BLANK = re.compile(r"[ \t\r\n]*+")
-#: What is quoted of a wrong word.
+#: Number of characters quoted from a wrong word.
 SHOWN = 40
-#: Lengths of one unit of the machine, [TRAJ] LINEAR_UNITS: everything that LinuxCNC reads is in machine units.
+#: Length of a machine unit, [TRAJ] LINEAR_UNITS: everything that LinuxCNC reads is in machine units.
 MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 
 
@@ -62,9 +62,9 @@ def check_size(source: SourceFile, most: int) -> None:
 
 
 def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
-    """Yield number (from 1), text without its end, and whether the line has an end, of each line (LF or CRLF).
+    """Yield for each line its number (from 1), its text, and whether it has a line end (LF or CRLF).
 
-    Of blank lines behind each other, however many, only the first is yielded.
+    Only the first of consecutive blank lines is yielded.
     """
     text, start, number = source.text, 0, 1
     while start < len(text):
@@ -95,21 +95,21 @@ def whole_in(source: SourceFile, line: int, word: str, what: str, limits: tuple[
     return int(word)
 
 
-# LinuxCNC's COMP_FILE: strict reading, and the control's rule in its own arithmetic (float32 trims and slopes).
+# LinuxCNC's COMP_FILE: strict reading, and the control's rule in the control's arithmetic (float32 trims and slopes).
 #
-# The rule was read from running LinuxCNC 2.9: trims and their slopes are stored as float32, positions as double; the table
-# holds its end values outside; a position p with ``nominal[i] <= p < nominal[i+1]`` is corrected by
+# Found by running LinuxCNC 2.9: trims and their slopes are stored as float32, positions as double; the table
+# keeps its end values outside; a position p with ``nominal[i] <= p < nominal[i+1]`` is corrected by
 # ``trim[i] + slope[i] * (p - nominal[i])``, forward while the joint moves up, reverse while it moves down. The correction is
 # ADDED to the motor command.
 
 
-#: Rows that LinuxCNC keeps, and characters of a line that it reads.
+#: Maximum number of rows that LinuxCNC keeps, and of characters it reads per line.
 MOST_ROWS, LONGEST_LINE = 256, 254
 _MOST_CHARACTERS = 1_000_000
-#: A step of the correction at standstill acts at once below the first share of a T^2, is ramped above the second, and
+#: A correction step at standstill acts at once below the first multiple of a T^2, is ramped above the second, and
 #: never acts in between (a: joint acceleration, T: servo period).
 AT_ONCE, RAMPED = 0.25, 0.5
-#: Columns whose values grow by more than this share of the nominal position are positions and no trims.
+#: Columns whose values grow by more than this fraction of the nominal position are positions, not trims.
 _LIKE_POSITIONS = 0.9
 _COLUMNS = ("the nominal position", "the forward value", "the reverse value")
 
@@ -142,9 +142,9 @@ class CompTable:
         return self.reverse * self.mm_per_unit
 
     def at(self, position_mm: FloatArray, direction: int) -> FloatArray:
-        """Return the correction at joint positions (m,) in the direction +1 or -1, bit for bit as the control."""
+        """Return the correction at joint positions (m,) in direction +1 or -1, bit for bit as in the control."""
         trims = (self.forward if direction > 0 else self.reverse).astype(np.float32)
-        # slopes behind each row: float32 of the float32 differences; zero behind the last
+        # slopes after each row: float32 of the float32 differences; zero after the last
         differences = (trims[1:] - trims[:-1]).astype(np.float64)
         slopes = np.append((differences / np.diff(self.nominal)).astype(np.float32), np.float32(0.0))
         position = np.asarray(position_mm, dtype=np.float64) / self.mm_per_unit
@@ -160,9 +160,9 @@ class CompTable:
 
 
 def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: float) -> str:
-    """Say what a step of the correction does from standstill: ``"at once"``, ``"never"`` or ``"ramped"``.
+    """Say how a correction step acts from standstill: ``"at once"``, ``"never"`` or ``"ramped"``.
 
-    LinuxCNC ramps the correction with half of the joint's acceleration. A step of at most 0.25 a T^2 is applied at once,
+    LinuxCNC ramps the correction with half the joint acceleration. A step of at most 0.25 a T^2 is applied at once,
     above 0.5 a T^2 it is ramped; in between the filter keeps its velocity of zero (found by running LinuxCNC 2.9).
 
     >>> [standstill_outcome(step, 5000.0, 1e-3) for step in (0.001, 0.002, 0.003)]
@@ -179,15 +179,15 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
 
     Parameters
     ----------
-    source : the text; CRLF, exponents and further columns are what the control takes too.
-    file_type : 0: nominal, actual forward, actual reverse (the trim is nominal minus actual); 1: the trims themselves.
-    mm_per_unit : unit of the machine, in which the file is written; the file itself does not say it.
+    source : the text; CRLF, exponents and additional columns are accepted, as by the control.
+    file_type : 0: nominal, actual forward, actual reverse (trim = nominal minus actual); 1: the trims themselves.
+    mm_per_unit : machine unit used in the file; the file itself does not state it.
 
     Raises
     ------
     InputError
-        with the line, for what makes the control stop reading without a word (a comment, a blank line, text, a decimal
-        comma), for rows that it drops (more than 256, or not increasing), and for a file that was cut.
+        with the line, for anything that makes the control silently stop (a comment, a blank line, text, a decimal
+        comma), for rows that it drops (more than 256, or not increasing), and for a truncated file.
     """
     check_size(source, _MOST_CHARACTERS)
     rows: list[tuple[float, ...]] = []
@@ -204,7 +204,7 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
     if not rows:
         raise source.fail("contains no row; is it the right file, or is it truncated?", 1)
     nominal, forward, reverse = np.array(rows).T
-    # positions that would be read as trims, and trims that would be read as positions, are mistakes of many mm
+    # positions read as trims, and trims read as positions, cause errors of many mm
     span = float(np.ptp(nominal))
     slope = float(np.ptp(forward)) / span if span > 0.0 and len(nominal) > 2 else 0.5
     if slope > _LIKE_POSITIONS if file_type == 1 else slope < 1.0 - _LIKE_POSITIONS:
@@ -237,16 +237,16 @@ def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]
     return row
 
 
-# What is said to the user of a COMP_FILE: sign, INI lines, and reversal steps that the control may not apply.
+# Information for the user of a COMP_FILE: sign, INI lines, and reversal steps that the control may not apply.
 
 
 _SECONDS_PER_US = 1e-6
-#: A step below this is none.
+#: A smaller step is ignored.
 _NO_STEP_MM = 1e-9
 
 
 def sign_statement(file_type: int, unit: str, tables: Mapping[int, CompTable]) -> str:
-    """Return the sign in words with a number from the file."""
+    """Return the sign in words, with a number from the file."""
     axis, table = max(tables.items(), key=lambda item: float(np.max(np.abs(item[1].forward))))
     row = int(np.argmax(np.abs(table.forward)))
     position, trim = float(table.nominal[row]), float(table.forward[row])
@@ -283,7 +283,7 @@ def parameters(
         )
         steps = table.step_mm[table.step_mm > _NO_STEP_MM]
         if len(steps):
-            # accelerations between which some of the steps are in the dead zone
+            # range of accelerations for which some steps are in the dead zone
             square = (servo_period_us * _SECONDS_PER_US) ** 2
             low = float(steps.min()) / (RAMPED * square) / table.mm_per_unit
             high = float(steps.max()) / (AT_ONCE * square) / table.mm_per_unit
@@ -328,12 +328,12 @@ def dead_zone_warnings(
 #: Names of the files; joint 0, 1, 2 is X, Y, Z as in ``trivkins coordinates=XYZ``.
 FILES = ("joint0-x.comp", "joint1-y.comp", "joint2-z.comp")
 POSITION_DIGITS, VALUE_DIGITS = 9, 9
-#: Decimals, and float32: a trim of 1 mm is kept to 3e-8 mm, its slope likewise.
+#: Decimals, and float32: a trim of 1 mm is kept to 3e-8 mm, and so is its slope.
 _RESOLUTION_MM = 1e-7
 _AXIS_OF_NAME = re.compile(r"joint_?([012])(?!\d)|(?<![a-z])([xyz])(?![a-z])", re.IGNORECASE)
 
 
-#: The letter of an axis at the end of a name, behind small letters (screwcompX) or a mark (screw_x).
+#: The letter of an axis at the end of a name, after small letters (screwcompX) or a separator (screw_x).
 _LAST_LETTER = re.compile(r"((?<=[a-z0-9])[XYZ]|(?<=[_.-])[xyzXYZ])$")
 
 
@@ -400,7 +400,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return one_dimensional_terms(self.machine, errors, nodes, [(axis, axis) for axis in range(3)])
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CompTables:
-        """Return the trims, rounded as they are written; both directions alike."""
+        """Return the trims, rounded as written; the same for both directions."""
         found = {}
         for axis in range(3):
             term = next(item for item in basis if item.name == one_dimensional_name(axis, axis))
@@ -409,7 +409,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return CompTables(found)
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return the reversal of each axis along itself; a displacement across has no place in a COMP_FILE."""
+        """Return the reversal of each axis along itself; a COMP_FILE cannot contain a transverse displacement."""
         return replace(reversal, curves={key: part for key, part in reversal.curves.items() if key[0] == key[1]})
 
     def with_reversal(self, tables: CompTables, reversal: ReversalCurves) -> CompTables:
@@ -430,11 +430,11 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return CompTables(found)
 
     def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
-        """Return none: a joint with a COMP_FILE ignores BACKLASH, and what is left lies across the axis."""
+        """Return none: a joint with a COMP_FILE ignores BACKLASH, and the rest is transverse to the axis."""
         return []
 
     def context(self, tables: CompTables) -> dict[str, Any]:
-        """Return rows by axis letter, INI lines, and what to know of small reversal steps."""
+        """Return rows by axis letter, INI lines, and what to know about small reversal steps."""
         settings = self.settings
         return {
             "sign_statement": sign_statement(settings.comp_file_type, settings.machine_units, tables.tables),
@@ -451,7 +451,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> CompTables:
-        """Read one file per joint; its name says which: ``joint0`` or the letter, as in ``joint0-x.comp``."""
+        """Read one file per joint; its name identifies the joint: ``joint0`` or the letter, as in ``joint0-x.comp``."""
         found: dict[int, CompTable] = {}
         for source in files:
             axis = _axis_of(source)
@@ -463,7 +463,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return CompTables(found)
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CompTables, list[str]]:
-        """Read COMP_FILEs under any name: ``comp_files`` says whose they are, else a letter at the end of the name."""
+        """Read COMP_FILEs under any name: ``comp_files`` assigns them, else a letter at the end of the name."""
         settings = self.settings
         found: dict[int, CompTable] = {}
         remarks = []
@@ -475,7 +475,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
                 axis = AXES.index(last.group(1).upper())
             else:
                 try:
-                    axis = _axis_of(source)  # by our own rule
+                    axis = _axis_of(source)  # by our naming rule
                 except InputError:
                     message = (
                         "the name does not say which joint it belongs to; state it in the machine file: "
@@ -489,9 +489,9 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return CompTables(found), remarks
 
     def emulate(self, tables: CompTables, points: Points) -> FloatArray:
-        """Return the trims at the commanded positions in the direction of the last travel; its mean if unknown.
+        """Return the trims at the commanded positions in the direction of the last travel; the mean if unknown.
 
-        This is the settled correction; what the control's filter does with small steps from standstill is
+        This is the settled correction; for small steps from standstill in the control's filter see
         :func:`compgen.controls.linuxcnc_comp.standstill_outcome`.
         """
         added = np.zeros((len(points), 3))
@@ -502,7 +502,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return added
 
     def violations(self, tables: CompTables) -> list[str]:
-        """Return joints without a table, and travel that a table leaves out: that of a file in another unit among them."""
+        """Return joints without a table, and travel that a table does not cover, e.g. with a file in another unit."""
         found = [f"there is no COMP_FILE for {AXES[axis]}" for axis in range(3) if axis not in tables.tables]
         for axis, table in sorted(tables.tables.items()):
             first, last = table.nominal_mm[0], table.nominal_mm[-1]
@@ -515,7 +515,7 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return found
 
     def resolution_mm(self) -> float:
-        """Half of the last decimal, and what float32 takes away."""
+        """Half of the last decimal, plus float32 rounding."""
         return _RESOLUTION_MM
 
     def table_nodes_mm(self, tables: CompTables) -> tuple[FloatArray, ...]:
@@ -523,14 +523,14 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         return nodes_by_axis((axis, table.nominal_mm) for axis, table in tables.tables.items())
 
     def usage(self, tables: CompTables) -> list[Usage]:
-        """Return the rows of each joint against the 256 that LinuxCNC takes."""
+        """Return the rows of each joint against the 256 that LinuxCNC accepts."""
         return [
             Usage(f"rows of {AXES[axis]}", len(table.nominal_mm), MOST_ROWS, "rows")
             for axis, table in sorted(tables.tables.items())
         ]
 
     def _as_written(self, nominal_mm: FloatArray, forward_mm: FloatArray, reverse_mm: FloatArray) -> CompTable:
-        """Return the table of these positions and trims as it is read back from its text."""
+        """Return the table of these positions and trims as read back from its text."""
         unit = self.settings.mm_per_unit
         table = CompTable(nominal_mm / unit, forward_mm / unit, reverse_mm / unit, unit)
         nominal, forward, reverse = (_written(column) for column in np.array(self._rows(table)).T)
@@ -551,7 +551,7 @@ def _written(values: FloatArray, digits: int = POSITION_DIGITS) -> FloatArray:
 
 
 def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
-    """Positions as the file has them, in mm: two that are equal in the file are equal here, to the last bit."""
+    """Positions as in the file, in mm: those equal in the file are equal here to the last bit."""
     return _written(position_mm / settings.mm_per_unit) * settings.mm_per_unit
 
 

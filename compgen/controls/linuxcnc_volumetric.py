@@ -37,22 +37,22 @@ from compgen.kinematics.many_points import full_grid
 
 # The table of the LinuxCNC kinematics ``volkins``: E = C P or a grid, evaluated in the arithmetic of the C sources.
 #
-# E(q, t) is the error of the tool tip (actual minus commanded) with the axes at q and the tool offset t; the tip stands at
-# P = q + E(q, t) (less the tool offset), so the control sends the axes to q = P - E(q, t), by iteration.
+# E(q, t) is the error of the tool tip (actual minus commanded) with the axes at q and the tool offset t; the tip is at
+# P = q + E(q, t) (minus the tool offset), so the control sends the axes to q = P - E(q, t), by iteration.
 
 
-#: Factors of a term, in the words of the file.
+#: Factors of a term, as words in the file.
 LEVERS = ("1", "x", "y", "z", "tx", "ty", "tz")
 #: Limits of ``volcomp.h``.
 MOST_CURVES, MOST_TERMS, MOST_NODES, MOST_VERTICES, LONGEST_NAME = 64, 512, 10_000, 100_000, 31
-#: The iteration of the inverse ends when no axis moves by more than this and this part of its coordinate (far from
-#: machine zero neighbouring numbers differ by more than the first), or fails after so many rounds.
+#: The inverse iteration ends when no axis moves by more than this plus this fraction of its coordinate (far from
+#: machine zero, adjacent floating-point numbers differ by more than the first), or fails after so many iterations.
 LAST_STEP_MM, LAST_PART, MOST_ROUNDS = 1e-13, 1e-15, 50
 
 
 @dataclass(frozen=True)
 class VolCurve:
-    """One curve over ``axis``: values (n,) in mm or rad at ``first_mm + k step_mm``; the end values hold outside."""
+    """One curve over ``axis``: values (n,) in mm or rad at ``first_mm + k step_mm``; constant outside."""
 
     name: str
     axis: int
@@ -71,13 +71,13 @@ class VolCurve:
 
     @property
     def grid(self) -> tuple[int, float, float, int]:
-        """Axis, first position, step and count: curves of the same grid have the same :meth:`cells`."""
+        """Axis, first position, step and count: curves on the same grid have the same :meth:`cells`."""
         return self.axis, self.first_mm, self.step_mm, len(self.values)
 
     def cells(
         self, position_mm: FloatArray
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.bool_]]:
-        """Values before and after positions (m,), the share of the one after, and whether a position is at the end."""
+        """Values before and after positions (m,), the weight of the one after, and whether a position is at the end."""
         last = len(self.values) - 1
         ratio = np.clip((position_mm - self.first_mm) / self.step_mm, 0.0, float(last))
         left = np.minimum(ratio.astype(np.int64), max(last - 1, 0))
@@ -112,9 +112,9 @@ class VolGrid:
 
 @dataclass(frozen=True)
 class VolTable:
-    """A table as the kinematics module reads it: curves with terms, or a grid.
+    """A table as read by the kinematics module: curves with terms, or a grid.
 
-    Numbers are in mm here; ``unit`` is that of the lengths in the file: the unit of the machine, ``"mm"`` or ``"inch"``.
+    Numbers here are in mm; ``unit`` is the unit of lengths in the file, the machine unit: ``"mm"`` or ``"inch"``.
     """
 
     curves: tuple[VolCurve, ...]
@@ -123,10 +123,10 @@ class VolTable:
     unit: str = "mm"
 
     def scaled(self, factor: float) -> VolTable:
-        """Return the table with all lengths times ``factor``: from the unit of the file to mm, and back.
+        """Return the table with all lengths times ``factor``: from the file's unit to mm, or back.
 
-        A curve is a length where a term takes it as it is (lever 1). Beside a lever it is an angle and has no unit; a curve
-        that is used in both ways is taken as a length, and the coefficient of the terms with a lever makes up for it.
+        A curve is a length if a term uses it directly (lever 1). With a lever it is an angle and has no unit; a curve
+        used in both ways is taken as a length, and the coefficient of the terms with a lever compensates for this.
         """
         if factor == 1.0:
             return self
@@ -159,7 +159,7 @@ class VolTable:
             )
         tool = np.broadcast_to(tool_mm, position_mm.shape)
         levers = dict(zip(LEVERS, [np.ones(len(position_mm)), *position_mm.T, *tool.T], strict=True))
-        # usually all curves over an axis have the same nodes: what depends on these alone is worked out once
+        # usually all curves over an axis have the same nodes: what depends only on these is computed once
         grids = {curve.grid: curve for curve in self.curves}
         cells = {grid: curve.cells(position_mm[:, curve.axis]) for grid, curve in grids.items()}
         values = {curve.name: curve.within(cells[curve.grid]) for curve in self.curves}
@@ -169,13 +169,13 @@ class VolTable:
         return error
 
     def forward(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-        """Where the tip is, less the tool offset, with the axes at positions (n, 3): shape (n, 3), mm."""
+        """Tip position minus the tool offset with the axes at positions (n, 3): shape (n, 3), mm."""
         return position_mm + self.error(position_mm, tool_mm)
 
     def inverse(self, wanted_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-        """Axis positions at which the tip is at ``wanted_mm`` (n, 3), less the tool offset: shape (n, 3), mm.
+        """Axis positions at which the tip (minus the tool offset) is at ``wanted_mm`` (n, 3): shape (n, 3), mm.
 
-        InputError where the iteration does not end: no machine has such errors, and the control refuses to move.
+        InputError if the iteration does not converge: no machine has such errors, and the control refuses to move.
         """
         axes = np.array(wanted_mm, dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -210,7 +210,7 @@ class VolTable:
 
 
 def checksum(words: Iterable[str]) -> str:
-    """CRC-32 of the words from ``volcomp`` to ``end`` with one blank between two, as 8 hexadecimal digits.
+    """CRC-32 of the words from ``volcomp`` to ``end`` separated by single blanks, as 8 hexadecimal digits.
 
     >>> checksum("volcomp 1 end".split())
     'CF835787'
@@ -222,12 +222,12 @@ def checksum(words: Iterable[str]) -> str:
     return f"{total:08X}"
 
 
-# Strict reading of the table of ``volkins``: as strict as the C sources, with the line of what is wrong.
+# Strict reading of the table of ``volkins``: as strict as the C sources, reporting the line of an error.
 #
-# Words are separated by white space: ``volcomp 1``, ``unit mm`` or ``unit inch`` (mm where it is missing: tables of versions that
+# White space separates words: ``volcomp 1``, ``unit mm`` or ``unit inch`` (mm if missing: tables of versions that
 # wrote mm only), then ``curve NAME AXIS COUNT FIRST STEP`` with COUNT numbers, ``term OUTPUT
 # CURVE COEFFICIENT LEVER``, or ``grid NX NY NZ X0 Y0 Z0 HX HY HZ`` with 3 NX NY NZ numbers (x fastest), then ``end``.
-# Comments (``#`` to the end of the line) and one ``crc32 XXXXXXXX`` of all words up to ``end`` follow.
+# Comments (``#`` to the end of the line) and one ``crc32 XXXXXXXX`` of all words up to ``end`` may follow.
 
 
 _LONGEST_LINE = 4096
@@ -236,7 +236,7 @@ _MAGIC = ("volcomp", "1")
 
 
 class _WordReader:
-    """The words of a file one by one, with the line that they are in; all that were taken count for the checksum."""
+    """The words of a file one by one, with their line; all words taken count for the checksum."""
 
     def __init__(self, source: SourceFile) -> None:
         self.source, self.line, self.taken = source, 1, list[str]()
@@ -244,7 +244,7 @@ class _WordReader:
         self._words: Iterator[str] = iter(())
 
     def take(self, what: str) -> str:
-        """Return the next word, which must be there; InputError at the end of the file."""
+        """Return the next word; InputError at the end of the file."""
         word = next(self._words, None)
         while word is None:
             following = next(self._lines, None)
@@ -263,7 +263,7 @@ class _WordReader:
 
     def number(self, what: str) -> float:
         """Return the next word as a finite number."""
-        word = self.take(what)  # first: it may be in the next line
+        word = self.take(what)  # first: it may be on the next line
         return number_in(self.source, self.line, word, what)
 
     def whole(self, what: str, low: int, high: int) -> int:
@@ -283,14 +283,14 @@ class _WordReader:
         return np.array([self.number("a value") for _ in range(count)])
 
     def rest(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield line and words of what follows; the words left in the line that is being read come first."""
+        """Yield line and words of the rest, starting with the words left in the current line."""
         first = (self.line, list(self._words))
         split = ((line, self._split(line, text, ended)) for line, text, ended in self._lines)
         return ((line, words) for line, words in chain([first], split) if words)
 
 
 def parse_volcomp(source: SourceFile) -> VolTable:
-    """Read a table; InputError with the line for anything that the kinematics module refuses."""
+    """Read a table; InputError with the line for anything that the kinematics module rejects."""
     check_size(source, _MOST_CHARACTERS)
     words = _WordReader(source)
     for due in _MAGIC:
@@ -373,16 +373,16 @@ def _check_trailer(source: SourceFile, words: _WordReader) -> None:
         raise source.fail("there is no 'crc32 XXXXXXXX' after 'end': the file is truncated", words.line)
 
 
-# How the numbers of a ``volkins`` table are written, their checksum, and the files that stand beside a table.
+# How the numbers of a ``volkins`` table are written, their checksum, and the files exported with a table.
 
 
 #: Decimals of positions and of values in mm, and of angles in rad.
 POSITION_DIGITS, LENGTH_DIGITS, ANGLE_DIGITS = 6, 9, 13
-#: Decimals in inch: lengths no coarser, and after 400 rounded steps a curve still ends where the travel ends.
+#: Decimals in inch: lengths are not coarser, and after 400 rounded steps a curve still ends at the end of travel.
 _INCH_POSITION_DIGITS, _INCH_LENGTH_DIGITS = 12, 11
-#: Name and last line of the licence text that belongs to the sources.
+#: Name and last line of the licence text for the sources.
 LICENCE, _LICENCE_ENDS = "COPYING", "Public License instead of this License."
-#: Suffixes of what else is exported beside the table; each ends with a line that holds ``end of`` and its name.
+#: Suffixes of other files exported with the table; each ends with a line containing ``end of`` and its name.
 COMPANIONS = (".ini", ".hal", ".comp", ".h")
 
 
@@ -403,7 +403,7 @@ def digits_of(table: VolTable, curve: VolCurve) -> int:
 
 
 def in_file_units(table: VolTable) -> VolTable:
-    """Return the table with the numbers that its file has: lengths in mm or inch (the fields keep their names)."""
+    """Return the table with the numbers in its file: lengths in mm or inch (the fields keep their names)."""
     return table.scaled(1.0 / MM_PER_UNIT[table.unit])
 
 
@@ -413,7 +413,7 @@ def _rounded(values: FloatArray, digits: int) -> FloatArray:
 
 
 def as_written(table: VolTable) -> VolTable:
-    """Return the table as it is read back from its text, in mm."""
+    """Return the table as read back from its text, in mm."""
     inside, places = in_file_units(table), position_digits(table)
     curves = tuple(
         replace(
@@ -457,12 +457,12 @@ def grid_rows(grid: VolGrid) -> list[list[float]]:
 
 
 def is_companion(source: SourceFile) -> bool:
-    """Whether a file is one of those that are exported beside the table, by its name."""
+    """Whether a file is one of those exported with the table, judged by its name."""
     return source.path.suffix.lower() in COMPANIONS or source.path.name.endswith(LICENCE)
 
 
 def check_companion(source: SourceFile) -> None:
-    """Raise InputError if INI, HAL, C source or licence text does not end with its last line: it is truncated."""
+    """Raise InputError if INI, HAL, C source or licence text lacks its last line: it is truncated."""
     last = source.text.rstrip().rpartition("\n")[2]
     whole = (
         last == _LICENCE_ENDS if source.path.name.endswith(LICENCE) else last.startswith(("# end of ", "// end of "))
@@ -473,7 +473,7 @@ def check_companion(source: SourceFile) -> None:
         )
 
 
-# What is said to the user of a ``volkins`` table, and what its template needs.
+# Information for the user of a ``volkins`` table, and what its template needs.
 
 
 #: Decimals of travel limits in the INI file.
@@ -512,10 +512,10 @@ def shown_table(table: VolTable) -> dict[str, Any]:
 
 
 def _outward(range_mm: tuple[float, float], margin_mm: float, scale: float) -> list[float]:
-    """Limits of travel in machine units, rounded outward to the decimals of the INI file: the ends can be reached."""
+    """Travel limits in machine units, rounded outward to the decimals of the INI file: the ends can be reached."""
     low, high = range_mm
     fine = 10.0**LIMIT_DIGITS
-    # a rounding error of the division must not move a limit that has few decimals
+    # a rounding error of the division must not move a limit with few decimals
     below, above = (round(value / scale * fine, 3) for value in (low - margin_mm, high + margin_mm))
     return [float(np.floor(below)) / fine, float(np.ceil(above)) / fine]
 
@@ -554,22 +554,22 @@ def _parameters(gauge_mm: Vector3, coordinates: str, unit: str) -> list[dict[str
 # LinuxCNC volumetric compensation: the table of the kinematics module ``volkins``, which comes with compgen.
 #
 # The module (``templates/linuxcnc-volumetric/``, GPL-2.0-or-later) evaluates E = C P, or a grid, in every servo cycle, and
-# takes the tool offset from the control. Its arithmetic is that of :mod:`compgen.controls.linuxcnc_volumetric`.
+# takes the tool offset from the control. Its arithmetic is the same as in :mod:`compgen.controls.linuxcnc_volumetric`.
 
 
-#: Values of a grid are written with the digits of lengths; eight of them and the rounding of all curves of one axis.
+#: Values of a grid have the digits of lengths; eight of them and the rounding of all curves of one axis.
 _ROUNDED_CURVES = 12
-#: Vertices of a grid along one axis: 46 x 46 x 46 is within what the module takes.
+#: Vertices of a grid along one axis: 46 x 46 x 46 is within the limit of the module.
 MOST_ALONG_AXIS = 46
-#: Axes and joints that LinuxCNC knows.
+#: Axes and joints known to LinuxCNC.
 _AXIS_LETTERS, _MOST_JOINTS = "XYZABCUVW", 16
-#: A table whose errors change by more than this per mm of travel is refused; real machines stay below 0.01.
+#: A table whose errors change by more than this per mm of travel is rejected; real machines stay below 0.01.
 STEEPEST = 0.5
 
 
 @toml_files.accepts({"type": "string", "pattern": f"^[{_AXIS_LETTERS}{_AXIS_LETTERS.lower()}]{{3,{_MOST_JOINTS}}}$"})
 def _coordinates(value: Any) -> str:
-    """One letter of an axis for each joint, X, Y and Z among them."""
+    """One letter of an axis for each joint, including X, Y and Z."""
     letters = str(value).upper() if isinstance(value, str) else ""
     if set(letters) - set(_AXIS_LETTERS) or not set(AXES) <= set(letters) or len(letters) > _MOST_JOINTS:
         raise ValueError(f"expected the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}")
@@ -580,7 +580,7 @@ def _coordinates(value: Any) -> str:
 class VolumetricSettings:
     """Settings ``[controllers.linuxcnc-volumetric]``.
 
-    A grid holds for the tool offset of the machine file only. ``gauge_mm`` goes into the pins ``volkins.gauge-*``.
+    A grid is valid only for the tool offset of the machine file. ``gauge_mm`` sets the pins ``volkins.gauge-*``.
     """
 
     form: str = setting(
@@ -606,14 +606,14 @@ class VolumetricSettings:
 
 
 class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
-    """``linuxcnc-volumetric``: all 21 errors on all 24 chains, with the tool in use."""
+    """``linuxcnc-volumetric``: all 21 errors on all 24 chains, for the current tool."""
 
     name = "linuxcnc-volumetric"
     settings_class = VolumetricSettings
     at_axes = True
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return one term per error, on equidistant nodes; the module evaluates E = C P itself, a grid holds products."""
+        """Return one term per error on equidistant nodes; the module evaluates E = C P; a grid represents products too."""
         settings = self.settings
         nodes = [
             equidistant_grid(
@@ -629,12 +629,12 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return error_terms(self.machine, errors, nodes)
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> VolTable:
-        """Return curves and terms, or the grid made of them, rounded as they are written."""
+        """Return curves and terms, or the grid made from them, rounded as written."""
         ordered = sorted(basis, key=lambda term: ERROR_INDEX[term.name])
         curves = []
         for term in ordered:
             axis, nodes, found = term.axis, term.nodes_mm, np.asarray(values[term.name])
-            if axis is None:  # a squareness is a constant: two equal nodes at the ends of the travel of its axis
+            if axis is None:  # squareness is a constant: two equal nodes at the ends of the travel of its axis
                 axis = AXES.index(term.name[-1])
                 nodes, found = np.array(self.machine.axes[axis].range_mm), np.repeat(found[0], 2)
             curves.append(VolCurve(term.name, axis, float(nodes[0]), float(nodes[1] - nodes[0]), found))
@@ -657,11 +657,11 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return as_written(VolTable((), (), VolGrid((x[0], y[0], z[0]), (x[1], y[1], z[1]), errors), table.unit))
 
     def context(self, tables: VolTable) -> dict[str, Any]:
-        """Return curves, terms or grid as they are written, the checksum, and what INI and HAL need."""
+        """Return curves, terms or grid as written, the checksum, and what INI and HAL need."""
         return {**shown_table(tables), **self._notes(self.settings.gauge_mm, self.settings.coordinates, tables)}
 
     def parse(self, files: Sequence[SourceFile]) -> VolTable:
-        """Read the table; INI, HAL and C sources that are exported beside it are only checked for their last line."""
+        """Read the table; INI, HAL and C sources exported with it are only checked for their last line."""
         tables = [source for source in files if not is_companion(source)]
         for source in files:
             if is_companion(source):
@@ -673,12 +673,12 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return parse_volcomp(tables[0])
 
     def emulate(self, tables: VolTable, points: Points) -> FloatArray:
-        """Return q - P, with q the axis positions that put the tip where the command P says, tool offset of the points."""
+        """Return q - P, with q the axis positions that put the tip at the command P for the points' tool offset."""
         tool = tool_of(self.machine, points.tool_mm)
         return tables.inverse(points.position_mm, tool) - points.position_mm
 
     def violations(self, tables: VolTable) -> list[str]:
-        """Return travel that curves leave out, errors too steep for the inverse, and a unit that is not the machine's."""
+        """Return travel not covered by curves, errors too steep for the inverse, and a unit unlike the machine's."""
         machine, settings = self.machine, self.settings
         found = []
         if tables.unit != settings.machine_units:
@@ -715,7 +715,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         ]
 
     def _notes(self, gauge_mm: Vector3, coordinates: str, table: VolTable) -> dict[str, Any]:
-        """Return sign statement, parameters, warnings, and travel, tool offset and joints for INI and HAL, in machine units."""
+        """Return sign statement, parameters, warnings, and travel, tool and joints for INI and HAL, in machine units."""
         tool = np.array(gauge_mm) - np.array(self.machine.tool_offset_mm)
         scale = MM_PER_UNIT[table.unit]
         margin_mm = float(np.ceil(2.0 * np.max(np.abs(self._at_corners(table)[1])))) or 1.0
@@ -745,7 +745,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         }
 
     def _at_corners(self, table: VolTable) -> tuple[FloatArray, FloatArray]:
-        """Corners and middles of the volume (27, 3) and the errors there, mm."""
+        """Corners, mid-points and centre of the volume (27, 3) and the errors there, mm."""
         lines = [
             np.array([low, 0.5 * (low + high), high]) for low, high in (axis.range_mm for axis in self.machine.axes)
         ]
@@ -753,7 +753,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         return points, table.error(points, tool_of(self.machine, None))
 
     def _sign_statement(self, table: VolTable) -> str:
-        """Return the sign in words, with the axis and corner where the table has its largest error."""
+        """Return the sign in words, with the axis and corner of the largest error in the table."""
         points, error = self._at_corners(table)
         place, axis = divmod(int(np.argmax(np.abs(error))), 3)
         x, y, z = points[place]
@@ -786,7 +786,7 @@ def _grid_lines(grid: VolGrid) -> list[FloatArray]:
 
 
 def _spans(tables: VolTable) -> list[tuple[int, float, float, str]]:
-    """Return (axis, first, last, what) of everything that depends on an axis."""
+    """Return (axis, first, last, what) for everything that depends on an axis."""
     if tables.grid is not None:
         lines = enumerate(_grid_lines(tables.grid))
         return [(axis, float(line[0]), float(line[-1]), "the grid") for axis, line in lines]

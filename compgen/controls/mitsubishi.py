@@ -1,4 +1,4 @@
-"""Mitsubishi machine error compensation (``mitsubishi``): positioning and relative position errors in whole numbers."""
+"""Mitsubishi machine error compensation (``mitsubishi``): positioning and relative position errors as whole numbers."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import CompgenWarning, InputError
 
-# Rows of a set sheet and records of the control's own parameter file, and what that file shows of all axes.
+# Rows of a set sheet and records of the control's parameter file, and what that file shows about all axes.
 #
-# The parameter file (``ALL.PRM``) has a line ``%`` at either end, comments that begin with ``;``, a line ``PARA101()`` and
-# records ``N4101P-2``: number, perhaps a word T, A or K with an index, and behind P the value. So a public backup of an M80
-# has it; no document describes it.
+# The parameter file (``ALL.PRM``) has a line ``%`` at each end, comments starting with ``;``, a line ``PARA101()`` and
+# records ``N4101P-2``: number, perhaps a word T, A or K with an index, and the value after P. This is the form of a
+# public backup of an M80; no document describes it.
 
 
 # Mitsubishi machine error compensation: records of the parameter file, settings, tables, and their limits.
 
-#: Increment or absolute system, for all sets alike; unit of the values.
+#: Increment or absolute system, the same for all sets; unit of the values.
 SYSTEM, UNIT = 4000, 1006
 #: Parameters of set k have these numbers plus 10 (k - 1).
 BASE, OUTPUT, REFERENCE, NEGATIVE, POSITIVE, SCALE, INTERVAL = range(4001, 4008)
 SET_STEP, SETS = 10, 10
-#: Numbers of compensation values: the last one of most controls, and of an M80.
+#: Numbers of compensation values: the last one on most controls, and on an M80.
 FIRST_NUMBER, LAST_NUMBER, MOST_NUMBER = 4101, 5124, 5999
-#: Values of #1006 as they are remembered, um.
+#: Values of #1006 as remembered, um.
 UNITS_UM = {"A": 10.0, "B": 1.0, "C": 0.1, "D": 0.01, "E": 0.001}
-#: No sheet and no parameter file is longer than this, or has lines of this length.
+#: Limits for sheets and parameter files: length of the text and of a line.
 MOST_CHARACTERS, MOST_IN_LINE = 4_000_000, 500
 MOST_IN_SHEET = 1_000_000
 
@@ -97,7 +97,7 @@ class ParameterEntry:
 
 
 def is_parameter_file(file: SourceFile) -> bool:
-    """Whether a text is a parameter file of the control: it begins with ``%``."""
+    """Whether a text is a parameter file of the control: it starts with ``%``."""
     return file.text.removeprefix("\ufeff").lstrip().startswith("%")
 
 
@@ -107,7 +107,7 @@ def begins_with_mark(path: Path) -> bool:
 
 
 def sheet_entries(file: SourceFile) -> list[ParameterEntry]:
-    """Rows ``#number,value,meaning``; blank lines and lines that begin with '#' and no digit (the header) are skipped."""
+    """Rows ``#number,value,meaning``; blank lines and lines starting with '#' but no digit (the header) are skipped."""
     check_size(file, MOST_IN_SHEET)
     found = []
     for line, raw in enumerate(file.text.removeprefix("\ufeff").split("\n"), start=1):
@@ -132,9 +132,9 @@ def _row(file: SourceFile, line: int, text: str) -> ParameterEntry:
 
 
 def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
-    """Records of a parameter file that compensation needs, and how many lines were passed over.
+    """Records of a parameter file needed for compensation, and the number of skipped lines.
 
-    InputError with the line for a record of compensation that is not understood, and for a file that is cut.
+    InputError with the line for a compensation record that is not understood, and for a truncated file.
     """
     check_size(file, MOST_CHARACTERS)
     lines = [raw.strip(" \t\r") for raw in file.text.removeprefix("\ufeff").split("\n")]
@@ -166,7 +166,7 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
 
 
 def by_number(entries: Sequence[ParameterEntry]) -> dict[int, ParameterEntry]:
-    """Return entries by their number; InputError for a number that is given twice."""
+    """Return entries by their number; InputError for a duplicate number."""
     found: dict[int, ParameterEntry] = {}
     for entry in entries:
         before = found.setdefault(entry.number, entry)
@@ -177,7 +177,7 @@ def by_number(entries: Sequence[ParameterEntry]) -> dict[int, ParameterEntry]:
 
 @dataclass(frozen=True)
 class ControlSet:
-    """A set of the control's file: its index 0 ... 9, axis names, numbers, scale and interval as they are there."""
+    """A set of the control's file: its index 0 ... 9, axis names, numbers, scale and interval as in the file."""
 
     index: int
     base: str
@@ -191,15 +191,15 @@ class ControlSet:
 
     @property
     def span(self) -> Span:
-        """Numbers that the set uses, that of its reference point among them."""
+        """Numbers that the set uses, including its reference point."""
         return min(self.first, self.reference), max(self.last, self.reference)
 
 
 @dataclass(frozen=True)
 class ControlFile:
-    """What the parameter file of the user's control shows; without one it is empty.
+    """What the parameter file of the user's control shows; empty if there is none.
 
-    ``absolute`` is the system of all sets (None: not known), ``unit_um`` the unit of the values as #1006 has it.
+    ``absolute`` is the system of all sets (None: not known), ``unit_um`` the unit of the values as given by #1006.
     """
 
     file: SourceFile | None = None
@@ -210,12 +210,12 @@ class ControlFile:
     entries: Mapping[int, ParameterEntry] = field(default_factory=dict)
 
     def others(self, names: Sequence[str]) -> list[ControlSet]:
-        """Return the sets that belong to an axis other than ``names``."""
+        """Return the sets of axes other than ``names``."""
         return [item for item in self.sets if not {item.base, item.output} <= set(names)]
 
 
 def read_control_file(paths: Sequence[Path]) -> ControlFile:
-    """Read the parameter file of the user's control; InputError for what is not understood."""
+    """Read the parameter file of the user's control; InputError for anything not understood."""
     if not paths:
         return ControlFile()
     if len(paths) > 1:
@@ -231,9 +231,7 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
     if SYSTEM not in entries:
         raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
     sets = []
-    for index in range(
-        SETS
-    ):  # a set without axes is empty, whatever its numbers are; others need not be of a linear axis
+    for index in range(SETS):  # a set without axes is empty, whatever its numbers; the others may be of a rotary axis
         shift = SET_STEP * index
         expected = [entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)]
         present = [entry for entry in expected if entry is not None]
@@ -254,7 +252,7 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
     return ControlFile(file, entries[SYSTEM].whole(0, 1) == 0, unit_um, tuple(sets), last, entries)
 
 
-# Settings of ``[controllers.mitsubishi]``: what the control counts in, section lengths, numbers that are free.
+# Settings of ``[controllers.mitsubishi]``: counts of the control, section lengths, free numbers.
 
 
 #: Smallest step of the division interval.
@@ -284,8 +282,8 @@ def _name(value: Any) -> str:
 class MitsubishiSettings:
     """Settings of machine error compensation.
 
-    ``sample`` is the control's own parameter file; ``absolute`` says whether values are sums up to their point (#4000 = 0)
-    and not steps (1), None: not known; ``adds`` is True if the control adds the numbers (corrections), False if it
+    ``sample`` is the control's parameter file; ``absolute`` says whether values are sums up to their point (#4000 = 0)
+    or steps (1), None: unknown; ``adds`` is True if the control adds the numbers (corrections), False if it
     subtracts them; ``across`` are (output, base axis) of the tables of one axis as a function of another.
     """
 
@@ -350,7 +348,7 @@ class MitsubishiSettings:
         return 0.5 * self.setting_unit_um * MM_PER_UM
 
     def scale_of(self, pair: tuple[int, int]) -> int:
-        """Scale of a table (output, base axis): that of the machine file, else of the control's own set, else 1."""
+        """Scale of a table (output, base axis): from the machine file, else from the control's set, else 1."""
         own = self.own_set(pair)
         return self.scale or (own.scale if own is not None and own.scale else 1)
 
@@ -364,24 +362,24 @@ class MitsubishiSettings:
         return [*((axis, axis) for axis in range(3)), *self.across]
 
     def own_set(self, pair: tuple[int, int]) -> ControlSet | None:
-        """Return the set of the control's file that holds a table (output, base axis)."""
+        """Return the set in the control's file for a table (output, base axis)."""
         output, base = (self.axis_names[axis] for axis in pair)
         return next((item for item in self.sample.sets if (item.output, item.base) == (output, base)), None)
 
     def kept(self, pair: tuple[int, int]) -> ControlSet | None:
-        """Return the set of the control whose numbers and interval a table keeps: unless another interval is stated."""
+        """Return the control's set whose numbers and interval a table keeps, unless another interval is stated."""
         own, stated = self.own_set(pair), self.interval_mm[pair[1]]
         same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
         return own if same else None
 
     def kept_at_reference(self, pair: tuple[int, int]) -> int:
-        """Return the value at the reference number that a kept set of the control has: a constant, which stays; else 0."""
+        """Return the value of a kept set at its reference number: a constant, which is preserved; else 0."""
         kept = self.kept(pair)
         entry = None if kept is None else self.sample.entries.get(kept.reference)
         return 0 if entry is None or not entry.value else entry.whole(LOWEST_VALUE, HIGHEST_VALUE)
 
     def free_sets(self) -> list[int]:
-        """Return the sets (0 to 9) that no table of the control's file needs, from ``first_set`` on."""
+        """Return the sets (0 to 9) not used by a table in the control's file, from ``first_set`` on."""
         used = {item.index for item in self.sample.sets}
         return [index for index in range(self.first_set - 1, SETS) if index not in used]
 
@@ -389,7 +387,7 @@ class MitsubishiSettings:
 def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
     """Read and check ``[controllers.mitsubishi]``.
 
-    Every key has a default but ``mode``, which an export needs unless the control's own file is given.
+    Every key except ``mode`` has a default; an export needs ``mode`` unless the control's file is given.
     """
     section = machine.controller_settings("mitsubishi")
     settings = toml_files.read_settings(MitsubishiSettings, section)
@@ -415,7 +413,7 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
     return settings
 
 
-# Numbers of machine error compensation: tables read from text, the curves they mean, the limits they must keep.
+# Numbers of machine error compensation: tables read from text, the curves they represent, their limits.
 #
 # Increment system, E60/E68 manual p. II-292 and C64 manual 9.2. On the positive side of the reference point the value of
 # point n is (division interval - actual movement) x 2 for a feed from n-1 to n, on the negative side (division interval +
@@ -423,16 +421,16 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
 #
 #     A[n] = A[n-1] + v[n] on the positive side,   A[n] = A[n+1] - v[n] on the negative side.
 #
-# In the absolute system (#4000 = 0) the value of a point is A itself, but for a constant: the value at the reference number
-# shifts the zero of the axis and nothing else. That system holds for the sets of all axes.
+# In the absolute system (#4000 = 0) the value of a point is A itself plus a constant: the value at the reference number
+# only shifts the zero of the axis. The system applies to the sets of all axes.
 
 
 @dataclass(frozen=True)
 class SetTable:
     """One set: the axis ``output`` is corrected as a function of the axis ``base``.
 
-    ``values`` are the numbers as stored for ``first`` ... ``last``; ``reference`` is the number at the reference point;
-    ``absolute`` tells how they count; ``index`` is the place of the set, 0 to 9.
+    ``values`` are the numbers as stored for ``first`` ... ``last``; ``reference`` is the number of the reference point;
+    ``absolute`` is their system; ``index`` is the number of the set, 0 to 9.
     """
 
     base: int
@@ -452,7 +450,7 @@ class SetTable:
 
     @property
     def last(self) -> int:
-        """Farthest number on the positive side."""
+        """Number farthest on the positive side."""
         return self.first + len(self.values) - 1
 
     @property
@@ -479,7 +477,7 @@ class SetTable:
 
 @dataclass(frozen=True)
 class SetShortfall:
-    """How far the limit of the values keeps a table from what was requested, in counts."""
+    """Deviation of a table from the request due to the limit of the values, in counts."""
 
     output: int
     base: int
@@ -488,10 +486,10 @@ class SetShortfall:
 
 @dataclass(frozen=True)
 class MitsubishiTables:
-    """All sets of X, Y, Z; ``shortfalls`` is known of tables that were built.
+    """All sets of X, Y, Z; ``shortfalls`` is known only for tables that were built.
 
-    ``others`` are the sets of other axes in a parameter file, as (name, first, last number); ``remarks`` say what reading
-    kept apart and passed over.
+    ``others`` are the sets of other axes in a parameter file, as (name, first, last number); ``remarks`` state what was
+    kept apart and skipped when reading.
     """
 
     sets: tuple[SetTable, ...]
@@ -501,7 +499,7 @@ class MitsubishiTables:
 
 
 def values_of(curve: NDArray[np.int64], at: int, at_reference: int = 0, *, absolute: bool = False) -> tuple[int, ...]:
-    """Return the numbers for a curve (n,) in counts that is zero at the index ``at``, where ``at_reference`` is stored."""
+    """Return the numbers for a curve (n,) in counts, zero at the index ``at`` where ``at_reference`` is stored."""
     if absolute:
         return tuple(int(value) + at_reference for value in curve)
     steps = np.diff(curve)
@@ -509,9 +507,9 @@ def values_of(curve: NDArray[np.int64], at: int, at_reference: int = 0, *, absol
 
 
 def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> MitsubishiTables:
-    """Read set sheets, or the control's own parameter file; files that end in ``.json`` (the plan) are left out.
+    """Read set sheets, or the control's parameter file; ``.json`` files (the plan) are ignored.
 
-    A parameter file that is given with a sheet must hold the same tables.
+    A parameter file given with a sheet must contain the same tables.
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
@@ -532,7 +530,7 @@ def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> M
 def _sets_of(
     settings: MitsubishiSettings, file: SourceFile, entries: dict[int, ParameterEntry], passed_over: int | None = None
 ) -> MitsubishiTables:
-    """Tables of the entries of a sheet, or (``passed_over`` is not None) of a parameter file of the control."""
+    """Tables from the entries of a sheet or, if ``passed_over`` is not None, of a parameter file of the control."""
     if SYSTEM not in entries:
         raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
     absolute = entries[SYSTEM].whole(0, 1) == 0
@@ -572,7 +570,7 @@ def _set_table(
 ) -> tuple[SetTable | None, tuple[str, tuple[int, int]] | None]:
     """Return set ``number`` (1 to 10), None if it is empty; or the name of another axis and the numbers of its set.
 
-    In a parameter file of the control a set without axes is empty, whatever its numbers are.
+    In a parameter file of the control, a set without axes is empty, whatever its numbers.
     """
     shift = SET_STEP * (number - 1)
     due = {parameter: entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)}
@@ -619,7 +617,7 @@ def _values(entries: dict[int, ParameterEntry], first: int, last: int, who: Para
 
 
 def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: MitsubishiTables) -> list[str]:
-    """Return broken limits: range of values, numbers, overlaps, scale, doubled pairs, travel left out."""
+    """Return exceeded limits: range of values, numbers, overlaps, scale, duplicate pairs, uncovered travel."""
     found = []
     for table in tables.sets:
         what = set_name(table)
@@ -662,7 +660,7 @@ def set_name(table: SetTable) -> str:
 
 
 def shortfall_text(settings: MitsubishiSettings, item: SetShortfall) -> str:
-    """Say that the range of the values keeps a table from what was requested, and what helps."""
+    """Say that the range of the values keeps a table from reaching the request, and what helps."""
     count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
     return (
         f"the table {one_dimensional_name(item.output, item.base)} is too steep for {HIGHEST_VALUE} counts of "
@@ -682,7 +680,7 @@ def sheet_usage(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[
     ]
 
 
-# What the templates of machine error compensation show: rows of the set sheet, plan, worked numbers, warnings.
+# Template content for machine error compensation: rows of the set sheet, plan, worked example, warnings.
 
 
 #: Name and meaning of the seven parameters of a set, in the order of their numbers.
@@ -710,10 +708,10 @@ def _setting_row(number: int, value: str, meaning: str) -> dict[str, str]:
 
 # Mitsubishi machine error compensation: positioning and relative position errors as a set sheet of whole numbers.
 #
-# What the control is taken to do, and how sure that is, is in ``templates/mitsubishi/format.toml``.
+# What the control is assumed to do, and how certain that is: see ``templates/mitsubishi/format.toml``.
 
 
-#: The final curve may be steeper than the estimate by this factor: angular errors are spread over the volume.
+#: Factor by which the final curve may be steeper than the estimate: angular errors are spread over the volume.
 STEEPER = 1.1
 
 
@@ -732,7 +730,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return read_mitsubishi_settings(machine)
 
     def missing(self) -> InputError | None:
-        """Return the error of a mode that neither the machine file nor the control's own file states."""
+        """Return the error for a mode stated in neither the machine file nor the control's file."""
         if self.settings.absolute is not None:
             return None
         return self.machine.controller_settings(self.name).fail(
@@ -743,7 +741,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         )
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return one term per set, its nodes the division points, the reference point one of them."""
+        """Return one term per set, with the division points as nodes, including the reference point."""
         chosen = [self._grid(errors, axis).nodes_mm for axis in range(3)]
         terms = []
         for pair in self.settings.pairs:
@@ -778,7 +776,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             at = int(np.argmin(np.abs(term.nodes_mm - self.machine.reference_point_mm[base])))
             corrections = np.asarray(values[term.name])
             wanted = settings.sign * (corrections - corrections[at]) / settings.count_mm(pair)
-            # sums can take steps of any size; violations say where one is out of range
+            # sums allow steps of any size; violations report values out of range
             limit = int(2 * np.max(np.abs(wanted))) + 2 if settings.absolute else HIGHEST_VALUE
             best = best_integers(wanted, travel_weights(self.machine, base, term.nodes_mm), at, limit)
             numbers = values_of(best.counts, at, settings.kept_at_reference(pair), absolute=settings.absolute)
@@ -795,7 +793,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return MitsubishiTables(tuple(sorted(sets, key=lambda table: table.index)), tuple(shortfalls))
 
     def context(self, tables: MitsubishiTables) -> dict[str, Any]:
-        """Return the context beyond the common one; ``rows`` are the sheet's, ``plan`` holds number -> value."""
+        """Return the context beyond the common one; ``rows`` are the sheet's rows, ``plan`` maps number -> value."""
         settings = self.settings
         absolute = tables.sets[0].absolute
         parameters, values = self._rows(tables)
@@ -824,11 +822,11 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> MitsubishiTables:
-        """Read the set sheet or the parameter file of the control; a ``.json`` plan is passed over."""
+        """Read the set sheet or the parameter file of the control; a ``.json`` plan is skipped."""
         return parse_tables(self.settings, files)
 
     def emulate(self, tables: MitsubishiTables, points: Points) -> FloatArray:
-        """Return the sum of the sets' curves, linear between division points, held beyond the ends."""
+        """Return the sum of the sets' curves, linear between division points, constant beyond the ends."""
         added = np.zeros((len(points), 3))
         for table in tables.sets:
             along = points.position_mm[:, table.base] - self.machine.reference_point_mm[table.base]
@@ -837,7 +835,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return added
 
     def violations(self, tables: MitsubishiTables) -> list[str]:
-        """Return broken limits: values, numbers, overlaps, scale, travel left out."""
+        """Return exceeded limits: values, numbers, overlaps, scale, uncovered travel."""
         return sheet_violations(self.machine, self.settings, tables)
 
     def table_nodes_mm(self, tables: MitsubishiTables) -> tuple[FloatArray, ...]:
@@ -845,21 +843,21 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return nodes_by_axis((t.base, self.machine.reference_point_mm[t.base] + t.along_mm) for t in tables.sets)
 
     def usage(self, tables: MitsubishiTables) -> list[Usage]:
-        """Return the largest value, numbers and sets against their limits."""
+        """Return the largest value, the numbers and the sets against their limits."""
         return sheet_usage(self.settings, tables)
 
     def keeping_others(self, tables: MitsubishiTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
-        """Return ``style_from`` with the parameter file of the control, if that is among the files."""
+        """Return ``style_from`` with the parameter file of the control, if it is among the files."""
         own = [] if self.settings.sample.file is not None else list(filter(begins_with_mark, files))
         return {self.name: {"style_from": str(own[0].resolve())}} if len(own) == 1 else {}
 
     def resolution_mm(self) -> float:
-        """Half a count of each table that acts on an axis, where the range of the values does not bind."""
+        """Half a count of each table that acts on an axis, where the range of the values is not active."""
         most = max(self.settings.count_mm(pair) for pair in self.settings.pairs)
         return 0.5 * most * max(sum(1 for output, _ in self.settings.pairs if output == axis) for axis in range(3))
 
     def _control_file(self, rows: dict[str, str]) -> SourceFile | None:
-        """The control's own parameter file with the rows put in, every other line byte for byte as it was."""
+        """The control's parameter file with the rows inserted, every other line unchanged byte for byte."""
         settings = self.settings
         if settings.sample.file is None:
             return None
@@ -878,7 +876,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return SourceFile(settings.sample.file.path, "\n".join(lines))
 
     def _overwrites(self, tables: MitsubishiTables, rows: list[dict[str, str]]) -> list[str]:
-        """Say what sheet and file overwrite, other axes first."""
+        """Say what the sheet and file overwrite, other axes first."""
         sample = self.settings.sample
         others = [
             f"set {item.index + 1} ({item.output} over {item.base}, numbers {item.span[0]} to {item.span[1]})"
@@ -930,13 +928,13 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return found
 
     def _no_longer_used(self, tables: MitsubishiTables) -> list[ControlSet]:
-        """Sets of X, Y, Z in the control's file that hold none of the tables: they would still act, with the new ones."""
+        """Sets of X, Y, Z in the control's file that contain none of the tables: they would act as well as the new ones."""
         written = {table.index for table in tables.sets}
         others = self.settings.sample.others(self.settings.axis_names)
         return [item for item in self.settings.sample.sets if item.index not in written and item not in others]
 
     def _rows(self, tables: MitsubishiTables) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
-        """Rows of the sheet: parameters of the sets, and values."""
+        """Rows of the sheet: set parameters and values."""
         names, absolute = self.settings.axis_names, tables.sets[0].absolute
         known = "as the control has it" if self.settings.sample.file is not None else "must be the control's own value"
         system = f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}"
@@ -1009,7 +1007,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         ]
 
     def _check(self, table: SetTable) -> dict[str, Any]:
-        """A trial of one division next to the reference point: which number to set, what a laser must then read."""
+        """Trial of one division next to the reference point: which number to set, and the laser reading to expect."""
         upper = table.last > table.reference
         number = table.reference + (1 if upper else -1)
         start_mm = self.machine.reference_point_mm[table.base]
@@ -1032,7 +1030,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         }
 
     def _check_free(self, pair: tuple[int, int], first: int, last: int) -> None:
-        """Refuse numbers that a set of another table in the control's file uses."""
+        """Reject numbers used by a set of another table in the control's file."""
         own = self.settings.own_set(pair)
         for item in self.settings.sample.sets:
             low, high = item.span
@@ -1043,10 +1041,10 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
                 )
 
     def _grid(self, errors: ErrorTable, axis: int) -> EquidistantGrid:
-        """Division points of a base axis: equal intervals in whole 0.001 mm, an equal share of the numbers for each set.
+        """Division points of a base axis: equal intervals in whole 0.001 mm, equal shares of the numbers for each set.
 
-        The interval is the user's, else the widest that loses nothing that matters and keeps every value, with a margin,
-        within its range, as far as the numbers suffice.
+        The interval is the user's, else the widest that has no significant loss and keeps every value, with a margin,
+        within its range, as far as there are enough numbers.
         """
         settings = self.settings
         new = [pair for pair in settings.pairs if settings.kept(pair) is None]
@@ -1070,7 +1068,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         if asked is not None:
             return grid_of(asked)
         grid = grid_of(None)
-        largest = 0.0  # change of a correction over one interval, in counts; it stays in proportion to the interval
+        largest = 0.0  # change of a correction over one interval, in counts; it is proportional to the interval
         if not settings.absolute:
             fine = np.unique(np.concatenate([grid.nodes_mm, curve_nodes_mm(self.machine, errors, axis)]))
             pairs = [pair for pair in settings.pairs if pair[1] == axis]
@@ -1082,6 +1080,6 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             return grid
         rounding = ROUND_CEILING if share == 1.0 else ROUND_FLOOR
         quanta = (grid.step * Decimal(repr(share)) / INTERVAL_QUANTUM_MM).to_integral_value(rounding=rounding)
-        # Two nodes less: with the reference point as a node the ends may need one more on either side.
+        # Two nodes fewer: with the reference point as a node, each end may need one more.
         least = Decimal(repr(self.machine.axes[axis].length_mm)) / max(most - 3, 1) / INTERVAL_QUANTUM_MM
         return grid_of(float(max(quanta, least.to_integral_value(rounding=ROUND_CEILING)) * INTERVAL_QUANTUM_MM))

@@ -34,12 +34,12 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import CompgenWarning, InputError
 
-# Compensation tables of PMAC and Turbo PMAC as the control keeps them: whole 1/16 counts that roll over.
+# Compensation tables of PMAC and Turbo PMAC as stored in the control: whole 1/16 counts that roll over.
 #
 # Source: PMAC User Manual p. 79-83, PMAC 2 Software Reference p. 207-211, Turbo PMAC Software Reference p. 301-306.
 
 
-# Compensation tables of PMAC and Turbo PMAC as the control keeps them, and their download files.
+# Compensation tables of PMAC and Turbo PMAC as stored in the control, and their download files.
 
 IntArray = NDArray[np.int64]
 
@@ -51,8 +51,8 @@ PER_COUNT = 16.0
 class CompTable1D:
     """``DEFINE COMP entries,#source,#target,length``: the table of motor ``motor``.
 
-    ``entries`` (n,): the first is at one spacing (length / n) from the source's zero, where the value is 0 by
-    definition; the last is at ``length``. ``desired``: over the commanded position of the source.
+    ``entries`` (n,): the first is one spacing (length / n) from the source's zero, where the value is 0 by
+    definition; the last is at ``length``. ``desired``: as a function of the source's commanded position.
     """
 
     motor: int
@@ -96,7 +96,7 @@ class CompTable2D:
 
 @dataclass(frozen=True)
 class BacklashTable:
-    """``DEFINE BLCOMP entries,length`` of motor ``motor``: taken off after negative travel only, in addition to Ixx86."""
+    """``DEFINE BLCOMP entries,length`` of motor ``motor``: subtracted after negative travel only, on top of Ixx86."""
 
     motor: int
     length: int
@@ -108,14 +108,14 @@ class BacklashTable:
 
 
 def _cell(counts: FloatArray, span: int, cells: int) -> tuple[np.ndarray, FloatArray]:
-    """Cell and share within it of positions (n,) that are rolled over into 0 ... span."""
+    """Cell, and fraction within it, of positions (n,) rolled over into 0 ... span."""
     ratio = np.mod(counts, span) * (cells / span)
     cell = np.minimum(ratio.astype(np.intp), cells - 1)
     return cell, ratio - cell
 
 
 def rolled(counts: FloatArray, length: int, entries: IntArray) -> FloatArray:
-    """Interpolate entries (n,) that begin one spacing above zero, at positions in counts that roll over.
+    """Interpolate entries (n,) that start one spacing above zero, at positions in counts that roll over.
 
     >>> rolled(np.array([250.0, -250.0]), 4000, np.array([160, 80, 0, -80, -160, -80, 80, 0])) / 16
     array([5. , 2.5])
@@ -127,7 +127,7 @@ def rolled(counts: FloatArray, length: int, entries: IntArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class PmacTables:
-    """What the control has: tables in the order of the file, Ixx86 by motor in 1/16 count, I51 (None: no file says)."""
+    """Contents of the control: tables in file order, Ixx86 by motor in 1/16 count, I51 (None: not in any file)."""
 
     tables: tuple[CompTable1D | CompTable2D, ...]
     backlash: tuple[BacklashTable, ...] = ()
@@ -146,7 +146,7 @@ _VARIABLE = re.compile(r"I ?([0-9]{1,4}) ?= ?([+-]?[0-9]{1,9})")
 _DELETE = re.compile(r"DELETE ?(?:BL|T)?(?:COMP|BUF)|DELETE ?(?:GATHER|ROTARY|LOOKAHEAD)|CLOSE", re.IGNORECASE)
 _DECLARED = re.compile(r";\s{0,9}tables:\s{0,9}([0-9]{1,4})\s*$")
 _LARGEST = 2**23 - 1
-#: Files of other programs: comments, programs, and what has to do with tables or their switches.
+#: Files of other programs: comments, programs, and commands related to tables or their switches.
 _COMMENT = re.compile(r";|//")
 _OPEN = re.compile(r"OPEN\b", re.IGNORECASE)
 _CLOSE = re.compile(r"CLOSE", re.IGNORECASE)
@@ -158,7 +158,7 @@ _MOST_ENTRIES = 150_000
 
 @dataclass
 class _Open:
-    """A table whose entries are being read."""
+    """Table whose entries are being read."""
 
     line: int
     head: str
@@ -295,12 +295,12 @@ def _sheet(table: _Open, values: IntArray) -> CompTable2D:
 
 
 def parse_pmac(files: Sequence[SourceFile]) -> PmacTables:
-    """Return the tables of all files; InputError with file and line for anything malformed or cut."""
+    """Return the tables of all files; InputError with file and line for anything malformed or truncated."""
     return _joined([_read(source) for source in files])
 
 
 def _joined(readers: Sequence[_DownloadReader]) -> PmacTables:
-    """The tables of all files; a motor has one of each kind."""
+    """The tables of all files; a motor has at most one of each kind."""
     owners: dict[tuple[bool, int], SourceFile] = {}
     for reader in readers:
         for table in (*reader.tables, *reader.backlash):
@@ -317,10 +317,10 @@ def _joined(readers: Sequence[_DownloadReader]) -> PmacTables:
 
 
 def parse_foreign_pmac(files: Sequence[SourceFile]) -> tuple[PmacTables, list[str]]:
-    """Return the tables of files that this program did not write, and what was passed over in one line.
+    """Return the tables of files not written by this program, and one line on what was skipped.
 
-    A size may be before the sources without a comma, entries may be separated by commas, comments hold any character.
-    Motion and PLC programs and commands that have nothing to do with tables are passed over; a line with a table or its
+    The size may precede the sources without a comma, commas may separate entries, comments may contain any character.
+    Motion and PLC programs and commands unrelated to tables are skipped; a line with a table or its
     switch that is not understood is an InputError.
     """
     readers, passed = [], 0
@@ -363,7 +363,7 @@ def _read(source: SourceFile) -> _DownloadReader:
 
 
 def _complete(reader: _DownloadReader, line: int) -> _DownloadReader:
-    """Return the reader if its file holds a table, and all of it."""
+    """Return the reader if its file contains a complete table."""
     if reader.open is not None:
         table = reader.open
         have = f"{len(table.entries)} of {table.count} entries"
@@ -401,7 +401,7 @@ def _scales(value: Any) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, kw_only=True)
 class PmacSettings:
-    """Settings ``[controllers.pmac]``; ``desired``: tables go over the commanded position of their source."""
+    """Settings ``[controllers.pmac]``; ``desired``: tables are functions of the commanded position of their source."""
 
     motors_available: int = setting(whole(3, 32), 32, meaning="motors that can own a table (Turbo PMAC 32, PMAC 8)")
     motors: tuple[int, int, int] = axis_setting(
@@ -435,11 +435,11 @@ class PmacSettings:
 
     @property
     def free_motors(self) -> list[int]:
-        """Motors without an axis that may own a table."""
+        """Motors without an axis that may have a table."""
         return [number for number in range(1, self.motors_available + 1) if number not in self.motors]
 
 
-# What PMAC tables can hold, and their numbers: rings of nodes from the motor's zero, negative travel at the far end.
+# Layout of PMAC tables: rings of nodes from the motor's zero, with negative travel at the far end.
 
 
 #: A function or product that moves its target by less than this (rms) needs no table.
@@ -448,10 +448,10 @@ NOTHING_MM = 0.02 * MM_PER_UM
 
 @dataclass(frozen=True)
 class Ring:
-    """Nodes ``number * step`` counts from the motor's zero: those over the travel, and one more on either side.
+    """Nodes ``number * step`` counts from the motor's zero: over the travel, and one more on each side.
 
-    ``low`` ... ``high`` are the numbers over the travel, ``first`` <= 0 <= ``last`` all that the table holds; the
-    position of the table is ``number`` modulo ``size``.
+    ``low`` ... ``high`` are the numbers over the travel, ``first`` <= 0 <= ``last`` all numbers in the table; the
+    place in the table is ``number`` modulo ``size``.
     """
 
     axis: int
@@ -483,7 +483,7 @@ class Ring:
         return settings.home_mm[self.axis] + self.step * numbers / settings.counts_per_mm[self.axis]
 
     def positions_mm(self, settings: PmacSettings) -> FloatArray:
-        """Where each place 0 ... size - 1 of the table takes its value, mm: nodes beyond the travel hold its end."""
+        """Position that gives each place 0 ... size - 1 its value, mm: nodes beyond the travel use the travel end."""
         places = np.arange(self.size)
         numbers = np.where(places <= self.last, places, places - self.size)
         return self.to_mm(settings, np.clip(numbers, self.low, self.high))
@@ -495,14 +495,14 @@ def _pair(term: Term) -> tuple[int, int]:
     return first, second
 
 
-# Words for the people at a PMAC: the sign, what must be set, warnings, and the tables as the template writes them.
+# Texts for PMAC users: sign, what must be set, warnings, and the tables as written by the template.
 
 
 _ENTRIES_PER_LINE = 10
 
 
 def table_context(table: CompTable1D | CompTable2D, letters: Mapping[int, str]) -> dict[str, Any]:
-    """Return one table as the template writes it: command, title, rows of entries."""
+    """Return one table as written by the template: command, title, rows of entries."""
     if isinstance(table, CompTable1D):
         mark = "D" if table.desired else ""
         command = f"DEFINE COMP {len(table.entries)},#{table.source}{mark},#{table.target},{table.length}"
@@ -535,7 +535,7 @@ def _letter(letters: Mapping[int, str], motor: int) -> str:
 
 _MOST_PER_TARGET = 6
 _SPAN_SLACK = 1e-6
-#: Spacings of a pitch table are divided into at most so many parts to hold a reversal.
+#: Spacings of a pitch table are divided into at most this many parts to represent a reversal.
 _MOST_PARTS = 64
 
 
@@ -549,7 +549,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
 
     @classmethod
     def read_settings(cls, machine: Machine) -> PmacSettings:
-        """Read the settings; ``counts_per_mm`` is mandatory."""
+        """Read the settings; ``counts_per_mm`` is required."""
         section = machine.controller_settings(cls.name)
         if "counts_per_mm" not in section:
             raise section.fail("counts_per_mm", _COUNTS_MISSING, kind="missing", instead=1000.0)
@@ -562,7 +562,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return settings
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return the functions and products that get a table: pitch, and as many others as there are motors to own them."""
+        """Return the functions and products that get a table: pitch, and as many others as motors allow."""
         curves = [self._curve(errors, output, axis) for output in range(3) for axis in range(3)]
         pitch = [term for term in curves if term.axis == term.carrier[0].output]
         groups = [[term] for term in curves if term.axis != term.carrier[0].output]
@@ -606,11 +606,11 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
 
     def with_reversal(self, tables: PmacTables, reversal: ReversalCurves) -> PmacTables:
-        """Return the tables with Ixx86 and, where the reversal varies, a backlash table and its half in the pitch table.
+        """Return the tables with Ixx86 and, if the reversal varies, a backlash table and half of it in the pitch table.
 
-        With the reversal B the control takes -B off after negative travel, so both directions are at +B/2 of the
-        mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant. B, both halves and "positive" are those
-        of the motor: a motor that counts against its axis sees the same B in its counts.
+        With the reversal B the control subtracts -B after negative travel, so both directions are at +B/2 from the
+        mean; -(B - B at zero)/2 goes into the pitch table, the rest is a constant. B, both halves and "positive" refer
+        to the motor: a motor that counts against its axis sees the same B in its counts.
         """
         lines, backlash, constants = list(tables.tables), [], {}
         for (axis, _), curve in sorted(reversal.curves.items()):
@@ -624,7 +624,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return replace(tables, tables=tuple(lines), backlash=tuple(backlash), constants=constants)
 
     def context(self, tables: PmacTables) -> dict[str, Any]:
-        """Return the tables with their entries, the sign with a worked number, and what must be set."""
+        """Return the tables with their entries, the sign with a worked example, and what must be set."""
         letters = {motor: AXES[axis] for axis, motor in enumerate(self.settings.motors)}
         return {
             "sign_statement": (
@@ -658,7 +658,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         }
 
     def parse(self, files: Sequence[SourceFile]) -> PmacTables:
-        """Read download files; motors that are no axis of the machine file cannot be sources or targets."""
+        """Read download files; motors that are not axes in the machine file cannot be sources or targets."""
         settings = self.settings
         if not files:
             raise InputError("no file was given; comp.pmc is one")
@@ -691,9 +691,9 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return kept, remarks
 
     def emulate(self, tables: PmacTables, points: Points) -> FloatArray:
-        """Return the sum of all tables of each target, and minus the backlash after negative travel of a motor.
+        """Return the sum of all tables of each target, minus the backlash after negative travel of a motor.
 
-        Where the last direction of travel is unknown half of the backlash is taken off, with a CompgenWarning.
+        If the last direction of travel is unknown, half of the backlash is subtracted, with a CompgenWarning.
         """
         settings = self.settings
         position = np.asarray(points.position_mm, dtype=np.float64)
@@ -757,7 +757,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
                     f"the table of motor {table.motor} spans {span} counts of motor {motor}, the travel needs "
                     f"{needed:g}: positions roll over within the travel"
                 )
-        # at the roll-over the last entry is the value at zero, and the far edges are the zero edges
+        # at roll-over the last entry equals the value at zero, and the far edges equal the zero edges
         if isinstance(table, CompTable1D):
             if table.entries[-1]:
                 found.append(
@@ -770,7 +770,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return found
 
     def usage(self, tables: PmacTables) -> list[Usage]:
-        """Return the motors that own a table against those there are, and the longest table."""
+        """Return the number of motors with a table against the number available, and the longest table."""
         longest = max((_entries(table) for table in tables.tables), default=0)
         return [
             Usage("motors with a COMP table", len(tables.tables), self.settings.motors_available, "tables"),
@@ -782,7 +782,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return np.array(self.settings.home_mm)
 
     def table_nodes_mm(self, tables: PmacTables) -> tuple[FloatArray, ...]:
-        """Return the entries' positions over the travel and one beyond, by source."""
+        """Return the positions of the entries over the travel and one beyond, by source."""
         settings = self.settings
         found = []
         for table in (*tables.tables, *tables.backlash):
@@ -797,7 +797,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return nodes_by_axis(found)
 
     def resolution_mm(self) -> float:
-        """Half of 1/16 count for every table that may act on one axis."""
+        """Half of 1/16 count for each table that may act on one axis."""
         most = _MOST_PER_TARGET if self.settings.two_dimensional else 3
         return most * 0.5 / (PER_COUNT * float(np.min(np.abs(self.settings.counts_per_mm))))
 
@@ -810,7 +810,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return Ring(axis, step, low, max(high, low + 1))
 
     def _step_mm(self, errors: ErrorTable, axis: int, output: int) -> float:
-        """Widest step from the motor's zero that loses nothing that matters."""
+        """Widest step from the motor's zero without significant loss."""
         home = list(self.machine.reference_point_mm)
         low, high = self.machine.axes[axis].range_mm
         home[axis] = min(max(self.settings.home_mm[axis], low), high)
@@ -835,7 +835,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return replace(term, start=start, zero_at_mm=float(np.clip(home, nodes[0], nodes[-1])))
 
     def _ring_from(self, axis: int, nodes_mm: FloatArray) -> Ring:
-        """Return the ring whose nodes over the travel these are."""
+        """Return the ring with these nodes over the travel."""
         step = round(abs(self.settings.counts_per_mm[axis]) * float(nodes_mm[1] - nodes_mm[0]))
         ring = self._ring_of(axis, step / abs(self.settings.counts_per_mm[axis]))
         return replace(ring, step=step)
@@ -865,7 +865,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Two-dimensional table with the row motor of the first axis of the pair; the far edges repeat the zero edges."""
         settings = self.settings
         rings = []
-        for axis in pair:  # the ring of its functions, or a wide one if the axis is a lever only
+        for axis in pair:  # the ring of its functions, or a wide one if the axis is only a lever
             nodes = next((term.nodes_mm for term in terms if term.axis == axis), None)
             wide_mm = 0.5 * self.machine.axes[axis].length_mm
             rings.append(self._ring_of(axis, wide_mm) if nodes is None else self._ring_from(axis, nodes))
@@ -906,7 +906,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
 
     def _overwrites(self, tables: PmacTables) -> list[str]:
-        """Say which tables and variables the file overwrites, those of motors without an axis first."""
+        """Say which tables and variables the file overwrites, starting with motors without an axis."""
         own = sorted(table.motor for table in tables.tables if table.motor in self.settings.motors)
         others = sorted(table.motor for table in tables.tables if table.motor not in self.settings.motors)
         names = {motor: letter for letter, motor in zip(AXES, self.settings.motors, strict=True)}
@@ -951,7 +951,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         constant = round(-PER_COUNT * scale * at_home)
         if len(curve.position_mm) == 1:
             return table, None, constant
-        # the spacing of the pitch table is divided as far as the reversal needs it
+        # the spacing of the pitch table is divided as finely as the reversal needs
         travel, step = self.machine.axes[axis].range_mm, table.length // len(table.entries)
         where = np.clip(np.unique(np.concatenate([np.array(travel), curve.position_mm])), *travel)
         rings = []
@@ -968,8 +968,8 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         pitch = np.rint(table.at(counts)).astype(np.int64)
         varying = curve.at(ring.positions_mm(settings)) - at_home
         varying[0] = 0.0
-        # In the motor's own counts a reversal B is |counts per mm| B, whichever way the motor counts: where it counts
-        # against its axis, both the position and the direction of travel change their sign.
+        # In counts of the motor a reversal B is |counts per mm| B, whichever way the motor counts: if it counts
+        # against its axis, both the position and the direction of travel change sign.
         size = np.rint(-PER_COUNT * scale * varying).astype(np.int64)
         half = np.rint(-0.5 * PER_COUNT * scale * varying).astype(np.int64)
         entries: IntArray = np.append(pitch[1:] + half[1:], 0)
@@ -1000,7 +1000,7 @@ def _spans(table: CompTable1D | CompTable2D) -> list[tuple[int, int]]:
 
 
 def _steps(table: CompTable1D | CompTable2D | BacklashTable) -> list[tuple[int, float]]:
-    """Sources and the distance of their nodes in counts."""
+    """Sources and the spacing of their nodes in counts."""
     if isinstance(table, CompTable2D):
         rows, columns = (size - 1 for size in table.values.shape)
         return [(table.row, table.row_span / columns), (table.column, table.column_span / rows)]
