@@ -9,16 +9,16 @@ from compgen.accuracy.field import Figure, range_weight
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 
-#: Angles at which runs and directions are compared: four for each degree.
+#: Angles at which runs and directions are compared: four per degree.
 COMPARED = 1440
 
 
 def accuracy_of_circles(circles: Circles) -> Accuracy:
     """Return G of each direction, G(b) of both, the hysteresis H, and the radial deviations F, by plane and set-up.
 
-    The centre is that of least squares. Several runs of a direction count as their mean. The uncertainty is that of the
-    scatter between runs, or of the readings as the file states it; nan without either. F needs a calibrated radius, which the
-    comment ``# radius = calibrated`` of a file states.
+    The centre is the least-squares centre. Several runs of a direction are averaged. The uncertainty comes from the
+    scatter between runs, or from the uncertainty of the readings stated in the file; nan without either. F needs a
+    calibrated radius, stated by the comment ``# radius = calibrated`` of a file.
     """
     groups: dict[str, dict[str, Figure]] = {}
     statements = [
@@ -50,7 +50,7 @@ def _figures(circles: Circles, own: np.ndarray, *, calibrated: bool) -> dict[str
             continue
         paths = [_at_angles(angle[rows & (run == k)], radial[rows & (run == k)]) for k in np.unique(run[rows])]
         mean = np.nanmean(paths, axis=0)
-        if len(paths) > 1:  # the uncertainty of the mean path at one angle: by the scatter between runs, else as stated
+        if len(paths) > 1:  # uncertainty of the mean path at one angle: from the scatter between runs, else as stated
             u = float(np.sqrt(np.nanmean(np.nanvar(paths, axis=0, ddof=1)) / len(paths)))
         else:
             u = float(np.sqrt(np.mean(circles.u_mm[own][rows] ** 2)))
@@ -77,7 +77,7 @@ def _figures(circles: Circles, own: np.ndarray, *, calibrated: bool) -> dict[str
 
 
 def _at_angles(angle: FloatArray, radial: FloatArray) -> FloatArray:
-    """Radial deviations at the angles of comparison, linear between the readings; nan where an arc has none near by."""
+    """Radial deviations at the comparison angles, linear between readings; nan where an arc has none nearby."""
     at = np.arange(COMPARED) * 2 * np.pi / COMPARED
     order = np.argsort(angle % (2 * np.pi))
     known, values = (angle % (2 * np.pi))[order], radial[order]

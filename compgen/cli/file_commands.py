@@ -39,11 +39,11 @@ from compgen.instruments.sixdof_instrument import instrument_of, instrument_sche
 from compgen.simulate.run import Scenario, scenario_of
 from compgen.tables import load_format
 
-# The kinds of TOML files: how each is recognised, read, and described.
+# The kinds of TOML files: how each is detected, read, and described.
 
 
 def read_whole_machine(root: toml_files.Section) -> None:
-    """Read a machine file with the settings of all of its controls and effects; ask about what is hardly meant."""
+    """Read a machine file with the settings of all of its controls and effects; query unlikely values."""
     machine = machine_of(root, root.path or Path())
     for controller in machine.controllers:
         check_settings(machine, controller)
@@ -65,7 +65,7 @@ def machine_schema() -> dict[str, Any]:
 
 
 def read_whole_job(root: toml_files.Section) -> None:
-    """Read a job file; warn of machine files that cannot be read, which keep only their own machine from being measured."""
+    """Read a job file; warn of unreadable machine files: only their machines cannot be measured."""
     for name, item in job_of(root, (root.path or Path()).absolute()).machines.items():
         try:
             load_machine(item.machine)
@@ -75,7 +75,7 @@ def read_whole_job(root: toml_files.Section) -> None:
 
 @dataclass(frozen=True)
 class FileKind:
-    """A kind of TOML file: in words, the keys by which one is recognised, its reader, and its JSON schema."""
+    """A kind of TOML file: its description, the keys by which it is detected, its reader, and its JSON schema."""
 
     title: str
     keys: frozenset[str]
@@ -83,7 +83,7 @@ class FileKind:
     schema: Callable[[], dict[str, Any]]
 
 
-#: A file is of the kind of which it has the most keys.
+#: A file is of the kind with which it shares the most keys.
 KINDS: Mapping[str, FileKind] = {
     "machine": FileKind(
         "Machine file", frozenset({"chain", "axes", "controllers"}), read_whole_machine, machine_schema
@@ -104,7 +104,7 @@ KINDS: Mapping[str, FileKind] = {
         instrument_schema,
     ),
 }
-#: Tables of these files whose entries have nothing to do with each other.
+#: Tables of these files whose entries are independent of each other.
 _APART = ("controllers", "effects", "machines")
 
 
@@ -146,7 +146,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
     for path, named in _paths(files):
         try:
             present = set(toml_files.read_toml(path).data)
-        except InputError:  # the problem that is listed
+        except InputError:  # listed as a problem below
             present = set()
         likeliest = max(KINDS, key=lambda name: len(KINDS[name].keys & present))
         known = kind or (likeliest if KINDS[likeliest].keys & present else None)
@@ -156,7 +156,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         if known is None and present:
             none = InputError(f"is none of {', '.join(KINDS)}: no key tells its kind; say it by --kind", file=path)
             found = toml_files.FileProblems((none,))
-        else:  # where nothing tells the kind, the file is no TOML, which any reader says
+        else:  # if the kind is unknown, the file is not TOML, which any reader reports
             found = toml_files.problems_of(path, KINDS[known or "machine"].read, _APART)
         problems = [
             {
@@ -196,7 +196,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
 
 
 def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:
-    """The files to look at, each once, and whether it was named itself."""
+    """The files to check, each once, and whether it was named explicitly."""
     found: dict[Path, bool] = {}
     for name in files:
         path = Path(name)
@@ -282,7 +282,7 @@ def init_command(
             f"Controls ({', '.join(sorted(CONTROLLERS))}; several with commas)", default="none", err=True
         )
         controls = () if text == "none" else tuple(controller_named(item.strip()).name for item in text.split(","))
-    # a control whose settings have to be stated is read only once they are
+    # a control with mandatory settings is read only once they are stated
     plain = machine_text(name, understood, ranges, counts)
     machine = parse_machine(plain, target)
     sections = [_control_section(machine, control) for control in dict.fromkeys(controls)]
@@ -308,7 +308,7 @@ def _asked(question: str, option: str, asks: bool) -> str:
 
 
 def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
-    """The chain, and what was assumed of it."""
+    """The chain, and what was assumed about it."""
     words = words or _asked('What moves what (e.g. "table moves in X and Y, head in Z")', "--chain", asks)
     fits = chains_of(words)
     if not fits:
@@ -372,7 +372,7 @@ def _nodes(given: Sequence[str], ranges: Mapping[str, Interval]) -> dict[str, in
 def _control_section(machine: Machine, name: str) -> str:
     """The section of a control: every setting as a comment with its default and meaning.
 
-    Where something must be stated before the section can be read, its header is a comment too.
+    If a setting must be stated before the section can be read, its header is a comment too.
     """
     control = controller_named(name)
     settings: dict[str, list[tuple[toml_files.DeclaredKey, str]]] = {}

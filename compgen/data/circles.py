@@ -16,7 +16,7 @@ from compgen.errors import InputError
 
 #: First and second axis of each plane; angles count from the first to the second.
 PLANES = {"XY": (0, 1), "YZ": (1, 2), "ZX": (2, 0)}
-#: Largest radius of a circular test, mm; a larger one is taken for a slip of unit.
+#: Largest radius of a circular test, mm; a larger one is taken as a wrong unit.
 LARGEST_RADIUS_MM = 1e4
 
 
@@ -33,8 +33,8 @@ class Circles(Displayed):
     direction : +1 counter-clockwise (from the first axis to the second), -1 clockwise, (n,).
     run : number of the run, (n,).
     setup : number of the set-up; readings of one share the centre and the zero of the gauge, (n,).
-    centre_mm : commanded centre, (n, 3); nan where the file does not say it.
-    u_mm : standard uncertainty of each reading (n,), nan where it is not known.
+    centre_mm : commanded centre, (n, 3); nan where the file does not state it.
+    u_mm : standard uncertainty of each reading (n,), nan where unknown.
     covariates : further numbers by column name (feed_mm_min, time_s, temp_..._c), each of shape (n,).
     metadata : comments ``key = value`` of the file.
     origin : (file, line) of each row, for messages.
@@ -112,13 +112,13 @@ _CIRCLES = Schema(
 
 
 def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
-    """Read one or more ``*.circle.csv`` files into one :class:`Circles`, um to mm; each file has set-ups of its own.
+    """Read one or more ``*.circle.csv`` files into one :class:`Circles`, um to mm; each file has separate set-ups.
 
     Raises
     ------
     InputError
-        for a plane other than XY, YZ and ZX (angles would turn the other way), a direction that is not 1 or -1, a centre of
-        which a coordinate is missing.
+        for a plane other than XY, YZ and ZX (angles would turn the other way), a direction that is not 1 or -1, a
+        centre with a missing coordinate.
     """
     parts, first = [], 0
     for table in _CIRCLES.read_tables(files):

@@ -1,6 +1,6 @@
-"""Comparison of two fields of errors: the rigid motion between them, their figures, and what their uncertainty explains.
+"""Comparison of two error fields: rigid motion between them, figures, and how much the uncertainty explains.
 
-Everything that weighs one set of errors against another does it here: tables against the best possible ones, two sets of
+All comparisons of two sets of errors are made here: tables against the best possible ones, two sets of
 tables, predicted against measured errors, two calibrations of one machine, two instruments, a part against its drawing.
 A field is errors (n, 3) at points (n, 3); where its covariance is known it is written as a factor F (3 n, r) with the
 components of the points one after another, F F^T. Nothing here knows a machine.
@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.names import MM_PER_UM
 
-# Rigid motion: where the workpiece lies and how it is turned is no error of the machine.
+# Rigid motion: the position and orientation of the workpiece are not errors of the machine.
 #
-# An error field is freed of it in two ways. ``without_rigid_motion`` takes out the finite motion that fits best, for
-# figures of one field. ``small_motion`` takes out its first order in the angles, t + w x p. That is a projection: it acts
-# in the same way on errors, on columns of a design and on a covariance, and it takes the same from a sum as from its
-# parts. A finite rotation (``scipy.spatial.transform.Rotation``) has none of that, so it cannot serve for uncertainties
+# It is removed in two ways. ``without_rigid_motion`` removes the best-fit finite motion, for figures of one field.
+# ``small_motion`` removes the motion to first order in the angles, t + w x p. This is a projection: it acts in the same
+# way on errors, columns of a design and a covariance, and it removes the same from a sum as from its parts. A finite
+# rotation (``scipy.spatial.transform.Rotation``) has none of these properties, so it cannot be used for uncertainties
 # and tests. For angles w the two differ by w^2 / 2 times the distance: 0.05 nm for 10 urad at 1 m.
 
 
 def best_rotation(moment: FloatArray) -> FloatArray:
     """Return the rotation R (3, 3) with the least sum of w |target - R point|^2; never a reflection.
 
-    The points enter by their ``moment`` (3, 3) alone, the sum of w target point^T, both counted from where they are brought
-    together (Kabsch 1976, Acta Crystallographica A32). If they lie on one line, the turn about it is arbitrary.
+    The points enter only through their ``moment`` (3, 3), the sum of w target point^T, both relative to the points that
+    are made to coincide (Kabsch 1976, Acta Crystallographica A32). For points on a line the rotation about it is free.
     """
     left, _, right = np.linalg.svd(moment)
     left[:, 2] *= np.sign(
@@ -40,7 +40,7 @@ def best_rotation(moment: FloatArray) -> FloatArray:
 
 
 def without_rigid_motion(position_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
-    """Take the best-fit rigid motion (least squares, finite rotation) out of errors (n, 3) at points (n, 3).
+    """Remove the best-fit rigid motion (least squares, finite rotation) from errors (n, 3) at points (n, 3).
 
     Examples
     --------
@@ -66,25 +66,25 @@ def rigid_fields(tip_mm: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SmallMotion:
-    """A rigid motion to first order: its six ``fields``, (3 n, 6), and what reads their amounts off a field, (6, 3 n)."""
+    """A rigid motion to first order: six ``fields``, (3 n, 6), and the matrix that extracts their amounts, (6, 3 n)."""
 
     fields: FloatArray
     reading: FloatArray
 
     def taken_out(self, values: FloatArray) -> FloatArray:
-        """Take the motion out of a field (n, 3) or (3 n,), or out of each of k fields, (3 n, k)."""
+        """Remove the motion from a field (n, 3) or (3 n,), or from each of k fields, (3 n, k)."""
         flat = values.reshape(len(self.fields), -1)
         return np.asarray((flat - self.fields @ (self.reading @ flat)).reshape(values.shape))
 
     def taken_out_of_weights(self, weight: FloatArray) -> FloatArray:
-        """Return the weights that read off a field what ``weight`` (n, 3) reads off it without the motion (transpose)."""
+        """Return weights that give on a field what ``weight`` (n, 3) gives on it without the motion (transpose)."""
         return np.asarray(weight - ((weight.ravel() @ self.fields) @ self.reading).reshape(weight.shape))
 
 
 def small_motion(tip_mm: FloatArray, weight: FloatArray | None = None) -> SmallMotion:
     """Return the best-fit small rigid motion at points (n, 3), by weighted least squares.
 
-    Points that do not show all six amounts (fewer than three, or on one line) lose what they show.
+    If the points do not determine all six amounts (fewer than three, or on one line), the determined part is removed.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def small_motion(tip_mm: FloatArray, weight: FloatArray | None = None) -> SmallM
     weight : of each point, (n,); default 1.
     """
     fields = rigid_fields(tip_mm - tip_mm.mean(axis=0))
-    fields = fields / np.maximum(np.linalg.norm(fields, axis=0), 1e-300)  # shift and turn of one size
+    fields = fields / np.maximum(np.linalg.norm(fields, axis=0), 1e-300)  # translation and rotation of equal size
     root = np.ones(len(fields)) if weight is None else np.repeat(np.sqrt(weight), 3)
     return SmallMotion(fields, np.linalg.pinv(root[:, None] * fields, rcond=1e-12) * root)
 
@@ -150,11 +150,11 @@ def residuals(error_mm: FloatArray) -> Residuals:
 
 
 def residuals_twice(tip_mm: FloatArray, error_mm: FloatArray) -> tuple[Residuals, Residuals]:
-    """Return the figures of errors (n, 3) as they stand, and with the best-fit rigid motion about tips (n, 3) removed."""
+    """Return the figures of errors (n, 3) as they are, and with the best-fit rigid motion about tips (n, 3) removed."""
     return residuals(error_mm), residuals(without_rigid_motion(tip_mm, error_mm))
 
 
-# What two sets of numbers differ by, against the uncertainty of both.
+# Difference of two sets of numbers compared with the uncertainty of both.
 
 
 #: Numbers (m,) and a factor (m, r) of their covariance.
@@ -165,7 +165,7 @@ ROUNDING = 1e-7
 
 @dataclass(frozen=True)
 class Difference:
-    """First minus second of m numbers, ``value`` (m,), with a factor F (m, r) of the covariance F F^T of that.
+    """First minus second of m numbers, ``value`` (m,), with a factor F (m, r) of its covariance F F^T.
 
     The numbers are the values of errors, or a field with the three components of each point one after another.
     """
@@ -200,8 +200,8 @@ class Difference:
     def p_of_sum(self) -> float:
         """Probability of at least this sum of squares if nothing differs.
 
-        The sum is one of chi-squares weighted with the eigenvalues of the covariance; its distribution is taken as that
-        of a scaled chi-square with the same mean and variance (Satterthwaite 1946, Biometrics Bulletin 2).
+        The sum is one of chi-squares weighted with the eigenvalues of the covariance; its distribution is approximated
+        by a scaled chi-square with the same mean and variance (Satterthwaite 1946, Biometrics Bulletin 2).
         """
         from scipy.special import chdtrc  # imported here: few comparisons are tests
 
@@ -213,9 +213,9 @@ class Difference:
         return float(chdtrc(mean * mean / squares, total * mean / squares))
 
     def p_of_pattern(self) -> float:
-        """Probability of at least this difference, in its own covariance (chi-square), if nothing differs.
+        """Probability of at least this difference, given its covariance (chi-square), if nothing differs.
 
-        What the covariance excludes, but for rounding, does not count.
+        Directions that the covariance excludes, apart from rounding, do not count.
         """
         from scipy.special import chdtrc  # imported here: few comparisons are tests
 
@@ -233,7 +233,7 @@ def compare(first: Uncertain, second: Uncertain, motion: SmallMotion | None = No
     Parameters
     ----------
     first, second : numbers (m,) and a factor (m, r) of their covariance; r = 0 for exact ones.
-    motion : the rigid motion that is taken out of a field and its covariance; default none.
+    motion : the rigid motion to remove from a field and its covariance; default none.
     """
     value, factor = first[0] - second[0], np.hstack([first[1], second[1]])
     if motion is None:
@@ -242,7 +242,7 @@ def compare(first: Uncertain, second: Uncertain, motion: SmallMotion | None = No
 
 
 def normalized_error(difference: FloatArray, expanded: FloatArray) -> FloatArray:
-    """E_n number of each difference (ISO/IEC 17043): its size over its expanded uncertainty; 0 for nothing over nothing."""
+    """E_n number of each difference (ISO/IEC 17043): its absolute value over its expanded uncertainty; 0 for 0/0."""
     size, expanded = np.abs(difference), np.asarray(expanded, dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where((size == 0.0) & (expanded == 0.0), 0.0, size / expanded))

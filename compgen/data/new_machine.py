@@ -38,7 +38,7 @@ EXAMPLES = (
 
 @dataclass(frozen=True)
 class Carried:
-    """One axis as words have it: what carries it, on which side (None: not said), and how far from the foundation."""
+    """One axis as described: what carries it, on which side (None: not stated), and how far from the foundation."""
 
     axis: str
     word: str
@@ -49,13 +49,13 @@ class Carried:
 def chains_of(words: str) -> tuple[Chain, ...]:
     """Return the chains that ``words`` can mean, the likeliest first: one of them if the words are clear.
 
-    Of axes on one carriage the one that is named first is taken to be next to the workpiece (table), or next to the
-    foundation (gantry, head); the other orders come after it.
+    Of axes on one carriage, the first named is taken to be next to the workpiece (table) or next to the foundation
+    (gantry, head); the other orders follow.
 
     Raises
     ------
     InputError
-        for words without axes and carriages, and for an axis that is said to be on both sides.
+        for words without axes and carriages, and for an axis stated to be on both sides.
 
     Examples
     --------
@@ -75,7 +75,7 @@ def chains_of(words: str) -> tuple[Chain, ...]:
             message = f"{words!r}: {letter} is carried by {known.word!r} and by {carrier.group()!r}; name one of them"
             raise InputError(message, field="--chain")
         found[letter] = Carried(letter, carrier.group(), side, level)
-    # a slide is on a gantry where there is one, moving or not; else below the table or on the column, if only one moves
+    # a slide is on a gantry if there is one, moving or not; else below the table or on the column, if only one moves
     table = any(item.tool_side is False for item in found.values())
     column = any(item.tool_side and item.level < 2 for item in found.values())
     gantry = re.search(_CARRIERS[2][0], words.lower().translate(_UMLAUTS)) is not None
@@ -92,7 +92,7 @@ def chains_of(words: str) -> tuple[Chain, ...]:
 
 
 def _pairs(words: str) -> list[tuple[str, re.Match[str]]]:
-    """Each axis with the word for what carries it; within a part of the sentence either of them may come first."""
+    """Each axis with the word for what carries it; within a part of the sentence either may come first."""
     pairs: list[tuple[str, re.Match[str]]] = []
     carrier: re.Match[str] | None = None
     waiting: list[str] = []  # axes whose carrier is still to come: "X and Y by the table"
@@ -134,7 +134,7 @@ def _turned(chain: Chain, carried: Mapping[str, Carried]) -> int:
 
 
 def in_words(chain: Chain) -> str:
-    """Return what a chain means, in words.
+    """Describe a chain in words.
 
     >>> in_words(Chain("WXYFZT"))
     'table moves in X, on a carriage in Y, on the bed; head moves in Z'
@@ -150,14 +150,14 @@ def in_words(chain: Chain) -> str:
 
 
 def usual_nodes(travel: Interval) -> int:
-    """Return a usual number of nodes: one every 100 mm or so, five at least."""
+    """Return a usual number of nodes: about one every 100 mm, at least five."""
     return max(5, min(101, round((travel[1] - travel[0]) / 100.0) + 1))
 
 
 def machine_text(
     name: str, chain: Chain, travel_mm: Mapping[str, Interval], nodes: Mapping[str, int], sections: Sequence[str] = ()
 ) -> str:
-    """Return the text of a machine file in which a comment explains every key; ``sections`` follow, for the controls."""
+    """Return the text of a machine file with a comment on every key, followed by ``sections`` for the controls."""
     said = toml_files.section_schema(Machine, Emphasis)["properties"]
     of_axis = toml_files.section_schema(Axis)["properties"]
     at_zero = [min(max(0.0, travel_mm[letter][0]), travel_mm[letter][1]) for letter in AXES]

@@ -25,7 +25,7 @@ from compgen.identify.identification import (
 from compgen.identify.reversal_errors import SIGNIFICANT
 from compgen.kinematics.first_order import c_matrix
 
-#: Targets closer than this are the same one, mm.
+#: Targets closer than this are the same target, mm.
 SAME_TARGET_MM = 1e-4
 POSITIONING = ("EXX", "EYY", "EZZ")
 
@@ -41,12 +41,12 @@ def two_way_mean(
 
     Returns
     -------
-    mean : at each target the mean of the means of both directions (ISO 230-2), or that of the only one.
-    reversal : positive minus negative approach where both were made; None if nowhere.
+    mean : at each target the mean of the means of both directions (ISO 230-2), or the mean of the only direction.
+    reversal : positive minus negative approach where both were measured; None if nowhere.
     residual : reading minus mean of its target and direction, (n,).
 
-    Standard uncertainties come from the scatter within targets and directions, pooled over the axis, because a handful
-    of runs says little about a single one; nan where nothing was repeated.
+    Standard uncertainties come from the scatter within targets and directions, pooled over the axis, because a few
+    runs tell little about a single target; nan where nothing was repeated.
     """
     keys = np.round(position_mm / SAME_TARGET_MM).astype(np.int64)
     _, first, target = np.unique(keys, return_index=True, return_inverse=True)
@@ -70,7 +70,7 @@ def two_way_mean(
 
 
 def worth_a_table(reversal: Curve) -> bool:
-    """Whether a reversal is large enough, and beyond its uncertainty somewhere."""
+    """Whether a reversal is large enough, and exceeds its uncertainty somewhere."""
     size = np.abs(reversal.value)
     beyond = np.isnan(reversal.u) | (size > SIGNIFICANT * reversal.u)
     return bool(size.max() >= WORTH_MM and beyond.any())
@@ -93,9 +93,9 @@ def positioning_errors(
 
 
 def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
-    """Take the positioning errors of the measured axes from their runs; nothing else shows in them.
+    """Take the positioning errors of the measured axes from their runs; the runs show no other errors.
 
-    The curves are zero at the reference point, as those of every identification; the details say what was taken off.
+    The curves are zero at the reference point, as in every identification; the details state the subtracted offset.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     """
     check_axis_travel(machine, runs.axis, runs.position_mm, runs.origin)
     raw, reversal, residual = positioning_errors(runs, metadata_of(machine, runs.metadata))
-    # where the laser was zeroed means nothing: each curve is zero at the machine's reference point
+    # the zero of the laser is arbitrary: each curve is zero at the machine's reference point
     offsets = {
         name: float(np.interp(machine.reference_point_mm[axis], raw.curves[name].position_mm, raw.curves[name].value))
         for axis, name in ((axis, POSITIONING[axis]) for axis in runs.axes)
@@ -151,12 +151,12 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
 
 # Squareness, reversal and the scales of two axes from circular tests (ballbar; ISO 230-4).
 #
-# The gauge reads the distance of the tool from a pivot, whose place in the machine and whose zero are unknown. At the angle t on
-# a circle of radius R in the plane of the axes 1 and 2 the deviation of the radius is
+# The gauge reads the distance of the tool from a pivot; the pivot's position and the zero of the gauge are unknown. At
+# angle t on a circle of radius R in the plane of axes 1 and 2 the deviation of the radius is
 #
 #     d(t) = n . (E(p) - c) + r,    n = (cos t, sin t)
 #
-# with the offset c of the centre, the constant r of the gauge, and of the errors E what such a circle shows:
+# with the offset c of the centre, the constant r of the gauge, and the part of the errors E that such a circle shows:
 #
 #     squareness            n . C S         one row of C for each squareness error S of the plane
 #     scales                R/2 cos 2t (s1 - s2)
@@ -164,13 +164,13 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
 #     servo mismatch        direction R/2 sin 2t m    only with both directions told from squareness
 #     straightness          cos 3t, sin 3t            bows of the two axes
 #
-# Higher harmonics (cyclic errors, spikes at reversal) stay in the residuals. They are not white, so uncertainties are widened
-# by their correlation along the path.
+# Higher harmonics (cyclic errors, spikes at reversal) stay in the residuals. They are not white, so uncertainties are
+# enlarged by their correlation along the path.
 
 
-#: A combination of columns counts as not determined below this share of their size.
+#: Below this share of their size a combination of columns counts as not determined.
 RCOND = 1e-7
-#: An arc shorter than this, degrees, tells the offset of the centre from nothing.
+#: A shorter arc, degrees, cannot separate the offset of the centre from anything else.
 LEAST_ARC_DEG = 90.0
 
 
@@ -188,8 +188,8 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
 
     Parameters
     ----------
-    machine : chain, travel, reference of squareness. Where a file does not say where its circles were, they are taken to have
-        been in the middle of the travel.
+    machine : chain, travel, reference of squareness. If a file does not state where its circles were, they are
+        assumed in the middle of the travel.
     circles : readings in one or more planes, with one or both directions, whole circles or arcs.
 
     Raises
@@ -197,7 +197,7 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     InputError
         for circles that leave the travel.
     UndeterminedError
-        where arcs are too short to tell squareness from the centre and the scales.
+        if arcs are too short to separate squareness from the centre and the scales.
     """
     position_mm = _positions(machine, circles)
     columns = _columns(machine, circles, position_mm)
@@ -322,7 +322,7 @@ def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> lis
 
 
 def _correlated(circles: Circles, residual: FloatArray) -> float:
-    """How many readings in a row count as one: 1 plus twice the sum of the correlations along the path, while above 0."""
+    """How many successive readings count as one: 1 + twice the sum of correlations along the path, while above 0."""
     total, weight = 0.0, 0
     for key in np.unique(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]), axis=0):
         own = np.all(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]) == key, axis=1)

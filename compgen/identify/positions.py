@@ -61,8 +61,8 @@ IntArray = NDArray[np.int64]
 class FramePose:
     """Pose of the frame of one set-up: measured = offset + rotation(scale x (nominal + error)).
 
-    ``offset_mm`` (3,) is that of the nominal origin, ``turn_rad`` (3,) the rotation vector; nan in components that the
-    readings do not show. ``scale`` is 1 if it was not free.
+    ``offset_mm`` (3,) is the offset of the nominal origin, ``turn_rad`` (3,) the rotation vector; nan in components
+    that the readings do not determine. ``scale`` is 1 if it was not free.
     """
 
     setup: int
@@ -212,7 +212,7 @@ def _readings(machine: Machine, deviations: Deviations, sigma_mm: FloatArray) ->
 
 
 def observed_positions(layout: ErrorParameters, readings: _Readings, *, free_scale: bool = False) -> Observations:
-    """The components of positions as readings of the errors, and of shift, turn and scale of each set-up about its centre."""
+    """Position components as readings of the errors, and of shift, turn and scale of each set-up about its centre."""
     read = np.arange(len(readings.component)), readings.component
     block = rigid_fields(readings.arm_mm).reshape(-1, 3, 6)[read]
     if free_scale:
@@ -237,10 +237,10 @@ def position_observations(
     options: IdentifyOptions,
     around: FloatArray | None = None,
 ) -> Observations:
-    """Return measured positions as readings of the errors of a layout, each set-up with a pose of its own.
+    """Return measured positions as readings of the errors of a layout, each set-up with a separate pose.
 
-    ``around`` are errors of the layout (size,) that are nearly right: poses and errors then count from there, exactly, so that
-    terms of second order (2 um over a metre for a squareness of 2 mrad) stay out of the rest.
+    ``around`` are approximate errors of the layout (size,): poses and errors then count from there, exactly, and
+    second-order terms (2 um over a metre for a squareness of 2 mrad) stay out of the remainder.
 
     Raises
     ------
@@ -295,7 +295,7 @@ def _result(
     row: IntArray,
     component: IntArray,
 ) -> Identification:
-    """The result of adjusted components (k,) with those that were rejected, and the verdict about the residuals."""
+    """The result of adjusted components (k,) with the rejected ones, and the assessment of the residuals."""
     residual, sigma, accepted = adjusted.residual_mm, adjusted.sigma_mm, adjusted.accepted
     found = replace(
         adjusted.identification(errors, layout, deviations.metadata, float(np.median(sigma)) / MM_PER_UM),
@@ -342,20 +342,20 @@ def _poses(
     return found
 
 
-# Errors from artefacts that the machine's own probe measured.
+# Errors from artefacts measured with the machine's probe.
 #
-# The probe finds a feature at the coordinates m, where the tool is at m + E(m): that is the place of the feature,
+# The probe finds a feature at the coordinates m, where the tool is at m + E(m): this is the position of the feature,
 #
 #     m + E(m) = shift_s + R_s (q + dq)
 #
-# with its place q in the artefact, and the unknown pose of the set-up. So what the probe reads has the errors of the machine with
-# the opposite sign of those in a part. dq is zero for a calibrated artefact, known to the uncertainty of its calibration, or
-# unknown: then the same plate in several set-ups, turned and shifted, tells its own errors from those of the machine
-# (self-calibration; a common scale is not among what it tells).
+# with its position q in the artefact, and the unknown pose of the set-up. So probe readings contain the machine errors
+# with the opposite sign of those in a part. dq is zero for a calibrated artefact, known to the uncertainty of its
+# calibration, or unknown: then the same plate in several set-ups, turned and shifted, separates its errors from the
+# errors of the machine (self-calibration; it does not determine a common scale).
 
 
 def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOptions) -> Identification:
-    """Identify what an artefact under the machine's own probe determines of the errors.
+    """Identify the errors that an artefact measured with the machine's probe determines.
 
     Parameters
     ----------
@@ -366,13 +366,13 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
     Raises
     ------
     InputError
-        for features outside the travel, or that do not lie where they should.
+        for features outside the travel, or far from their expected position.
     UndeterminedError
-        where no error at all is determined.
+        if no error is determined.
     """
     layout = error_parameters(machine, modelled_errors(machine))
     around = np.zeros(layout.size)
-    for _ in range(2):  # once more about the first result, so that terms of second order stay out
+    for _ in range(2):  # repeat about the first result, to keep second-order terms out
         observations, count, source = artefact_observations(machine, layout, artefact, options, around)
         solution, accepted = _robust(layout, observations, count, reject=options.reject)
         around = solution.on(layout)
@@ -414,7 +414,7 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
 def _robust(
     layout: ErrorParameters, observations: Observations, count: int, *, reject: bool
 ) -> tuple[Determined, NDArray[np.bool_]]:
-    """The adjustment without the probed coordinates, the first ``count`` readings, that do not fit; and which of them do."""
+    """The adjustment without outliers among the probed coordinates, the first ``count`` readings; and which fit."""
 
     def fit(accepted: NDArray[np.bool_], _: Determined | None) -> Determined:
         return least_squares(
@@ -433,10 +433,10 @@ def _robust(
 def artefact_observations(
     machine: Machine, layout: ErrorParameters, artefact: Artefact, options: IdentifyOptions, around: FloatArray
 ) -> tuple[Observations, int, str]:
-    """Return probed coordinates as readings of the errors of a layout, and behind them what the calibration says.
+    """Return probed coordinates as readings of the errors of a layout, followed by the calibration data.
 
-    Also their number, and whether their uncertainty is "stated" or "assumed". ``around`` are errors of the layout (size,) that
-    are nearly right; poses and errors count from there.
+    Also their number, and whether their uncertainty is "stated" or "assumed". ``around`` are approximate errors of the
+    layout (size,); poses and errors count from there.
     """
     tool_mm = np.broadcast_to(tool_of(machine, artefact.tool_mm), artefact.measured_mm.shape)
     position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
@@ -449,7 +449,7 @@ def artefact_observations(
     arm_mm = np.einsum("nij,nj->ni", rotation, artefact.nominal_mm - np.array([pose.nominal_mm for pose in poses]))
     there_mm = arm_mm + np.array([pose.measured_mm for pose in poses])
     row, component = np.nonzero(np.isfinite(artefact.measured_mm))
-    # where the rough pose has the features: there a common scale of the machine and of the plate are exactly the same
+    # at the features' positions by the rough pose: there a common scale of machine and plate are exactly the same
     at_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, there_mm)
     design = layout.design(c_matrix(machine, at_mm, tool_mm), layout.bases(at_mm))[row, component]
     unit = np.eye(3)[component]
@@ -459,7 +459,7 @@ def artefact_observations(
     number = np.array([features[name] for name in artefact.feature])
     own = np.zeros((len(row), len(features), 3))
     own[np.arange(len(row)), number[row]] = rotation[row, component]
-    # features with an uncertainty are free and known at once; exact ones are not free
+    # features with an uncertainty are both free and observed; exact ones are not free
     first = np.array([artefact.feature.index(name) for name in features])
     u_mm = np.where(artefact.calibrated[first, None], np.nan_to_num(artefact.u_nominal_mm[first]), np.inf)
     free = (u_mm > 0).ravel()
@@ -491,7 +491,7 @@ def artefact_observations(
 # Errors from measured and commanded positions (``*.deviations.csv``): the separation step alone.
 #
 # The rigid placement of the measured frame is unknown (six more unknowns), so the file may be in the frame of any
-# instrument whose axes are those of the machine to a few degrees.
+# instrument whose axes agree with the machine's to a few degrees.
 
 
 def identify_deviations(
@@ -508,7 +508,7 @@ def identify_deviations(
     Raises
     ------
     InputError
-        for positions outside the travel, or an uncertainty that is not above zero.
+        for positions outside the travel, or an uncertainty that is not positive.
     UndeterminedError
         if the positions do not determine the errors; it lists the combinations.
     ConvergenceError

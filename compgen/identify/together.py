@@ -1,9 +1,9 @@
 """Several measurements of one machine in one adjustment: axis runs, lengths, positions, six-DOF readings, known errors.
 
-Readings are linear in the errors, or nearly so: what each kind has unknown beside them (where a laser was set to zero, the
-pose of a plate) stays its own. What no reading determines is not identified. Where each error comes from one source only and
-directly, as pitch from a laser and squareness from a granite square, nothing has to be adjusted: the results are joined as
-they are, at the targets that were measured.
+Readings are linear in the errors, or nearly so; each kind keeps its separate further unknowns (the zero of a laser, the
+pose of a plate). What no reading determines is not identified. If each error comes directly from a single source, such
+as pitch from a laser and squareness from a granite square, no adjustment is needed: the results are joined unchanged,
+at the targets that were measured.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from compgen.kinematics.first_order import modelled_errors
 
 @dataclass(frozen=True)
 class Source:
-    """One of several measurements: what to call it, the measurement, and what it determines alone (None: too little)."""
+    """One of several measurements: its name, the measurement, and what it determines alone (None: too little)."""
 
     name: str
     measurement: object
@@ -46,11 +46,11 @@ class Source:
     def observed(
         self, machine: Machine, layout: ErrorParameters, options: IdentifyOptions, around: FloatArray | None
     ) -> Observations:
-        """Return what it says about the errors of a layout; ``around`` are errors (size,) that are nearly right.
+        """Return its readings of the errors of a layout; ``around`` are approximate errors (size,).
 
-        Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with the joint
-        covariance of these: stations, dead lengths and rejected readings are settled then. Axis runs and known errors enter value
-        by value.
+        Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with
+        their joint covariance: stations, dead lengths and rejected readings are already settled. Axis runs and known
+        errors enter value by value.
         """
         if isinstance(self.measurement, Deviations):
             found = position_observations(machine, layout, self.measurement, options, around)
@@ -87,18 +87,18 @@ class Source:
 
 
 def identify_together(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
-    """Identify what several measurements determine together.
+    """Identify the errors that several measurements determine together.
 
     Parameters
     ----------
     machine : chain, nodes, reference point and the errors that its model contains.
-    parts : the measurements; errors that are known otherwise have no ``measurement``.
-    options : those that apply to the kinds of the measurements.
+    parts : the measurements; errors known from elsewhere have no ``measurement``.
+    options : those that apply to these kinds of measurements.
 
     Raises
     ------
     UndeterminedError
-        where no error at all is determined, or a kind that is not linear does not determine its own unknowns.
+        if no error is determined, or a nonlinear kind does not determine its further unknowns.
     """
     known = [part.alone for part in parts if part.alone is not None]
     if not known:
@@ -111,7 +111,7 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
 
 
 def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
-    """The errors of all results, none of which is in two of them; each keeps the positions at which it was measured."""
+    """The errors of all results, each in one result only; each keeps the positions at which it was measured."""
     errors = ErrorTable(
         dict(chain.from_iterable(result.errors.curves.items() for result in known)),
         dict(chain.from_iterable(result.errors.squareness.items() for result in known)),
@@ -191,9 +191,9 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
 def _agreement(
     layout: ErrorParameters, parts: Sequence[Source], found: Sequence[Observations]
 ) -> dict[str, dict[str, float]]:
-    """Largest E_n number of each error between a part alone and all others, by the part's name.
+    """Largest E_n number of each error between one part alone and all others, by name of the part.
 
-    The coverage factor is chosen so that the probability of a false alarm holds for all values of a part together.
+    The coverage factor is chosen to give the probability of a false alarm for all values of a part together.
     """
     from scipy.special import stdtrit  # imported here: slow to load
 
@@ -220,7 +220,7 @@ def _agreement(
 
 
 def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
-    """What the results of all parts have in common: readings one after the other, stations, reversals, objections."""
+    """The combined fields of all parts' results: readings one after another, stations, reversals, objections."""
     measured = [part.alone for part in parts if part.alone is not None and part.measurement is not None]
     residual = np.concatenate([np.zeros(0), *(result.residual_mm for result in measured)])
     accepted = np.concatenate([np.zeros(0, dtype=bool), *(result.accepted for result in measured)])

@@ -234,7 +234,7 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
 
 
 def _regression(cause: FloatArray, effect: FloatArray) -> dict[str, float] | None:
-    """Slope of effect against cause, both centred, in standard errors too, and explained share; None if insignificant."""
+    """Slope of effect against cause, both centred, its standard error, the explained share; None if insignificant."""
     square = float(cause @ cause)
     if len(cause) < LEAST or square == 0.0:
         return None

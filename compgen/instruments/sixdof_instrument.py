@@ -1,7 +1,8 @@
 """The six-DOF instrument: its optics, the linear model of its signals, and the instrument file.
 
 Signals = S_g errors + S_s systematics + S_d drift; :func:`error_matrix`, :func:`systematic_columns` and
-:func:`drift_matrix` return these matrices, :func:`solve_errors` inverts the first, :func:`read_instrument` reads constants.
+:func:`drift_matrix` return these matrices, :func:`solve_errors` inverts the first. :func:`read_instrument` reads the
+constants.
 """
 
 from __future__ import annotations

@@ -54,7 +54,7 @@ class RelativeRun:
     rows : rows of the readings.
     position_mm : commanded positions of the axis, (n,).
     distance_mm : optical distance L, (n,).
-    shift_mm : displacement of the front centre of the first cube corner in machine axes, without nominal travel, (n, 3).
+    shift_mm : displacement of the front centre of the first cube corner in machine axes, less nominal travel, (n, 3).
     turn_rad : rotation of the target, (n, 3).
     away : +1 if the target moves along the positive axis relative to the unit when the command rises, else -1.
     direction : sign of travel, 0 if not given, (n,).
@@ -202,8 +202,8 @@ def _distance(
 #
 # Unit on the workpiece side, target at the tool (A): the measurement gives the error E of the tool point at the
 # target's front centre, tool offset ``target_offset_mm``. Unit on the tool side, target on the workpiece (B): the error
-# of the unit's reference point (where beam 1 meets the reflector; X: the exit point), which then has that offset. In both,
-# with the model's lever arms,
+# of the unit's reference point (where beam 1 meets the reflector; X: the exit point), which then has that offset.
+# In both, with the model's lever arms,
 #
 #     delta_i(q) = E(q) - eps_i(q) x lever_i(q) - (sum of eps of the carriers of i) x q e_i
 #

@@ -1,7 +1,7 @@
 """Compiled kernels: E = C P at points and on grids, and the exact model, each in one pass. Needs numba.
 
-Import through :mod:`compgen.kinematics.many_points`. Rows of a table hold four numbers left of an interval and four steps
-(three components and a zero), so that one vector instruction works on a row.
+Import through :mod:`compgen.kinematics.many_points`. A row of a table contains four numbers left of an interval and
+four steps (three components and a zero): one vector instruction works on a row.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def _inline(function: Function) -> Function:
 
 @_inline
 def _locate(position: Any, axis: Any, even: bool) -> Any:
-    """Interval and share of its upper node; as ``NodeIndex.locate``. Unsigned numbers need no test for the sign."""
+    """Interval and share of its upper node, as in ``NodeIndex.locate``. Unsigned numbers need no sign test."""
     low, high, per_mm, last, start, nodes, upper, per_gap, _ = axis
     inside = low if position < low else position
     inside = high if inside > high else inside
@@ -82,7 +82,7 @@ def _plus_times(a: Row, factor: Any, b: Row) -> Row:
 
 @_inline
 def _axis_terms(total: Row, axis: Any, located: Any, factors: Any, offsets: Any) -> Row:
-    """Add the rows of one axis; ``offsets`` are known when this is compiled, so absent groups leave no trace."""
+    """Add the rows of one axis; ``offsets`` are known at compile time, so absent groups cost nothing."""
     rows, (cell, share) = axis[8], located
     at = cell * np.uint64(offsets[7])
     if offsets[0] >= 0:
@@ -110,9 +110,9 @@ def field_kernel(
 
     Parameters
     ----------
-    offsets : per axis the place of each of seven groups in a row (-1: absent), and the length of a row.
+    offsets : per axis the position of each of seven groups in a row (-1: absent), and the length of a row.
     even : whether the nodes of X, Y and Z are equidistant.
-    tools : whether ``tool`` holds an offset for each point.
+    tools : whether ``tool`` contains an offset for each point.
     """
     of_x, of_y, of_z = offsets
     even_x, even_y, even_z = even
@@ -154,7 +154,7 @@ def grid_kernel(tilted: bool) -> Callable[..., None]:
     """Kernel ``(x, y, z, along_x, along_y, along_z, out)`` of E = C P on a grid.
 
     A row along z is written as 3 nz numbers, twelve (four points) at a time: constant and slope repeat every three.
-    ``tilted``: the Z axis has errors whose lever is y, so that such a row also depends on y by more than a line.
+    ``tilted``: the Z axis has errors whose lever is y, so the dependence of such a row on y is not just linear.
     """
 
     @_inline

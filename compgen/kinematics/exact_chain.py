@@ -23,7 +23,7 @@ from compgen.kinematics.many_points import (
     volumetric_error,
 )
 
-# The small rotation: R(eps) of a rotation vector eps in rad, and its derivative. The one place of these formulas.
+# The small rotation: R(eps) of a rotation vector eps in rad, and its derivative. These formulas are only here.
 #
 # With a = |eps| and [eps]x the matrix of the cross product (Rodrigues; Chirikjian 2011, Stochastic Models 2, section 10.6)
 #
@@ -94,7 +94,7 @@ def cross_matrices(vectors: FloatArray) -> FloatArray:
 # * workpiece side, from the foundation outwards: x -> R(eps) (x + q a + delta)
 #
 # with q the commanded travel, a the axis direction turned by its squareness, delta and eps the small motion of the
-# carriage. A workpiece-side carriage stands at -q with small motion (-delta, -eps), hence the inverse above.
+# carriage. A workpiece-side carriage is at -q with small motion (-delta, -eps), hence the inverse above.
 
 
 def _squareness_vectors(machine: Machine, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -205,15 +205,15 @@ def travel_directions(machine: Machine, squareness_rad: FloatArray) -> tuple[Flo
 
 # The exact model at many points, in blocks of constant memory.
 #
-# The same chain as :func:`tip_position`, but of the error alone: with x = nominal + error, each body adds its own
-# motion to the error, and nothing is lost to the difference of two large coordinates:
+# The same chain as :func:`tip_position`, but only for the error: with x = nominal + error, each body adds its motion to
+# the error, and no digits are lost in the difference of two large coordinates:
 #
 # * tool side:       error <- error + delta + q (a - axis) + (R - 1)(nominal + error),  then nominal <- nominal + q axis
 # * workpiece side:  nominal <- nominal + q axis,  error <- error + delta + q (a - axis),
 #                    then error <- error + (R - 1)(nominal + error)
 
 
-#: From so many points on, loading the kernels pays for a single call.
+#: From this number of points on, loading the kernels pays off for a single call.
 _POINTS_FOR_KERNELS = 5_000_000
 _SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
 
@@ -306,7 +306,7 @@ def predict(machine: Machine, errors: ErrorTable, points: Points, *, exact: bool
 
     Parameters
     ----------
-    machine, errors, points : what moves, how wrong, and where to.
+    machine, errors, points : the machine, its errors, and the commanded points.
     exact : finite rotations along the chain instead of E = C P.
 
     Examples

@@ -1,4 +1,4 @@
-"""First-order volumetric model E = C P, and which of the 21 errors it can show."""
+"""First-order volumetric model E = C P, and which of the 21 errors are observable."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | No
     return matrix
 
 
-# Which of the 21 errors a machine's own motion can show (``docs/conventions.md``, "Names").
+# Which of the 21 errors the machine's motion can show (``docs/conventions.md``, "Names").
 
 
 _SAME_TOOL_MM = 1e-9
@@ -112,17 +112,17 @@ _PARALLEL = 1e-6  # sine of the angle below which two lever arms count as parall
 
 
 def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
-    """Return the names of the errors that can be told from every other one.
+    """Return the names of the errors that can be separated from all others.
 
-    A linear error and a squareness error always can. An angular error can if the travel of ANOTHER axis is a lever
-    arm of it, or if tools of different offset were used: with its own travel or one tool alone it acts as a function
-    of its own axis only, which is that axis' straightness or positioning. For one tool this leaves 17 on every chain.
-    If all lever arms of an axis are parallel, the rotation about them moves nothing; one error is left out for it
-    and the others, taken together, do what it would do for those tools.
+    Linear and squareness errors always can. An angular error can if the travel of ANOTHER axis is one of its lever
+    arms, or if tools of different offset were used: with only its own travel or one tool it is a function of its own
+    axis only, the same as straightness or positioning of that axis. For one tool this leaves 17 on every chain.
+    If all lever arms of an axis are parallel, the rotation about them moves nothing; one error is omitted for it,
+    and the others together have its effect for those tools.
 
     Parameters
     ----------
-    machine : its chain counts.
+    machine : its chain is used.
     tools_mm : the tool offsets that were used, shape (n, 3); default: one tool.
 
     Examples
@@ -139,7 +139,7 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
         set(),
         set(),
         set(),
-    ]  # directions of the angular errors that the lever arms of an axis do not show
+    ]  # directions of the angular errors that have no effect with the lever arms of an axis
     for axis in range(3):
         others = [other for other in machine.chain.lever_axes(axis) if other != axis]
         if len(others) > 1:
@@ -154,9 +154,9 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
 
 
 def modelled_errors(machine: Machine, tools_mm: FloatArray | None = None) -> tuple[str, ...]:
-    """Return the names of the errors that the machine's model contains, as its ``errors`` entry asks for.
+    """Return the names of the errors that the machine's model contains, as given by its ``errors`` entry.
 
-    ``"observable"`` follows the tools that were used, 17 takes those of one tool, 21 all, a list is taken as it is.
+    ``"observable"`` depends on the tools that were used, 17 means those of one tool, 21 all, a list is used unchanged.
     """
     if machine.errors == 21:
         return ERROR_NAMES

@@ -1,10 +1,10 @@
-"""Gauge alignment: two tables that describe the same machine differ by changes that no measurement shows.
+"""Gauge alignment: two tables of the same machine may differ by changes that no measurement can show.
 
 A constant or a line in a curve acts, through C, as an affine field of the commanded position. Combinations of them
-and of squareness whose fields add up to nothing, or to a rigid motion of the workpiece, leave the machine as it is.
-For the 17 errors of one tool these are the 20 directions of ``docs/conventions.md``. An angular error without any
-lever arm may change altogether; one whose only lever arm is the tool offset may change together with the straightness
-and positioning of its axis.
+and of squareness whose fields add up to zero, or to a rigid motion of the workpiece, leave the machine as it is.
+For the 17 errors of one tool these are the 20 directions of ``docs/conventions.md``. An angular error without a
+lever arm may change freely; one whose only lever arm is the tool offset may change together with the straightness and
+positioning of its axis.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, error_name
 from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.many_points import full_grid
 
-#: 1 um counts as much as 1 urad: an angle counts at this lever.
+#: Lever arm at which an angle counts: 1 urad is equivalent to 1 um.
 LEVER_MM = 1000.0
 #: Singular value below which a combination has no effect; coordinates and levers are scaled to about 1.
 NO_EFFECT = 1e-9
@@ -71,7 +71,7 @@ def _sample(machine: Machine, tools_mm: FloatArray | None) -> tuple[FloatArray, 
 def _effects(
     machine: Machine, names: Sequence[str], position: FloatArray, tool: FloatArray
 ) -> tuple[FloatArray, list[tuple[str, int]]]:
-    """Fields of unit constants and slopes at points (n, 3), one column each, and what each column is."""
+    """Fields of unit constants and slopes at points (n, 3), one column each, and the meaning of each column."""
     matrix = c_matrix(machine, position, tool)
     columns, slots = [], []
     for name in names:
@@ -94,10 +94,10 @@ def gauge_changes(directions: FloatArray, error: Sequence[str], position_mm: Flo
 
 
 def gauge_part(changes: FloatArray, conditions: FloatArray) -> FloatArray:
-    """Matrix (k, k) that finds what ``changes`` (k, d) have to take out of values (k,): G (W G)^+ W.
+    """Matrix (k, k) that gives the part of values (k,) to be removed along ``changes`` (k, d): G (W G)^+ W.
 
-    With it taken out, the ``conditions`` W (m, k) leave as little of the values as they can (least squares). This is the
-    choice of a gauge: which values shall be zero or small. It is linear, so it takes its part out of a covariance too.
+    Without that part, the ``conditions`` W (m, k) on the values are as small as possible (least squares). This is the
+    choice of a gauge: which values are to be zero or small. It is linear, so it also applies to a covariance.
     """
     effect = conditions @ changes
     scale = np.linalg.norm(effect, axis=0)
@@ -107,7 +107,7 @@ def gauge_part(changes: FloatArray, conditions: FloatArray) -> FloatArray:
 
 
 def curve_weights(error: Sequence[str]) -> FloatArray:
-    """Weights (k,) of error values with which every curve counts alike however many nodes it has, an angle by its lever."""
+    """Weights (k,) of error values: every curve counts equally whatever its number of nodes, angles at ``LEVER_MM``."""
     counts = Counter(error)
     reach = {name: 1.0 if error_named(name).kind == "linear" else LEVER_MM for name in counts}
     return np.array([reach[name] / np.sqrt(counts[name]) for name in error])
@@ -116,7 +116,7 @@ def curve_weights(error: Sequence[str]) -> FloatArray:
 def align(
     machine: Machine, errors: ErrorTable, reference: ErrorTable, tools_mm: FloatArray | None = None
 ) -> ErrorTable:
-    """Change ``errors`` along the gauge directions so that it comes as close to ``reference`` as it can.
+    """Change ``errors`` along the gauge directions so that it is as close to ``reference`` as possible.
 
     E stays the same up to a rigid motion, to first order. Close means least squares over the nodes of all curves, each
     curve with the same weight, 1 um counting as much as 1 urad. Curves that only the reference has are added where a
@@ -133,7 +133,7 @@ def align(
     names = [name for name in full.names if name in full.squareness or len(full.curves[name].value) > 1]
     changes = gauge_changes(gauge_directions(machine, names, tools_mm), error, position_mm)
     changes = np.hstack([changes, *_free_changes(machine, full, tools_mm)])
-    there = np.zeros(len(error))  # an error that the reference lacks comes close to zero
+    there = np.zeros(len(error))  # an error missing in the reference is brought close to zero
     for name, rows in full.rows().items():
         if name in reference.curves:
             there[rows] = reference.curves[name].at(position_mm[rows])
@@ -155,7 +155,7 @@ def _completed(errors: ErrorTable, reference: ErrorTable) -> ErrorTable:
 
 
 def _free_changes(machine: Machine, full: ErrorTable, tools_mm: FloatArray | None) -> list[FloatArray]:
-    """Changes (k, nodes) of angular errors that no travel shows, node by node, with what makes up for them elsewhere."""
+    """Changes (k, nodes) of angular errors that no travel shows, node by node, with compensating changes elsewhere."""
     tools = np.atleast_2d(tool_of(machine, None) if tools_mm is None else tools_mm)
     if len(tools) > 1 and np.ptp(tools, axis=0).max() > 0:
         return []

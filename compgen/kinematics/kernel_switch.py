@@ -17,14 +17,14 @@ from threadpoolctl import ThreadpoolController
 
 from compgen.errors import InputError
 
-# The one switch between compiled kernels (numba, ``pip install compgen[fast]``) and their plain forms (numpy).
+# The switch between compiled kernels (numba, ``pip install compgen[fast]``) and their plain forms (numpy).
 #
-# Both forms of a calculation agree to rounding, not in every bit. Which of them serves a call is therefore said by the
+# Both forms of a calculation agree to rounding, not in every bit. Which form is used is therefore decided by the
 # environment variable ``COMPGEN_KERNELS`` and the call itself, never by what the process did before:
 #
-# * ``auto`` (default): compiled from so many points or readings on that loading the kernels pays for a single call, plain
-#   below that and where numba is not installed;
-# * ``compiled``: always compiled; an error where numba is not installed;
+# * ``auto`` (default): compiled if there are enough points or readings for loading the kernels to pay off in a single
+#   call, otherwise plain, as without numba;
+# * ``compiled``: always compiled; an error if numba is not installed;
 # * ``plain``: never compiled.
 #
 # The variable is read at every call. Machine code is kept on disk, so that a computer compiles a kernel only once.
@@ -46,12 +46,12 @@ def kernel_choice() -> str:
 
 
 def use_compiled(size: int, enough: int) -> bool:
-    """Whether the compiled form serves a job of this size, which in ``auto`` it does from ``enough`` on.
+    """Whether to use the compiled form for a job of this size, in ``auto`` from ``enough`` on.
 
     Raises
     ------
     InputError
-        if ``COMPGEN_KERNELS`` is ``compiled`` and numba cannot be imported, or has another value than the three.
+        if ``COMPGEN_KERNELS`` is ``compiled`` and numba cannot be imported, or is none of the three values.
     """
     choice = kernel_choice()
     if choice == PLAIN or (choice == AUTO and size < enough):
@@ -75,9 +75,9 @@ def has_numba() -> bool:
 
 
 def load_kernels() -> bool:
-    """Use the compiled kernels for every size from now on, as the environment's ``COMPGEN_KERNELS=compiled`` does.
+    """Use the compiled kernels for every size from now on, as with ``COMPGEN_KERNELS=compiled`` in the environment.
 
-    This process and those that it starts are switched. False, and nothing is changed, where numba (``compgen[fast]``)
+    This applies to this process and those that it starts. Return False and change nothing if numba (``compgen[fast]``)
     is not installed or ``COMPGEN_KERNELS`` is plain.
     """
     if kernel_choice() == PLAIN or not has_numba():
@@ -87,7 +87,7 @@ def load_kernels() -> bool:
 
 
 def cache_folder(kind: str) -> Path:
-    """Folder for compiled code of a kind, below the user's cache folder; nothing is written next to the program."""
+    """Folder for compiled code of a kind, in the user's cache folder; nothing is written next to the program."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
     else:
@@ -97,7 +97,7 @@ def cache_folder(kind: str) -> Path:
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Compile with vectors inside a row, and keep the code in :func:`cache_folder` unless numba was told where."""
+    """Vectorise within a row, and keep the code in :func:`cache_folder` unless numba has another folder set."""
     import numba
 
     before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
@@ -110,7 +110,7 @@ def _settings() -> Iterator[None]:
 
 
 def compile_for(function: Function, *signature: object, **options: object) -> Function:
-    """Compile, for one signature if it is given, and keep the code on disk where a folder can be written."""
+    """Compile, for one signature if given, and keep the code on disk if a folder is writable."""
     import numba
 
     chosen = {"error_model": "numpy", "fastmath": {"contract"}} | options
@@ -123,20 +123,20 @@ def compile_for(function: Function, *signature: object, **options: object) -> Fu
 
 
 def loop(**options: object) -> Callable[[Function], Function]:
-    """Decorate a loop that is compiled, or taken from the disk, when it is first called with arguments of some types."""
+    """Decorate a loop that is compiled, or loaded from disk, at the first call with given argument types."""
     return lambda function: compile_for(function, **options)
 
 
-# LAPACK without the rest of scipy, which takes longer to load than any identification to compute.
+# LAPACK without the rest of scipy, which takes longer to load than any identification takes to compute.
 
 
 @cache
 def lapack() -> Any:
     """Return the routines of ``scipy.linalg.lapack``: the same functions, so the same bits.
 
-    ``import scipy.linalg`` asks numpy for everything it has, which takes twice as long as to load numpy. The routines are
-    one compiled module of scipy that needs none of that, and it is loaded by itself; where scipy keeps it elsewhere, or
-    has been loaded already, the routines come from ``scipy.linalg.lapack``.
+    ``import scipy.linalg`` loads all of numpy's parts, which takes twice as long as loading numpy. The routines are in
+    one compiled module of scipy that needs none of them and is loaded alone; if scipy keeps it elsewhere, or is already
+    loaded, the routines come from ``scipy.linalg.lapack``.
     """
     if sys.platform == "win32":
         importlib.import_module("scipy")  # tells the system where scipy's libraries are
@@ -153,12 +153,12 @@ def lapack() -> Any:
     return module
 
 
-# One BLAS thread: for matrices of a few hundred columns a second thread only waits, and another number rounds otherwise.
+# One BLAS thread: for matrices of a few hundred columns a second thread only waits, and rounding depends on the number.
 
 
 @cache
 def _controller() -> ThreadpoolController:
-    """Numerical libraries of this process: numpy's, and that of scipy, which comes with its LAPACK."""
+    """Numerical libraries of this process: numpy's, and scipy's, which is loaded with its LAPACK."""
     lapack()
     return ThreadpoolController()
 

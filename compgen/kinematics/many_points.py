@@ -21,12 +21,12 @@ from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
 # Points that fill the working volume: where tables have their nodes, and between them.
 
-#: A full grid larger than this is thinned to about as many points.
+#: A larger full grid is thinned to about this many points.
 MOST_POINTS = 20_000
 
 
 NO_EMPHASIS = Emphasis()
-#: Gauss-Legendre points across an axis of which the own levels are taken.
+#: Gauss-Legendre points on each of the other two axes, for an axis with all of its levels.
 LEAST_ACROSS, MOST_ACROSS = 4, 12
 #: Fewer points than this in a plane of a thinned grid are not spread evenly enough.
 LEAST_IN_PLANE = 144
@@ -73,7 +73,7 @@ class VolumeGrid:
 
 
 def volume_grid(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> VolumeGrid:
-    """Return the grid of the nodes and the middles between them; thinned evenly where it would exceed ``most``."""
+    """Return the grid of the nodes and the midpoints between them; thinned evenly if it would exceed ``most``."""
     levels = [
         levels_between(np.asarray(nodes), *axis.range_mm) for nodes, axis in zip(nodes_mm, machine.axes, strict=True)
     ]
@@ -91,23 +91,23 @@ def volume_sample(
     most: int = MOST_POINTS,
     emphasis: Emphasis = NO_EMPHASIS,
 ) -> VolumeSample:
-    """Return points that determine tables with the given nodes over the volume; weighted sums are integrals over it.
+    """Return points that determine tables with the given nodes; weighted sums over them are integrals over the volume.
 
-    Along each axis there are two Gauss-Legendre points between neighbouring nodes: what tables that are linear there can
-    hold is integrated exactly. Of the full grid of them, where it has more than ``most`` points, those (i, j, k) are taken
-    whose i + j + k is a multiple of a whole number. Each plane of the grid then has points that are spread evenly over
-    the other two axes, so that a function of one axis is orthogonal to functions of the others as it is over the
-    volume; a random sample would turn what the tables cannot hold into ragged values.
+    Along each axis there are two Gauss-Legendre points between neighbouring nodes: tables that are linear there are
+    integrated exactly. If the full grid has more than ``most`` points, only points (i, j, k) with i + j + k a multiple
+    of a whole number are used. Each plane of the grid then has points evenly distributed over the other two axes, and
+    a function of one axis is orthogonal to functions of the others as it is over the volume; with a random sample,
+    errors that the tables cannot represent would make their values ragged.
 
     The weight of the work zone of ``emphasis`` is part of the weights, interval by interval: its ends are nodes. Points
-    at the nodes, on lines along the axes through corners and middles of the travel, follow with weight 0: what is largest
-    anywhere is usually largest there.
+    at the nodes, on lines along the axes through corners and middles of the travel, follow with weight 0: the largest
+    error is usually there.
     """
     nodes_mm = tuple(np.append(nodes, emphasis.ends_mm(axis)) for axis, nodes in enumerate(nodes_mm))
     sides = []
     for axis, nodes in enumerate(nodes_mm):
-        # two Gauss-Legendre points in each interval between nodes within the travel; their weights sum to 1; few
-        # intervals are parted, because the errors are not as smooth as the tables
+        # two Gauss-Legendre points in each interval between nodes within the travel; their weights sum to 1; if there
+        # are few intervals they are divided, because the errors are less smooth than the tables
         low, high = machine.axes[axis].range_mm
         inside = nodes[(nodes > low + 1e-9) & (nodes < high - 1e-9)]
         ends = np.concatenate([[low], np.unique(inside), [high]])
@@ -151,7 +151,7 @@ def _lattice(counts: Sequence[int], every: int) -> list[NDArray[np.int64]]:
 def _three_grids(
     machine: Machine, sides: Sequence[tuple[FloatArray, FloatArray]], most: int, emphasis: Emphasis
 ) -> VolumeSample:
-    """Three grids, one for each axis: its own points by a few Gauss-Legendre points of the other two.
+    """Three grids, one for each axis: all its points times a few Gauss-Legendre points of the other two.
 
     For tables with so many nodes that a thinned grid would leave too few points in a plane.
     """
@@ -172,7 +172,7 @@ def _three_grids(
     return VolumeSample(np.concatenate(positions), joined * (len(joined) / joined.sum()))
 
 
-# Curves of one axis on common nodes: one look-up per position, then all values of that axis from neighbouring rows.
+# Curves of one axis on common nodes: one look-up per position, then all values of the axis from neighbouring rows.
 #
 # A field is a sum over axes and groups, ``factor_g(position) * table_a,g(position of axis a)``, with three values per
 # table. For E = C P the factors are 1, the coordinates and the tool offset (:func:`field_tables`); the exact model takes
@@ -188,8 +188,8 @@ _MOST_BUCKETS = 4096
 class NodeIndex:
     """Finds the interval of a position among ascending ``nodes_mm`` (n,), n > 1, in constant time.
 
-    Even nodes need a multiplication only. Others are looked up in buckets of the shortest interval, so that at most
-    one node lies inside a bucket (``single``), or in as many buckets as are allowed.
+    Equidistant nodes only need a multiplication. Others are looked up in buckets as long as the shortest interval, with
+    at most one node inside a bucket (``single``), or in the largest allowed number of buckets.
     """
 
     nodes_mm: FloatArray
@@ -220,7 +220,7 @@ class NodeIndex:
 
     @cached_property
     def start(self) -> NDArray[np.intp]:
-        """First interval of each bucket: that of the last node which lies in a lower bucket; not for even nodes."""
+        """First interval of each bucket: starts at the last node in a lower bucket; not for equidistant nodes."""
         if self.even:
             return np.zeros(1, dtype=np.intp)
         buckets = self._bucket(self.nodes_mm)
@@ -229,7 +229,7 @@ class NodeIndex:
 
     @cached_property
     def single(self) -> bool:
-        """Whether no bucket holds more than one node that begins an interval."""
+        """Whether no bucket contains more than one node that begins an interval."""
         return bool(np.bincount(self._bucket(self.nodes_mm)[1:-1]).max(initial=0) <= 1)
 
     @cached_property
@@ -243,7 +243,7 @@ class NodeIndex:
         return 1.0 / np.diff(self.nodes_mm)
 
     def locate(self, position_mm: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-        """Interval (m,) and share (m,) of its upper node of positions (m,); the end values hold outside the nodes.
+        """Interval (m,) and share (m,) of its upper node of positions (m,); outside the nodes the end values apply.
 
         A position that is nan has the share nan and any interval; take with ``mode="clip"``.
         """
@@ -320,7 +320,7 @@ AxisTables = tuple[AxisTable, AxisTable, AxisTable]
 
 
 def _indices(errors: ErrorTable) -> tuple[NodeIndex, NodeIndex, NodeIndex]:
-    """All nodes of the curves of each axis; two nodes at least."""
+    """All nodes of the curves of each axis; at least two nodes."""
     positions: tuple[list[FloatArray], ...] = ([], [], [])
     for name, curve in errors.curves.items():
         positions[error_named(name).axis].append(curve.position_mm)
@@ -332,7 +332,7 @@ def _indices(errors: ErrorTable) -> tuple[NodeIndex, NodeIndex, NodeIndex]:
 def field_tables(machine: Machine, errors: ErrorTable, tool_mm: FloatArray | None) -> AxisTables:
     """Return tables of E = C P with seven groups; a tool offset (3,) is folded into group ``ONE``, as are constants.
 
-    Without ``tool_mm`` the groups ``TOOL`` wait for a tool offset at each point.
+    Without ``tool_mm`` the groups ``TOOL`` remain, for a tool offset at each point.
     """
     tables = [AxisTable(index, np.zeros((len(index.nodes_mm), 7, 3))) for index in _indices(errors)]
     for term in coefficients(machine.chain, machine.squareness_reference):
@@ -345,7 +345,7 @@ def field_tables(machine: Machine, errors: ErrorTable, tool_mm: FloatArray | Non
             table.values[:, group, term.output] += values
     for term in coefficients(machine.chain, machine.squareness_reference):
         if term.error in errors.squareness and term.lever is not None:
-            # a table that has the group anyway takes the constant, else the first
+            # the constant goes into a table that already has the group, else into the first
             table = next((table for table in tables if np.any(table.values[:, 1 + term.lever])), tables[0])
             table.values[:, 1 + term.lever, term.output] += term.sign * errors.squareness[term.error][0]
     return tables[0], tables[1], tables[2]
@@ -356,7 +356,7 @@ def grid_tables(
 ) -> list[FloatArray]:
     """Return the tables of E = C P at the levels of a grid, (n, 4, 3) per axis: groups ``ONE`` and ``COORDINATES``.
 
-    As :func:`field_tables` at these positions, without tables for positions in between.
+    Like :func:`field_tables` at these positions, without tables for positions in between.
     """
     values = {name: curve.at(levels_mm[error_named(name).axis]) for name, curve in errors.curves.items()}
     tables = [np.zeros((1 + len(COORDINATES), 3, len(level))) for level in levels_mm]
@@ -384,7 +384,7 @@ def motion_tables(errors: ErrorTable) -> AxisTables:
 
 
 # Calls of the compiled kernels of :mod:`compgen.kinematics.compiled_kernels`;
-# :mod:`compgen.kinematics.kernel_switch` says when they serve.
+# :mod:`compgen.kinematics.kernel_switch` decides when they are used.
 #
 # Importing this does not import numba: that alone takes a third of a second.
 
@@ -464,16 +464,16 @@ def _apart(values: FloatArray, out: FloatArray) -> FloatArray:
 #
 #     E(x, y, z) = sum over g of f_g * (X_g(x) + Y_g(y) + Z_g(z)),
 #
-# each table a vector of three, squareness and signs in it (:mod:`compgen.kinematics.many_points`). A list of points costs one
+# each table a vector of three, including squareness and signs (:func:`field_tables`). A list of points costs one
 # look-up per axis. On a full grid no points are formed: as a matrix of rows (x, y) against columns (z, component) E has
 # a rank of at most nine. The kernels of :mod:`compgen.kinematics.many_points` do the same in one pass
-# (:mod:`compgen.kinematics.kernel_switch` says when).
+# (:mod:`compgen.kinematics.kernel_switch` decides when).
 
 
-#: Points that are worked on together: their intermediate arrays stay in the cache of one core.
+#: Points per block: the intermediate arrays stay in the cache of one core.
 BLOCK = 16_384
 _GRID_BLOCK = 32_768
-#: From so many points on, loading the kernels (half a second, some seconds for the first time) pays for a single call.
+#: From this many points on, loading the kernels (half a second, at first some seconds) pays off in a single call.
 _POINTS_FOR_KERNELS, _GRID_FOR_KERNELS = 20_000_000, 500_000_000
 
 
@@ -512,7 +512,7 @@ def volumetric_error(
 
     Parameters
     ----------
-    machine, errors : what moves, and how wrong.
+    machine, errors : the machine and its errors.
     position_mm : shape (n, 3).
     tool_mm : tool offset, shape (3,) or (n, 3), default the machine's.
     out : array (n, 3) for the result; new if not given.
@@ -556,7 +556,7 @@ def volumetric_error(
 
 
 def _group_sums(tables: AxisTables, coordinates: Sequence[FloatArray]) -> dict[tuple[int, int], FloatArray]:
-    """X_g(x) + Y_g(y) + Z_g(z) by group and component, as far as they are not zero."""
+    """X_g(x) + Y_g(y) + Z_g(z) by group and component, unless zero."""
     sums: dict[tuple[int, int], FloatArray] = {}
     value, left = np.empty((2, len(coordinates[0])))
     for table, coordinate in zip(tables, coordinates, strict=False):
@@ -587,7 +587,7 @@ def volumetric_error_on_grid(
 
     Parameters
     ----------
-    machine, errors : what moves, and how wrong.
+    machine, errors : the machine and its errors.
     levels_mm : positions of X, Y and Z, shapes (nx,), (ny,), (nz,), in any order.
     tool_mm : tool offset, shape (3,), default the machine's.
     out : array (nx, ny, nz, 3) for the result; new if not given.

@@ -1,8 +1,8 @@
 """One function for many items, in processes of this machine or on a Dask cluster: the same results in the same order.
 
-Function and items are pickled, whatever decides about a result is part of the item (a seed too), and every item is computed
-on one thread; so it does not matter where that happens. The processes are those of :mod:`concurrent.futures`, but each with
-a pool of its own: one that is killed breaks its pool, which must not take the items of the others with it.
+Function and items are pickled, everything that affects a result is part of the item (including a seed), and every item
+is computed on one thread; so it does not matter where. The processes come from :mod:`concurrent.futures`, each in a
+separate pool: a killed process breaks its pool, which must not affect the items of the others.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Stop = Callable[[], bool]
 Map = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
-#: How often somebody who waits looks whether to stop, s.
+#: Interval at which a waiting caller checks whether to stop, s.
 POLL_S = 0.2
-#: Freed memory that a worker process keeps, and largest block that comes from it, bytes; see ``mallopt(3)``.
+#: Freed memory that a worker process keeps, and largest block allocated from it, bytes; see ``mallopt(3)``.
 KEPT_BYTES, BLOCK_BYTES = 64 << 20, 32 << 20
-#: Items that are handed out ahead of the first that is not finished, for each call at a time.
+#: Items submitted ahead of the first unfinished one, for each concurrent call.
 AHEAD = 256
 
 
@@ -55,17 +55,17 @@ class LostError(CompgenError):
 
 
 class StoppedError(CompgenError):
-    """An item was not begun, because somebody asked to stop."""
+    """An item was not begun, because a stop was requested."""
 
     exit_code = 1
 
 
 class RemoteError(CompgenError):
-    """An error of another process that cannot be sent as it is."""
+    """An error of another process that cannot be sent unchanged."""
 
 
 class Packed:
-    """Something pickled once; its text names the kind only, because the contents may hold a password."""
+    """An object pickled once; its text shows only the type, because the contents may include a password."""
 
     def __init__(self, value: object) -> None:
         self.kind = type(value).__name__
@@ -81,14 +81,14 @@ class Packed:
 
 @dataclass(frozen=True)
 class Answer:
-    """What came of one item: a result or an error, pickled, and the warnings of compgen."""
+    """The outcome of one item: a result or an error, pickled, and the warnings of compgen."""
 
     content: bytes
     failed: bool
     warnings: tuple[str, ...] = ()
 
     def value(self) -> Any:
-        """Warn as the work did, and return its result or raise its error."""
+        """Repeat the warnings of the work, and return its result or raise its error."""
         for text in self.warnings:
             warnings.warn(text, CompgenWarning, stacklevel=2)
         found = pickle.loads(self.content)
@@ -98,7 +98,7 @@ class Answer:
 
 
 class Workers(Protocol):
-    """Something that works on ``size`` items at a time; :meth:`call` may be called by as many threads.
+    """Works on ``size`` items at a time; :meth:`call` may be called by as many threads.
 
     ``same_files`` says whether it sees the files of this process by the same paths.
     """
@@ -111,7 +111,7 @@ class Workers(Protocol):
         ...
 
     def close(self) -> None:
-        """Begin nothing more, wait for what runs in processes of this machine, and leave."""
+        """Start nothing more, wait for running work in processes of this machine, and disconnect."""
         ...
 
 
@@ -119,16 +119,16 @@ class Workers(Protocol):
 
 _BUSY = threading.Lock()
 _STOP: list[Any] = []
-#: What this process tells the one that started it: its number, and until when it may work (0: no limit), s.
+#: What this process reports to its parent: its process id, and until when it may work (0: no limit), s.
 _TOLD: list[Any] = []
 
 
-#: The function of a packed one: the same few are asked for again and again.
+#: Unpack a function: the same few are needed repeatedly.
 _unpacked = lru_cache(maxsize=4)(pickle.loads)
 
 
 def perform(function: Packed, item: Packed) -> Answer:
-    """Compute one item in this process, one at a time, and return what came of it."""
+    """Compute one item in this process, one at a time, and return the outcome."""
     with _BUSY, one_thread(), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
@@ -139,7 +139,7 @@ def perform(function: Packed, item: Packed) -> Answer:
             try:
                 content = pickle.dumps(error)
                 pickle.loads(content)
-            except Exception:  # it cannot be sent: its text and exit code can
+            except Exception:  # it cannot be sent; its text and exit code can
                 known = isinstance(error, CompgenError)
                 other = RemoteError(str(error) if known else f"{type(error).__name__}: {error}")
                 other.exit_code = error.exit_code if isinstance(error, CompgenError) else 3
@@ -148,13 +148,13 @@ def perform(function: Packed, item: Packed) -> Answer:
 
 
 def stopping() -> bool:
-    """Whether this process was asked to stop after what it is doing."""
+    """Whether this process was asked to stop after its current work."""
     return bool(_STOP and _STOP[0].value)
 
 
 @contextmanager
 def limited(seconds: float) -> Iterator[None]:
-    """Have this process killed if the block takes longer, whatever it does; only one that :class:`Processes` started."""
+    """Have this process killed if the block takes longer; only for processes started by :class:`Processes`."""
     for told in _TOLD:
         told[1] = time.monotonic() + seconds
     try:
@@ -165,7 +165,7 @@ def limited(seconds: float) -> Iterator[None]:
 
 
 def _begin(stop: Any, told: Any) -> None:
-    """Make this process leave signals to the one that started it, and end with it."""
+    """Make this process leave signals to its parent, and end with it."""
     _STOP[:], _TOLD[:] = [stop], [told]
     told[0] = os.getpid()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -178,8 +178,8 @@ def _begin(stop: Any, told: Any) -> None:
             os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    # freed memory is kept: to give every array back and fetch it again takes a tenth to a third of the time
-    with suppress(OSError, AttributeError, TypeError):  # other systems do it their way
+    # keep freed memory: returning every array to the system and fetching it again takes 10 to 30 % of the time
+    with suppress(OSError, AttributeError, TypeError):  # not available on other systems
         library = ctypes.CDLL(None)
         library.mallopt(-1, KEPT_BYTES)  # M_TRIM_THRESHOLD
         library.mallopt(-3, BLOCK_BYTES)  # M_MMAP_THRESHOLD
@@ -189,7 +189,7 @@ def _begin(stop: Any, told: Any) -> None:
 
 
 class _Lane:
-    """One process, and a new one when it is killed."""
+    """One process, replaced when it is killed."""
 
     def __init__(self, context: BaseContext, stop: Any, told: Any) -> None:
         self._context, self._stop, self._told = context, stop, told
@@ -204,15 +204,15 @@ class _Lane:
 
     @property
     def pid(self) -> int:
-        """Number of the process, 0 if it did not come so far."""
+        """Process id, 0 if the process has not reported it yet."""
         return int(self._told[0])
 
     def overdue(self) -> bool:
-        """Whether the process works for longer than it may."""
+        """Whether the process has exceeded its time limit."""
         return bool(0.0 < self._told[1] < time.monotonic())
 
     def kill(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         with suppress(OSError):
             os.kill(self.pid, getattr(signal, "SIGKILL", signal.SIGTERM))
 
@@ -223,14 +223,15 @@ class _Lane:
 
 
 class Processes:
-    """Processes of this machine; one that is killed is replaced, and its item tried once more.
+    """Processes of this machine; a killed one is replaced, and its item tried once more.
 
     Parameters
     ----------
     count : processes at a time.
-    copied : where the system can, a process begins as a copy of this one, which saves seconds; only for a program that
-        has no threads at work.
-    died : told of each process that ended over an item: the item, its number, and whether :func:`limited` ended it.
+    copied : if the system can, start a process as a copy (fork) of this one, which saves seconds; only for a program
+        without running threads.
+    died : called for each process that ended during an item: the item, the process id, and whether :func:`limited`
+        ended it.
     """
 
     same_files = True
@@ -243,7 +244,7 @@ class Processes:
         try:
             self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
             self._lanes = [_Lane(context, self._stop, context.RawArray("d", 2)) for _ in range(count)]
-        except OSError as error:  # memory that processes share is a file to the system
+        except OSError as error:  # shared memory is a file to the system
             raise CompgenError(f"processes cannot be started here: {error.strerror or error}") from error
         self._idle: queue.LifoQueue[_Lane] = queue.LifoQueue()
         for lane in self._lanes:
@@ -277,7 +278,7 @@ class Processes:
         raise LostError("the process that worked on it was killed, twice (out of memory?)")
 
     def close(self) -> None:
-        """Begin nothing more, wait for what runs, end the processes."""
+        """Start nothing more, wait for running work, end the processes."""
         self._stop.value = 1
         for lane in self._lanes:
             lane.close()
@@ -294,15 +295,15 @@ def spread(
     lost: Callable[[Item, CompgenError], Result] | None = None,
     stop: Stop = lambda: False,
 ) -> Iterator[Result]:
-    """Yield ``function(item)`` for each item, in their order; only some of them are under way at a time.
+    """Yield ``function(item)`` for each item, in order; only some of them are in progress at a time.
 
     Parameters
     ----------
-    workers : that do the work.
-    function : can be pickled; an error that it raises ends everything.
+    workers : do the work.
+    function : can be pickled; if it raises an error, everything ends.
     items : can be pickled.
     lost : gives the result of an item whose processes ended, or that was not begun; without it the error is raised.
-    stop : asked now and then; once it is true nothing more is begun.
+    stop : called now and then; once true, nothing more is started.
     """
     packed = Packed(function)
 
@@ -331,7 +332,7 @@ def spread(
 
 
 def opened_workers(workers: int, cluster: str | None) -> Workers | None:
-    """Return what does the work: None for this process, which is the case for one worker and no cluster."""
+    """Return the workers; None (this process) for one worker without a cluster."""
     if cluster is not None:
         return Cluster(cluster)
     return Processes(workers) if workers > 1 else None
@@ -341,20 +342,20 @@ def opened_workers(workers: int, cluster: str | None) -> Workers | None:
 
 #: How long to try to reach the scheduler, s.
 CONNECT_S = 5.0
-#: How often somebody who waits for a task looks at the cluster, s.
+#: Interval at which a caller waiting for a task checks the cluster, s.
 CLUSTER_POLL_S = 1.0
 #: How long a cluster may be without a worker before its tasks count as lost, s.
 NO_WORKER_S = 60.0
-#: How often Dask tries a task again that a worker could not even begin.
+#: How often Dask retries a task that a worker could not start.
 RETRIES = 2
-#: Least and most tasks at the scheduler at a time; between them two for each thread of the workers.
+#: Fewest and most tasks at the scheduler at a time; within these limits two per thread of the workers.
 LEAST, MOST = 8, 256
-#: What must be the same everywhere for the same bytes.
+#: Packages that need the same version everywhere for the same bytes.
 PACKAGES = ("compgen", "numpy", "scipy")
 
 
 class ClusterError(CompgenError):
-    """The cluster cannot be used: not reached, other versions, workers on other machines."""
+    """The cluster cannot be used: not reached, different versions, workers on other machines."""
 
 
 class _BlamedError(Exception):
@@ -363,7 +364,7 @@ class _BlamedError(Exception):
 
 @dataclass(frozen=True)
 class WorkerFacts:
-    """What a worker has to be like: versions of packages, and the machine (empty: any)."""
+    """Requirements on a worker: versions of packages, and the machine (empty: any)."""
 
     versions: tuple[tuple[str, str], ...]
     host: str = ""
@@ -371,7 +372,7 @@ class WorkerFacts:
 
 @cache
 def facts(*, host: bool) -> WorkerFacts:
-    """Return the facts of this process; ``host`` names this start of this computer."""
+    """Return the facts of this process; ``host`` identifies this boot of this computer."""
     versions = tuple((name, next((item.version for item in distributions(name=name)), "none")) for name in PACKAGES)
     if not host:
         return WorkerFacts(versions)
@@ -383,7 +384,7 @@ def facts(*, host: bool) -> WorkerFacts:
 
 
 def objection(required: WorkerFacts, found: WorkerFacts, who: str) -> str:
-    """Say why a scheduler or worker cannot be used, empty if it can."""
+    """Reason why a scheduler or worker cannot be used, empty if it can."""
     here, there = dict(required.versions), dict(found.versions)
     other = [f"{name} {there.get(name, 'none')} instead of {here[name]}" for name in here if here[name] != there[name]]
     if other:
@@ -394,7 +395,7 @@ def objection(required: WorkerFacts, found: WorkerFacts, who: str) -> str:
 
 
 def perform_there(required: WorkerFacts, function: Packed, item: Packed) -> Answer | str:
-    """Compute one item on a worker, or say why that worker must not."""
+    """Compute one item on a worker, or return the reason why that worker must not."""
     return objection(required, facts(host=bool(required.host)), "a worker") or perform(function, item)
 
 
@@ -404,7 +405,7 @@ class Cluster:
     Parameters
     ----------
     address : of the scheduler, e.g. ``tcp://10.0.0.5:8786``.
-    same_host : why every worker has to run on this machine; empty if it need not.
+    same_host : why every worker must run on this machine; empty if not required.
 
     Raises
     ------
@@ -425,7 +426,7 @@ class Cluster:
         self._required = facts(host=bool(same_host))
         self._empty_since: float | None = None
         for name in ("distributed", "tornado"):
-            logging.getLogger(name).setLevel(logging.CRITICAL)  # what matters is raised
+            logging.getLogger(name).setLevel(logging.CRITICAL)  # relevant errors are raised
         make: Any = Client
         try:
             self._client = make(address, timeout=CONNECT_S, set_as_default=False, name="compgen")
@@ -444,7 +445,7 @@ class Cluster:
         self.size = min(max(2 * threads, LEAST), MOST)
 
     def _check(self) -> None:
-        """Refuse a cluster of other versions, or, where that counts, of other machines."""
+        """Refuse a cluster with other versions or, if required, on other machines."""
         found = self._client.get_versions(packages=list(PACKAGES))
         sides = {"the scheduler": found["scheduler"], **{f"worker {k}": v for k, v in found["workers"].items()}}
         for who, item in sides.items():
@@ -466,7 +467,7 @@ class Cluster:
             raise StoppedError("not begun: stopped")
         if self._empty_since is not None:
             self._look()
-        for _ in range(2):  # it may be blamed for another task, which took the worker with it: once more
+        for _ in range(2):  # another task may have killed the worker: try once more
             try:
                 answer = self._answer(function, item, stop)
             except _BlamedError:
@@ -477,10 +478,10 @@ class Cluster:
         raise LostError("every worker of the cluster that worked on it was lost")
 
     def _answer(self, function: Packed, item: Packed, stop: Stop) -> Any:
-        """Submit the item and wait for it; polled, because the cluster may be lost and the user may ask to stop."""
+        """Submit the item and wait for it; polled, because the cluster may be lost and the user may request a stop."""
         from distributed import CancelledError, KilledWorker
 
-        key = f"compgen-{uuid.uuid4().hex}"  # the default one could show arguments
+        key = f"compgen-{uuid.uuid4().hex}"  # the default key could reveal arguments
         future = self._client.submit(
             perform_there, self._required, function, item, key=key, pure=False, retries=RETRIES
         )
@@ -496,7 +497,7 @@ class Cluster:
                     if stop():
                         raise StoppedError("stopped; what runs on the cluster is kept when it ends") from None
                     self._look()
-                except Exception as error:  # the worker could not begin it: what it raises is not of the item
+                except Exception as error:  # the worker could not start it: the error is not from the item
                     raise ClusterError(f"the cluster {self.address} cannot run compgen: {error}") from error
         finally:
             if not future.done():
@@ -504,7 +505,7 @@ class Cluster:
             future.release()
 
     def _look(self) -> None:
-        """Raise LostError if the scheduler is gone, or no worker has been there for a while."""
+        """Raise LostError if the scheduler is gone, or there has been no worker for a while."""
         if self._client.status != "running":
             raise LostError(f"the scheduler {self.address} was lost")
         try:
@@ -517,5 +518,5 @@ class Cluster:
             raise LostError(f"the cluster {self.address} has had no worker for {NO_WORKER_S:.0f} s")
 
     def close(self) -> None:
-        """Leave the cluster; tasks that were not begun are forgotten by it."""
+        """Disconnect from the cluster, which drops tasks that were not started."""
         self._client.close()

@@ -1,9 +1,10 @@
-"""Readings that are linear in the errors of a machine: least squares in what they determine, and no more.
+"""Readings that are linear in the errors of a machine: least squares only in what they determine.
 
-Readings along single axes, circles, plates of unknown pose, or a mixture of them rarely determine the whole model: at one
-height nothing over Z is seen, without dz no straightness in Z. So directions of the unknowns that no reading shows are found
-(singular values) and stay zero; errors of which nothing is seen are left out and named. Where only nodes at the ends of a
-curve see no reading, they are tied to the others by smoothness, and their uncertainty grows as that of an extrapolation.
+Readings along single axes, circles, plates of unknown pose, or a mixture of them rarely determine the whole model: one
+height shows nothing over Z, data without dz no straightness in Z. So directions of the unknowns that no reading shows
+are found (singular values) and stay zero; errors that are not seen at all are omitted and named. If only nodes at the
+ends of a curve have no readings, they are tied to the others by smoothness, with the growing uncertainty of an
+extrapolation.
 """
 
 from __future__ import annotations
@@ -22,36 +23,36 @@ from compgen.identify.adjust.unknowns import CurveParameters, ErrorParameters, e
 
 #: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
 SHOWS, RCOND = 1e-6, 1e-9
-#: Angles are counted in mm at this lever, so that they compare with translations.
+#: Angles are expressed in mm at this lever, comparable to translations.
 LEVER_MM = 1000.0
 #: Nodes with less than this share of the readings of the median node are tied to their neighbours.
 WEAK = 0.25
-#: An error counts as identified if readings determine this share of its unknowns, or one direction at least.
+#: An error counts as identified if readings determine this share of its unknowns, or at least one direction.
 SEEN = 1e-6
-#: A part of an error is not determined if the readings show less than this share of one of its unknowns.
+#: An error is partly undetermined if the readings show less than this share of one of its unknowns.
 WHOLLY = 1.0 - 1e-4
-#: Standard uncertainty of values that state none, and the least of all, um and urad.
+#: Standard uncertainty of values that state none, and the smallest allowed, um and urad.
 USUAL_U, FINEST = 1.0, 1e-3
-#: So many positions of each error stand for all at which it was read.
+#: Largest number of positions of each error that represent all at which it was read.
 MOST_SHOWN = 50
-#: A value is determined if less than this share of it lies beside the determined directions.
+#: A value is determined if less than this share of it is outside the determined directions.
 BESIDE = 1e-4
-#: Curvature of a curve between neighbouring nodes where too few of them are seen to measure it, um and urad.
+#: Assumed curvature of a curve between neighbouring nodes if too few nodes are seen to measure it, um and urad.
 USUAL_BEND = 2.0
 
 
 @dataclass(frozen=True)
 class Observations:
-    """k readings: value = ``design`` times the unknown errors + ``others`` times unknowns of their own + noise.
+    """k readings: value = ``design`` times the unknown errors + ``others`` times further unknowns + noise.
 
     Parameters
     ----------
     design : (k, size of the layout), per mm and rad of the unknown errors.
-    others : (k, q), per unit of what else is unknown: the pose of a plate, where a laser was set to zero.
+    others : (k, q), per unit of the further unknowns: the pose of a plate, the zero of a laser.
     value, sigma : (k,), in any unit that both share.
-    at_mm : position of each axis, (k, 3), or nan where the reading says nothing about the errors of that axis.
-    shows : which curves of the layout a reading is about, (k, curves).
-    covered : errors that are known over the whole travel, wherever the readings were.
+    at_mm : position of each axis, (k, 3), or nan if the reading does not depend on the errors of that axis.
+    shows : which curves of the layout a reading depends on, (k, curves).
+    covered : errors known over the whole travel, wherever the readings were.
     """
 
     design: FloatArray
@@ -75,9 +76,10 @@ class Observations:
         value: FloatArray,
         covariance: FloatArray,
     ) -> Observations:
-        """Return error values with a covariance as independent readings of unit variance; directions without extent stay out.
+        """Return error values with a covariance as independent readings of unit variance, zero-variance directions omitted.
 
-        Values without uncertainty (a curve where it is zero by definition) say nothing. Every curve counts as read everywhere.
+        Values without uncertainty (a curve where it is zero by definition) are ignored. Every curve counts as read
+        everywhere.
         """
         design = layout.value_rows(names, position_mm)
         size, direction = np.linalg.eigh(covariance)
@@ -96,9 +98,9 @@ class Observations:
 
     @classmethod
     def of_curves(cls, layout: ErrorParameters, errors: ErrorTable) -> Observations:
-        """Return values of errors as independent readings, each curve with a constant of its own, straightness with a line.
+        """Return error values as independent readings, each curve with a free constant, straightness with a free line.
 
-        An uncertainty that is not known is taken as usual. Errors that the layout does not contain stay out.
+        An unknown uncertainty is set to the usual value. Errors that the layout does not contain are omitted.
         """
         errors = errors.only(*(name for name, _ in layout.columns()))
         names = [name for name, rows in errors.rows().items() for _ in range(rows.stop - rows.start)]
@@ -126,7 +128,7 @@ class Observations:
         )
 
     def positions(self, layout: ErrorParameters) -> dict[str, FloatArray]:
-        """Where readings say something about each error: at most ``MOST_SHOWN`` of their positions, else the nodes."""
+        """Positions of the readings of each error: at most ``MOST_SHOWN`` of them, else the nodes."""
         positions = {name: np.array([np.nan]) for name in layout.squareness}
         for number, curve in enumerate(layout.curves):
             along = np.unique(self.at_mm[self.shows[:, number], curve.error.axis])
@@ -137,7 +139,7 @@ class Observations:
 
 
 def stacked(parts: Sequence[Observations]) -> Observations:
-    """Return several sets of readings as one; each keeps its own other unknowns."""
+    """Return several sets of readings as one; each keeps its further unknowns."""
     widths = np.cumsum([0, *(part.others.shape[1] for part in parts)])
     others = [np.pad(part.others, ((0, 0), (widths[k], widths[-1] - widths[k + 1]))) for k, part in enumerate(parts)]
     return Observations(
@@ -155,8 +157,9 @@ def stacked(parts: Sequence[Observations]) -> Observations:
 class Determined:
     """Optimum: unknown errors with a factor F of their covariance (F F^T), the other unknowns, residuals (all readings).
 
-    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors of which nothing is seen; ``partly`` those
-    of which a part is not determined. ``freedom`` is readings minus what they determine, poses and the like included.
+    ``unreached`` are nodes that no reading reaches, by error; ``left_out`` the errors that are not seen; ``partly`` the
+    errors that are partly undetermined. ``freedom`` is the number of readings minus the number of determined unknowns,
+    including poses and the like.
     """
 
     layout: ErrorParameters
@@ -173,7 +176,7 @@ class Determined:
     left_out: tuple[str, ...] = ()
 
     def on(self, layout: ErrorParameters) -> FloatArray:
-        """The unknowns of a layout that contains more errors, (size,); zero for those that are not determined."""
+        """The unknowns of a layout that contains more errors, (size,); zero for undetermined ones."""
         whole = np.zeros(layout.size)
         own = dict(self.layout.columns())
         for name, columns in layout.columns():
@@ -188,10 +191,10 @@ class Determined:
 
 
 def determined_values(layout: ErrorParameters, observations: Observations, rows: FloatArray) -> NDArray[np.bool_]:
-    """Which values of errors, linear in the unknowns by ``rows`` (m, size), readings tell apart from all other unknowns, (m,).
+    """Which error values, ``rows`` (m, size) times the unknowns, the readings separate from all other unknowns, (m,).
 
-    At one height a positioning error is not told apart from an angle about a horizontal axis: neither value is determined,
-    although the direction that both share is.
+    At one height a positioning error cannot be separated from an angle about a horizontal axis: neither value is
+    determined, although their common direction is.
     """
     unit = _kinds(layout)[1]
     explained = _range(observations.others / observations.sigma[:, None])
@@ -213,7 +216,7 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
     Raises
     ------
     UndeterminedError
-        where no error at all is determined.
+        if no error is determined.
     """
     names = [name for name, _ in layout.columns()]
     angular, unit = _kinds(layout)
@@ -229,7 +232,7 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
     observations = replace(observations, design=observations.design[:, columns], shows=observations.shows[:, curves])
     unreached, tied = _far_nodes(smaller, observations, accepted)
     found = _optimum(smaller, observations, accepted, _ties(smaller, tied, {}))
-    if tied:  # once more, with the bend that the curves have where they are seen
+    if tied:  # repeat with the curvature of the curves where they are seen
         found = _optimum(smaller, observations, accepted, _ties(smaller, tied, _bends(smaller, found.unknowns, tied)))
     return replace(found, unreached=unreached, left_out=tuple(name for name in names if name not in kept))
 
@@ -237,10 +240,10 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
 def _optimum(
     layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_], bends: FloatArray
 ) -> Determined:
-    """Least squares in the directions that the readings show; angles only for what translations cannot explain.
+    """Least squares in the directions that the readings show; angles only explain what translations cannot.
 
-    At one height an angle about a horizontal axis is the same as a straightness. The translations and the squareness are
-    therefore taken first, and of the angles what is left of their columns. ``bends`` are rows that tie nodes to others.
+    At one height an angle about a horizontal axis is the same as a straightness. Translations and squareness therefore
+    come first, then the remainder of the columns of the angles. ``bends`` are rows that tie nodes to others.
     """
     angular, unit = _kinds(layout)
     used = (accepted / observations.sigma)[:, None]
@@ -251,7 +254,7 @@ def _optimum(
     whole = np.hstack([design @ shown, frames])
     target = np.concatenate([observations.value * used[:, 0], np.zeros(len(bends))])
     scale = np.linalg.norm(whole, axis=0)
-    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding stays one
+    scale = np.where(scale > 1e-9 * scale.max(), scale, scale.max())  # a column of rounding errors is not scaled up
     values = np.linalg.svd(whole / scale, compute_uv=False)
     inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
     found = inverse @ target
@@ -262,7 +265,7 @@ def _optimum(
     return Determined(
         layout,
         unknowns=unit * (shown @ seen),
-        factor=direction * np.sqrt(np.maximum(size, 0.0)),  # as wide as the unknowns, not as the readings
+        factor=direction * np.sqrt(np.maximum(size, 0.0)),  # as many columns as unknowns, not as readings
         others=beside,
         u_others=np.linalg.norm(inverse[shown.shape[1] :], axis=1),
         residual=observations.value - errors @ (shown @ seen) - others @ beside,
@@ -283,10 +286,10 @@ def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
 
 
 def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
-    """Orthonormal directions (size, r) of the unknown errors that the readings tell apart from the poses, and r.
+    """Orthonormal directions (size, r) of the unknown errors that the readings separate from the poses, and r.
 
-    The angles get what neither poses nor translations explain. Directions without effect stay out: an unknown in them is
-    zero, the smallest value that agrees with the readings.
+    The angles get what neither poses nor translations explain. Directions without effect are omitted: their unknowns
+    are zero, the smallest value that agrees with the readings.
     """
     explained = _range(frames)
     parts = []
@@ -310,7 +313,7 @@ def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np
 
 
 def _range(matrix: FloatArray) -> FloatArray:
-    """Orthonormal basis of the columns, (rows, rank); columns of very different size count alike."""
+    """Orthonormal basis of the columns, (rows, rank); columns of very different size count equally."""
     size = np.linalg.norm(matrix, axis=0)
     matrix = matrix[:, size > 0] / size[size > 0]
     left, values, _ = np.linalg.svd(matrix, full_matrices=False)
@@ -319,7 +322,7 @@ def _range(matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Tied:
-    """Nodes of a curve that are tied to others, and the first nodes of the triples whose second difference does so."""
+    """Nodes of a curve that are tied to others, and the first nodes of the triples whose second difference does it."""
 
     nodes_mm: FloatArray
     triples: tuple[int, ...]
@@ -330,8 +333,8 @@ def _far_nodes(
 ) -> tuple[dict[str, FloatArray], dict[str, _Tied]]:
     """Nodes without a reading in the intervals next to them, and nodes with few readings or none; both by error.
 
-    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would turn the whole
-    curve, since a straightness is zero at both ends.
+    A round plate hardly reaches the ends of the travel: without a tie the noise of a few holes there would tilt the
+    whole curve, since straightness is zero at both ends.
     """
     unreached, tied = {}, {}
     for number, curve in enumerate(layout.curves):
@@ -354,7 +357,7 @@ def _far_nodes(
 
 
 def _bends(layout: ErrorParameters, unknowns: FloatArray, tied: Mapping[str, _Tied]) -> dict[str, float]:
-    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least what is usual."""
+    """Second difference of the tied curves between nodes that readings show, rms, mm and rad; at least the usual."""
     found = {}
     for curve in layout.curves:
         if curve.error.name in tied:
