@@ -3,7 +3,7 @@
     y = cell means + S c + noise,   cov(noise) = sigma^2 V,   V_ij = (1 - w) phi^|t_i - t_j| + w 1[i = j]
 
 The likelihood is computed from the contrasts in which the cell means cancel (REML), with sigma in closed form, and
-summed over a grid of (phi, w): wandering noise and a wandering effect are weighed against each other, not fitted in turn.
+summed over a grid of (phi, w): wandering noise and a wandering effect are weighed against each other, not in sequence.
 The criterion of a set S is 2 log likelihood minus a penalty for every member; the thresholds are calibrated with
 simulated sessions without any effect (docs/diagnosis-benchmark.md). An effect with one parameter is fitted freely; the
 coefficients of several columns have a normal prior, or many columns could explain everything.

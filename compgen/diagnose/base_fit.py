@@ -20,21 +20,21 @@ from compgen.identify.adjust.unknowns import DistinctPoses
 from compgen.kinematics.exact_chain import exact_columns
 from compgen.kinematics.first_order import modelled_errors
 
-# The base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
+# Base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
 #
-# Legendre polynomials, because the positions of lines and diagonals form no grid; where the data ask for more, higher
-# degrees or the curves of the machine file between its nodes are added. What cannot be told apart is left to the rank.
+# Legendre polynomials, because the positions of lines and diagonals do not form a grid; if the data require more,
+# higher degrees or the nodal curves of the machine file are added. The rank test removes what cannot be distinguished.
 
 
 T = TypeVar("T")
 
-#: Degree of the curves, if there are enough levels; and of those of an axis that asks for more.
+#: Degree of the curves if there are enough levels, and of the curves of an axis that requires more.
 DEGREE, HIGHER_DEGREE = 7, 11
-#: Readings at distinct poses for each unknown of the curves; a smaller degree would leave errors of the machine over.
+#: Readings at distinct poses for each unknown of the curves; a lower degree would leave machine errors unexplained.
 READINGS_PER_UNKNOWN = 2
-#: A position this near a node is at it, mm.
+#: A position this close to a node is at the node, mm.
 SAME_MM = 1e-3
-#: Nodes beyond this are not tried as a richer basis.
+#: A nodal basis with more nodes than this is not tried.
 MOST_NODES = 40
 
 
@@ -45,10 +45,10 @@ def legendre(s: FloatArray, degree: int) -> FloatArray:
 
 @dataclass(frozen=True)
 class CurveBasis:
-    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` where nodes are added.
+    """Basis of the curves of the three axes: ``degree`` of the polynomials, ``nodal`` if nodes are added.
 
-    ``span_mm``: lowest and highest position of each axis over which the polynomials run; default its travel. Over a part
-    of the travel, those of the whole would be nearly alike.
+    ``span_mm``: range of positions of each axis over which the polynomials are defined; default its travel. Within a
+    part of the travel, polynomials over the whole travel would be nearly collinear.
     """
 
     machine: Machine
@@ -78,7 +78,7 @@ class CurveBasis:
 
     def parts(self, position_mm: FloatArray) -> list[Part]:
         """Name, place in the vector of unknowns and basis (m, k) of every error at positions (m, 3)."""
-        bases = []  # of each axis: zero at the reference point, and zero at both ends of the span
+        bases = []  # per axis: zero at the reference point, and zero at both ends of the span
         for axis in range(3):
             start, end = self._span(axis)
             fixed = np.array([np.clip(self.machine.reference_point_mm[axis], start, end), start, end])
@@ -101,7 +101,7 @@ class CurveBasis:
 
 @dataclass(frozen=True)
 class Part:
-    """One error: its name, its place in the vector of unknowns, its basis at the poses (m, k)."""
+    """One error: name, place in the vector of unknowns, basis at the poses (m, k)."""
 
     name: str
     place: slice
@@ -114,7 +114,7 @@ def size_of(parts: Sequence[Part]) -> int:
 
 
 def names_of(parts: Sequence[Part]) -> list[str]:
-    """Error of every unknown."""
+    """Name of the error that each unknown belongs to."""
     return [part.name for part in parts for _ in range(part.basis.shape[1])]
 
 
@@ -127,7 +127,7 @@ def values_of(parts: Sequence[Part], unknowns: FloatArray, poses: int) -> FloatA
 
 
 def tip_columns(parts: Sequence[Part], columns: FloatArray) -> FloatArray:
-    """Derivative of the tip by the unknowns, (3, m, k); ``columns`` (m, 3, 21) is that by the errors."""
+    """Derivative of the tip by the unknowns, (3, m, k); ``columns`` (m, 3, 21) is its derivative by the errors."""
     design = np.empty((3, len(columns), size_of(parts)))
     for part in parts:
         own = columns[:, :, ERROR_INDEX[part.name]]
@@ -137,12 +137,12 @@ def tip_columns(parts: Sequence[Part], columns: FloatArray) -> FloatArray:
 
 
 def base_errors(machine: Machine) -> tuple[str, ...]:
-    """Errors of the base model: those of the machine file with its own tool; what other tools show is an effect."""
+    """Errors of the base model: those of the machine file with its tool; what other tools show is an effect."""
     return modelled_errors(machine)
 
 
 def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses: int) -> CurveBasis:
-    """Return the smooth basis that ``readings`` at ``poses`` distinct positions can carry."""
+    """Return the smooth basis that ``readings`` at ``poses`` distinct positions can support."""
     errors = base_errors(machine)
     curves = sum(name not in SQUARENESS_NAMES for name in errors)
     most = max(2, int(min(readings, 3 * poses) / READINGS_PER_UNKNOWN / max(curves, 1)))
@@ -157,13 +157,13 @@ def first_basis(machine: Machine, position_mm: FloatArray, readings: int, poses:
 
 
 def _at_nodes(machine: Machine, axis: int, levels_mm: FloatArray) -> bool:
-    """Whether an axis was measured at nodes of the machine file only: then its curves are free at every level."""
+    """Whether an axis was measured only at nodes of the machine file: then its curves are free at every level."""
     nodes = machine.axes[axis].nodes_mm
     return len(levels_mm) > 2 and bool(np.all(np.abs(levels_mm[:, None] - nodes).min(axis=1) < SAME_MM))
 
 
 def wider_bases(basis: CurveBasis, axis: int, position_mm: FloatArray, readings: int) -> list[CurveBasis]:
-    """Return wider bases of one axis that ``readings`` can carry: of higher degree, with the nodes of the machine file."""
+    """Wider bases of one axis that ``readings`` can support: higher degree, or with the nodes of the machine file."""
     if basis.nodal[axis]:
         return []
     levels = len(np.unique(np.round(position_mm[:, axis], 3)))
@@ -179,7 +179,7 @@ def wider_bases(basis: CurveBasis, axis: int, position_mm: FloatArray, readings:
 
 
 def _with(values: tuple[T, T, T], axis: int, value: T) -> tuple[T, T, T]:
-    """Return three values with that of one axis changed."""
+    """Return three values with the value of one axis changed."""
     changed = list(values)
     changed[axis] = value
     return changed[0], changed[1], changed[2]
@@ -187,8 +187,8 @@ def _with(values: tuple[T, T, T], axis: int, value: T) -> tuple[T, T, T]:
 
 # The nonlinear base fit: error curves, squareness, stations and dead lengths together, with the exact machine model.
 #
-# Gauss-Newton steps by QR and a truncated SVD, so that directions that the data do not determine stay where they are.
-# Effects of the catalogue may take part with parameters of their own.
+# Gauss-Newton steps by QR and a truncated SVD: directions that the data do not determine stay unchanged.
+# Effects of the catalogue can be included, with their parameters as unknowns.
 
 
 Whiten = Callable[[FloatArray], FloatArray]
@@ -198,15 +198,15 @@ STEPS = 12
 LEAST_SINGULAR = 1e-9
 #: A step that changes the readings by less than this, mm, ends the iteration.
 SMALL_MM = 1e-8
-#: Curves are taken to be about this small, mm and rad, against readings good to ``READING_MM``: far too loose to matter
-#: where the data say anything, but what they hardly determine stays put instead of running away.
+#: Curves are assumed to be about this small, mm and rad, and readings accurate to ``READING_MM``: too loose to matter
+#: where the data are informative, but what the data hardly determine stays near zero instead of diverging.
 LIKELY, READING_MM = 0.1, 1e-3
 LIKELY_RAD = 1e-4
 
 
 @dataclass(frozen=True)
 class BaseFit:
-    """A fit of the base model, and of effects if there were any; n readings, p unknowns.
+    """A fit of the base model, with effects if there are any; n readings, p unknowns.
 
     Parameters
     ----------
@@ -214,10 +214,10 @@ class BaseFit:
     basis : the curves.
     unknowns : curve and squareness coefficients, placement, then the parameters of the effects in SI units, (p,).
     residual_mm : reading minus model, (n,).
-    jacobian : derivative of the model by the unknowns, (n, p); those of the effects come last.
+    jacobian : derivative of the model by the unknowns, (n, p); the parameters of effects come last.
     names : what each unknown is.
-    readings : the readings as effects see them, at this fit.
-    effects : effects that took part, with the number of their parameters.
+    readings : the readings in the form that effects use, at this fit.
+    effects : the effects included, with the number of their parameters.
     """
 
     observed: Observed
@@ -236,7 +236,7 @@ class BaseFit:
 
     @property
     def base_size(self) -> int:
-        """Number of unknowns without those of the effects."""
+        """Number of unknowns without the parameters of effects."""
         return len(self.unknowns) - sum(count for _, count in self.effects)
 
 
@@ -274,17 +274,17 @@ def fit_base(
     ----------
     observed : the measurement.
     basis : curves of the errors.
-    effects : effects with their scan position fixed that take part.
+    effects : effects to include, with their scan position fixed.
     start : start values of curves, squareness and placement.
-    whiten : takes columns (n, k) to those whose noise is white; default: all readings alike.
-    steps : most Gauss-Newton steps.
+    whiten : maps columns (n, k) to columns with white noise; default: all readings have equal weight.
+    steps : maximum number of Gauss-Newton steps.
     """
     parts = basis.parts(observed.poses.position_mm)
     unknowns = np.concatenate([np.zeros(size_of(parts)), observed.start()]) if start is None else start.copy()
     counts: list[int] = [0] * len(effects)
     now = _linearise(observed, parts, unknowns, effects, counts)
     unknowns = np.concatenate([unknowns, np.zeros(sum(counts))])
-    # weight that holds each coefficient of the curves near zero: accuracy of a reading over its likely size
+    # weight that keeps each curve coefficient near zero: accuracy of a reading over the likely size of the coefficient
     likely = [LIKELY if error_named(name).kind == "linear" else LIKELY_RAD for name in names_of(parts)]
     hold = READING_MM / np.array(likely)
     for _ in range(steps):
@@ -307,7 +307,7 @@ def fit_base(
 
 
 def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:
-    """Least-squares step with the first unknowns held near zero by weights ``hold`` (k,)."""
+    """Least-squares step with the first unknowns kept near zero by weights ``hold`` (k,)."""
     held = np.zeros((len(hold), design.shape[1]))
     held[:, : len(hold)] = np.diag(hold)
     return least_norm(np.vstack([design, held]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
@@ -316,7 +316,7 @@ def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: Fl
 def _linearise(
     observed: Observed, parts: Sequence[Part], unknowns: FloatArray, effects: Sequence[Effect], counts: list[int]
 ) -> _Linearised:
-    """Model and derivative at ``unknowns``; ``counts`` receives the number of parameters of every effect."""
+    """Model and derivative at ``unknowns``; the number of parameters of each effect is appended to ``counts``."""
     poses = observed.poses
     size = size_of(parts)
     tip, columns = exact_columns(
@@ -344,7 +344,7 @@ def _columns(effect: Effect, readings: Readings) -> FloatArray:
 
 
 def along(direction: FloatArray, poses: DistinctPoses) -> csr_array:
-    """Sparse matrix (n, 3 m) that takes the three components of all poses to the readings along ``direction`` (n, 3)."""
+    """Sparse matrix (n, 3 m) that projects the three components at all poses on the readings' ``direction`` (n, 3)."""
     count, size = len(direction), len(poses.position_mm)
     rows, columns = np.tile(np.arange(count), 3), np.concatenate([poses.of + k * size for k in range(3)])
     return csr_array((direction.T.ravel(), (rows, columns)), shape=(count, 3 * size))

@@ -46,7 +46,7 @@ from compgen.kinematics.kernel_switch import one_thread
 
 Show = Callable[[str], None]
 
-#: Residuals of the base model beyond this, mm, are no errors of a machine.
+#: Residuals of the base model larger than this, mm, are not machine errors.
 HOPELESS_MM = 1.0
 
 
@@ -56,13 +56,13 @@ class DiagnoseOptions:
 
     Parameters
     ----------
-    max_effects : most named effects at once.
+    max_effects : maximum number of named effects.
     effects : names to look for; default the whole catalogue.
-    add : names that are added whether they were found or not.
-    u_um : standard uncertainty of a reading in um, if it is known; used without repeats.
+    add : names to add whether found or not.
+    u_um : standard uncertainty of a reading in um, if known; used without repeats.
     against : predicted errors that the measurement is compared with.
-    leave_out_disturbed : leave out bursts of disturbed readings (lengths and deviations) once they are found.
-    order : order of axis runs in time: as logged, else run by run, up then down; or what the user says.
+    leave_out_disturbed : leave out bursts of disturbed readings (lengths and deviations) that are found.
+    order : time order of axis runs: as logged, otherwise run by run, up then down; or as requested by the user.
     """
 
     max_effects: int = option(4, "Most named effects at once.", within=(0, 6))
@@ -95,15 +95,15 @@ def diagnose(
 
     Parameters
     ----------
-    machine : chain, travel and which errors its model contains.
+    machine : kinematic chain, travel, and the errors that its model contains.
     measurement : tracer lengths, measured deviations, or axis runs.
-    options : what it may do.
-    show : is told each step in words.
+    options : options of the diagnosis.
+    show : called with a description of each step.
 
     Raises
     ------
     InputError
-        for names that are no effects, and for too few readings.
+        for names that are not effects, and for too few readings.
     """
     chosen = options or DiagnoseOptions()
     known = catalogue(measurement.stations if isinstance(measurement, Lengths) else ())
@@ -126,7 +126,7 @@ def diagnose(
         fit = _base(observed)
         classed: list[Classed] = []
         before = fit
-        _refuse_too_few(fit)  # before the search, which takes its time
+        _refuse_too_few(fit)  # before the search, which is slow
         if isinstance(observed, ObservedLengths) and looks_gross(observed, fit.rms_mm):
             show("residuals are gross: trying other axes, signs and labels")
             corrected = correction_of(machine, observed.lengths, fit.rms_mm)
@@ -165,7 +165,7 @@ def _refuse_too_few(fit: BaseFit) -> None:
 
 
 def _base(observed: Observed) -> BaseFit:
-    """Fit the base model, with what the machine file switches on taken off the readings."""
+    """Fit the base model after subtracting the effects enabled in the machine file from the readings."""
     fit = fit_smooth(observed)
     known = [effect.change_mm(fit.readings) for effect in active_effects(observed.machine)]
     present = [change for change in known if change is not None]
@@ -175,7 +175,7 @@ def _base(observed: Observed) -> BaseFit:
 
 
 def _analysed(observed: Observed, fit: BaseFit, options: DiagnoseOptions, show: Show) -> Analysis:
-    # standard uncertainty of every reading, if it was stated
+    # standard uncertainty of every reading, if stated
     sigma_mm: FloatArray | None = None
     if options.u_um is not None:
         if not options.u_um > 0:
@@ -221,7 +221,7 @@ def _completed(
         if not groups:
             known = sorted({group.name for group in design.groups if group.tier == "named"})
             raise InputError(f"{name!r} cannot be added to this measurement; possible are {', '.join(known)}")
-        if not set(groups) & set(verdict.added):  # wanted by the user: at its best scan position
+        if not set(groups) & set(verdict.added):  # requested by the user: use its best scan position
             added.append(max(groups, key=lambda g: float(np.sum(design.score[design.place(g)] ** 2))))
     found = refit(analysis, added)
     show("testing on lines, stations and times left out")
@@ -247,16 +247,16 @@ def _completed(
     return done
 
 
-# Six-DOF readings: what they say about the instrument that took them, in the form of a diagnosis.
+# Six-DOF readings: what they show about the instrument, in the form of a diagnosis.
 #
-# An error of the instrument that depends on the distance alone is the same as a geometric error, so that no statistics
-# can name it; only what changes with direction, time or order shows. Hence names are tentative: a machine may bend so.
+# An instrument error that depends only on distance is indistinguishable from a geometric error, and statistics cannot
+# identify it; only changes with direction, time or order are visible. Names are tentative: a machine may bend that way.
 
 
 NOTE = (
     "an optical error that depends only on the distance equals a geometric error: no statistics can distinguish the two"
 )
-#: What separates instrument and machine.
+#: How to separate instrument and machine.
 ADVICE = (
     "turn the target by 180 degrees and measure again: separates crosstalk fixed to the target from straightness",
     "measure with a second target offset: separates crosstalk and detector gains from straightness",
@@ -266,14 +266,14 @@ ADVICE = (
 
 @dataclass(frozen=True)
 class SixDofDiagnosis:
-    """What six-DOF readings show of their instrument."""
+    """What six-DOF readings show about their instrument."""
 
     machine: Machine
     suspicions: tuple[Suspicion, ...]
 
     @property
     def acceptable(self) -> bool:
-        """Hints are no reason to refuse the readings."""
+        """Hints are not a reason to reject the readings."""
         return True
 
     def to_dict(self) -> dict[str, Any]:
@@ -308,7 +308,7 @@ def _effect(item: Suspicion) -> dict[str, Any]:
 
 
 def diagnose_sixdof(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> SixDofDiagnosis:
-    """Return what the readings say about the instrument."""
+    """Return what the readings show about the instrument."""
     return SixDofDiagnosis(machine, tuple(sixdof_health(machine, readings, instrument)))
 
 

@@ -25,18 +25,18 @@ from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.active import section_text
 from compgen.effects.catalogue import what_to_do
 
-# The full nonlinear model with the effects inside: their parameters with uncertainty, and the extended machine file.
+# The full nonlinear model including the effects: their parameters with uncertainty, and the extended machine file.
 
 
 class FixedColumns(Effect):
-    """A smooth term without a name, with the columns that it had at the base fit."""
+    """An unnamed smooth term, with its columns from the base fit."""
 
     def __init__(self, group: Group, mapping: FloatArray) -> None:
         self.card = Card(group.name, group.name, "", "", group.covariates, ())
         self._columns = group.columns @ mapping
 
     def columns(self, readings: Readings) -> FloatArray:
-        """The columns of the base fit; a change of the stations by um does not matter to them."""
+        """The columns from the base fit; station shifts of some um do not affect them."""
         return self._columns
 
 
@@ -51,14 +51,14 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Refit:
-    """The nonlinear fit with the effects inside, and the parameters of each by its group."""
+    """The nonlinear fit including the effects, and the parameters of each effect, keyed by group."""
 
     fit: BaseFit
     parameters: dict[int, tuple[Fitted, ...]]
 
 
 def refit(analysis: Analysis, members: Sequence[int]) -> Refit:
-    """Fit base model and members together with the noise model as weight."""
+    """Fit base model and members together, weighted by the noise model."""
     design = analysis.design
     members = [g for g in members if design.size(g)]
     effects = [design.groups[g].effect or FixedColumns(design.groups[g], design.maps[g]) for g in members]
@@ -118,26 +118,26 @@ def extended_toml(machine: Machine, analysis: Analysis, found: Refit, groups: Se
 
 
 def settings_of(analysis: Analysis, item: Group) -> dict[str, float]:
-    """Settings of an effect that hold for the readings: what a machine file has to keep."""
+    """Settings of an effect that apply to the readings and must be stored in the machine file."""
     return {} if item.effect is None else item.effect.used(analysis.fit.readings)
 
 
-# Does the misfit shrink: residuals before and after, on the readings used and on lines, stations and times left out.
+# Does the misfit shrink? Residuals before and after, for the readings used and for left-out lines, stations and times.
 #
-# Plain least squares on all but the part left out; columns that vanish on the rest (a dead length, a station) are fitted
-# to the part itself, since nothing else can know them.
+# Unweighted least squares on all but the left-out part; columns that are zero on the rest (a dead length, a station)
+# are fitted to the left-out part, because no other readings determine them.
 
 
 FOLDS = 5
-#: Stations that must be left for the others to determine the errors.
+#: Least number of remaining stations that still determine the errors.
 LEAST_STATIONS = 3
-#: Eigenvalues of the scaled normal matrix below this hold no information.
+#: Eigenvalues of the scaled normal matrix below this contain no information.
 LEAST_EIGENVALUE = 1e-9
 
 
 @dataclass(frozen=True)
 class BeforeAfter:
-    """RMS of the residuals without and with what was added, mm."""
+    """RMS of the residuals without and with the added columns, mm."""
 
     before_mm: float
     after_mm: float
@@ -148,13 +148,13 @@ class BeforeAfter:
 
     @property
     def shrinks(self) -> bool:
-        """Whether what was added makes the residual smaller."""
+        """Whether the added columns make the residual smaller."""
         return self.after_mm < self.before_mm
 
 
 @dataclass(frozen=True)
 class Gap:
-    """The misfit on the readings used and on parts left out; None where that is not possible."""
+    """The misfit of the readings used and of left-out parts; None where it cannot be computed."""
 
     train: BeforeAfter
     lines: BeforeAfter | None
@@ -179,9 +179,9 @@ def gap_of(
     ----------
     fit : the base fit.
     added : columns (n, k) of everything that was added.
-    predicting : those of them that say something about readings that were left out.
+    predicting : the added columns that can predict left-out readings.
     noise : the noise model.
-    base : further columns that belong to the base model: they are there before and after.
+    base : further columns of the base model, included before and after.
     """
     count = len(fit.residual_mm)
     columns = np.hstack([fit.jacobian[:, : fit.base_size], *base])
@@ -190,13 +190,13 @@ def gap_of(
     before, after = everything.fitted(False), everything.fitted(True)
     some = _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
     layout = fit.observed.layout
-    # whole conditions, so that both repeats of a line are left out together
+    # whole conditions: both repeats of a line are left out together
     kinds, lines = int(layout.condition.max()) + 1, None
     if kinds >= 2 * FOLDS:
         order = np.random.default_rng(0).permutation(kinds)
         lines = np.asarray((order % FOLDS)[layout.condition[layout.stop]], dtype=np.int64)
     stations = layout.channel if len(fit.readings.stations) > LEAST_STATIONS else None
-    # what the repeats alone leave, else the standard deviation of the noise model
+    # standard deviation from the repeats, otherwise from the noise model
     if noise.source == "repeats":
         squares, size = 0.0, 0
         for block in layout.blocks:
@@ -223,7 +223,7 @@ def _hstack(columns: Sequence[FloatArray], count: int) -> FloatArray:
 
 
 def _time_folds(fit: BaseFit) -> IntArray | None:
-    """Fold of every reading: time blocks of the file, else quarters of the time."""
+    """Fold of each reading: time blocks of the file, otherwise quarters of the time."""
     block = fit.readings.labels.get("block")
     if block is not None and len(np.unique(block)) > 2:
         return np.unique(block, return_inverse=True)[1].ravel().astype(np.int64)
@@ -240,7 +240,7 @@ def _rms_pair(before: FloatArray, after: FloatArray) -> BeforeAfter:
 
 
 class _Problem:
-    """Linear least squares with base columns and added ones, through one normal matrix."""
+    """Linear least squares with base columns and added columns, using one normal matrix."""
 
     def __init__(self, base: FloatArray, added: FloatArray, residual: FloatArray, weight: FloatArray) -> None:
         self.base = base.shape[1]
@@ -256,7 +256,7 @@ class _Problem:
         return int(self.columns.shape[1]) if added else self.base
 
     def fitted(self, added: bool) -> FloatArray:
-        """Residuals after a fit to everything, (n,)."""
+        """Residuals after a fit to all readings, (n,)."""
         k = self._sizes(added)
         return np.asarray(self.residual - self.columns[:, :k] @ _solve(self.normal[:k, :k], self.right[:k]))
 
@@ -290,7 +290,7 @@ class _Problem:
 
 
 def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of normal equations without directions that hold no information."""
+    """Solution of normal equations without the directions that contain no information."""
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     square, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
     kept = square > LEAST_EIGENVALUE * max(float(square[-1]), 1e-300)
@@ -298,12 +298,12 @@ def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray((vectors[:, kept] @ (turned / square[kept])) / scale)
 
 
-# The result of a diagnosis, and the JSON that holds it.
+# The result of a diagnosis, and its JSON.
 
 
 @dataclass(frozen=True)
 class Classed:
-    """Something about the noise or the file that has a name of the catalogue: outliers, a trend of the variance ..."""
+    """A property of the noise or the file with a name in the catalogue: outliers, a trend of the variance ..."""
 
     name: str
     parameters: dict[str, float]
@@ -313,16 +313,16 @@ class Classed:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(DisplayedDiagnosis):
-    """What a diagnosis found.
+    """Findings of a diagnosis.
 
     Parameters
     ----------
     machine : the machine.
     analysis, verdict, refit, gap : the results of the steps.
     classed : noise classes and gross errors.
-    advice : measurements that would decide or separate, in words.
-    changes, against_rms_mm : errors that differ from those that were compared with, and the residual against them.
-    notes : what was assumed or left out, in words.
+    advice : texts on measurements that would decide between or separate effects.
+    changes, against_rms_mm : errors that differ from the predicted ones, and the residual against the prediction.
+    notes : texts on what was assumed or left out.
     """
 
     machine: Machine
@@ -338,7 +338,7 @@ class Diagnosis(DisplayedDiagnosis):
 
     @property
     def acceptable(self) -> bool:
-        """Whether it is decided, and the misfit shrinks on readings left out if something was added."""
+        """Whether the verdict is decided and, if something was added, the misfit of left-out readings shrinks."""
         if self.verdict.word == "not_decidable":
             return False
         left_out = self.gap.lines or self.gap.times
@@ -436,7 +436,7 @@ class Diagnosis(DisplayedDiagnosis):
         }
 
     def extended(self) -> str:
-        """The machine file with the effects that were found; empty without a name or a file."""
+        """The machine file with the effects found; empty without a named effect or without a file."""
         if not self.verdict.named or self.machine.source is None:
             return ""
         groups = [i.group for i in self.verdict.named if i.name == self.analysis.design.groups[i.group].name]

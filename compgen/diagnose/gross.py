@@ -1,4 +1,4 @@
-"""Gross errors: wrong conventions of axes, signs and stations, outliers, disturbed readings, quantisation."""
+"""Gross errors: wrong axis, sign and station conventions, outliers, disturbed readings, quantisation."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ from compgen.identify.adjust.starts import robust_state
 from compgen.identify.adjust.unknowns import State, dead_lengths_of
 from compgen.kinematics.first_order import tool_of
 
-# Gross errors of convention, looked for first: swapped axes, wrong signs, the tool the wrong way, mixed-up stations.
+# Gross errors of convention, checked first: swapped axes, wrong signs, reversed tool offset, mixed-up stations.
 #
-# They leave residuals of mm where errors of a machine leave um. All 48 signed permutations of the axes are tried again,
-# each with the tool unchanged, reversed, and mapped like the axes; then the labels of stations in single runs.
+# They leave residuals of mm, whereas machine errors leave um. All 48 signed permutations of the axes are tried, each
+# with the tool unchanged, reversed, and mapped like the axes; then the station labels in single runs.
 
 
-#: Residuals this many times the scatter of repeats, or without repeats this many mm, call for a second look.
+#: Residuals above this many times the scatter of repeats, or this many mm without repeats, are checked further.
 SUSPICIOUS, SUSPICIOUS_MM = 20.0, 0.02
-#: A mapping is taken if it makes the residual this many times smaller.
+#: A mapping is accepted if it makes the residual this many times smaller.
 BETTER = 5.0
 #: Readings that a mapping is tried on.
 READINGS = 900
-#: Residual of a reading, mm, that only a wrong label explains.
+#: Residual of a reading, mm, above which only a wrong label explains it.
 LABEL_MM = 0.5
-#: Mappings that are compared with the errors of the machine inside.
+#: Maximum number of mappings that are compared with the machine errors in the model.
 MOST_CLOSE = 24
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Corrected lengths, and what was wrong in words."""
+    """Corrected lengths, and a description of what was wrong."""
 
     lengths: Lengths
     text: str
 
 
 def looks_gross(observed: ObservedLengths, rms_mm: float) -> bool:
-    """Whether the residual of the base model is far beyond the scatter of repeats."""
+    """Whether the residual of the base model is far larger than the scatter of repeats."""
     squares, count = 0.0, 0
     for block in observed.layout.blocks:
         values = difference_matrix(observed.layout, block) @ observed.value_mm[block.rows]
@@ -68,7 +68,7 @@ def correction_of(machine: Machine, lengths: Lengths, rms_mm: float) -> Correcti
     scored = [(_stations_only(machine, mapped), text, mapped) for text, mapped in _mappings(machine, some)]
     if scored:
         scored.sort(key=lambda item: item[0])
-        # those that the stations alone cannot tell apart are compared with the errors inside
+        # mappings that the stations alone cannot distinguish are compared with the machine errors in the model
         close = [item for item in scored if item[0] < 3.0 * scored[0][0]][:MOST_CLOSE]
         if len(close) > 1 or scored[0][0] > 0.5 * _stations_only(machine, some):
             close = sorted(((_small_fit(machine, e[2]), e[1], e[2]) for e in close), key=lambda item: item[0])
@@ -124,7 +124,7 @@ def _small_fit(machine: Machine, lengths: Lengths) -> float:
 
 
 def _stations_only(machine: Machine, lengths: Lengths) -> float:
-    """Residual RMS in mm if the machine is taken as perfect: enough to tell mm from um."""
+    """Residual RMS in mm for a perfect machine: enough to distinguish mm from um."""
     target = lengths.position_mm + tool_of(machine, lengths.tool_mm)
     group = dead_lengths_of(lengths)
     squares = 0.0
@@ -137,7 +137,7 @@ def _stations_only(machine: Machine, lengths: Lengths) -> float:
 
 
 def _relabelled(machine: Machine, lengths: Lengths, rms_mm: float) -> Correction | None:
-    """Exchange the labels of two stations in the runs whose readings then fit."""
+    """Swap the labels of two stations in runs whose readings fit after the swap."""
     observed = ObservedLengths(machine, lengths)
     if len(lengths.stations) < 2:
         return None
@@ -163,7 +163,7 @@ def _relabelled(machine: Machine, lengths: Lengths, rms_mm: float) -> Correction
 def _swapped(
     observed: ObservedLengths, lengths: Lengths, distance: FloatArray, state: State
 ) -> tuple[IntArray, list[tuple[int, int, int]]]:
-    """Labels after the exchanges, and each exchange as (run, station, station)."""
+    """Labels after the swaps, and each swap as (run, station, station)."""
     count = len(lengths.stations)
     run = observed.layout.run[observed.layout.stop]
     setup = lengths.labels.get("setup", np.zeros(len(lengths), dtype=np.int64))
@@ -185,42 +185,44 @@ def _swapped(
     return station, found
 
 
-# Classes of noise that have a name of their own: outliers, a trend of the variance with time, quantisation.
+# Named classes of noise: outliers, a trend of the variance with time, quantisation.
 #
-# They are looked for in what is left when the model, everything that was found and the free generic terms are taken out
-# of the readings, so that an effect does not pass for an outlier.
+# They are looked for in the residuals after the model, all effects found and the free generic terms, so an effect is
+# not mistaken for an outlier.
 
 
-#: A reading further than this many standard deviations from its neighbours in time is gross; readings of 4600 without
-#: gross errors hold one in one of 10^5 sets.
+#: A reading further than this many standard deviations from its neighbours in time is gross; without gross errors, only
+#: one in 10^5 sets of 4600 readings contains such a reading.
 GROSS = 6.5
-#: Gross readings are the exception: with a larger share something else is the matter.
+#: Gross readings are the exception: a larger share has another cause.
 MOST_GROSS = 0.03
-#: Neighbours in time whose median a reading is compared with, itself among them.
+#: Number of neighbours in time, including the reading itself, whose median a reading is compared with.
 NEIGHBOURS = 5
-#: A gross reading moves the fit, and by it others: the largest are taken out first, and the fit is repeated.
+#: Maximum number of rounds: a gross reading shifts the fit and other residuals, so the largest are removed first and
+#: the fit is repeated.
 ROUNDS = 8
-#: Numbers of stops in a burst that are tried, and the largest share of the session that is one.
+#: Burst lengths (stops) that are tried, and the largest share of the session that counts as a burst.
 BURSTS, LONGEST_BURST = (2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48), 0.03
-#: Mean square in a burst beyond the median of all windows of its length, in robust standard deviations of these. Noise
-#: that wanders alike at all stations has one degree of freedom in a window: 30 is beyond one window in 50,000 then.
+#: Least excess of the mean square in a burst over the median of all windows of that length, in their robust standard
+#: deviations. Wandering noise common to all stations has one degree of freedom per window: fewer than one window in
+#: 50,000 then exceeds 30.
 LOUD = 30.0
-#: Stops at the ends of a burst below this many times the median mean square do not belong to it.
+#: Stops at the ends of a burst with less than this many times the median mean square are not part of it.
 QUIET = 5.0
-#: Most bursts, and rounds in which the fit is repeated without them.
+#: Maximum number of bursts, and of rounds in which the fit is repeated without them.
 MOST_BURSTS = 3
-#: Deviate of the slope of the variance against time that counts as a trend.
+#: Standard normal deviate of the slope of the variance against time above which it is a trend.
 TREND_Z = 6.0
-#: Share of readings that must lie on a grid of the step, and the least step over the noise.
+#: Least share of readings on the grid of the step, and least ratio of step to noise.
 ON_GRID, COARSE = 0.999, 1.0
 
 
 def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
-    """Return the classes of noise that the readings show beyond doubt; ``removed`` gross readings were left out."""
+    """Return the noise classes that the readings clearly show; ``removed`` gross readings were left out."""
     text = f"{removed} reading(s) lie more than {GROSS:g} standard deviations from their neighbours; they were left out"
     found = [Classed("outliers", {"count": float(removed)}, 1.0, text)] if removed else []
     found += _trend(analysis, leftover(analysis.design, analysis.chosen))
-    # readings that all lie on a grid whose step is as large as the noise
+    # all readings are on a grid whose step is as large as the noise
     values = analysis.fit.observed.value_mm
     apart = np.diff(np.unique(np.round(values, 7)))
     step = float(apart.min()) if apart.size else 0.0
@@ -233,7 +235,7 @@ def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
 
 
 def gross_readings(analysis: Analysis) -> IntArray:
-    """Rows of readings that lie far from their neighbours when all that was found is taken off; none if they are many."""
+    """Rows of readings far from their neighbours after subtracting all findings; none if there are many."""
     fit, design = analysis.fit, analysis.design
     added = [design.groups[g].columns @ design.maps[g] for g in analysis.chosen.members]
     columns = np.hstack([fit.jacobian, *added])
@@ -249,7 +251,7 @@ def gross_readings(analysis: Analysis) -> IntArray:
 
 
 def _apart(layout: MeasurementLayout, left: FloatArray) -> FloatArray:
-    """Distance from the median of the neighbours in time at the same channel, in standard deviations, (n,)."""
+    """Distance from the median of the neighbours in time on the same channel, in standard deviations, (n,)."""
     apart = np.zeros_like(left)
     for channel in np.unique(layout.channel):
         rows = np.flatnonzero(layout.channel == channel)
@@ -264,7 +266,7 @@ def _apart(layout: MeasurementLayout, left: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Burst:
-    """Readings ``rows`` that are far off for a short time, from ``first`` to ``last`` (s, or numbers of the stops)."""
+    """Readings ``rows`` that are far off for a short time, from ``first`` to ``last`` (s, or stop numbers)."""
 
     rows: IntArray
     first: float
@@ -274,7 +276,7 @@ class Burst:
 
     @property
     def text(self) -> str:
-        """In words."""
+        """Description in words."""
         unit = " s" if self.timed else ""
         what = "time" if self.timed else "stop"
         return (
@@ -284,10 +286,10 @@ class Burst:
 
 
 def disturbed_readings(analysis: Analysis) -> list[Burst]:
-    """Short bursts in time in which the readings of all channels are far off (a gust, somebody at the machine).
+    """Short bursts in time in which the readings of all channels are far off (a draught, a person at the machine).
 
-    What is left of the readings is compared between windows of equal length, so that noise of any size, and slow noise,
-    sets its own scale; the fit is repeated without each burst, since a burst pulls it.
+    Residuals are compared between windows of equal length, which scales with the noise, including slow noise. The fit
+    is repeated without each burst because a burst distorts it.
     """
     fit, design = analysis.fit, analysis.design
     layout = fit.observed.layout
@@ -309,7 +311,7 @@ def disturbed_readings(analysis: Analysis) -> list[Burst]:
 
 
 def _loudest(layout: MeasurementLayout, square: FloatArray) -> tuple[int, int] | None:
-    """First and last stop of the loudest window, None if none is loud; ``square`` (n,) is zero where left out."""
+    """First and last stop of the window with the largest excess, or None; ``square`` (n,) is zero where left out."""
     count = np.bincount(layout.stop, minlength=layout.stops)
     power = np.bincount(layout.stop, square, layout.stops) / np.maximum(count, 1)
     best: tuple[float, tuple[int, int]] | None = None
@@ -336,7 +338,7 @@ def _loudest(layout: MeasurementLayout, square: FloatArray) -> tuple[int, int] |
 
 
 def disturbed_class(bursts: Sequence[Burst], *, left_out: bool) -> list[Classed]:
-    """Bursts as they are reported."""
+    """Bursts in the form in which they are reported."""
     end = "left out" if left_out else "--leave-out-disturbed leaves them out"
     return [
         Classed(
@@ -350,7 +352,7 @@ def disturbed_class(bursts: Sequence[Burst], *, left_out: bool) -> list[Classed]
 
 
 def _trend(analysis: Analysis, residual: FloatArray) -> list[Classed]:
-    """Score test of the variance against time (Breusch and Pagan 1979, in the form of Koenker 1981), outliers clipped."""
+    """Score test of the variance against time (Breusch and Pagan 1979, Koenker 1981 form), with outliers clipped."""
     layout = analysis.fit.observed.layout
     time = analysis.design.whiten.order_of(layout.stop)
     t = layout.time[time]

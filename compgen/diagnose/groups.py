@@ -1,4 +1,4 @@
-"""The groups of columns that a diagnosis chooses among: effects of the catalogue, smooth terms, richer base curves."""
+"""The groups of columns that a diagnosis chooses from: effects of the catalogue, smooth terms, richer base curves."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from compgen.effects import Effect, Readings, catalogue
 from compgen.errors import CompgenWarning
 from compgen.kinematics.exact_chain import exact_columns
 
-# Groups of columns that a diagnosis chooses among: effects of the catalogue and smooth terms without a name.
+# Groups of columns that a diagnosis chooses from: effects of the catalogue and unnamed smooth terms.
 
 
 Tier = Literal["named", "generic", "base"]
@@ -40,9 +40,9 @@ Tier = Literal["named", "generic", "base"]
 
 @dataclass(frozen=True)
 class Placed:
-    """Columns (n, k) = place @ values; a term of position or time has one row of ``values`` (T, k) for each stop.
+    """Columns (n, k) = place @ values; a term in position or time has one row of ``values`` (T, k) per stop.
 
-    ``place`` (n, T), with the direction of each reading as its entries, is None where ``values`` are the columns.
+    ``place`` (n, T) contains the direction of each reading; if it is None, ``values`` are the columns.
     """
 
     values: FloatArray
@@ -58,7 +58,7 @@ class Placed:
         return self.values if self.place is None else np.asarray(self.place @ self.values)
 
     def products(self, vectors: FloatArray, summed: dict[int, FloatArray]) -> FloatArray:
-        """Products (k, q) with vectors (n, q); ``summed`` keeps those with ``place``, which other terms share."""
+        """Products (k, q) with vectors (n, q); ``summed`` caches the products with ``place``, which terms share."""
         if self.place is None:
             return np.asarray(self.values.T @ vectors)
         if id(self.place) not in summed:
@@ -68,9 +68,9 @@ class Placed:
 
 @dataclass(frozen=True)
 class Scanned:
-    """Columns of neighbouring scan positions, ``each`` at a time: a step differs from the next in a few readings only.
+    """Columns of neighbouring scan positions, ``each`` per position: adjacent steps differ in only a few readings.
 
-    ``changes`` (n, k): the columns of the first position, then what each position changes in those of the one before.
+    ``changes`` (n, k): the columns of the first position, then the change of each position from the previous one.
     """
 
     changes: csr_array
@@ -94,19 +94,19 @@ class Scanned:
 
 @dataclass(frozen=True)
 class Group:
-    """Columns (n, k) that enter together.
+    """Columns (n, k) that enter the model together.
 
     Parameters
     ----------
     name : of the effect, or a description of the smooth term.
-    tier : ``"named"``, ``"generic"``, or ``"base"`` for what belongs to the base model and is never reported.
-    source, place : where the columns come from, and which of them belong to this group; change of every reading per unit.
+    tier : ``"named"``, ``"generic"``, or ``"base"`` for columns of the base model, which are never reported.
+    source, place : the source of the columns (change of each reading per unit), and which of them belong to this group.
     effect : the effect of the catalogue, with its scan position fixed.
-    scans : number of scan positions among which this is one.
+    scans : number of scan positions, of which this is one.
     position : its scan position.
     covariates, direction : what a generic term depends on, and how it acts (``dX``, ``length``).
     slow : whether it depends on time or temperature.
-    predicts : whether it says anything about readings that were left out.
+    predicts : whether it can predict left-out readings.
     """
 
     name: str
@@ -123,18 +123,18 @@ class Group:
 
     @property
     def columns(self) -> FloatArray:
-        """Change of every reading per unit, (n, k); computed anew."""
+        """Change of each reading per unit, (n, k); recomputed at each call."""
         return self.source.columns()[:, self.place or slice(None)]
 
 
-#: Most scan positions of an effect.
+#: Maximum number of scan positions of an effect.
 MOST_SCANS = 400
-#: Scan positions whose columns are kept together, and the share of changed readings below which the changes are kept.
+#: Scan positions whose columns are stored together; share of changed readings below which only the changes are stored.
 TOGETHER, LEAST_CHANGED = 64, 0.2
 
 
 def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Group], list[str]]:
-    """Return the groups of the catalogue, one for each scan position, and the names that lack a covariate."""
+    """Return the groups of the catalogue, one per scan position, and the names without the covariate they need."""
     groups: list[Group] = []
     missing: list[str] = []
     for name, effect in catalogue(readings.stations).items():
@@ -157,7 +157,7 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
             dense = np.hstack([columns for _, _, columns in found])
             ends = np.cumsum([0, *(columns.shape[1] for _, _, columns in found)]).tolist()
             source: Placed | Scanned = Placed(dense)
-            if len(set(np.diff(ends))) == 1 < len(found):  # a degree that is scanned changes the number of columns
+            if len(set(np.diff(ends))) == 1 < len(found):  # scanning a degree changes the number of columns
                 changes = dense.copy()
                 changes[:, ends[1] :] -= dense[:, : -ends[1]]
                 if np.count_nonzero(changes) < LEAST_CHANGED * changes.size:
@@ -183,22 +183,22 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
 
 
 def check_names(names: Sequence[str], stations: Sequence[str]) -> None:
-    """Warn of names that are no effect of the catalogue."""
+    """Warn of names that are not effects of the catalogue."""
     unknown = [name for name in names if name not in catalogue(stations)]
     if unknown:
         warnings.warn(f"{', '.join(unknown)}: no such effect", CompgenWarning, stacklevel=3)
 
 
-# Smooth terms without a name: what an effect that no catalogue holds would look like.
+# Unnamed smooth terms: what an effect that is not in the catalogue would look like.
 #
-# One search tries them together with the effects of the catalogue. Where one of them wins, the verdict is "unknown", with the
+# They are searched together with the effects of the catalogue. If one of them wins, the verdict is "unknown", with the
 # covariates that it depends on and the direction in which it acts.
 
 
 Columns = dict[str, FloatArray]
 #: Narrow bumps along each axis.
 BUMPS = 12
-#: More lines than this get no offsets of their own.
+#: With more lines than this, lines do not get separate offsets.
 MOST_LINES = 400
 
 
@@ -209,13 +209,13 @@ def _scaled(values: FloatArray) -> FloatArray:
 
 
 def _times(first: FloatArray, second: FloatArray) -> FloatArray:
-    """All products of columns (n, a) and (n, b), (n, a b)."""
+    """All products of the columns (n, a) and (n, b), (n, a b)."""
     return np.asarray((first[:, :, None] * second[:, None, :]).reshape(len(first), -1))
 
 
 @dataclass(frozen=True)
 class Covariates:
-    """Covariates of the readings, scaled to -1 ... +1; what was not logged or never changed is None or absent."""
+    """Covariates of the readings, scaled to -1 ... +1; covariates not logged or constant are None or absent."""
 
     readings: Readings
     layout: MeasurementLayout
@@ -338,7 +338,7 @@ TERMS: Sequence[Callable[[Covariates], Iterator[Term]]] = (
 
 
 def _station_terms(c: Covariates) -> Iterator[Term]:
-    """Terms that act along the beam of one station."""
+    """Terms along the beam of one station."""
     range_mm, u = _scaled(c.readings.range_mm), c.readings.direction
     azimuth = np.arctan2(u[:, 1], u[:, 0])
     waves = np.column_stack([f(k * azimuth) for k in range(1, 7) for f in (np.cos, np.sin)])
@@ -357,7 +357,7 @@ def _station_terms(c: Covariates) -> Iterator[Term]:
 
 
 def _common_length_terms(c: Covariates) -> Iterator[Term]:
-    """Terms that act along the beam of every station alike."""
+    """Terms that act equally along the beam of every station."""
     r = c.readings
     range_mm = _scaled(r.range_mm)
     yield "range", ("range",), legendre(range_mm, 4)[:, 1:], False, True
@@ -380,14 +380,14 @@ def _common_length_terms(c: Covariates) -> Iterator[Term]:
 
 
 def generic_groups(readings: Readings, layout: MeasurementLayout) -> list[Group]:
-    """Return the generic tier for the readings."""
+    """Return the generic groups for the readings."""
     c = covariates_of(readings, layout)
     stop, count = layout.stop, len(readings)
     first = np.unique(stop, return_index=True)[1]
     places: dict[tuple[str, bool], csr_array] = {}
 
     def groups_of(term: Term, ways: Sequence[tuple[str, str, tuple[str, ...], FloatArray]]) -> list[Group]:
-        # one group for each way (ending of the name, direction, further covariates, weight of each reading) of a term
+        # one group for each way a term acts (suffix of the name, direction, extra covariates, weight of each reading)
         text, covariates, columns, slow, predicts = term
         groups = []
         by_stop = columns[first]
@@ -424,7 +424,7 @@ def generic_groups(readings: Readings, layout: MeasurementLayout) -> list[Group]
 
 
 def base_groups(readings: Readings) -> list[Group]:
-    """What belongs to the base model but is only fitted where the data ask for it: the tilt of the tools."""
+    """Terms of the base model that are fitted only if the data require them: the tilt of the tools."""
     tools = readings.tool_mm
     spread = tools - tools.mean(axis=0)
     if readings.kind == "axis" or np.abs(spread).max() < 1e-6:
@@ -433,22 +433,22 @@ def base_groups(readings: Readings) -> list[Group]:
     return [Group("tilt of the tool", "base", Placed(columns))]
 
 
-# How rich the base model is: smooth curves first; steeper ones and nodes are searched like everything else.
+# Richness of the base model: smooth curves first; steeper curves and nodes take part in the search.
 #
-# Nodes could take up an effect that repeats along an axis, and what a named effect explains with few parameters is not
-# for the machine's errors. So the wider curves of an axis are one group of the search, charged for every column, and the
-# base model is fitted with them only if they win there.
+# Nodes could absorb an effect that repeats along an axis, and what a named effect explains with few parameters should
+# not go into the machine errors. The wider curves of an axis are therefore one group of the search, charged for every
+# column, and are added to the base model only if they win.
 
 
-#: Directions of new columns of which less than this (squared) is left without the old ones say nothing.
+#: Directions of new columns with less than this (squared) left after projecting out the old ones are ignored.
 LEAST_SQUARE = 1e-6
-#: Standard deviations of a chi-square beyond its mean that wider curves must explain to be looked at more closely.
+#: Wider curves are examined if their chi-square exceeds its mean by this many standard deviations.
 CHANCE = 4.0
 
 
 @dataclass(frozen=True)
 class Wider:
-    """A wider basis of one axis that the readings ask for, and what it adds as a group of the search."""
+    """A wider basis of one axis that the readings may require, and its added columns as a group of the search."""
 
     axis: int
     basis: CurveBasis
@@ -463,7 +463,7 @@ def fit_smooth(observed: Observed) -> BaseFit:
 
 
 def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
-    """Return for every axis the wider basis with the largest evidence, if one explains more than chance: a first look."""
+    """Preselection: for each axis, the wider basis with the largest evidence, if one explains more than chance."""
     if not fit.basis.errors:
         return ()
     poses, machine = fit.observed.poses, fit.observed.machine
@@ -476,7 +476,7 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
     for axis in range(3):
         best, least = None, -np.inf
         for basis in wider_bases(fit.basis, axis, poses.position_mm, len(fit.observed)):
-            # Derivative of the readings by what the wider curves have more than those of the fit, at the fit.
+            # Derivative of the readings, at the fit, by the coefficients that the wider curves add.
             added: list[Part] = []
             for before, after in zip(old, basis.parts(poses.position_mm), strict=True):
                 more = after.basis[:, before.basis.shape[1] :]
@@ -487,14 +487,14 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
             if count and gain > count + CHANCE * np.sqrt(2.0 * count) and evidence > least:
                 best, least = (basis, columns), evidence
         if best is not None:
-            # what is visible of a group is a share of its whole span: the curves of the fit belong to it
+            # the visible share of a group refers to its whole span, which includes the curves of the fit
             whole = Placed(np.hstack([fit.jacobian[:, : size_of(old)], best[1]]))
             found.append(Wider(axis, best[0], Group(f"wider curves of {AXES[axis]}", "base", whole)))
     return tuple(found)
 
 
 def widened(fit: BaseFit, taken: Sequence[Wider]) -> BaseFit:
-    """Fit the base model again with the wider bases ``taken``."""
+    """Refit the base model with the wider bases ``taken``."""
     basis = fit.basis
     for item in taken:
         basis = basis.with_axis(item.axis, item.basis)
@@ -502,7 +502,7 @@ def widened(fit: BaseFit, taken: Sequence[Wider]) -> BaseFit:
 
 
 def _gain(fit: BaseFit, base: FloatArray, extra: FloatArray) -> tuple[float, int]:
-    """chi-square that columns gain in addition to the base model, in its residual variance, and how many are new.
+    """Gain in chi-square from columns added to the base model, over the residual variance, and how many are new.
 
     ``base`` is an orthonormal basis of its Jacobian.
     """
@@ -519,7 +519,7 @@ def _gain(fit: BaseFit, base: FloatArray, extra: FloatArray) -> tuple[float, int
 
 
 def _extended(fit: BaseFit, wider: CurveBasis) -> FloatArray:
-    """Start values for a wider basis: the present ones, zero for what is new."""
+    """Start values for a wider basis: the present values, zero for new coefficients."""
     position_mm = fit.observed.poses.position_mm[:1]
     old, new = fit.basis.parts(position_mm), wider.parts(position_mm)
     values = np.zeros(size_of(new))

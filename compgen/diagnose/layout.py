@@ -1,6 +1,6 @@
-"""Stops, runs, conditions and repeats of a measurement: which readings were taken together, and which twice.
+"""Stops, runs, conditions and repeats of a measurement: which readings were taken together, and which were repeated.
 
-A stop is one place at one time; its channels are the stations that read there, or the components of a deviation. A
+A stop is one position at one time; its channels are the stations that read there, or the components of a deviation. A
 run is a sequence of stops under one condition; stops of one cell agree in everything that an effect depends on.
 """
 
@@ -17,28 +17,28 @@ from compgen.effects import Readings
 
 IntArray = NDArray[np.int64]
 
-#: Positions, loads and feeds that differ less than this are the same, mm (kg, mm/min).
+#: Positions, loads and feeds that differ by less than this are equal, mm (kg, mm/min).
 SAME = 1e-4
-#: Directions of resting axes tell stops apart if this share of the repeats is left then.
+#: Approach directions, also of axes at rest, distinguish stops if at least this share of the repeats remains.
 ENOUGH_PAIRS = 0.9
 
 
 @dataclass(frozen=True)
 class Block:
-    """Stops that were read by the same channels: ``rows`` (T, c) of readings in order of time; ``stop`` (T,)."""
+    """Stops read by the same channels: ``rows`` (T, c) of readings in time order; ``stop`` (T,)."""
 
     rows: IntArray
     stop: IntArray
 
     @property
     def channels(self) -> int:
-        """Number of channels of every stop."""
+        """Number of channels of each stop."""
         return int(self.rows.shape[1])
 
 
 @dataclass(frozen=True)
 class MeasurementLayout:
-    """The order of a measurement; T stops, n readings.
+    """The structure of a measurement; T stops, n readings.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class MeasurementLayout:
     timed : whether ``time`` is in s.
     run, condition, cell : labels of each stop, (T,); runs are numbered in time, equal cells are repeats.
     in_run : number of the stop within its run, standardised, (T,).
-    blocks : stops by the channels that they have.
+    blocks : stops grouped by their channels.
     """
 
     stop: IntArray
@@ -67,7 +67,7 @@ class MeasurementLayout:
 
     @property
     def repeated(self) -> float:
-        """Share of the stops whose cell was measured more than once."""
+        """Share of stops whose cell was measured more than once."""
         return _repeated(self.cell)
 
 
@@ -76,7 +76,7 @@ def _repeated(cell: IntArray) -> float:
 
 
 def _codes(columns: Sequence[FloatArray]) -> IntArray:
-    """Number every distinct row of ``columns``, (n,)."""
+    """Number the distinct rows of ``columns``, (n,)."""
     stacked = np.column_stack([np.round(np.nan_to_num(column, nan=-9e9) / SAME) for column in columns])
     _, codes = np.unique(stacked, axis=0, return_inverse=True)
     return codes.ravel().astype(np.int64)
@@ -89,7 +89,7 @@ def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None
     ----------
     readings : the readings.
     channel : station or component of each reading, (n,).
-    given_stop : stop of each reading where it is known, (n,).
+    given_stop : stop of each reading if known, (n,).
     """
     seconds = readings.covariates.get("time_s")
     timed = seconds is not None and not bool(np.isnan(seconds).any())
@@ -106,7 +106,7 @@ def layout_of(readings: Readings, channel: IntArray, given_stop: IntArray | None
     run = _runs(readings, first)
     cell = _cells(readings, first, run)
     condition = _conditions(run, cell)
-    # Number of each stop in its run, from -1 to +1; zeros for runs of one stop.
+    # Number of each stop in its run, scaled to -1 ... +1; zeros for runs of one stop.
     start = np.unique(run, return_index=True)[1]
     count = np.bincount(run)
     number = np.arange(len(run)) - start[run]
@@ -128,7 +128,7 @@ def _first_rows(stop: IntArray) -> IntArray:
 
 
 def _stops(readings: Readings, channel: IntArray, seconds: FloatArray | None) -> IntArray:
-    """Index of the stop of every reading, in the order in which they first appear."""
+    """Index of the stop of each reading, in order of first appearance."""
     pose = readings.labels.get("pose")
     columns = [*readings.position_mm.T, *readings.tool_mm.T]
     columns += [values.astype(np.float64) for values in readings.labels.values()]
@@ -139,7 +139,7 @@ def _stops(readings: Readings, channel: IntArray, seconds: FloatArray | None) ->
         if readings.approach is not None:
             columns += list(readings.approach.T)
     code = _codes(columns)
-    # the k-th reading of a channel within one code gets a code of its own
+    # the k-th reading of a channel within one code gets a separate code
     order = np.lexsort((channel, code))
     same = (np.diff(code[order]) == 0) & (np.diff(channel[order]) == 0)
     nth = np.zeros(len(code), dtype=np.int64)
@@ -153,7 +153,7 @@ def _stops(readings: Readings, channel: IntArray, seconds: FloatArray | None) ->
 
 
 def _runs(readings: Readings, first: IntArray) -> IntArray:
-    """Number of the run of every stop: what the labels say, else a stretch of one direction and condition."""
+    """Number of the run of each stop: from the labels, otherwise a stretch with one direction and condition."""
     names = [name for name in ("run", "line", "repeat", "setup", "block") if name in readings.labels]
     columns = [readings.labels[name][first].astype(np.float64) for name in names]
     for name in ("feed_mm_min", "load_kg"):
@@ -168,7 +168,7 @@ def _runs(readings: Readings, first: IntArray) -> IntArray:
 
 
 def _heading(position_mm: FloatArray) -> FloatArray:
-    """Direction of travel (T, 3) to every stop, rounded; the first stop of a stretch takes that of the second."""
+    """Direction of travel (T, 3) to each stop, rounded; the first stop of a stretch gets that of the second."""
     step = np.diff(position_mm, axis=0, prepend=position_mm[:1])
     length = np.linalg.norm(step, axis=1, keepdims=True)
     unit = np.round(step / np.maximum(length, 1e-9), 2)
@@ -181,7 +181,7 @@ def _heading(position_mm: FloatArray) -> FloatArray:
 
 
 def _cells(readings: Readings, first: IntArray, run: IntArray) -> IntArray:
-    """Number stops alike whose position, tool, load, feed and direction agree."""
+    """Give the same number to stops that agree in position, tool, load, feed and direction."""
     columns = [*readings.position_mm[first].T, *readings.tool_mm[first].T]
     columns += [readings.covariates[n][first] for n in ("feed_mm_min", "load_kg") if n in readings.covariates]
     columns += [readings.labels[n][first].astype(np.float64) for n in ("line", "setup") if n in readings.labels]
@@ -194,7 +194,7 @@ def _cells(readings: Readings, first: IntArray, run: IntArray) -> IntArray:
 
 
 def _travel(position_mm: FloatArray, run: IntArray) -> FloatArray:
-    """Sign of travel of each axis from first to last stop of the run of every stop, (T, 3)."""
+    """Sign of the travel of each axis from the first to the last stop of the run that each stop belongs to, (T, 3)."""
     _, start, inverse = np.unique(run, return_index=True, return_inverse=True)
     end = np.append(start[1:], len(run)) - 1
     moved = position_mm[end] - position_mm[start]
@@ -202,7 +202,7 @@ def _travel(position_mm: FloatArray, run: IntArray) -> FloatArray:
 
 
 def _conditions(run: IntArray, cell: IntArray) -> IntArray:
-    """Number alike the runs that go through the same cells: the smallest cell of a run represents it."""
+    """Give the same number to runs through the same cells: the smallest cell of a run represents it."""
     least = np.full(int(run.max()) + 1, np.iinfo(np.int64).max)
     np.minimum.at(least, run, cell)
     _, codes = np.unique(least, return_inverse=True)
@@ -210,7 +210,7 @@ def _conditions(run: IntArray, cell: IntArray) -> IntArray:
 
 
 def _blocks(stop: IntArray, channel: IntArray) -> tuple[Block, ...]:
-    """Group the stops by the set of channels that read there; many small groups are taken channel by channel."""
+    """Group the stops by the set of channels that read there; if there are many small groups, channel by channel."""
     stops, channels = int(stop.max()) + 1, int(channel.max()) + 1
     rows = np.full((stops, channels), -1, dtype=np.int64)
     rows[stop, channel] = np.arange(len(stop))

@@ -14,24 +14,24 @@ from compgen.diagnose.base_fit import BaseFit
 from compgen.diagnose.groups import Group
 from compgen.diagnose.layout import Block, IntArray, MeasurementLayout
 
-# The noise of a measurement: white, slow parts of each channel and common to all, and parts that change from run to run.
+# Noise of a measurement: white, slow parts per channel and common to all, and parts that change from run to run.
 #
-# The covariance is a sum of kernels whose variances are found by restricted maximum likelihood on the differences of
-# repeats (Patterson and Thompson 1971): every effect that depends on position, direction, feed, load or set-up cancels
-# there, known or not. Channels of a stop are rotated to their mean and contrasts, which decouples a common part.
+# The covariance is a sum of kernels whose variances are estimated by restricted maximum likelihood from the differences
+# of repeats (Patterson and Thompson 1971), in which every effect of position, direction, feed, load or set-up cancels,
+# known or not. The channels of a stop are rotated to their mean and contrasts, which decouples a common part.
 
 
-#: Time constants of the kernels, in distances between stops.
+#: Time constants of the kernels, in intervals between stops.
 TAU = (3.0, 10.0, 40.0, 200.0, 2000.0)
-#: Lower bound of a variance, as a share of the raw one.
+#: Lower bound of a variance, as a share of the raw variance.
 LEAST_SHARE = 1e-5
-#: Differences of repeats, and stops without repeats, beyond these numbers cost time and tell little more.
+#: Maximum numbers of differences of repeats, and of stops without repeats: more cost time and add little information.
 MOST_DIFFERENCES, MOST_STOPS = 640, 450
 
 
 @dataclass(frozen=True)
 class Variances:
-    """Variances of the kernels, mm^2: white, own to each channel (K,), common to all (K,); ``runs`` of the last two."""
+    """Variances of the kernels, mm^2: white, per channel (K,), common to all (K,); ``runs`` of the last two."""
 
     white: float
     own: FloatArray
@@ -39,7 +39,7 @@ class Variances:
 
     @property
     def slow(self) -> float:
-        """Variance of everything but white in one channel."""
+        """Variance of one channel without the white part."""
         return float(self.own.sum() + self.common.sum())
 
     @property
@@ -55,12 +55,12 @@ class Noise:
     Parameters
     ----------
     variances : of the kernels.
-    scale : factor s of the standard deviation of every reading, (n,); 1 without dependence on range.
+    scale : factor s of the standard deviation of each reading, (n,); 1 if it does not depend on range or channel.
     quadratic : d' P d of the differences, the pure-error sum of squares.
     freedom : its degrees of freedom.
     criterion : twice the REML criterion, up to a constant.
     source : ``"repeats"``, ``"given"`` or ``"assumed"``.
-    spacing_s : median distance between stops.
+    spacing_s : median time between stops.
     """
 
     variances: Variances
@@ -75,7 +75,7 @@ class Noise:
 def kernels(
     time: FloatArray, spacing: float, run: IntArray, in_run: FloatArray, *, runs: bool = True
 ) -> list[FloatArray]:
-    """Correlation matrices (T, T) of a block: one per time constant, then two of single runs."""
+    """Correlation matrices (T, T) of a block: one per time constant, then two for single runs."""
     apart = np.abs(time[:, None] - time[None, :]) / spacing
     found = [np.exp(-apart / tau) for tau in TAU]
     if runs:
@@ -87,7 +87,7 @@ def kernels(
 
 
 def rotation(channels: int) -> FloatArray:
-    """Orthonormal matrix (c, c) whose first row takes the mean of the channels, the others contrasts."""
+    """Orthonormal matrix (c, c) whose first row forms the mean of the channels and the others contrasts."""
     matrix = np.zeros((channels, channels))
     matrix[0] = 1.0 / np.sqrt(channels)
     for k in range(1, channels):
@@ -106,14 +106,14 @@ def rotated(block: Block, columns: FloatArray) -> FloatArray:
 
 
 def spacing_of(layout: MeasurementLayout) -> float:
-    """Median distance between stops in time, 1 if they have none."""
+    """Median time between stops, 1 if there is none."""
     steps = np.diff(layout.time)
     steps = steps[steps > 0]
     return float(np.median(steps)) if steps.size else 1.0
 
 
 def difference_matrix(layout: MeasurementLayout, block: Block) -> csr_array:
-    """Orthonormal differences (d, T) of the repeats in a block; stops of one cell in their order in time."""
+    """Orthonormal differences (d, T) of the repeats in a block; the stops of a cell are in time order."""
     cells = layout.cell[block.stop]
     order = np.argsort(cells, kind="stable")
     rows, columns, values, at = [], [], [], 0
@@ -131,7 +131,7 @@ def difference_matrix(layout: MeasurementLayout, block: Block) -> csr_array:
 
 @dataclass(frozen=True)
 class _Part:
-    """One block in its differences: kernels (K, d, d), data (c, d), fixed effects (c, d, q)."""
+    """Differences of one block: kernels (K, d, d), data (c, d), fixed effects (c, d, q)."""
 
     kernels: FloatArray
     data: FloatArray
@@ -140,7 +140,7 @@ class _Part:
 
 @dataclass
 class Reml:
-    """The REML criterion of the differences of repeats; log-variances of white, own and common kernels."""
+    """REML criterion of the differences of repeats, by the log-variances of white, per-channel and common kernels."""
 
     parts: list[_Part]
     fixed: int
@@ -206,8 +206,8 @@ def reml_problem(
 ) -> Reml:
     """Set up the criterion: residuals (n,) and fixed effects (n, q) in the differences of repeats.
 
-    Without ``repeats`` the residuals themselves are taken; they must then hold nothing but noise. ``numbered``: noise
-    goes on from stop to stop, however long that takes.
+    Without ``repeats`` the residuals themselves are used; they must then contain only noise. ``numbered``: noise
+    evolves from stop to stop, regardless of the time between them.
     """
     time = np.arange(layout.stops, dtype=np.float64) if numbered else layout.time
     spacing = 1.0 if numbered else spacing_of(layout)
@@ -221,7 +221,7 @@ def reml_problem(
             continue
         taken = np.unique(matrix.indices)
         stop, few = block.stop[taken], matrix[:, taken]
-        run = layout.run[stop]  # within one run alone, what a run shares is a constant, which the fit takes up
+        run = layout.run[stop]  # with only one run, the part common to a run is a constant, which the fit absorbs
         pattern = kernels(time[stop], spacing, run, layout.in_run[stop], runs=runs and len(np.unique(run)) > 1)
         between = np.stack([np.ascontiguousarray(few @ (few @ kernel).T) for kernel in pattern])
         channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
@@ -289,25 +289,25 @@ def packed(variances: Variances, common: bool) -> FloatArray:
     return np.maximum(np.concatenate(parts), 1e-30)
 
 
-# From a base fit to its noise model: dependence on range and channel, then the variances of the kernels.
+# Noise model of a base fit: dependence on range and channel, then the variances of the kernels.
 
 
-#: Differences of repeats below which the residuals themselves have to serve.
+#: With fewer differences of repeats than this, the residuals themselves are used.
 LEAST_DIFFERENCES = 60
-#: Slope over its uncertainty above which the noise depends on range.
+#: Ratio of slope to uncertainty above which the noise depends on range.
 RANGE_Z = 3.5
-#: The same for channels whose noise differs: deviate of the logarithm of a variance.
+#: The same for noise that differs between channels: deviate of the logarithm of a variance.
 CHANNEL_Z = 6.0
 #: Neighbouring second differences overlap: sum of their squared correlations.
 OVERLAP = 1 + 2 * (4 / 6) ** 2 + 2 * (1 / 6) ** 2
-#: Squares beyond this many times the variance are gross errors and count as this much.
+#: Squares above this many times the variance are gross errors and are clipped to it.
 FAR_OUT = 16.0
-#: Variance of single runs, as a share of the white one, below which it is not tested.
+#: Variance of single runs, as a share of the white variance, below which it is not tested.
 LEAST_RUN_SHARE = 0.04
 
 
 def has_repeats(layout: MeasurementLayout) -> bool:
-    """Whether the measurement holds enough repeats for an independent noise model."""
+    """Whether the measurement contains enough repeats for an independent noise model."""
     counts = np.bincount(layout.cell)
     return int(np.sum(np.maximum(counts - 1, 0))) >= LEAST_DIFFERENCES
 
@@ -320,13 +320,13 @@ def noise_of(
     Parameters
     ----------
     fit : the base fit.
-    fixed : groups whose columns may differ between repeats; they neither inflate the noise nor are eaten by it.
-    sigma_mm : standard uncertainty of every reading, if it is given, (n,); used without repeats.
+    fixed : groups whose columns may differ between repeats; they neither inflate the noise nor are absorbed by it.
+    sigma_mm : standard uncertainty of each reading, if given, (n,); used without repeats.
     before : an earlier model to start from.
     """
     layout = fit.observed.layout
     if not has_repeats(layout):
-        # from the residuals of the base model and of the groups ``fixed``: an assumption, not a measurement
+        # from the residuals after the base model and the groups ``fixed``: an assumption, not a measurement
         residual, count = fit.residual_mm, len(fit.residual_mm)
         design = np.hstack([fit.jacobian, _unit_columns(fixed, count)])
         q = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))[0]
@@ -357,8 +357,8 @@ def _unit_columns(groups: Sequence[Group], count: int) -> FloatArray:
 def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise, enough: float = 0.0) -> float:
     """Likelihood ratio of the parts that change from run to run; 0 where they are too small to matter.
 
-    They are compared with noise that goes on in time, and with noise that goes on from stop to stop, unless the first
-    comparison gives no more than ``enough``.
+    They are compared with noise that evolves in time, and, unless that gives no more than ``enough``, with noise that
+    evolves from stop to stop.
     """
     runs = float(noise.variances.own[-2:].sum() + noise.variances.common[-2:].sum())
     if noise.source != "repeats" or runs <= LEAST_RUN_SHARE * noise.variances.white:
@@ -376,9 +376,9 @@ def run_ratio(fit: BaseFit, fixed: Sequence[Group], noise: Noise, enough: float 
 
 
 def noise_scale(fit: BaseFit) -> FloatArray:
-    """Factor of the standard deviation of every reading, (n,), mean square 1.
+    """Factor of the standard deviation of each reading, (n,), with mean square 1.
 
-    It is 1 unless the noise grows with range, or differs between channels by more than that.
+    It is 1 unless the noise grows with range or differs between channels by more than range explains.
     """
     bends = _bends(fit)
     count = len(fit.residual_mm)
@@ -398,14 +398,14 @@ def noise_scale(fit: BaseFit) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Bends:
-    """Squared second differences of the differences of repeats, mm^2, with variance of a reading; their middle rows."""
+    """Squared second differences of differences of repeats, mm^2, scaled to the variance of a reading; middle rows."""
 
     power: FloatArray
     rows: IntArray
 
 
 def _bends(fit: BaseFit) -> _Bends | None:
-    """Second differences of the differences of repeats along a run: they hold nothing slow. None if they are few."""
+    """Second differences of differences of repeats along a run, which contain no slow part. None if there are few."""
     layout = fit.observed.layout
     power, middle = [], []
     for block in layout.blocks:
@@ -424,12 +424,12 @@ def _bends(fit: BaseFit) -> _Bends | None:
 
 
 def _clipped(power: FloatArray) -> FloatArray:
-    """Squares without the weight of gross errors; 0.455 is the median of a squared normal deviate."""
+    """Squares with gross errors clipped; 0.455 is the median of a squared normal deviate."""
     return np.minimum(power, FAR_OUT * float(np.median(power)) / 0.455)
 
 
 def _channel_factor(fit: BaseFit, bends: _Bends, power: FloatArray, *, certain: bool = False) -> FloatArray:
-    """Standard deviation of every channel over that of all, (channels,); zeros if they do not differ beyond doubt."""
+    """Standard deviation of each channel relative to all channels, (channels,); zeros unless they clearly differ."""
     channel = fit.observed.layout.channel[bends.rows]
     factor = np.zeros(int(fit.observed.layout.channel.max()) + 1)
     means, counts = np.zeros(len(factor)), np.bincount(channel, minlength=len(factor))
@@ -446,7 +446,7 @@ def _channel_factor(fit: BaseFit, bends: _Bends, power: FloatArray, *, certain: 
 
 
 def _range_scale(power: FloatArray, rows: IntArray, square: FloatArray | None, count: int) -> FloatArray:
-    """Factor of the standard deviation by range, mean square 1, from a regression of squares on the squared range."""
+    """Range-dependent factor of the standard deviation, mean square 1, from regressing squares on squared range."""
     if square is None:
         return np.ones(count)
     against, power = square[rows], _clipped(power)
@@ -465,7 +465,7 @@ def _range_scale(power: FloatArray, rows: IntArray, square: FloatArray | None, c
 
 
 def _pairs(layout: MeasurementLayout, stop: IntArray) -> tuple[IntArray, IntArray]:
-    """Places in a block of the first and second stop of each repeated cell, in the order of the second one in time."""
+    """Places in a block of the first and second stop of each repeated cell, in time order of the second."""
     cells = layout.cell[stop]
     order = np.lexsort((np.arange(len(cells)), cells))
     starts = np.flatnonzero(np.diff(cells[order], prepend=-1))
@@ -476,27 +476,27 @@ def _pairs(layout: MeasurementLayout, stop: IntArray) -> tuple[IntArray, IntArra
     return first[by_time], second[by_time]
 
 
-# Whitening: columns and readings in which the noise is white with variance 1.
+# Whitening: transform columns and readings so that the noise is white with variance 1.
 #
-# The inverse Cholesky factor of a covariance is never formed. Each kernel has a state (an exponential of its time constant,
-# a level and a slope of the run), whose value at the beginning of a piece of stops is all that earlier stops say about it.
-# So a piece is whitened by its own small factor once what is known of the states is taken off: time and memory grow with the
-# number of stops, not with its square.
+# The full inverse Cholesky factor is never formed. Each kernel has a state (an exponential with its time constant, a
+# level and a slope of the run); its value at the start of a piece of stops contains all information from earlier stops.
+# After the known states are subtracted, a piece is whitened by its small factor: time and memory grow linearly with the
+# number of stops.
 
 
-#: Stops of a piece.
+#: Stops per piece.
 PIECE = 64
 
 
 @dataclass(frozen=True)
 class Piece:
-    """Stops first ... last - 1 that are whitened together; b stops, J states at the first of them.
+    """Stops first ... last - 1, whitened together; b stops, J states at the first stop.
 
     Parameters
     ----------
     inverse : inverse Cholesky factor of their covariance given all earlier stops, (b, b).
     known : whitened stops per unit of each state, (b, J).
-    kept, learnt : states of the next piece per unit of these states, (J,), and of these whitened stops, (J, b).
+    kept, learnt : states of the next piece per unit of these states, (J,), and per unit of the whitened stops, (J, b).
     """
 
     first: int
@@ -510,7 +510,7 @@ class Piece:
 def pieces_of(
     time: FloatArray, run: IntArray, in_run: FloatArray, white: float, variances: FloatArray
 ) -> tuple[Piece, ...]:
-    """Factorise a covariance; stops (T,) in order of time, in units of their distance, ``variances`` (J,) of the kernels."""
+    """Factorise a covariance: ``time`` (T,) ascending, in stop intervals, ``variances`` (J,) of the kernels."""
 
     def seen(rows: slice, at: int) -> FloatArray:
         same = (run[rows] == run[at]).astype(np.float64)
@@ -540,9 +540,9 @@ def pieces_of(
 
 @dataclass(frozen=True)
 class Whitener:
-    """Takes columns (n, k) of all readings to (n, k) of whitened ones, block by block and channel by channel.
+    """Maps columns (n, k) of all readings to whitened columns (n, k), block by block and channel by channel.
 
-    ``pieces`` of a block: those of the covariance of the mean of its channels, and of the contrasts.
+    ``pieces`` of a block: the factors of the covariance of its channel mean, and of its contrasts.
     """
 
     layout: MeasurementLayout
@@ -550,7 +550,7 @@ class Whitener:
     pieces: tuple[tuple[tuple[Piece, ...], tuple[Piece, ...]], ...]
 
     def __call__(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n, k), or one of (n,)."""
+        """Whiten columns (n, k) or one column (n,)."""
         wide = columns.reshape(len(columns), -1)
         result, at = np.empty(wide.shape), 0
         for block, both in zip(self.layout.blocks, self.pieces, strict=True):
@@ -572,7 +572,7 @@ class Whitener:
         return result.reshape(columns.shape)
 
     def transposed(self, whitened: FloatArray) -> FloatArray:
-        """The transpose of the whitening: whitened columns (n, k) to those whose products with readings are the same."""
+        """Transpose of the whitening, (n, k): its products with raw columns equal those of ``whitened`` with white ones."""
         result, at = np.empty(whitened.shape), 0
         for block, both in zip(self.layout.blocks, self.pieces, strict=True):
             turn = rotation(block.channels)
@@ -593,13 +593,13 @@ class Whitener:
         return result
 
     def order_of(self, stop: IntArray) -> IntArray:
-        """Stop of every whitened row, (n,); ``stop`` is that of every reading."""
+        """Stop of each whitened row, (n,); ``stop`` contains the stop of each reading."""
         blocks = self.layout.blocks
         return np.concatenate([np.tile(stop[block.rows[:, 0]], block.channels) for block in blocks])
 
 
 def whitener(layout: MeasurementLayout, noise: Noise) -> Whitener:
-    """Return the whitening of a noise model."""
+    """Return the whitener for a noise model."""
     variances, spacing = noise.variances, spacing_of(layout)
     found = []
     for block in layout.blocks:

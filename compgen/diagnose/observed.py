@@ -1,4 +1,4 @@
-"""One form for every kind of measurement: scalar readings, the unknowns that place them, and their derivative."""
+"""One form for all kinds of measurement: scalar readings, the unknowns that place them, and their derivative."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from compgen.identify.adjust.starts import StationStart, station_start
 from compgen.identify.adjust.unknowns import DistinctPoses, dead_lengths_of, distinct_poses
 from compgen.kinematics.first_order import tool_of
 
-# Start values of a station in closed form, refined on the distances; no search, so that gross errors show at once.
+# Start values of a station in closed form, refined on the distances; no search, so gross errors show immediately.
 
 
 REFINEMENTS = 4
@@ -34,7 +34,7 @@ LEAST_SHARE = 1e-9
 def located(
     target_mm: FloatArray, length_mm: FloatArray, group: IntArray, groups: int
 ) -> tuple[StationStart, FloatArray]:
-    """Place and dead lengths of a station, and the residuals of its readings, (n,).
+    """Position and dead lengths of a station, and the residuals of its readings, (n,).
 
     |P|^2 - L^2 = 2 P.s + 2 l L - (|s|^2 - l^2), linear in s, l and a constant for each set-up.
     """
@@ -74,13 +74,13 @@ def _residual(target_mm: FloatArray, length_mm: FloatArray, group: IntArray, sta
     return np.asarray(length_mm - distance + start.dead_length_mm[group])
 
 
-# One form for every kind of measurement: scalar readings, the unknowns that place them, and their derivative.
+# One form for all kinds of measurement: scalar readings, the unknowns that place them, and their derivative.
 #
 # Reading = model(errors, placement) + effects + noise. Lengths are placed by stations and dead lengths, deviations by a
 # rigid motion of their frame.
 
 
-#: Positions that agree to so many decimals of a mm are one.
+#: Positions in mm that agree to this many decimals are equal.
 SAME_DIGITS = 7
 
 
@@ -103,14 +103,14 @@ class Observed(ABC):
 
     @abstractmethod
     def placed(self, tip_mm: FloatArray, placement: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predicted readings (n,), direction of each (n, 3), derivative by the placement (n, k); tips (m, 3)."""
+        """Predicted readings (n,), their directions (n, 3), derivative by the placement (n, k); tips (m, 3)."""
 
     @abstractmethod
     def readings(self, tip_mm: FloatArray, placement: FloatArray) -> Readings:
-        """The readings as effects see them."""
+        """The readings in the form that effects use."""
 
     def minus(self, change_mm: FloatArray) -> Self:
-        """Return the same measurement with ``change_mm`` (n,) taken off its readings."""
+        """Return the same measurement with ``change_mm`` (n,) subtracted from its readings."""
         changed = copy.copy(self)
         changed.value_mm = self.value_mm - change_mm
         return changed
@@ -121,7 +121,7 @@ class Observed(ABC):
 
 
 class ObservedLengths(Observed):
-    """Tracer lengths: unknown stations, and a dead length for each station and set-up."""
+    """Tracer lengths: unknown stations, and a dead length per station and set-up."""
 
     def __init__(self, machine: Machine, lengths: Lengths) -> None:
         self.machine, self.lengths = machine, lengths
@@ -136,7 +136,7 @@ class ObservedLengths(Observed):
             where = "" if setup is None else f" in set-up {setup[row]}"
             names.append(f"dead length of {lengths.stations[lengths.station[row]]}{where}")
         self.placement_names = tuple(names)
-        # Readings with directions and ranges left open: all that the layout needs.
+        # Readings without meaningful directions and ranges: enough for the layout.
         far = self.lengths.position_mm.mean(axis=0) + np.array([0.0, 0.0, 1e5])
         tips = self.lengths.position_mm
         self.layout = layout_of(
@@ -180,7 +180,7 @@ class ObservedLengths(Observed):
 
 
 class ObservedDeviations(Observed):
-    """Measured deviations: the placement of their frame, three shifts (mm) and three turns (rad), is unknown."""
+    """Measured deviations: the placement of their frame, three shifts (mm) and three rotations (rad), is unknown."""
 
     def __init__(self, machine: Machine, deviations: Deviations, rows: IntArray | None = None) -> None:
         self.machine, self.deviations = machine, deviations
@@ -198,11 +198,11 @@ class ObservedDeviations(Observed):
         self.placement_names = tuple(f"placement {what}" for what in ("x", "y", "z", "a", "b", "c"))
 
     def start(self) -> FloatArray:
-        """No shift and no turn."""
+        """No shift and no rotation."""
         return np.zeros(6)
 
     def placed(self, tip_mm: FloatArray, placement: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Component of tip - nominal, shifted and turned (to first order) with the frame."""
+        """Component of tip - nominal, shifted and rotated (to first order) with the frame."""
         nominal = self.poses.position_mm + self.poses.tool_mm
         fields = rigid_fields(nominal).reshape(-1, 3, 6)
         moved = tip_mm - nominal + fields @ placement
@@ -218,7 +218,7 @@ class ObservedDeviations(Observed):
         return ObservedDeviations(self.machine, self.deviations, self.rows[rows])
 
 
-# Measurements that can be diagnosed, told apart by the columns of their files.
+# Measurements that can be diagnosed, distinguished by the columns of their files.
 
 
 Measurement = Lengths | Deviations | AxisRuns

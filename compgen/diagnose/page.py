@@ -1,4 +1,4 @@
-"""The files of a diagnosis: JSON, text, extended machine file, and the HTML page with its pictures."""
+"""The files of a diagnosis: JSON, text, extended machine file, and the HTML page with figures."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
 from compgen.diagnose.diagnosis import Diagnosis
 from compgen.diagnose.search import gains, remainder_of
 
-# Pictures of a diagnosis: residuals before and after over everything that they may depend on, and the suspects.
+# Figures of a diagnosis: residuals before and after over all quantities they may depend on, and the suspects.
 
 
 BINS = 24
-#: Readings drawn in a picture; more do not show.
+#: Maximum number of readings drawn in a figure; more would not be visible.
 MOST_DOTS = 1500
 MOST_SUSPECTS = 12
 
 
 def axis_pictures(part: AxisFindings) -> list[Picture]:
-    """Return scatter within the cells over time, and all runs over the targets, as measured and without what was removed."""
+    """Return scatter within the cells over time, and all runs over the targets, as measured and after subtraction."""
     session = part.session
     measured, without = session.deviation_mm / MM_PER_UM, (session.deviation_mm - part.removed_mm) / MM_PER_UM
     kept = ~np.isin(np.arange(len(session)), part.left_out)
@@ -72,7 +72,7 @@ def axis_pictures(part: AxisFindings) -> list[Picture]:
 
 
 def residual_pictures(found: Diagnosis) -> list[Picture]:
-    """Return mean and scatter of the residuals before and after over every quantity that they may depend on."""
+    """Return mean and scatter of the residuals, before and after, over each quantity they may depend on."""
     readings, layout = found.analysis.fit.readings, found.analysis.fit.observed.layout
     over = [(f"{'XYZ'[k]} (mm)", readings.position_mm[:, k]) for k in range(3) if np.ptp(readings.position_mm[:, k])]
     if len(readings.stations) > 1:
@@ -115,7 +115,7 @@ def residual_pictures(found: Diagnosis) -> list[Picture]:
 
 
 def volume_pictures(found: Diagnosis) -> list[Picture]:
-    """Return the residuals over the volume, seen from three sides, before and after, on one scale of colours."""
+    """Return the residuals over the volume from three sides, before and after, with a common colour scale."""
     position = found.analysis.fit.readings.position_mm
     rows = np.arange(len(position))
     if len(position) > MOST_DOTS:
@@ -139,7 +139,7 @@ def volume_pictures(found: Diagnosis) -> list[Picture]:
 
 
 def suspects_picture(ranked: Sequence[tuple[str, float, float]], chosen: Container[str]) -> Picture:
-    """Return what each suspect would explain by itself, as bars of its logarithm; those of the verdict in a colour."""
+    """Return bars of the logarithm of what each suspect would explain on its own; those in the verdict are coloured."""
     size = np.log10([max(chi2, 0.5) for _, chi2, _ in ranked])
     ends = float(np.floor(size.min(initial=0.0))), float(np.ceil(size.max(initial=1.0)))
     height, count = 14.0 * len(ranked), len(ranked)
@@ -156,7 +156,7 @@ def suspects_picture(ranked: Sequence[tuple[str, float, float]], chosen: Contain
 
 
 def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
-    """Name, chi-square on its own and visible share of the strongest suspects."""
+    """Name, chi-square on its own, and visible share of the strongest suspects."""
     design = found.analysis.design
     wanted = [g for g, group in enumerate(design.groups) if group.tier == "named" and design.size(g)]
     alone = gains(design, remainder_of(design, []), wanted) if wanted else np.zeros(0)
@@ -169,7 +169,7 @@ def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
     return [(name, chi2, share) for name, (chi2, share) in ranked]
 
 
-# The page of a diagnosis: one self-contained HTML file with its pictures.
+# The page of a diagnosis: one self-contained HTML file with figures.
 
 
 def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
@@ -196,7 +196,7 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
 
 
 def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
-    """Return the text of ``index.html`` of axis runs."""
+    """Return the text of ``index.html`` for axis runs."""
     title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
     parts = [_effects(data), _figures(data), _gap(data)]
     for part in found.axes:
@@ -211,7 +211,7 @@ def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
 
 
 def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
-    """The page with its parts and what every page ends with."""
+    """The page with its parts and the common end of all pages."""
     parts = [
         f"<h1>{escape(title)}</h1>",
         *parts,
@@ -257,7 +257,7 @@ def _effects(data: dict[str, Any]) -> str:
 
 
 def _figures(data: dict[str, Any]) -> str:
-    """Figures of ISO 230-2 as measured and without what was taken off."""
+    """Figures of ISO 230-2 as measured and after subtraction of the changes."""
     parts = []
     for axis, figures in data["iso_230_2"].items():
         taken = ", ".join(data["taken_off"][axis]) or "nothing was taken off"
@@ -296,7 +296,7 @@ def _list(title: str, items: list[str]) -> str:
 
 
 def diagnosis_files(found: Diagnosis | AxisDiagnosis) -> dict[str, str]:
-    """Return the content of every file by its name."""
+    """Return the content of each file, keyed by file name."""
     data = found.to_dict()
     files = {"diagnosis.json": json_text(data), "diagnosis.md": summary(found.machine.name, data, markdown=True)}
     if isinstance(found, AxisDiagnosis):
@@ -311,7 +311,7 @@ def diagnosis_files(found: Diagnosis | AxisDiagnosis) -> dict[str, str]:
 
 
 def next_steps(files: Container[str], machine: str, measurement: str, out: str) -> str:
-    """Say which command uses ``extended.toml``; nothing without it."""
+    """Tell which command uses ``extended.toml``; empty without that file."""
     if "extended.toml" not in files:
         return ""
     return (
@@ -354,7 +354,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
             lines.append(f"* {item['error']}: {size:.2f} {item['unit']} (chi-square {item['chi2']:.0f})")
         if not data["against"]["changes"]:
             lines.append("* none")
-    # figures of ISO 230-2 before and after, a row for each axis and figure
+    # figures of ISO 230-2 before and after, one row per axis and figure
     for axis, figures in data.get("iso_230_2", {}).items():
         taken = ", ".join(data.get("taken_off", {}).get(axis, ()))
         lines += ["", f"ISO 230-2, axis {axis}, as measured and without {taken or 'anything (nothing was taken off)'}:"]
