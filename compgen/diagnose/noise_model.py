@@ -572,7 +572,7 @@ class Whitener:
         return result.reshape(columns.shape)
 
     def transposed(self, whitened: FloatArray) -> FloatArray:
-        """Transpose of the whitening, (n, k): its products with raw columns equal those of ``whitened`` with white ones."""
+        """Transpose of whitening: its products with raw columns equal those of ``whitened`` (n, k) with white ones."""
         result, at = np.empty(whitened.shape), 0
         for block, both in zip(self.layout.blocks, self.pieces, strict=True):
             turn = rotation(block.channels)

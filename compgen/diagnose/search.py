@@ -1,4 +1,4 @@
-"""The search for the set of groups that explains the whitened residual best, and the alternatives to it."""
+"""Search for the set of groups that best explains the whitened residual, and its alternatives."""
 
 from __future__ import annotations
 
@@ -18,29 +18,30 @@ from compgen.diagnose.groups import Group, Placed, Scanned
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.noise_model import Whitener
 
-# The whitened problem with the base model projected out: products of columns on which all sets of groups are compared.
+# The whitened problem with the base model projected out: products of columns, from which all sets are compared.
 #
-# Frisch-Waugh-Lovell: what the base model can do as well is invisible, so both residual and columns lose their part in
-# the span of the base Jacobian first.
+# Frisch-Waugh-Lovell: what the base model can also explain is invisible, so the part in the span of the base Jacobian
+# is first removed from the residual and from the columns.
 
 
-#: Directions of a group of which less than this share is left without the base model are dropped.
+#: Directions of a group with less than this share left after projecting out the base model are dropped.
 LEAST_VISIBLE = 1e-3
-#: Columns smaller than this share of the largest of their group are rounding.
+#: Columns smaller than this share of the largest column of their group are rounding errors.
 ROUNDING = 1e-9
-#: Columns of the base model up to this number pay as in the BIC; more are curves, and pay as a random effect.
+#: Groups of the base model with up to this many columns are charged as in the BIC; larger ones are curves, charged as a
+#: random effect.
 FEW = 3
 #: Columns whitened at a time.
 CHUNK = 128
-#: Squared share of the raw columns of a group below which products of columns are too coarse for what is left of them.
+#: Squared share of the raw columns of a group below which products of columns are too inaccurate for the remainder.
 COARSE = 1e-4
 
 
 @dataclass(frozen=True)
 class GroupFacts:
-    """GroupFacts about all groups, (groups,): number of the name, tier, visible dimensions ...
+    """Properties of all groups, (groups,): number of the name, tier, visible dimensions ...
 
-    ``random``: charged as a random effect, as groups without a name are, and curves of many columns.
+    ``random``: charged as a random effect; this applies to unnamed groups and to curves of many columns.
     """
 
     name: IntArray
@@ -54,10 +55,10 @@ class GroupFacts:
 
 @dataclass(frozen=True)
 class Design:
-    """Groups in orthonormal coordinates of what is visible of them; K coordinates in all.
+    """Groups in orthonormal coordinates of their visible part; K coordinates in total.
 
-    The whitened columns of all groups are never kept. Products of a member with every coordinate are formed on its side:
-    its direction is taken back through the whitening once, and multiplied by the raw columns, which are short or sparse.
+    The whitened columns of all groups are never stored. For products of a member with every coordinate, its direction
+    is mapped back through the whitening once and multiplied by the raw columns, which are short or sparse.
 
     Parameters
     ----------
@@ -65,12 +66,12 @@ class Design:
     start : first coordinate of each group, (groups + 1,).
     maps : matrix (k, k_visible) of each group from its coordinates to the parameters of its columns.
     score : products with the residual, (K,).
-    visible : share of each group that is left without the base model (RMS over its columns), (groups,).
-    residual : whitened residual without its part in the base model, (N,).
+    visible : share of each group left after projecting out the base model (RMS over its columns), (groups,).
+    residual : whitened residual with the base model projected out, (N,).
     base : orthonormal columns of the whitened base model, (N, p).
-    whiten : the whitening.
+    whiten : the whitener.
     fit : the base fit.
-    kept : what was computed before, by what it is: products of members, sets.
+    kept : cache of earlier results: products of members, sets.
     """
 
     groups: tuple[Group, ...]
@@ -85,7 +86,7 @@ class Design:
     kept: dict[Any, Any] = field(default_factory=dict)
 
     def rows(self, members: Sequence[int]) -> FloatArray:
-        """Products of the coordinates of ``members`` with all coordinates, (r, K), computed when first asked for."""
+        """Products of the coordinates of ``members`` with all coordinates, (r, K), computed on first request."""
         new = [g for g in members if g not in self.kept]
         if new:
             vectors = self.whiten.transposed(self.directions(new))
@@ -114,7 +115,7 @@ class Design:
         return csr_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=shape)
 
     def directions(self, members: Sequence[int]) -> FloatArray:
-        """Coordinates of some groups as whitened columns, (N, r)."""
+        """Coordinates of the given groups as whitened columns, (N, r)."""
         if not members:
             return np.zeros((self.count, 0))
         left = self.projected(np.hstack([_centred(self.fit, self.groups[g].columns) for g in members]))
@@ -122,7 +123,7 @@ class Design:
         return np.hstack([left[:, ends[k] : ends[k + 1]] @ self.maps[g] for k, g in enumerate(members)])
 
     def first(self, count: int) -> Design:
-        """Return the design with the first groups only."""
+        """Return the design with only the first ``count`` groups."""
         size = int(self.start[count])
         return replace(
             self,
@@ -136,7 +137,7 @@ class Design:
 
     @property
     def total(self) -> float:
-        """Residual sum of squares of the base model, whitened."""
+        """Whitened residual sum of squares of the base model."""
         return float(self.residual @ self.residual)
 
     @property
@@ -146,12 +147,12 @@ class Design:
 
     @property
     def freedom(self) -> int:
-        """Readings less unknowns of the base model."""
+        """Number of readings minus unknowns of the base model."""
         return self.count - int(self.base.shape[1])
 
     @cached_property
     def facts(self) -> GroupFacts:
-        """What the search asks about all groups."""
+        """Properties of all groups that the search uses."""
         size, tier = np.diff(self.start), np.array([group.tier for group in self.groups], dtype=object)
         return GroupFacts(
             np.unique([group.name for group in self.groups], return_inverse=True)[1],
@@ -177,7 +178,7 @@ class Design:
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def projected(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n, k) and take out the base model."""
+        """Whiten columns (n, k) and project out the base model."""
         white = self.whiten(columns)
         return np.asarray(white - self.base @ (self.base.T @ white))
 
@@ -222,7 +223,7 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
 
 
 def _centred(fit: BaseFit, columns: FloatArray) -> FloatArray:
-    """Columns without their mean at every channel, which a dead length takes up."""
+    """Columns minus their mean on each channel, which a dead length would absorb."""
     channel = fit.observed.layout.channel
     member = csr_array((np.ones(len(channel)), (np.arange(len(channel)), channel)))
     mean = np.asarray(member.T @ columns) / np.bincount(channel)[:, None]
@@ -230,10 +231,10 @@ def _centred(fit: BaseFit, columns: FloatArray) -> FloatArray:
 
 
 def _reduced(raw: FloatArray, seen: FloatArray, base: FloatArray) -> tuple[FloatArray, float]:
-    """Map (k, m) of orthonormal visible directions to the parameters, and the visible share.
+    """Map (k, m) from orthonormal visible directions to the parameters, and the visible share.
 
-    ``raw`` (N, k) are whitened columns, ``seen`` (p, k) their products with the base model. The raw columns are made
-    orthonormal first, so that the eigenvalues of what is left are squared shares.
+    ``raw`` (N, k) are whitened columns, ``seen`` (p, k) their products with the base model. The raw columns are
+    orthonormalised first; the eigenvalues of the remainder are then squared shares.
     """
     whole = raw.T @ raw
     left = whole - seen.T @ seen
@@ -257,10 +258,10 @@ def _reduced(raw: FloatArray, seen: FloatArray, base: FloatArray) -> tuple[Float
     return turn @ (axes[:, visible] / np.sqrt(share2[visible])), float(np.sqrt(max(share, 0.0)))
 
 
-# The search for the set of groups that explains the residual best: forward beam, drops and swaps, then a prune.
+# Search for the set of groups that best explains the residual: forward beam, drops and swaps, then pruning.
 #
-# Criterion: -chi2 plus a penalty for each member. Named effects pay as in the extended BIC (Chen and Chen 2008); generic
-# groups pay the evidence of a random effect with optimised prior variance, k + k log(chi2/k), and a handicap.
+# Criterion: -chi2 plus a penalty for each member. Named effects are charged as in the extended BIC (Chen and Chen
+# 2008); generic groups as a random effect with optimised prior variance, k + k log(chi2/k), plus a handicap.
 
 
 #: Handicap of a generic group, and of one that depends on time or temperature.
@@ -269,22 +270,22 @@ MOST_MEMBERS = 6
 BEAM, ADDITIONS = 2, 3
 #: Largest p-value of a member, corrected for the number of groups and scan positions.
 LARGEST_P = 1e-3
-#: Directions of which less than this (squared) is left without the other members say nothing.
+#: Directions with less than this (squared) left after projecting out the other members are ignored.
 LEAST_SQUARE = 1e-6
-#: A determinant above this has no such direction (it is at most as large as the smallest eigenvalue, which is at most 1).
+#: With a determinant above this there is no such direction: the eigenvalues are at most 1, so none is below it.
 SAFE = 1e-5
 
 
 @dataclass(frozen=True)
 class Rules:
-    """What the search may do.
+    """Limits of the search.
 
     Parameters
     ----------
     named : number of named effects.
-    most_named, most_members : how many named effects and groups in all may be chosen.
-    predicting : whether groups that say nothing about other readings (an offset of each line) are left out.
-    generic : whether groups without a name may be chosen.
+    most_named, most_members : maximum number of named effects, and of groups in total.
+    predicting : whether groups that cannot predict other readings (an offset of each line) are excluded.
+    generic : whether unnamed groups may be chosen.
     trials : number of distinct groups that are compared.
     """
 
@@ -298,7 +299,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A set of groups: members in the order named, then generic; criterion; chi-square of all; and of each in turn."""
+    """A set of groups: members (named first), criterion, chi-square of the set, and gain of each member in turn."""
 
     members: tuple[int, ...]
     criterion: float
@@ -307,13 +308,13 @@ class Chosen:
 
 
 def rules_of(design: Design, most_named: int) -> Rules:
-    """Return the rules for the groups of a design."""
+    """Return the rules for a design."""
     names = {group.name for group in design.groups if group.tier == "named"}
     return Rules(max(len(names), 1), most_named, trials=len({group.name for group in design.groups}))
 
 
 def penalties(design: Design, rules: Rules, groups: Sequence[int], chi2: FloatArray) -> FloatArray:
-    """Penalty of each of some members that gain ``chi2``, (m,)."""
+    """Penalty of each of the groups that gain ``chi2``, (m,)."""
     facts = design.facts
     tier, k = facts.tier[groups], facts.size[groups]
     plain = k * np.log(design.count)
@@ -325,7 +326,7 @@ def penalties(design: Design, rules: Rules, groups: Sequence[int], chi2: FloatAr
 
 @dataclass(frozen=True)
 class Remainder:
-    """What is left of all groups once a set is taken out: ``cross`` (r, K) and ``score`` (K,)."""
+    """What remains of all groups after projecting out a set: ``cross`` (r, K) and ``score`` (K,)."""
 
     cross: FloatArray
     score: FloatArray
@@ -333,7 +334,7 @@ class Remainder:
 
 
 def remainder_of(design: Design, members: Sequence[int]) -> Remainder:
-    """Take a set of groups out of all others."""
+    """Project a set of groups out of all others."""
     index = design.coordinates(members)
     if not len(index):
         return Remainder(np.zeros((0, len(design.score))), design.score, 0.0)
@@ -358,10 +359,10 @@ def explained(design: Design, members: Sequence[int]) -> float:
 
 
 def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
-    """chi-square that each of the groups ``wanted`` would gain in addition to the set.
+    """Gain in chi-square of each of the groups ``wanted`` when added to the set.
 
-    s' (I - c'c)^-1 s of the products c (r, k) of a group with the set and its scores s, for all groups of one size
-    together; through (I - cc')^-1 where the set is smaller than the group.
+    s' (I - c'c)^-1 s with the products c (r, k) of a group and the set, and the scores s of the group, for all groups
+    of one size together; by (I - cc')^-1 if the set is smaller than the group.
     """
     result = np.zeros(len(wanted))
     sizes = design.facts.size[list(wanted)]
@@ -379,7 +380,7 @@ def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
         inner = cross @ cross.transpose(0, 2, 1) if short else cross.transpose(0, 2, 1) @ cross
         seen = np.einsum("grk,gk->gr", cross, score) if short else score
         apart = np.eye(inner.shape[1]) - inner
-        # directions that the set holds as well say nothing: where there may be some, they are left out one by one
+        # directions also contained in the set carry no information: if there may be any, remove them group by group
         with np.errstate(all="ignore"):
             safe = np.abs(np.linalg.det(apart)) > SAFE
         if safe.any():
@@ -394,7 +395,7 @@ def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
 
 
 def evaluate(design: Design, rules: Rules, members: Sequence[int]) -> Chosen:
-    """Criterion of a set; named members enter first."""
+    """Evaluate the criterion of a set; named members enter first."""
     facts = design.facts
     rank = {"base": 0, "named": 1, "generic": 2}
     order = sorted(members, key=lambda g: (facts.random[g], rank[design.groups[g].tier]))
@@ -410,12 +411,12 @@ def evaluate(design: Design, rules: Rules, members: Sequence[int]) -> Chosen:
 
 
 def gain_of(design: Design, others: Sequence[int], group: int) -> float:
-    """chi-square that a group gains in addition to others."""
+    """Gain in chi-square of a group when added to others."""
     return explained(design, [*others, group]) - explained(design, others)
 
 
 def allowed_with(design: Design, rules: Rules, members: Sequence[int]) -> list[int]:
-    """Groups that may be added: of another name, visible, allowed by the rules, and within the numbers allowed."""
+    """Groups that may be added: different name, visible, allowed by the rules, and within the maximum numbers."""
     facts = design.facts
     allowed = (facts.size > 0) & ~np.isin(facts.name, facts.name[list(members)])
     if rules.predicting:
@@ -430,13 +431,13 @@ def allowed_with(design: Design, rules: Rules, members: Sequence[int]) -> list[i
 
 
 def _best_additions(design: Design, rules: Rules, members: Sequence[int], most: int) -> list[Chosen]:
-    """The sets with one more group that lower the criterion most."""
+    """The sets with one more group that decrease the criterion most."""
     key = "additions", rules, frozenset(members)
     if key not in design.kept:
         allowed = allowed_with(design, rules, members)
         gained = gains(design, remainder_of(design, members), allowed)
         merit = gained - penalties(design, rules, allowed, gained)
-        # of exact aliases the first of the catalogue, whatever the rounding
+        # of exact aliases, take the first in the catalogue regardless of rounding
         first = np.argsort(-np.round(merit, 6), kind="stable")[: 4 * max(ADDITIONS, most)]
         design.kept[key] = [(allowed[k], float(merit[k])) for k in first]
     best: dict[str, int] = {}
@@ -451,8 +452,8 @@ def _best_additions(design: Design, rules: Rules, members: Sequence[int], most: 
 def search(design: Design, rules: Rules, start: Sequence[int] = ()) -> Chosen:
     """Find the set with the smallest criterion; then drop members that are not significant.
 
-    A free offset of each line holds everything that is constant in a line, so that what it took up first finds no way
-    in any more: where one won, a search without such groups is made as well.
+    A free offset per line absorbs everything that is constant in a line, so effects that it absorbed first cannot enter
+    later. If such a group wins, the search is repeated without such groups.
     """
     found = _forward(design, rules, start)
     rest = [g for g in found.members if design.groups[g].predicts]
@@ -463,7 +464,7 @@ def search(design: Design, rules: Rules, start: Sequence[int] = ()) -> Chosen:
 
 
 def _forward(design: Design, rules: Rules, start: Sequence[int]) -> Chosen:
-    """Forward beam from ``start``, drops and swaps, then the prune."""
+    """Forward beam from ``start``, drops and swaps, then pruning."""
     best = evaluate(design, rules, start)
     beam = [best]
     while True:
@@ -482,7 +483,7 @@ def _forward(design: Design, rules: Rules, start: Sequence[int]) -> Chosen:
 
 
 def _improved(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
-    """Drop and swap members as long as that lowers the criterion."""
+    """Drop and swap members as long as that decreases the criterion."""
     for _ in range(6):
         better = chosen
         for member in chosen.members:
@@ -496,18 +497,18 @@ def _improved(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
     return chosen
 
 
-#: A name that explains this share of what a generic group in its covariates explains takes its place.
+#: A named effect that explains this share of what a generic group in its covariates explains replaces it.
 SAME_LAW = 0.93
 
 
 def with_names(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
-    """Put names instead of generic groups that hold the same law with more freedom: a shape that is not quite exact."""
+    """Replace generic groups by names with the same law and less freedom, whose shape is not quite exact."""
     for generic in [g for g in chosen.members if design.groups[g].tier == "generic"]:
         rest = [g for g in chosen.members if g != generic]
         group, related = design.groups[generic], []
         own = plain_covariates(group.covariates) - {"x", "y", "z"}
         for g in allowed_with(design, rules, rest):
-            # a name for what depends on the covariates of the generic group; offsets of lines contain them all
+            # named effects in the covariates of the generic group; offsets of lines contain all covariates
             item = design.groups[g]
             same = not group.predicts or (own and own <= plain_covariates(item.covariates))
             if item.tier == "named" and same:
@@ -522,7 +523,7 @@ def with_names(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
 
 
 def plain_covariates(names: tuple[str, ...]) -> set[str]:
-    """Covariates of a card or of a generic term in one spelling: ``x``, ``approach_x``, ``temperature``, ``time``."""
+    """Covariates of a card or generic term in uniform spelling: ``x``, ``approach_x``, ``temperature``, ``time``."""
     found = set()
     for name in names:
         word = (
@@ -554,26 +555,26 @@ def prune(design: Design, rules: Rules, chosen: Chosen) -> Chosen:
     return chosen if len(members) == len(chosen.members) else evaluate(design, rules, members)
 
 
-# Names that explain the readings almost as well as the one that won, with weights.
+# Names that explain the readings almost as well as the winner, with weights.
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """A name that explains the readings almost as well instead of a member, with its weight and correlation."""
+    """A name that explains the readings almost as well as a member, with its weight and correlation."""
 
     name: str
     weight: float
     group: int
 
 
-#: Difference of the criterion within which a name belongs to the set of 99 %.
+#: Difference of the criterion within which a name belongs to the 99 % set.
 WITHIN = 9.2
 
 
 def alternatives(design: Design, rules: Rules, chosen: Chosen, member: int) -> list[Alternative]:
-    """Names that could take the place of a named member, with weights that add up to 1; itself first among equals.
+    """Names that could replace a named member, with weights that sum to 1; the member first among equals.
 
-    What belongs to the base model and is fitted where the data ask for it (the tilt of the tools) may be added to them.
+    Base groups that are fitted only if the data require them (the tilt of the tools) may be added to these names.
     """
     rest = [g for g in chosen.members if g != member]
     allowed = [g for g in allowed_with(design, rules, rest) if design.groups[g].tier == "named"]

@@ -1,4 +1,4 @@
-"""The verdict: names in three grades, what has no name, what the plan cannot see, and what to measure next."""
+"""The verdict: named effects in three grades, unnamed effects, effects the plan hides, and what to measure next."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from compgen.diagnose.search import (
 from compgen.effects import catalogue
 from compgen.kinematics.exact_chain import tip_position
 
-# The verdict: names in three grades, what has no name, what the plan cannot see.
+# The verdict: named effects in three grades, unnamed effects, and effects the plan cannot show.
 
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
@@ -38,7 +38,7 @@ Word = Literal["named", "none", "unknown", "not_decidable"]
 
 
 class DisplayedDiagnosis(Drawable):
-    """How a diagnosis shows itself, of any measurement: from the content of its ``diagnosis.json``."""
+    """Display of a diagnosis of any measurement, from the content of its ``diagnosis.json``."""
 
     machine: Machine
 
@@ -62,7 +62,7 @@ class DisplayedDiagnosis(Drawable):
         return Overview(title, ("effect", "grade", "parameters"), tuple(rows), notes)
 
     def panels(self) -> Sequence[Panel]:
-        """Root mean square of the residuals before and after, of the readings used and of those left out."""
+        """RMS of the residuals before and after, for the readings used and the readings left out."""
         gap = self.to_dict()["gap"]
         shown = {key.removeprefix("heldout_"): pair for key, pair in gap.items() if isinstance(pair, dict)}
         before = Bars("before", tuple(shown), tuple(pair["before_rms_um"] for pair in shown.values()))
@@ -70,32 +70,32 @@ class DisplayedDiagnosis(Drawable):
         return [Panel("residuals of the readings used and left out", "rms (um)", bars=(before, after))]
 
 
-#: Names of which less than this is left without the base model are never confirmed.
+#: Names with less than this left after projecting out the base model are never confirmed.
 LEAST_VISIBLE = 0.05
-#: A name is not confirmed if its chi-square is below this share of that of all members without a (firm) name.
+#: A name is not confirmed if its chi-square is below this share of the total of all members without a (firm) name.
 LEAST_SHARE = 0.1
-#: The same for a jump of the whole machine: among many times one suits any slow change a little.
+#: The same for a jump of the whole machine: of many possible times, one always fits a slow change to some extent.
 LEAST_JUMP_SHARE = 0.5
-#: p-value of the homogeneity below which a name is not confirmed next to something that has no name.
+#: Homogeneity p-value below which a name is not confirmed if something unnamed was also found.
 HOMOGENEITY_BESIDE_P = 0.01
-#: Unevenness that explains less than this share of the chi-square of a name is its inexact shape, not another effect.
+#: Unevenness that explains less than this share of the chi-square of a name is due to its inexact shape.
 SLIGHTLY_UNEVEN = 0.03
-#: A further name whose chi-square is below this share of the largest one is listed as a possible secondary one.
+#: A further name with a chi-square below this share of the largest is listed as a possible secondary effect.
 SECONDARY_SHARE = 0.005
-#: A generic group in the covariates of a name, with less than this share of its chi-square, is its inexact shape.
+#: A generic group in the covariates of a name, with less than this share of its chi-square, reflects its inexact shape.
 SHAPE_SHARE = 0.1
 RUNOUT = "tracer_runout_"
-#: A name that explains this share of what has no name resembles it.
+#: An unnamed effect resembles a name that explains this share of it.
 RESEMBLES = 0.3
-#: What is visible of an effect below this counts as invisible.
+#: An effect with a visible share below this counts as invisible.
 INVISIBLE = 0.05
-#: Names of what the readings' scale does, which any misfit can be reshaped into.
+#: Names of scale effects of the readings, into which any misfit can be reshaped.
 NEVER_CONFIRMED = ("laser_scale",)
 
 
 @dataclass(frozen=True)
 class Named:
-    """One named effect of the verdict; ``reasons`` say why the grade is not better."""
+    """One named effect of the verdict; ``reasons`` explain why the grade is not better."""
 
     name: str
     group: int
@@ -111,9 +111,9 @@ class Named:
 
 @dataclass(frozen=True)
 class Unknown:
-    """Something without a name: what it depends on, how it acts, its RMS in mm (nan if unknown), in words.
+    """An unnamed effect: what it depends on, how it acts, its RMS in mm (nan if unknown), description.
 
-    ``resembles`` is the name that explains most of it in its place, if one explains enough.
+    ``resembles`` is the name that explains most of it instead, if any explains enough.
     """
 
     covariates: tuple[str, ...]
@@ -138,7 +138,7 @@ class Verdict:
 
 
 def verdict_of(analysis: Analysis) -> Verdict:
-    """Draw the verdict."""
+    """Return the verdict."""
     design, evidence = analysis.design, analysis.evidence
     members = analysis.chosen.members
     names = [g for g in members if design.groups[g].tier == "named"]
@@ -181,7 +181,7 @@ def verdict_of(analysis: Analysis) -> Verdict:
 
 
 def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
-    """Steps of two or more stations at the same time: the machine or the target jumped, not the stations."""
+    """Simultaneous steps of two or more stations: the machine or the target jumped, not the stations."""
     steps = [g for g in names if analysis.design.groups[g].name.startswith("length_step_")]
     spacing = 12 * analysis.noise.spacing
     together = []
@@ -198,13 +198,13 @@ def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
 
 
 def _owner(analysis: Analysis, generic: int, names: list[int], gain: float | None = None) -> int | None:
-    """The named member whose inexact shape a generic group is, if there is one; ``gain`` if it is not a member."""
+    """Named member whose inexact shape a generic group reflects, if any; ``gain`` if the group is not a member."""
     design, evidence = analysis.design, analysis.evidence
     gain = evidence.chi2[generic] if gain is None else gain
     own = plain_covariates(design.groups[generic].covariates) - {"x", "y", "z"}
     for g in names:
         covariates = plain_covariates(design.groups[g].covariates)
-        if design.groups[g].name.startswith(RUNOUT):  # a runout of any law is a matter of the angles of its own beam
+        if design.groups[g].name.startswith(RUNOUT):  # any runout depends on the angles of its station's beam
             covariates |= {"azimuth", "elevation", f"station_{design.groups[g].name.removeprefix(RUNOUT)}"}
         if own and own <= covariates and gain < SHAPE_SHARE * evidence.chi2[g]:
             return g
@@ -275,7 +275,7 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
 
 
 def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
-    """Name that explains most in the place of a generic group; none if it explains too little or is there already."""
+    """Name that explains most instead of a generic group; empty if it explains too little or is already a member."""
     design = analysis.design
     rest = [g for g in analysis.chosen.members if g != generic]
     present = {design.groups[g].name for g in rest}
@@ -291,7 +291,7 @@ def _nearest(analysis: Analysis, generic: int, chi2: float) -> str:
 
 
 def _invisible(analysis: Analysis) -> tuple[str, ...]:
-    """Names that this plan hides: covariate missing or constant, or nothing left without the base model."""
+    """Names that this plan hides: covariate missing or constant, or nothing left after the base model."""
     design = analysis.design
     best: dict[str, float] = {}
     for g, group in enumerate(design.groups):
@@ -302,7 +302,7 @@ def _invisible(analysis: Analysis) -> tuple[str, ...]:
     readings = analysis.fit.readings
     cards = {name: effect.card for name, effect in catalogue(readings.stations).items()}
     lacking = []
-    for name in analysis.missing:  # those that would have columns if more had been logged or varied
+    for name in analysis.missing:  # effects that would have columns if more covariates had been logged or varied
         if name.startswith("lever_"):
             if name.removeprefix("lever_") not in analysis.fit.basis.errors:
                 lacking.append(name)
@@ -317,15 +317,15 @@ def _invisible(analysis: Analysis) -> tuple[str, ...]:
     return tuple(name for name in (*hidden, *lacking) if name not in of_base)
 
 
-# Which further measurement would decide: for alias sets, for near relatives, and for what this plan never shows.
+# Further measurements that would decide: for alias sets, for similar effects, and for effects hidden by this plan.
 
 
-#: Correlation above which a relative is printed next to a name, however decisive the criterion looks.
+#: Correlation above which a similar effect is printed with a name, however decisive the criterion is.
 NEAR = 0.9
 
 
 def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
-    """Return the advice, the most useful first."""
+    """Return the advice, most useful first."""
     cards = {name: effect.card for name, effect in catalogue(analysis.fit.readings.stations).items()}
     found: list[str] = []
     for item in verdict.named:
@@ -348,7 +348,7 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
 
 
 def relatives(design: Design, group: int, known: Sequence[str]) -> list[str]:
-    """Names whose visible part is nearly that of a member."""
+    """Names whose visible part is nearly the same as a member's."""
     rows = design.rows([group])
     found: dict[str, float] = {}
     for g, other in enumerate(design.groups):
@@ -366,10 +366,10 @@ def relatives(design: Design, group: int, known: Sequence[str]) -> list[str]:
     return [name for name, value in sorted(found.items(), key=lambda item: -item[1]) if value > NEAR][:2]
 
 
-# What has changed: a measurement against an earlier prediction, error by error.
+# Changes: a measurement against an earlier prediction, error by error.
 #
-# The prediction (an error file, with its effects if the machine file has some) takes the place of the unknown errors; the
-# base model then fits the difference, and says which errors differ by more than the noise allows.
+# The prediction (an error file, with effects if the machine file has any) replaces the unknown errors; the base model
+# is then fitted to the difference and shows which errors differ by more than the noise.
 
 
 #: p-value (over the number of errors) below which an error has changed.
@@ -378,7 +378,7 @@ SIGNIFICANT = 1e-3
 
 @dataclass(frozen=True)
 class Against:
-    """Residuals of the measurement against a prediction with only the placement free: before and after the change, mm."""
+    """Residuals against a prediction with only the placement free, (n,), the errors that changed, and the RMS, mm."""
 
     residual_mm: FloatArray
     changes: tuple[dict[str, Any], ...]
@@ -395,7 +395,7 @@ def compared(observed: Observed, analysis: Analysis, errors: ErrorTable) -> Agai
     errors : the predicted errors.
     """
     fit = analysis.fit
-    # Reading minus prediction with stations and dead lengths (or the rigid motion) fitted, (n,).
+    # Reading minus prediction, with stations and dead lengths (or the rigid motion) fitted, (n,).
     poses = observed.poses
     tip = tip_position(observed.machine, errors.at(poses.position_mm), poses.position_mm, poses.tool_mm)
     at = size_of(fit.basis.parts(poses.position_mm))
@@ -404,7 +404,7 @@ def compared(observed: Observed, analysis: Analysis, errors: ErrorTable) -> Agai
         model, _, columns = observed.placed(tip, placement)
         placement += least_norm(columns, observed.value_mm - model)
     residual = np.asarray(observed.value_mm - observed.placed(tip, placement)[0])
-    # errors whose curve, fitted to the difference, is significant in addition to all others; strongest first
+    # errors whose curve, fitted to the difference with all others, is significant; strongest first
     white = analysis.design.whiten(fit.jacobian)
     target = analysis.design.whiten(residual)
     solution = least_norm(white, target)
