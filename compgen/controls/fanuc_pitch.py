@@ -180,7 +180,7 @@ def _block(
 
 
 def _stored(settings: PitchSettings, best: IntegerCurve, below: int, keep: bool) -> tuple[int, ...]:
-    """Numbers as stored; without travel below it, the reference number is added unless the sample's points differ."""
+    """Numbers as stored; without travel below it, the reference number is added unless the sample's points are kept."""
     if settings.total:
         return tuple(int(value) for value in best.counts)
     steps = np.diff(best.counts, prepend=[0]) if below == 0 and not keep else np.diff(best.counts)

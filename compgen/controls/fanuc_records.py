@@ -447,7 +447,7 @@ def take_punched(kind: type[P], section: toml_files.Section, **given: Any) -> P:
 
 
 def as_sample(machine: Machine, files: Sequence[Path], names: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return ``style_from`` with punched files for each of the controls ``names``; the plan is left out."""
+    """Return ``style_from`` with punched files for each of the controls ``names``; the plan is ignored."""
     texts = [str(path.resolve()) for path in files if path.suffix.lower() != ".json"]
     return {name: {"style_from": texts} for name in names if "style_from" not in machine.controller_settings(name)}
 

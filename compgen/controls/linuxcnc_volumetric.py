@@ -227,7 +227,7 @@ def checksum(words: Iterable[str]) -> str:
 # White space separates words: ``volcomp 1``, ``unit mm`` or ``unit inch`` (mm if missing: tables of versions that
 # wrote mm only), then ``curve NAME AXIS COUNT FIRST STEP`` with COUNT numbers, ``term OUTPUT
 # CURVE COEFFICIENT LEVER``, or ``grid NX NY NZ X0 Y0 Z0 HX HY HZ`` with 3 NX NY NZ numbers (x fastest), then ``end``.
-# Comments (``#`` to the end of the line) and one ``crc32 XXXXXXXX`` of all words up to ``end`` may follow.
+# One ``crc32 XXXXXXXX`` of all words up to ``end`` must follow; comments (``#`` to the end of the line) may be added.
 
 
 _LONGEST_LINE = 4096
@@ -613,7 +613,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
     at_axes = True
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return one term per error on equidistant nodes; the module evaluates E = C P; a grid represents products too."""
+        """Return one term per error on equidistant nodes; the module evaluates E = C P; a grid also fits products."""
         settings = self.settings
         nodes = [
             equidistant_grid(
@@ -715,7 +715,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         ]
 
     def _notes(self, gauge_mm: Vector3, coordinates: str, table: VolTable) -> dict[str, Any]:
-        """Return sign statement, parameters, warnings, and travel, tool and joints for INI and HAL, in machine units."""
+        """Return sign statement, parameters, warnings; travel, tool, joints for INI and HAL in machine units."""
         tool = np.array(gauge_mm) - np.array(self.machine.tool_offset_mm)
         scale = MM_PER_UNIT[table.unit]
         margin_mm = float(np.ceil(2.0 * np.max(np.abs(self._at_corners(table)[1])))) or 1.0

@@ -928,7 +928,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         return found
 
     def _no_longer_used(self, tables: MitsubishiTables) -> list[ControlSet]:
-        """Sets of X, Y, Z in the control's file that contain none of the tables: they would act as well as the new ones."""
+        """Sets of X, Y, Z in the control's file that contain none of the tables: they would act in addition."""
         written = {table.index for table in tables.sets}
         others = self.settings.sample.others(self.settings.axis_names)
         return [item for item in self.settings.sample.sets if item.index not in written and item not in others]

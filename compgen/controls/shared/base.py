@@ -23,7 +23,7 @@ from compgen.kinematics.first_order import factor
 #
 # A control is described by its **basis**: a list of :class:`Term`, each one table (a curve over one axis, or a
 # constant) times a carrier field. The export step finds the table values whose correction field comes closest to
-# the required one; the control turns them into its own numbers, parses them back from text, and emulates what it does.
+# the required one; the control turns them into its numbers, parses them back from text, and emulates what it does.
 
 
 Settings = TypeVar("Settings")
@@ -192,7 +192,7 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     @abstractmethod
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> Tables:
-        """Turn term values (by name, shape of the term's nodes) into the control's own numbers, rounded as written."""
+        """Turn term values (by name, shape of the term's nodes) into the control's numbers, rounded as written."""
 
     @abstractmethod
     def context(self, tables: Tables) -> dict[str, Any]:

@@ -110,7 +110,7 @@ def best_integers(wanted: FloatArray, sections: FloatArray, reference: int, limi
 
     Parameters
     ----------
-    wanted : values v (n,) of the polyline at the nodes in counts, zero at the reference node.
+    wanted : requested values v (n,) of the polyline at the nodes in counts, zero at the reference node.
     sections : G of the sections, shape (n-1, 3), from :func:`section_weights` or :func:`nearest_polyline`.
     reference : index of the node where the table is zero.
     limit : largest step between neighbouring nodes in counts, or None.
