@@ -206,9 +206,15 @@ class Apart:
             self.server = postgres.Server(self.network)
             self.processes.append(self.started([sys.executable, "-c", SCHEDULE.format(self.host)], folder))
             self.address = self.processes[0].stdout.readline().strip()
+            root = next(place for place in (folder, *folder.parents) if place.name.startswith("pytest-"))
             for name in self.names:
                 worker = f"{sys.executable} -m distributed.cli.dask_worker {self.address} --nthreads 1 --no-dashboard"
-                alone = f"mount -t tmpfs none /dev/shm && mount -t tmpfs none /tmp && cd /tmp && exec {worker}"
+                # what the tests wrote is hidden, and all of /tmp unless the program itself is there
+                whole = [place for place in ("/dev/shm", "/tmp") if not Path(sys.prefix).is_relative_to(place)]
+                hidden = [*whole, *([] if any(root.is_relative_to(place) for place in whole) else [root])]
+                alone = " && ".join(
+                    [*(f"mount -t tmpfs none {place}" for place in hidden), f"cd {hidden[-1]}", f"exec {worker}"]
+                )
                 command = ["ip", "netns", "exec", name, "unshare", "--mount", "sh", "-c", alone]
                 self.processes.append(self.started(command, "/"))
         except BaseException:
