@@ -6,7 +6,7 @@ The likelihood is computed from the contrasts in which the cell means cancel (RE
 summed over a grid of (phi, w): wandering noise and a wandering effect are weighed against each other, not in sequence.
 The criterion of a set S is 2 log likelihood minus a penalty for every member; the thresholds are calibrated with
 simulated sessions without any effect (docs/diagnosis-benchmark.md). An effect with one parameter is fitted freely; the
-coefficients of several columns have a normal prior, or many columns could explain everything.
+coefficients of several columns have a normal prior of variance lambda sigma^2; otherwise they could explain everything.
 """
 
 from __future__ import annotations
