@@ -161,7 +161,7 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
 #     squareness            n . C S         one row of C for each squareness error S of the plane
 #     scales                R/2 cos 2t (s1 - s2)
 #     reversal of an axis   n_i sign(v_i) B_i / 2     its actual position from the positive side minus from the negative
-#     servo mismatch        direction R/2 sin 2t m    only with both directions told from squareness
+#     servo mismatch        direction R/2 sin 2t m    separable from squareness only with both directions
 #     straightness          cos 3t, sin 3t            bows of the two axes
 #
 # Higher harmonics (cyclic errors, spikes at reversal) stay in the residuals. They are not white, so uncertainties are

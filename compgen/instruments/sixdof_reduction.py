@@ -262,7 +262,7 @@ def errors_of_run(machine: Machine, instrument: SixDofInstrument, run: RelativeR
     eps = zeroed(machine, run.axis, run.position_mm, turn)
     if at_tool:
         error = error + np.cross(eps[0], along(run.axis, run.position_mm))
-    # the other axes are where the instrument file says, else at zero
+    # the other axes are at the position in the instrument file, else at zero
     position = np.tile(np.array(entry.position_mm or (0.0, 0.0, 0.0)), (len(run.position_mm), 1))
     position[:, run.axis] = run.position_mm
     lever = lever_arm(machine, run.axis, position, np.array(entry.target_offset_mm))

@@ -78,7 +78,7 @@ def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | No
 
     Parameters
     ----------
-    machine : chain, tool offset and squareness reference are taken from it.
+    machine : its chain, tool offset and squareness reference are used.
     position_mm : axis coordinates, shape (n, 3).
     tool_mm : tool offsets, shape (3,) or (n, 3), default the machine's.
 

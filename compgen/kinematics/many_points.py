@@ -393,7 +393,7 @@ _ROW = 8  # numbers per group and interval
 
 
 def _axis(table: AxisTable, groups: tuple[int, ...]) -> tuple[Any, ...]:
-    """One axis as the kernels take it."""
+    """One axis in the form that the kernels use."""
     index = table.index
     ends = float(index.nodes_mm[0]), float(index.nodes_mm[-1]), index.buckets_per_mm
     nodes = np.array(index.nodes_mm), index.upper_mm, index.per_gap
@@ -454,7 +454,7 @@ def exact_at(
 
 
 def _apart(values: FloatArray, out: FloatArray) -> FloatArray:
-    """Return C-ordered values that do not share memory with ``out``: kernels write ahead of what they read."""
+    """Return C-ordered values that do not share memory with ``out``: kernels write ahead of their reads."""
     return values.copy() if np.may_share_memory(values, out) else np.ascontiguousarray(values)
 
 

@@ -1,4 +1,4 @@
-"""Lengths in binary form (``*.lengths.npz``): identified chunk by chunk, with the result of a file that is read whole."""
+"""Lengths in binary form (``*.lengths.npz``): identified in chunks, with the same result as a file read at once."""
 
 import json
 import zipfile
@@ -66,7 +66,7 @@ def columns(machine, truth):
 
 @pytest.fixture
 def streamed(monkeypatch):
-    """Archives of more than a few readings are not read whole, and chunks end in the middle of a stop."""
+    """Archives of more than a few readings are not read at once, and chunks end in the middle of a stop."""
     monkeypatch.setattr(length_archive, "CHUNK", 7001)
     monkeypatch.setattr(streamed_lengths, "CHUNK", 7001)
     monkeypatch.setattr(any_measurement, "MOST_WHOLE", 1000)

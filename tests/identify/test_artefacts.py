@@ -1,4 +1,4 @@
-"""Plates under the machine's own probe: against machines with known errors, by an independent formula of what the probe finds."""
+"""Plates measured with the machine's probe: against known errors, by an independent formula of the probe readings."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def errors():
 
 
 def probed(machine, errors, poses, *, form_mm=0.0, seed=1):
-    """Rows of a plate of 6 x 6 holes in each pose (degrees, x, y): m with m + E(m) = the place of the hole, by iteration."""
+    """Rows of a plate of 6 x 6 holes in each pose (degrees, x, y): m with m + E(m) = hole position, by iteration."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(-125, 125, 6), np.linspace(-125, 125, 6))
     nominal = np.column_stack([x.ravel(), y.ravel(), np.zeros(36)])
@@ -74,7 +74,7 @@ def test_a_calibrated_plate_gives_squareness_scale_and_straightness(tmp_path, ma
 
 
 def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, machine, errors):
-    """Holes are off by 20 um: one set-up is wrong by that, turned ones find squareness and straightness; scale stays open."""
+    """Holes are off by 20 um: one set-up is wrong by that, turned ones give squareness and straightness, not scale."""
     rows = probed(
         machine, errors, [(0.0, 0.0, 0.0), (90.2, 2.0, 1.0), (180.1, -3.0, 2.0), (0.1, 50.0, 30.0)], form_mm=0.02
     )
@@ -87,7 +87,7 @@ def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, mach
         machine, errors, position
     )
     left[:, 2] = 0.0
-    scale = np.sum(left * position) / np.sum(position[:, :2] ** 2)  # the common scale is not among what turning tells
+    scale = np.sum(left * position) / np.sum(position[:, :2] ** 2)  # turning does not determine the common scale
     rest = compgen.without_rigid_motion(position, left - scale * position)
     assert np.abs(rest[:, :2]).max() < 8 * NOISE_MM
     assert any(name in text for text in found.unobservable for name in ("EXX: a part", "EYY: a part"))
@@ -113,7 +113,7 @@ def test_one_length_gives_a_turned_plate_its_scale(tmp_path, machine, errors):
 
 
 def test_the_sign_is_the_opposite_of_that_of_a_part(tmp_path, machine, errors):
-    """A machine that travels too far makes holes too far apart, and finds true holes too near."""
+    """A machine that travels too far makes holes too far apart, and measures true holes too close together."""
     rows = probed(machine, errors, [(0.0, 0.0, 0.0)])
     path = written(tmp_path / "plate.artefact.csv", rows, "u_probe_um = 0.3")
     as_part = tmp_path / "same.part.csv"

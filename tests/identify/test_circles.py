@@ -41,7 +41,7 @@ def errors_of(machine):
 
 
 def readings(machine, errors, plane, *, seed=1, mismatch=0.0, arc=(0.0, 360.0), directions=(1, -1), known_centre=True):
-    """Length of a bar from a pivot that is not quite in the centre, as an independent formula has it."""
+    """Length of a bar from a pivot slightly off centre, by an independent formula."""
     rng = np.random.default_rng(seed)
     centre = np.array([20.0, -10.0, 30.0])
     first, second = PLANES[plane]
@@ -97,7 +97,7 @@ def test_three_planes_give_squareness_and_reversal_with_their_uncertainty(tmp_pa
     assert found.errors.names == ("EC0Y", "EB0Z", "EA0Z")
     for name, (value, u) in found.errors.squareness.items():
         assert 0 < u < 2e-6
-        assert abs(value - SQUARENESS[name]) < 4 * u + 1e-6  # bows lean the axes a little at the circle
+        assert abs(value - SQUARENESS[name]) < 4 * u + 1e-6  # bows tilt the axes slightly at the circle
     for axis, value in enumerate(REVERSAL_MM):
         curve = found.reversal_curves.curves[axis, axis]
         assert curve.value[0] == pytest.approx(value, abs=4 * curve.u[0] + 1e-5)
@@ -108,7 +108,7 @@ def test_three_planes_give_squareness_and_reversal_with_their_uncertainty(tmp_pa
 
 def test_the_uncertainty_covers_the_truth_as_often_as_it_says(machine):
     errors = errors_of(machine)
-    # the circle sees the axes where it is: there, at x = 20, the bow of X leans it towards Y
+    # the circle shows the axes at its position: there, at x = 20, the bow of X tilts it towards Y
     local = SQUARENESS["EC0Y"] - 2 * 2e-8 * 20.0
     standard = []
     for seed in range(30):

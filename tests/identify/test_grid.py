@@ -23,7 +23,7 @@ DEAD_MM = np.array([400.0, 500.0, 600.0, 700.0])
 
 @pytest.fixture(params=[False, True], ids=["numpy", "compiled"])
 def compiled(request, monkeypatch):
-    """Whether the compiled loops serve."""
+    """Whether the compiled loops are used."""
     if request.param:
         pytest.importorskip("numba", reason="the compiled loops are an optional extra")
     monkeypatch.setenv("COMPGEN_KERNELS", "compiled" if request.param else "plain")
@@ -99,7 +99,7 @@ def test_a_missing_reading_at_a_station_that_stands_on_a_grid_point_disturbs_not
     plain, fast = both_problems(machine, lengths)
     state = State(np.zeros(plain.parameters.size), np.vstack([STATIONS[:3], inside]), DEAD_MM.copy())
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # the numpy path meets 0/0 there
+        warnings.simplefilter("ignore", RuntimeWarning)  # the numpy path computes 0/0 there
         values, matrix = fast.evaluate(state)[1], fast.normal_matrix(state)
     assert fast.compiled == compiled
     if compiled:

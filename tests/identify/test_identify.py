@@ -1,4 +1,4 @@
-"""Identification: against an independent least squares of scipy, for any chain, with tools, gaps and bad readings."""
+"""Identification: against independent least squares with scipy, for any chain, with tools, gaps and bad readings."""
 
 from dataclasses import replace
 
@@ -124,7 +124,7 @@ def test_stations_and_dead_lengths_come_back_as_well(reference):
 
 
 def independent_optimum(machine, lengths, names):
-    """The same sum of squares with scipy's own solver, numeric derivative and a readable parametrisation."""
+    """The same sum of squares with scipy's solver, numeric derivative and a readable parametrisation."""
     poses, pose = np.unique(lengths.position_mm, axis=0, return_inverse=True)
     slots = []
     for name in names:

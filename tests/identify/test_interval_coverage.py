@@ -1,4 +1,4 @@
-"""The 95 % intervals of identify hold the truth: a small run of ``benchmarks/interval_coverage.py``."""
+"""The 95 % intervals of identify contain the truth: a small run of ``benchmarks/interval_coverage.py``."""
 
 import importlib.util
 import sys
@@ -26,7 +26,7 @@ def test_95_percent_intervals_hold_the_truth_in_93_to_97_percent(benchmark):
     assert 0.93 < result.overall < 0.97
     assert result.rejected == 0
     assert np.mean(result.chi_square) == pytest.approx(1.0, abs=0.03)
-    # values of one identification are correlated: of each kind a machine counts as two independent ones
+    # values of one identification are correlated: each machine counts as two independent values of each kind
     limit = 3.0 * np.sqrt(0.95 * 0.05 / (2 * machines))
     for kind, share in result.by_kind.items():
         assert abs(share - 0.95) < limit, kind

@@ -1,4 +1,4 @@
-"""Features of parts that a machine made: what they determine of its errors, in frames of unknown pose."""
+"""Features of parts made on a machine: the errors that they determine, in frames of unknown pose."""
 
 import json
 import warnings
@@ -48,7 +48,7 @@ def exy(y):
 
 
 def displaced(x, y):
-    """Where the tool stands for the command (x, y) with X as the reference of squareness."""
+    """Tool position for the command (x, y) with X as the squareness reference."""
     return np.column_stack([x + exx(x) + exy(y) - EC0Y * y, y + eyy(y) + eyx(x)])
 
 
@@ -85,7 +85,7 @@ def plane_field(machine, errors, points):
 
 
 def without_plane_motion(points, field, *, scale=False):
-    """The field (n, 2) without its best shift and turn in the plane, and without its best scale."""
+    """The field (n, 2) without its best-fit shift and rotation in the plane, and without its best-fit scale."""
     x, y = points.T
     one, zero = np.ones(len(x)), np.zeros(len(x))
     columns = [np.r_[one, zero], np.r_[zero, one], np.r_[-y, x], *([np.r_[x, y]] if scale else [])]
@@ -155,7 +155,7 @@ def test_a_free_scale_takes_the_temperature_and_only_a_common_scale_of_the_axes(
     pose = free.summary()["deviations"]["poses"][0]
     assert pose["scale"] - 1.0 == pytest.approx(
         140e-6 + (SLOPE_X + SLOPE_Y) / 2, abs=12e-6
-    )  # scale errors have the size that agrees and is smallest
+    )  # scale errors: the smallest that agree
     field = plane_field(mill, free.errors, points) - (displaced(*points.T) - points)
     assert np.sqrt(np.mean(without_plane_motion(points, field, scale=True) ** 2)) < 0.6e-3
     assert any("EXX: a part of it" in text for text in free.unobservable)
@@ -295,7 +295,7 @@ def test_the_command_line_goes_from_a_plate_to_tables(tmp_path, capsys):
 
 
 def test_a_slip_in_the_fixture_halfway_is_found_in_the_residuals(mill, tmp_path):
-    """The second half of the features was measured after the part had moved by 30 um, in one set-up by the labels."""
+    """The second half of the features was measured after the part had moved by 30 um, but the labels say one set-up."""
     points, rng = drilled(11)
     made = displaced(*points.T) + rng.normal(0, 1e-3, points.shape)
     made[len(made) // 2 :, 0] += 0.03

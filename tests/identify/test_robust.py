@@ -25,7 +25,7 @@ from compgen.simulate.trajectory import serpentine
 NANOMETRE = 1e-6  # mm
 MICROMETRE = 1e-3
 SIGMA_MM = 0.2 * MICROMETRE
-#: Errors of the curves that noise of SIGMA_MM leaves on this machine (largest of some 80 nodes), with a margin.
+#: Errors of the curves from noise of SIGMA_MM on this machine (largest of about 80 nodes), with a margin.
 NOISE_LINEAR_MM = 0.5 * MICROMETRE
 NOISE_ANGULAR = 1.5e-6
 STATIONS = np.array([[400.0, -900.0, 50.0], [-700.0, -800.0, 100.0], [900.0, 700.0, -150.0], [-100.0, 1300.0, 600.0]])
@@ -64,7 +64,7 @@ TRUTH = truth_of(MACHINE)
 
 
 def stops_of(machine):
-    """There and back through a serpentine grid: positions, run, approach."""
+    """Forward and back through a serpentine grid: positions, run, approach."""
     there = serpentine([axis.nodes_mm for axis in machine.axes])
     position = np.vstack([there, there[::-1]])
     moves = np.diff(position, axis=0, prepend=[[axis.range_mm[0] - 1.0 for axis in machine.axes]])
@@ -170,8 +170,8 @@ def test_a_long_beam_break_is_one_segment_with_a_dead_length_of_its_own(clean, f
     assert not found.rejected
     (segment,) = found.segments
     inside = last - first <= 216
-    low, high, sign = (first, last, 1.0) if inside else (0, first, -1.0)  # the shorter part is the one that is off
-    if last - first == 216:  # two halves: either may be called the one that is off
+    low, high, sign = (first, last, 1.0) if inside else (0, first, -1.0)  # the shorter part is the displaced one
+    if last - first == 216:  # two halves: either may be reported as displaced
         low, high, sign = (first, last, 1.0) if set(segment.rows) == set(own[first:last]) else (0, 0, -1.0)
     if high:
         assert segment.rows == tuple(own[low:high].tolist())
@@ -306,7 +306,7 @@ def test_everything_at_once(clean):
     found = identify(MACHINE, disturbed(clean, disturb))
     large = {item.row for item in found.rejected}
     assert large <= set(rows.tolist())
-    assert len(large) >= 88  # an offset below 1 um is no gross error
+    assert len(large) >= 88  # an offset below 1 um is not a gross error
     assert sum(s.kept for s in found.segments) == 1
     assert_as_good_as_undisturbed(found)
 
@@ -381,7 +381,7 @@ def test_coplanar_stations_and_trajectory_are_refused():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gross_errors_in_hard_cases_never_end_in_a_silent_wrong_answer(seed):
-    """Random disturbances: what is accepted without a warning is right to the noise; the rest is an error."""
+    """Random disturbances: results accepted without a warning are correct within the noise; others raise an error."""
     rng = np.random.default_rng(100 + seed)
     lengths = measured(MACHINE, TRUTH, seed=seed)
     own = np.flatnonzero(lengths.station == rng.integers(4))
@@ -391,7 +391,7 @@ def test_gross_errors_in_hard_cases_never_end_in_a_silent_wrong_answer(seed):
     def disturb(reading):
         reading[rows] += rng.normal(0, 10.0 ** rng.uniform(-2, 3), len(rows))
         if seed % 2:
-            reading[own] = np.roll(reading[own], shift)  # every reading stands one or a few points off
+            reading[own] = np.roll(reading[own], shift)  # every reading is shifted by one or a few points
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CompgenWarning)
@@ -433,13 +433,13 @@ def test_reversal_is_reported_and_the_curves_are_the_two_way_means(backlash):
 
 
 def test_the_mean_difference_of_a_station_is_that_of_its_readings(backlash):
-    """Against a plain mean of the differences of pairs, for an axis that alone changes its direction."""
+    """Against a plain mean of the differences of pairs, when only one axis changes its direction."""
     found = identify(MACHINE, backlash)
     value, u = found.reversal.axes["X"].stations["LT1"]
     position, _, approach = stops_of(MACHINE)
     sight = position - STATIONS[0]
     sight = sight / np.linalg.norm(sight, axis=1)[:, None]
-    per_stop = sight @ REVERSAL_MM.T  # what each axis' reversal does to the reading, (n, 3)
+    per_stop = sight @ REVERSAL_MM.T  # effect of each axis' reversal on the reading, (n, 3)
     centred = 0.5 * approach * np.ones((len(position), 1))
     expected = np.linalg.lstsq(centred, np.sum(centred * per_stop, axis=1), rcond=None)[0][0]
     assert value == pytest.approx(expected, abs=5.0 * u + 0.05 * MICROMETRE)
@@ -539,7 +539,7 @@ def test_a_temperature_that_some_readings_lack_is_an_error():
 
 
 def test_the_refractive_index_agrees_with_that_of_ciddor():
-    """Against Ciddor (1996), table 1, whose equation is another one: 633 nm, dry air, 450 ppm CO2, (n - 1) 1e8."""
+    """Against Ciddor (1996), table 1, with a different equation: 633 nm, dry air, 450 ppm CO2, (n - 1) 1e8."""
     table = {(20.0, 800.0): 21458.0, (20.0, 1000.0): 26824.4, (20.0, 1200.0): 32191.6, (10.0, 1000.0): 27774.7}
     for (celsius, pressure_hpa), expected in table.items():
         index = float(refractive_index(np.array(celsius), pressure_hpa, 0.0, 633.0))
@@ -621,7 +621,7 @@ def test_residuals_of_a_right_model_are_white():
 def test_alarm_for_a_process_with_memory(clean):
     rng = np.random.default_rng(12)
     noise = rng.standard_normal(len(clean))
-    for k in range(4, len(noise)):  # each station's own series with correlation 0.5
+    for k in range(4, len(noise)):  # each station's series with correlation 0.5
         noise[k] = 0.5 * noise[k - 4] + np.sqrt(0.75) * noise[k]
     found = whiteness_of(clean, noise)
     assert all(item.lag_1 == pytest.approx(0.5, abs=0.12) for item in found.stations.values())

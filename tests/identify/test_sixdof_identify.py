@@ -1,4 +1,4 @@
-"""From *.sixdof.csv and an instrument file to errors, tables and reports: what users call."""
+"""From *.sixdof.csv and an instrument file to errors, tables and reports: the user interface."""
 
 import dataclasses
 import json
@@ -30,7 +30,7 @@ UM, ARCSEC = 1e-3, np.pi / 648000
 
 
 def main(words):
-    """The command line; the exit code."""
+    """Run the command line; return the exit code."""
     return run_command(cli, words)
 
 
@@ -45,7 +45,7 @@ def test_the_example_is_what_its_scenario_makes(tmp_path):
 
 
 def test_the_squareness_of_the_paper_comes_out_within_its_uncertainty():
-    """S_xy, S_xz, S_yz = -5.0, -6.7, -31.1 arcsec plus what the lines of the true straightness hold."""
+    """S_xy, S_xz, S_yz = -5.0, -6.7, -31.1 arcsec plus the slopes of the true straightness."""
     found = identify_sixdof(MACHINE, SixDofMeasurement(read_sixdof(DATA), read_instrument(FILE)))
     truth = read_errors(TRUTH)
     assert [round(truth.squareness[n][0] / ARCSEC * s, 2) for n, s in (("EC0Y", -1), ("EB0Z", 1), ("EA0Z", -1))] == [
@@ -106,7 +106,7 @@ def test_run_goes_straight_to_accepted_tables_that_make_the_true_machine_better(
     added = tables.correction(MACHINE, Points(at))
 
     def rms(values):
-        """About the best rigid motion: nobody knows the placement of the workpiece."""
+        """About the best-fit rigid motion: the placement of the workpiece is unknown."""
         design = np.hstack([np.tile(np.eye(3), (len(at), 1)), np.vstack([_turn(p) for p in at])])
         flat = values.ravel()
         return float(np.sqrt(np.mean((flat - design @ np.linalg.lstsq(design, flat, rcond=None)[0]) ** 2)))
@@ -353,7 +353,7 @@ def test_a_wrong_instrument_file_names_key_and_choices(tmp_path, old, new, messa
 
 
 def test_a_distance_that_becomes_negative_is_refused(tmp_path):
-    """Command and chain let the target come nearer by 800 mm from 100 mm on."""
+    """Command and chain bring the target closer by 800 mm from a distance of 100 mm."""
     text = FILE.read_text().replace("[axes.Z]\nmode = 1\nbeam_direction = 1", "[axes.Z]\nmode = 1\nbeam_direction = -1")
     (tmp_path / "near.toml").write_text(text)
     readings = read_sixdof(DATA)
@@ -372,9 +372,9 @@ def test_a_distance_that_becomes_negative_is_refused(tmp_path):
 
 
 def test_the_projection_keeps_how_the_tool_moves_up_to_a_rigid_motion():
-    """All 21 errors folded into the 17 that a tracer sees: E at random nodes, beyond the solver's sample.
+    """All 21 errors expressed in the 17 that a tracer sees: E at random nodes, outside the solver's sample.
 
-    Between nodes an angle times its own travel is no straight line, which a straightness curve is.
+    Between nodes an angle times its own travel is not a straight line, but a straightness curve is.
     """
     found = identify_sixdof(MACHINE, SixDofMeasurement(read_sixdof(DATA), read_instrument(FILE)))
     layout = error_parameters(MACHINE, modelled_errors(MACHINE))

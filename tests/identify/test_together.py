@@ -1,4 +1,4 @@
-"""Several measurements of one machine together: against what the machine was given, and against each of them alone."""
+"""Several measurements of one machine together: against its given errors, and against each measurement alone."""
 
 import json
 
@@ -24,12 +24,12 @@ NOISE_MM = 3e-4
 
 @pytest.fixture(scope="module")
 def truth(small_machine, small_errors):
-    """Errors of the machine, every curve zero where the gauge has it."""
+    """Errors of the machine, every curve zero at the point set by the gauge."""
     return small_errors
 
 
 def runs_of(machine, truth, axis, *, offset_mm=0.02, targets=None, seed=1):
-    """Five runs both ways along an axis, zeroed somewhere; values by the truth and nothing else."""
+    """Five runs in both directions along an axis, with an arbitrary zero; values only from the truth."""
     rng = np.random.default_rng(seed)
     name = ("EXX", "EYY", "EZZ")[axis]
     at = machine.axes[axis].nodes_mm if targets is None else np.asarray(targets)
@@ -108,7 +108,7 @@ def test_a_plane_and_runs_determine_what_neither_does_alone(tmp_path, small_mach
     assert found.method == "together"
     assert found.objections == ()
     assert 0.6 < found.reduced_chi_square < 1.5
-    for name in ("EXX", "EYY"):  # at one height a positioning error alone is not told apart from an angle
+    for name in ("EXX", "EYY"):  # at one height a positioning error cannot be separated from an angle
         curve, u = found.errors.curves[name], found.errors.curves[name].u
         difference = curve.value - truth.curves[name].at(curve.position_mm)
         assert np.max(np.abs(difference) / np.maximum(u, 1e-6)) < 4.0
@@ -159,7 +159,7 @@ def test_errors_of_several_files_are_one_set(tmp_path, small_machine, truth):
 
 
 def test_files_of_one_name_and_errors_that_the_model_lacks_do_not_disturb(tmp_path, small_machine, truth):
-    """Two folders with a file of one name; one of them holds ECX, which this machine does not show."""
+    """Two folders with files of the same name; one contains ECX, which this machine does not show."""
     at = small_machine.axes[0].nodes_mm
     yaw = compgen.Curve(at, 50e-6 * np.sin(at), np.full(len(at), 1e-6))
     paths = []
@@ -178,7 +178,7 @@ def test_files_of_one_name_and_errors_that_the_model_lacks_do_not_disturb(tmp_pa
 
 
 def test_how_a_straightedge_lay_makes_no_squareness(tmp_path, small_machine, truth):
-    """A line in the straightness of a file without squareness is the set-up of the straightedge."""
+    """A line in the straightness of a file without squareness comes from the set-up of the straightedge."""
     curve = truth.curves["EYX"]
     sloped = compgen.Curve(curve.position_mm, curve.value + 5e-5 * curve.position_mm + 0.01, curve.u)
     (path,) = written(tmp_path, s_errors_csv=format_errors(compgen.ErrorTable({"EYX": sloped})))
@@ -263,7 +263,7 @@ def test_a_command_takes_numbers_without_any_file(tmp_path, small_machine, capsy
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_formula_of_the_granite_square_on_the_page_of_instruments(small_machine, seed):
-    """EC0Y = -b/B - a/A + s, by the geometry of arms that lie somewhere and a gauge that travels with the tool."""
+    """EC0Y = -b/B - a/A + s, by the geometry of arms at any position and a gauge that travels with the tool."""
     rng = np.random.default_rng(seed)
     truth, lean, own = rng.uniform(-1e-4, 1e-4, 3)
     errors = StatedNumbers(squareness={"EC0Y": f"{truth * 1e6}"}).errors(small_machine)
@@ -272,12 +272,12 @@ def test_the_formula_of_the_granite_square_on_the_page_of_instruments(small_mach
     at, along_x, along_y = ends + compgen.volumetric_error(small_machine, errors, ends) - start
 
     def drift(tool, angle):
-        """How far the tool goes to the left of an arm at an angle, over its way."""
+        """Distance by which the tool moves to the left of an arm at an angle, over its travel."""
         return (tool - at)[1] * np.cos(angle) - (tool - at)[0] * np.sin(angle)
 
     a = drift(along_x, lean)  # plunger to +Y: the reading grows to the left of the X arm
     found = []
-    for turned in (1, -1):  # the second time turned over about the X arm, read along the same line towards +Y
+    for turned in (1, -1):  # the second time flipped about the X arm, read along the same line towards +Y
         b = -drift(along_y, np.pi / 2 + lean + turned * own)  # plunger to +X: it grows to the right of the Y arm
         found.append(-b / length - a / length + turned * own)
     assert found == pytest.approx([truth, truth], abs=1e-8)

@@ -49,7 +49,7 @@ def grid_of(machine):
 
 
 def measured(machine, truth, *, sigma_mm=0.0, seed=2, stations=STATIONS, runs=1, seen=None):
-    """Lengths by the exact model; ``seen`` (points, stations) tells which station reads which point."""
+    """Lengths by the exact model; ``seen`` (points, stations): which station reads which point."""
     rng = np.random.default_rng(seed)
     position = grid_of(machine)
     tip = position + np.array(machine.tool_offset_mm) + exact_error(machine, truth, position)
@@ -318,7 +318,7 @@ def test_noise_free_lengths_give_errors_stations_and_positions_back(machine, mak
         assert station.dead_length_mm == pytest.approx(DEAD_MM[k], abs=10 * NANOMETRE)
     found, position = result.positions.deviation_mm, result.positions.position_mm
     at_reference = np.flatnonzero(np.all(np.isclose(position, machine.reference_point_mm), axis=1))
-    assert np.allclose(found[at_reference], 0, atol=1e-9)  # eq. 20: the translation is that of the machine origin
+    assert np.allclose(found[at_reference], 0, atol=1e-9)  # eq. 20: the translation of the machine origin
     true = exact_error(machine, truth, position)
     tip = position + np.array(machine.tool_offset_mm) + true
     rest = compgen.without_rigid_motion(tip, found - true)
@@ -349,7 +349,7 @@ def test_joint_and_two_step_agree_and_both_cover_the_truth(machine, make_errors)
 
 
 def test_chi_square_is_split_into_the_tracers_and_the_machine(make_errors):
-    """An effect that the model lacks shows in the separation only: the tracers still agree among themselves."""
+    """An effect missing in the model appears only in the separation: the tracers still agree with each other."""
     truth = leaning(GANTRY, make_errors)
     lengths = measured(GANTRY, truth, sigma_mm=SIGMA_MM)
     whole = identify(GANTRY, lengths, TWO_STEP)
@@ -397,7 +397,7 @@ def test_three_stations_are_sent_to_the_joint_method(make_errors):
 
 
 def test_one_tracer_at_three_places_with_points_of_their_own_is_for_the_joint_method(make_errors):
-    """Time-sharing: every station has its own points; no point is seen twice, yet the machine ties them together."""
+    """Sequential stations with separate points: no point is seen twice, but the machine links them."""
     machine = machine_of(counts=(7, 6, 6), tool_offset_mm=(0.0, 0.0, -120.0))
     truth = leaning(machine, make_errors)
     owner = np.random.default_rng(3).integers(0, 3, len(grid_of(machine)))
@@ -439,7 +439,7 @@ def test_a_known_station_is_held_and_sharpens_the_rest(make_errors):
 
 
 def test_a_known_station_counts_as_an_observation(make_errors):
-    """Information of the free solution plus that of the known coordinates, in dense algebra."""
+    """Information of the free solution plus information of the known coordinates, in dense algebra."""
     lengths = measured(GANTRY, leaning(GANTRY, make_errors), sigma_mm=SIGMA_MM)
     u_mm, away = 0.3 * MICROMETRE, np.array([0.4, -0.2, 0.1]) * MICROMETRE
     free = identify(GANTRY, lengths, IdentifyOptions(reject=False))
@@ -459,7 +459,7 @@ def test_a_known_station_counts_as_an_observation(make_errors):
 
 
 def test_one_known_station_leaves_turns_about_it_open_and_says_so(make_errors):
-    """Every carriage position of Y may turn about the station: EAY with the EYY and EZY that belong to it is invisible."""
+    """Every carriage position of Y may rotate about the station: EAY with matching EYY and EZY is invisible."""
     truth = leaning(GANTRY, make_errors)
     y = GANTRY.axes[1].nodes_mm
     turn = np.array([0.0, 1e-6, -2e-6, 0.0])
@@ -543,7 +543,7 @@ def test_two_steps_take_no_known_station(make_errors):
 
 
 def deviations_of(machine, truth, *, sigma_mm=0.0, turn=(0.0, 0.0, 0.0), shift_mm=(0.0, 0.0, 0.0)):
-    """Positions in a frame that is turned (rotation vector, rad) and shifted against the machine's."""
+    """Positions in a frame rotated (rotation vector, rad) and shifted relative to the machine's."""
     position = grid_of(machine)
     tool = np.array(machine.tool_offset_mm)
     tip = position + tool + exact_error(machine, truth, position)
@@ -563,7 +563,7 @@ def test_positions_in_any_frame_give_the_errors_back(machine, make_errors):
 
 
 def test_noisy_positions_meet_the_dense_linear_solution(make_errors):
-    """First-order least squares with the placement as six columns, written out without any of the program's solver."""
+    """First-order least squares with the placement as six columns, without the program's solver."""
     truth = make_errors(GANTRY)
     sigma_mm = 1.5 * MICROMETRE
     data = deviations_of(GANTRY, truth, sigma_mm=sigma_mm)
@@ -588,7 +588,7 @@ def test_noisy_positions_meet_the_dense_linear_solution(make_errors):
 
 
 def test_a_component_that_nothing_measured_leaves_its_errors_out(make_errors):
-    """Without dz the translations in Z are not identified, and said to be; all others come out as with it."""
+    """Without dz the translations in Z are not identified, and reported as such; all others are the same as with dz."""
     truth = make_errors(GANTRY)
     data = deviations_of(GANTRY, truth)
     without = data.deviation_mm.copy()
@@ -599,7 +599,7 @@ def test_a_component_that_nothing_measured_leaves_its_errors_out(make_errors):
     left = compgen.volumetric_error(GANTRY, result.errors, data.position_mm) - compgen.volumetric_error(
         GANTRY, truth, data.position_mm
     )
-    left[:, 2] = 0.0  # nothing is known of dZ; a turn of the frame about X and Y shows in dX and dY all the same
+    left[:, 2] = 0.0  # dZ is unknown; a rotation of the frame about X and Y still appears in dX and dY
     turned = np.cross(np.eye(3)[:, None, :], data.position_mm[None]).transpose(1, 2, 0)
     design = np.concatenate([np.broadcast_to(np.eye(3), turned.shape), turned], axis=2)[:, :2].reshape(-1, 6)
     rest = left[:, :2].ravel() - design @ np.linalg.lstsq(design, left[:, :2].ravel(), rcond=None)[0]

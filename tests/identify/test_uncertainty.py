@@ -1,4 +1,4 @@
-"""Uncertainty of errors and of E: against dense algebra, repeated identification and closed forms; and its file."""
+"""Uncertainty of errors and of E, and its file: against dense algebra, repeated identification and closed forms."""
 
 import io
 import json
@@ -136,7 +136,7 @@ def test_the_uncertainty_of_e_is_that_of_the_full_dense_covariance(curves):
     size = result.layout.size
     expected = np.sqrt(np.einsum("nij,jk,nik->ni", design, dense[:size, :size], design))
     found = predict_uncertainty(machine, joint_covariance(result), points)
-    # the normal matrix takes C instead of the exact derivative; without errors the two agree
+    # the normal matrix uses C instead of the exact derivative; without errors the two agree
     assert np.allclose(found, expected, rtol=1e-5, atol=0)
     stations = joint_covariance(result).stations_covariance
     assert np.allclose(stations, dense[size : size + 12, size : size + 12], rtol=1e-4, atol=1e-4 * stations.max())
@@ -192,7 +192,7 @@ def test_many_points_and_their_own_tools_are_worked_in_blocks():
 
 
 def contribution(machine, lengths, **inputs):
-    """Errors' response (rows of the errors file, quantities) to one input."""
+    """Response of the errors (rows of the errors file, quantities) to one input."""
     result = identify(machine, lengths, IdentifyOptions(systematic=SystematicInputs(**inputs)))
     (item,) = result.systematic.contributions
     rows = [matrix @ item.response[columns] for _, _, columns, matrix in error_values(result.layout)]
@@ -257,7 +257,7 @@ def test_with_one_tool_a_misplaced_target_does_nothing_but_move_the_stations(nam
     assert np.hypot(without[0], 5e-3) == pytest.approx(result.stations[0].u_position_mm[0], rel=1e-6)
 
 
-@pytest.mark.filterwarnings("ignore:the residuals are not white")  # the misplaced target is seen there, too
+@pytest.mark.filterwarnings("ignore:the residuals are not white")  # the misplaced target also appears there
 def test_with_several_tools_a_misplaced_target_moves_the_errors_as_identification_does():
     machine = machine_of(tool_offset_mm=TOOLS[0])
     clean = readings(machine, tools=TOOLS)
@@ -499,7 +499,7 @@ def test_identify_refuses_a_negative_input(call, small_machine_file, small_lengt
 
 
 def test_lengths_with_times_and_tools_survive_writing(tmp_path):
-    """The systematic part rests on these columns; a measurement that went through a file gives the same numbers."""
+    """The systematic part uses these columns; a measurement written and read back gives the same numbers."""
     machine = machine_of(tool_offset_mm=TOOLS[0])
     lengths = readings(machine, tools=TOOLS)
     path = tmp_path / "a.lengths.csv"

@@ -76,7 +76,7 @@ class Observations:
         value: FloatArray,
         covariance: FloatArray,
     ) -> Observations:
-        """Return error values with a covariance as independent readings of unit variance, zero-variance directions omitted.
+        """Return error values with a covariance as independent readings of unit variance; no zero-variance directions.
 
         Values without uncertainty (a curve where it is zero by definition) are ignored. Every curve counts as read
         everywhere.
