@@ -24,7 +24,7 @@ from compgen.fit.zeroing import FrameChange
 if TYPE_CHECKING:
     import scipy.sparse as sp
 
-# What the fit returns: the fitted table, a report per curve, and what was moved out of the curves.
+# Result of the fit: the fitted table, a report per curve, and what was moved out of the curves.
 
 
 @dataclass(frozen=True)
@@ -45,22 +45,22 @@ class CurveReport:
 
     Parameters
     ----------
-    smoothness : the dimensionless weight that was used (:class:`compgen.fit.FitOptions` says what it means).
+    smoothness : the dimensionless weight used (defined in :class:`compgen.fit.FitOptions`).
     method : how the weight was found: ``REML`` (uncertainties known), ``GCV`` (unknown) or ``given``.
-    half_gain_mm : wave length that the smoothing halves, on even nodes; 0 if none is.
+    half_gain_mm : wavelength that the smoothing halves, on evenly spaced nodes; 0 if none is.
     degrees_of_freedom : effective ones, trace of the smoother without bounds; ``free_nodes`` is their largest number.
-    rms_residual : root mean square of data minus fit, over all nodes, after the data were brought to zero ends.
-    reduced_chi_square : weighted square sum of the residuals over its expectation, trace of (1 - S)^2 (Buckley,
-        Eagleson & Silverman 1988, Biometrika 75, 189): near 1 if the uncertainties are right; nan where they are
-        unknown or where less than half a degree of freedom is left.
+    rms_residual : root mean square of data minus fit, over all nodes, after zeroing the data.
+    reduced_chi_square : weighted sum of squared residuals over its expectation, trace of (1 - S)^2 (Buckley,
+        Eagleson & Silverman 1988, Biometrika 75, 189): near 1 if the uncertainties are right; nan if they are
+        unknown or if less than half a degree of freedom is left.
     noise : standard deviation of the data's noise at unit weight, from the same quotient; nan if too little is left.
     smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
     smoothing_bias : the same per position, shape (n,).
     active_bounds : where the curve touches a bound.
-    solver : ``direct``; ``active set`` when a bound is active (``Clarabel`` or ``OSQP`` where these find the active
-        bounds: curves of more than 301 independent nodes); ``cvxpy`` with constraints of your own.
+    solver : ``direct``; ``active set`` when a bound is active (``Clarabel`` or ``OSQP`` if these find the active
+        bounds: curves of more than 301 independent nodes); ``cvxpy`` with user constraints.
     correlated : whether the covariance of the nodes was used.
-    distrusted_mm : nodes that a robust loss gave less than their weight.
+    distrusted_mm : nodes to which a robust loss gave less than their full weight.
     """
 
     error: str
@@ -82,14 +82,14 @@ class CurveReport:
     distrusted_mm: tuple[float, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
-        """Return plain values for JSON; unknown numbers are None."""
+        """Return plain values for JSON; None for unknown numbers."""
         plain = {**asdict(self), "smoothing_bias": self.smoothing_bias.tolist()}
         return {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in plain.items()}
 
 
 @dataclass(frozen=True, repr=False)
 class FitResult(Drawable):
-    """Fitted ``errors`` with their uncertainty, the ``report`` by error name, and the ``change`` of the frame.
+    """Fitted ``errors`` with their uncertainty, the ``report`` by error name, and the frame ``change``.
 
     E of the input and E of the zeroed input differ by ``change``; the fit itself then only smooths.
 
@@ -135,10 +135,10 @@ class FitResult(Drawable):
         return self.errors.panels()
 
 
-# Bounds on one curve: magnitude, slope, curvature, one direction; as numbers and as rows of linear inequalities.
+# Bounds on one curve: magnitude, slope, curvature, monotonicity; as numbers and as rows of linear inequalities.
 
 
-#: Bounds are kept to this fraction of them.
+#: Bounds are met to within this fraction of their value.
 KEPT = 1e-9
 #: Names of the bounds in the order of their rows: values (over one node), slopes (two), curvatures (three).
 BOUND_KINDS = ("max_abs", "max_slope", "max_curvature")
@@ -147,9 +147,9 @@ MONOTONE = "monotone"
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of one curve in its unit (of the curve, per mm, per mm^2); inf and direction 0 are none.
+    """Bounds of one curve in its unit (of the curve, per mm, per mm^2); inf and direction 0 mean no bound.
 
-    ``direction`` is +1 for a curve that must not fall, -1 for one that must not rise. The zero curve keeps every bound.
+    ``direction`` is +1 for a curve that must not fall, -1 for one that must not rise. The zero curve meets every bound.
     """
 
     max_abs: float = math.inf
@@ -159,7 +159,7 @@ class Bounds:
 
     @property
     def none(self) -> bool:
-        """Whether nothing is bounded."""
+        """Whether there are no bounds."""
         return math.isinf(self.max_abs) and math.isinf(self.max_slope + self.max_curvature) and not self._some
 
     @property
@@ -172,11 +172,11 @@ class Bounds:
         return self.max_abs, self.max_slope, self.max_curvature
 
     def in_unit(self, unit: float) -> Bounds:
-        """Return the same bounds for a curve counted in ``unit``."""
+        """Return the same bounds for a curve in multiples of ``unit``."""
         return Bounds(self.max_abs / unit, self.max_slope / unit, self.max_curvature / unit, self.direction)
 
     def excess(self, position_mm: FloatArray, curve: FloatArray) -> tuple[float, float, float, float]:
-        """By how much a curve (n,) breaks magnitude, slope, curvature and direction; 0 where it keeps them."""
+        """Amounts by which a curve (n,) violates magnitude, slope, curvature and direction; 0 if it meets them."""
         slope = np.diff(curve) / np.diff(position_mm)
         bent = 0.0
         if math.isfinite(self.max_curvature):
@@ -188,13 +188,13 @@ class Bounds:
         return over[0], over[1], over[2], backward
 
     def kept_by(self, position_mm: FloatArray, curve: FloatArray) -> bool:
-        """Whether a curve (n,) keeps its bounds at every node and between them."""
+        """Whether a curve (n,) meets its bounds at every node and between nodes."""
         return self.none or not any(self.excess(position_mm, curve))
 
 
 @dataclass(frozen=True)
 class Rows:
-    """lower <= dense @ x <= upper in the smoother's unknowns: dense (m, n), limits (m,).
+    """lower <= dense @ x <= upper for the smoother's unknowns: dense (m, n), limits (m,).
 
     n values come first, then n - 1 slopes, then n - 2 curvatures, each over its bound; rows without limits are zero.
     """
@@ -205,8 +205,8 @@ class Rows:
 
     @cached_property
     def matrix(self) -> sp.csr_array:
-        """The rows as the general solvers want them: sparse."""
-        import scipy.sparse as sp  # imported here and below: slow to load, and general solvers alone want it
+        """The rows as a sparse matrix, as the general solvers need them."""
+        import scipy.sparse as sp  # imported here and below: slow to load, needed only by general solvers
 
         return sp.csr_array(self.dense)
 
@@ -222,14 +222,14 @@ def curvature(position_mm: FloatArray) -> FloatArray:
 
 
 def curvature_at(step: FloatArray) -> FloatArray:
-    """Return the same from the steps (n - 1,) between nodes in mm; zero beside an infinite step."""
+    """Return the same from the steps (n - 1,) between nodes in mm; zero next to an infinite step."""
     before, after = step[:-1], step[1:]
     scale = 2 / (before + after)
     return np.stack([scale / before, -scale / before - scale / after, scale / after], axis=1)
 
 
 def slope_limits(bounds: Bounds, typical: float) -> tuple[float, float, float]:
-    """Scale, lower and upper limit of the slope rows; without a bound on the slope they count in ``typical`` ones."""
+    """Scale, lower and upper limit of the slope rows; without a slope bound the scale is ``typical``."""
     bounded = math.isfinite(bounds.max_slope)
     scale, top = (bounds.max_slope, 1.0) if bounded else (typical, math.inf)
     return scale, 0.0 if bounds.direction > 0 else -top, 0.0 if bounds.direction < 0 else top
@@ -276,34 +276,34 @@ def active_bounds(position_mm: FloatArray, active: FloatArray, bounds: Bounds) -
     return tuple(found)
 
 
-# What a user may ask of the fit: smoothness and bounds.
+# Options of the fit: smoothness and bounds.
 
 
 ERROR_KINDS = ("linear", "angular")
 DIRECTIONS = {"increasing": 1, "decreasing": -1}
-_PER_M = 1e-3  # one per metre in one per mm
+_PER_M = 1e-3  # 1/m in 1/mm
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """Smoothness and bounds of the fit; everything may be left out.
+    """Smoothness and bounds of the fit; all optional.
 
     Parameters
     ----------
     smoothness : dimensionless weight mu of the squared second differences in
         ``sum((u0/u)^2 (c - y)^2) + mu |D2 c|^2``, with ``u0`` the harmonic root mean square of the uncertainties u
-        (all weights 1 where u is not known) and D2 the second difference over nodes at their mean spacing h. On even
-        nodes a wave of length L keeps the fraction ``1/(1 + mu (2 sin(pi h/L))^4)``: 0 keeps the data, 1 halves waves
-        of 6 nodes, 100 of 20 nodes, and mu much above (number of nodes/pi)^4 leaves a straight line (larger ones than
-        that needs are taken as if they were that). None: chosen from the data.
+        (all weights 1 if u is not known) and D2 the second difference over nodes at their mean spacing h. On evenly
+        spaced nodes a wave of length L keeps the fraction ``1/(1 + mu (2 sin(pi h/L))^4)``: 0 keeps the data, 1 halves
+        waves of 6 nodes, 100 of 20 nodes, and mu much above (number of nodes/pi)^4 leaves a straight line (mu is
+        limited to the value that needs). None: chosen from the data.
     max_abs : largest magnitude of a fitted curve in mm or rad, by error name or by ``"linear"``, ``"angular"``; the
-        name goes before the kind.
+        name takes precedence over the kind.
     max_slope : largest magnitude of its slope in mm/mm or rad/mm, likewise.
-    max_curvature : largest magnitude of its second derivative at the inner nodes (difference of the slopes beside a node
-        over half the distance between its neighbours) in mm/mm^2 or rad/mm^2, likewise.
-    monotone : ``"increasing"`` or ``"decreasing"`` by error name. A straightness is zero at both ends and cannot be.
-    robust : Huber's loss instead of squares, for data with outliers: a node pulls at most as if it were off by 1.345 of
-        its uncertainty. Where uncertainties are not known, their scale comes from the residuals.
+    max_curvature : largest magnitude of its second derivative at the inner nodes (difference of the slopes on either
+        side of a node over half the distance between its neighbours) in mm/mm^2 or rad/mm^2, likewise.
+    monotone : ``"increasing"`` or ``"decreasing"`` by error name. Not for straightness, which is zero at both ends.
+    robust : Huber's loss instead of squares, for data with outliers: a node pulls at most as if it deviated by 1.345
+        times its uncertainty. If uncertainties are not known, their scale comes from the residuals.
 
     Raises
     ------
@@ -391,7 +391,7 @@ class FitOptions:
         )
 
     def limits(self, name: str) -> tuple[float, float]:
-        """Return the bounds (magnitude, slope) of one curve in mm or rad and per mm, inf where there is none."""
+        """Return the bounds (magnitude, slope) of one curve in mm or rad and per mm, inf if there is none."""
         bounds = self.bounds(name)
         return bounds.max_abs, bounds.max_slope
 
@@ -417,36 +417,36 @@ def _check_key(bound: str, key: str) -> None:
         raise InputError(f"{key!r} is neither a curve nor a kind of error; {nearest(key, known)}", field=bound)
 
 
-# One curve at a given smoothness within its bounds.
+# One curve with a given smoothness within its bounds.
 #
 # minimise x^T A x / 2 - x^T g   subject to   lower <= G x <= upper
 #
 # in the unknowns of the smoother, with g = Z^T W y. The zero curve satisfies every bound, so the program always has a
-# solution. A free optimum that keeps its bounds is the solution. Otherwise a root F of the inverse of A turns the program
-# into that of the point nearest to the free optimum, x = free + F d with the least |d|; its multipliers are a
-# non-negative least-squares problem (Lawson & Hanson 1974, Solving Least Squares Problems, chapter 23). Its active bounds
-# become equations and are corrected one by one until the Karush-Kuhn-Tucker conditions (every bound kept, every
-# multiplier of the right sign) prove that the curve is the optimum. Curves with too many nodes for dense matrices begin
-# with the active bounds of a general solver. Where active bounds depend on one another, so that their multipliers are
-# not unique, the solver's own curve is taken if its duality gap is closed.
+# solution. A free optimum within its bounds is the solution. Otherwise a root F of the inverse of A turns the program
+# into finding the point nearest to the free optimum, x = free + F d with minimum |d|; its multipliers solve a
+# non-negative least-squares problem (Lawson & Hanson 1974, Solving Least Squares Problems, chapter 23). Its active
+# bounds become equations and are corrected one by one until the Karush-Kuhn-Tucker conditions (every bound satisfied,
+# every multiplier of the right sign) prove that the curve is optimal. Curves with too many nodes for dense matrices
+# start with the active bounds from a general solver. If active bounds are dependent, their multipliers are not unique;
+# the general solver's curve is then accepted if its duality gap is closed.
 
 
 DIRECT, ACTIVE_SET = "direct", "active set"
-#: Multipliers with the wrong sign up to this fraction of the largest are rounding.
+#: Multipliers with the wrong sign up to this fraction of the largest are rounding errors.
 _ACTIVE_SET_SIGN = 1e-9
-#: Combinations of active rows that reach less than this fraction of the largest take no part.
+#: Combinations of active rows with a reach below this fraction of the largest are ignored.
 _DEPENDENT = 1e-13
-#: Largest duality gap, as a fraction of what the bounds cost, of a solution whose active rows depend on one another.
+#: Largest duality gap, as a fraction of the cost of the bounds, of a solution with dependent active rows.
 _GAP = 1e-8
-#: Less than this fraction of the data is zero: what rounding leaves of a curve that its bounds keep there.
+#: Less than this fraction of the data is zero: rounding errors of a curve that its bounds keep at zero.
 _ROUNDING = 1e-15
 _UNTOUCHED: FloatArray = np.zeros(0)
 
 
 class CurveSolution(NamedTuple):
-    """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and who found it.
+    """A fitted ``curve`` (n,) in the unit of its data, the bounds that it touches, and the solver that found it.
 
-    ``touched`` holds -1, 0, 1 for n values, n - 1 slopes and n - 2 curvatures; empty if no bound is touched.
+    ``touched`` contains -1, 0, 1 for n values, n - 1 slopes and n - 2 curvatures; empty if no bound is touched.
     """
 
     curve: FloatArray
@@ -455,14 +455,14 @@ class CurveSolution(NamedTuple):
 
 
 def solve_curve(smoother: Smoother, mu: float, position_mm: FloatArray, y: FloatArray, bounds: Bounds) -> CurveSolution:
-    """Minimise the smoother's cost for data (n,) within bounds that count in the unit of ``y``.
+    """Minimise the smoother's cost for data (n,) within bounds in the unit of ``y``.
 
-    A free optimum that keeps its bounds is the bounded one; only curves that break a bound need more.
+    A free optimum within its bounds is the solution; only curves that violate a bound need more work.
     """
     curve = smoother.solve(mu, y[:, None])[:, 0]
     if bounds.kept_by(position_mm, curve):
         return CurveSolution(curve)
-    unit = max(float(np.abs(y).max()), float(np.finfo(float).tiny))  # solvers like numbers near 1
+    unit = max(float(np.abs(y).max()), float(np.finfo(float).tiny))  # solvers work best with numbers near 1
     rows = constraint_rows(position_mm, smoother, *bounds.in_unit(unit).limits, bounds.direction)
     found = fit_bounded(smoother, mu, y / unit, rows)
     return found._replace(curve=np.where(np.abs(found.curve) > _ROUNDING, found.curve * unit, 0.0))
@@ -500,9 +500,9 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Cur
 
 
 def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
-    """Active rows (-1, 0, 1) of the point within the bounds that is nearest to the free optimum; a good guess at least.
+    """Active rows (-1, 0, 1) of the point within the bounds nearest to the free optimum; at least a good guess.
 
-    With d in units of the greatest excess e, the rows G F over their lengths and the right side h = (G free - limit)/e,
+    With d in units of the largest excess e, the rows G F normalised and the right-hand side h = (G free - limit)/e,
     min |d| subject to -G F d >= h has the multipliers u of min |(-G F)^T u|^2 + (h^T u - 1)^2, u >= 0.
     """
     from scipy.optimize import nnls  # imported here: slow to load
@@ -520,14 +520,14 @@ def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
     system = np.vstack([-(sign / length[row]) * reach[row].T, excess])
     try:
         multiplier = nnls(system, np.append(np.zeros(reach.shape[1]), 1.0))[0]
-    except RuntimeError:  # too many steps: the rows most outside their limits are where the search begins
+    except RuntimeError:  # too many steps: start the search with the rows furthest outside their limits
         multiplier = np.maximum(excess, 0.0)
     chosen = multiplier > _ACTIVE_SET_SIGN * multiplier.max()
     active[row[chosen]] = sign[chosen]
     return active
 
 
-#: Solves min x^T P x / 2 + q^T x, lower <= A x <= upper for (P, q, A, lower, upper): x and multipliers, None if it fails.
+#: Solves min x^T P x / 2 + q^T x, lower <= A x <= upper for (P, q, A, lower, upper): x and multipliers, or None.
 _Solver = Callable[
     ["sp.csc_array", FloatArray, "sp.csc_array", FloatArray, FloatArray], tuple[FloatArray, FloatArray] | None
 ]
@@ -536,10 +536,10 @@ _Solver = Callable[
 def _general(
     smoother: Smoother, mu: float, y: FloatArray, rows: Rows, call: _Solver
 ) -> tuple[FloatArray, FloatArray] | None:
-    """Curve (n,) of a general solver, made to keep its bounds, and multipliers (m,), positive at upper limits."""
+    """Curve (n,) of a general solver, scaled to meet its bounds, and multipliers (m,), positive at upper limits."""
     import scipy.sparse as sp
 
-    # unknowns scaled to 1 on the diagonal of A, and only the rows that have a limit
+    # unknowns scaled to 1 on the diagonal of A, and only rows with a limit
     quadratic = smoother.matrix(mu)
     scale = 1 / np.sqrt(quadratic.diagonal())
     stretch: Any = sp.diags_array(scale)
@@ -552,7 +552,7 @@ def _general(
     multiplier = np.zeros(rows.matrix.shape[0])
     multiplier[used] = found[1]
     curve = smoother.expand((scale * found[0])[:, None])[:, 0]
-    # every smaller multiple of a curve keeps the bounds too
+    # every smaller multiple of a curve also meets the bounds
     values = rows.dense @ curve
     limit = np.where(values > 0, rows.upper, -rows.lower)
     share = np.where((limit > 0) & np.isfinite(limit), np.abs(values) / np.where(limit > 0, limit, 1.0), 0.0)
@@ -595,16 +595,16 @@ def _osqp(
     return (result.x, result.y) if result.info.status in ("solved", "solved inaccurate") else None
 
 
-#: General solvers in the order in which they are tried.
+#: General solvers in the order of trial.
 SOLVERS: dict[str, _Solver] = {"Clarabel": _clarabel, "OSQP": _osqp}
 
 
 def _is_optimal(
     smoother: Smoother, mu: float, free: FloatArray, rows: Rows, curve: FloatArray, multiplier: FloatArray
 ) -> bool:
-    """Whether the curve keeps its bounds and its duality gap is closed.
+    """Whether the curve meets its bounds and its duality gap is closed.
 
-    With e = x - free, cost e^T A e / 2 and the dual value for multipliers v (both against the free optimum), half the
+    With e = x - free, cost e^T A e / 2 and the dual value for multipliers v (both from the free optimum), half the
     squared distance to the optimum in the norm of A is at most their difference (A is the program's only curvature).
     """
     if np.abs(rows.excess(curve)).max(initial=0.0) > KEPT:
@@ -623,7 +623,7 @@ def _active_set(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Curve and active rows that satisfy the optimality conditions, from a guess of the active rows; None if not found.
 
-    One row enters (the one most outside its bound) or leaves (the one with the most wrong multiplier) at a time.
+    One row at a time enters (the furthest outside its bound) or leaves (the multiplier with the largest wrong sign).
     """
     active = active.copy()
     for _ in range(20 + 4 * len(free)):
@@ -650,9 +650,9 @@ def _active_set(
 def _equalities(
     smoother: Smoother, mu: float, free: FloatArray, signed: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Curve (n,) with the ``signed`` rows (k, n) at ``target`` (k,), and their multipliers times the root of their reach.
+    """Curve (n,) with ``signed`` rows (k, n) at ``target`` (k,), and their multipliers times the root of their reach.
 
-    Solved by the Schur complement of A, each row scaled to 1 on its diagonal, and refined against what is left.
+    Solved by the Schur complement of A, each row scaled to 1 on its diagonal, and refined with the residuals.
     """
     if not len(signed):
         return free, np.zeros(0)

@@ -42,17 +42,17 @@ from compgen.fit.zeroing import FixedCurve, zero_ends
 from compgen.identify.covariance import Covariance
 from compgen.kinematics.kernel_switch import lapack, one_thread
 
-# Many curves in one banded system: their nodes follow one another, and nothing couples one curve with the next.
+# Many curves in one banded system: their nodes are concatenated, and nothing couples one curve with the next.
 #
-# A = W + mu D2^T D2 of a curve with independent nodes that is fixed at whole nodes has half-bandwidth 2. Laid behind one
-# another such curves are one :class:`compgen.fit.smoother.Smoother` whose second differences across two curves are zero.
-# One factorisation serves all, whatever their nodes, weights and mu; each is refined by itself, so that no curve changes
-# with the company it has. What keeps its bounds is finished; the others are solved by
+# A = W + mu D2^T D2 of a curve with independent nodes that is fixed at nodes has half-bandwidth 2. Concatenated, such
+# curves are one :class:`compgen.fit.smoother.Smoother` whose second differences across two curves are zero. One
+# factorisation serves all, whatever their nodes, weights and mu; each curve is refined separately and does not depend
+# on the others. Curves that meet their bounds are finished; the others are solved by
 # :func:`compgen.fit.bounds.solve_curve`.
 
-#: Half-bandwidth of A, and one more.
+#: Half-bandwidth of A, plus one.
 _DIAGONALS = 3
-#: What is put behind the second differences of a curve of n nodes: it has n - 2 of them, or none.
+#: Appended to the second differences of a curve of n nodes: it has n - 2 of them, or none.
 _NO_ROWS: FloatArray = np.zeros((2, 3))
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
@@ -71,14 +71,14 @@ class CurveProblem(NamedTuple):
 def solve_curves(problems: Sequence[CurveProblem]) -> list[CurveSolution]:
     """Minimise the cost of every curve within its bounds.
 
-    Curves with independent nodes that are fixed at whole nodes are solved together first.
+    Curves with independent nodes that are fixed at nodes are solved together first.
 
     Raises
     ------
     ConvergenceError
-        when no solver's result for a curve that breaks a bound passes the optimality conditions.
+        when no solver's result for a curve that violates a bound passes the optimality conditions.
     """
-    # those whose nodes are independent (no subclass), and whose fixed functionals are values at nodes
+    # curves with independent nodes (no subclass) whose fixed functionals are values at nodes
     chosen = [
         k
         for k, problem in enumerate(problems)
@@ -100,7 +100,7 @@ def solve_curves(problems: Sequence[CurveProblem]) -> list[CurveSolution]:
 class Stack:
     """k curves with N nodes in all.
 
-    ``starts`` and ``sizes`` (k,): where the curves stand; ``laid``: one smoother of N nodes without eliminations;
+    ``starts`` and ``sizes`` (k,): location of the curves; ``laid``: one smoother of N nodes without eliminations;
     ``fixed``: the nodes at zero; ``mu`` (N,).
     """
 
@@ -112,7 +112,7 @@ class Stack:
 
     @classmethod
     def build(cls, problems: Sequence[CurveProblem]) -> Stack:
-        """Lay the curves one behind the other."""
+        """Concatenate the curves."""
         smoothers = [problem.smoother for problem in problems]
         sizes = np.array([len(smoother.weight) for smoother in smoothers])
         starts = np.cumsum(sizes) - sizes
@@ -165,7 +165,7 @@ class Stack:
 
 
 def _breaks(stack: Stack, problems: Sequence[CurveProblem], c: FloatArray) -> BoolArray:
-    """Which curves (k,) of a stack (N,) break a bound, as :meth:`compgen.fit.bounds.Bounds.kept_by` judges one."""
+    """Which curves (k,) of a stack (N,) violate a bound, as :meth:`compgen.fit.bounds.Bounds.kept_by` does for one."""
     bounds = [problem.bounds for problem in problems]
     wrong: BoolArray = stack.largest(c) > [bound.max_abs for bound in bounds]
     steepest, bent = [bound.max_slope for bound in bounds], [bound.max_curvature for bound in bounds]
@@ -189,12 +189,12 @@ def _breaks(stack: Stack, problems: Sequence[CurveProblem], c: FloatArray) -> Bo
     return wrong
 
 
-# One curve from preparation to report, in um or urad: weights, smoothness, uncertainty; many are solved together.
+# One curve from preparation to report, in um or urad: weights, smoothness, uncertainty; curves are solved together.
 
 
-#: An uncertainty counts at least this fraction of the curve's median one, and this much (um, urad): exact data.
+#: Lower limits of an uncertainty: this fraction of the curve's median one, and this value (um, urad), for exact data.
 _LEAST_FRACTION, _LEAST = 1e-3, 1e-6
-#: With fewer degrees of freedom left than this the residuals say nothing about the noise.
+#: With fewer residual degrees of freedom than this, the residuals say nothing about the noise.
 _LEAST_LEFT = 0.5
 
 
@@ -202,9 +202,9 @@ _LEAST_LEFT = 0.5
 class Prepared:
     """One curve ready to be fitted, everything in um or urad (``unit`` in mm or rad).
 
-    ``y`` (n,) is the zeroed input, ``u0`` the scale of its uncertainty (None: unknown), ``smoother`` holds weights and
-    zeros, ``trust`` (n,) the share of each node's weight that a robust loss leaves, ``covariance`` (n, n) that of the
-    input if it is used.
+    ``y`` (n,) is the zeroed input, ``u0`` the scale of its uncertainty (None: unknown), ``smoother`` contains weights
+    and zeros, ``trust`` (n,) is the fraction of each node's weight that a robust loss leaves, ``covariance`` (n, n) the
+    covariance of the input if it is used.
     """
 
     name: str
@@ -220,7 +220,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Weighted:
-    """Smoothness and how it was found."""
+    """Smoothness and the method by which it was found."""
 
     mu: float
     method: Method
@@ -257,7 +257,7 @@ def prepare(name: str, fixed: FixedCurve, options: FitOptions, trust: FloatArray
     covariance = None
     if fixed.covariance is not None and u0 is not None and smoother.unknowns:
         covariance = fixed.covariance / unit**2 / np.sqrt(share[:, None] * share)
-        # with the least variance that counts on the diagonal, so that it has an inverse
+        # the smallest variance that counts is added on the diagonal to make the matrix invertible
         least = _least(np.sqrt(np.diag(covariance))) ** 2 * np.eye(len(covariance))
         smoother = CorrelatedSmoother.of(smoother, (fixed.zeroing @ covariance @ fixed.zeroing.T + least) / u0**2)
     bounds = options.bounds(name).in_unit(unit)
@@ -265,7 +265,7 @@ def prepare(name: str, fixed: FixedCurve, options: FitOptions, trust: FloatArray
 
 
 def smoothness(prepared: Prepared, options: FitOptions) -> Weighted:
-    """Return the given smoothness, or the one that the data ask for."""
+    """Return the given smoothness, or the one chosen from the data."""
     if options.smoothness is not None:
         return Weighted(min(options.smoothness, prepared.smoother.largest_mu), "given")
     method: Method = "REML" if prepared.u0 is not None else "GCV"
@@ -273,7 +273,7 @@ def smoothness(prepared: Prepared, options: FitOptions) -> Weighted:
 
 
 def solve(prepared: Sequence[Prepared], mu: Sequence[float]) -> list[CurveSolution]:
-    """Fit curves at given smoothness within their bounds."""
+    """Fit curves with given smoothness within their bounds."""
     return solve_curves(
         [
             CurveProblem(item.smoother, weight, item.fixed.position_mm, item.y, item.bounds)
@@ -285,8 +285,8 @@ def solve(prepared: Sequence[Prepared], mu: Sequence[float]) -> list[CurveSoluti
 def finish(prepared: Prepared, weighted: Weighted, solution: CurveSolution) -> tuple[Curve, CurveReport]:
     """Return the fitted curve in mm or rad with its uncertainty, and the report.
 
-    The uncertainty is that of the input carried linearly through the zeroing and the smoother without bounds; it does
-    not hold the smoothing bias, which the report states.
+    The uncertainty of the input is propagated linearly through the zeroing and the smoother without bounds; it does not
+    include the smoothing bias, which the report states.
     """
     smoother, fixed = prepared.smoother, prepared.fixed
     bias = smoother.solve(weighted.mu, solution.curve[:, None])[:, 0] - solution.curve
@@ -322,8 +322,8 @@ def finish(prepared: Prepared, weighted: Weighted, solution: CurveSolution) -> t
 def propagate(smoother: Smoother, mu: float, fixed: FixedCurve, trust: FloatArray) -> FloatArray:
     """Standard uncertainty (n,) of the fitted curve in mm or rad: sqrt of the diagonal of (S G) U^2 (S G)^T.
 
-    G takes the line or constant out that zeroing removed (G = 1 where nothing was removed), U holds the input's u over
-    the root of ``trust`` (n,). An unknown u counts only where the fit uses it; if it does, the result is nan.
+    G removes the line or constant that zeroing removed (G = 1 if nothing was removed), U contains the input's u over
+    the root of ``trust`` (n,). An unknown u counts only if the fit uses it; the result is then nan.
     """
     if np.isnan(fixed.u).all():
         return np.where(smoother.expand(np.ones((len(fixed.u), 1)))[:, 0] == 0, 0.0, np.nan)
@@ -337,7 +337,7 @@ def propagate(smoother: Smoother, mu: float, fixed: FixedCurve, trust: FloatArra
 
 
 def half_gain_mm(mu: float, position_mm: FloatArray) -> float:
-    """Wave length L with 1/(1 + mu (2 sin(pi h/L))^4) = 1/2 at the mean spacing h; 0 if no wave is halved.
+    """Wavelength L with 1/(1 + mu (2 sin(pi h/L))^4) = 1/2 at the mean spacing h; 0 if no wave is halved.
 
     >>> round(half_gain_mm(1.0, np.array([0.0, 10.0, 20.0])), 6)  # six nodes
     60.0
@@ -346,13 +346,13 @@ def half_gain_mm(mu: float, position_mm: FloatArray) -> float:
     return math.pi * mean / math.asin(0.5 * mu**-0.25) if mu > 1 / 16 else 0.0
 
 
-# Huber's loss: nodes far from the curve pull with a constant force instead of one that grows (Huber 1964).
+# Huber's loss: nodes far from the curve pull with a constant force instead of a growing one (Huber 1964).
 #
-# Solved by reweighting: a node at distance r from the curve has its weight times min(1, k u/r), k = 1.345, until nothing
-# changes; the curve is then the minimum of Huber's loss plus the smoothness. Bounds are not part of that (they would make
-# good data look like outliers): the fit within bounds takes the weights as they are. With correlated nodes the variances
-# of a distrusted node and its covariances are inflated alike. The start compares each node with the median of
-# five neighbours, because a curve chosen by the data might follow an outlier and see none.
+# Solved by reweighting: the weight of a node at distance r from the curve is multiplied by min(1, k u/r), k = 1.345,
+# until nothing changes; the curve then minimises Huber's loss plus the smoothness term. Bounds are not included (they
+# would make good data look like outliers): the fit within bounds uses the final weights. With correlated nodes the
+# variance of a distrusted node and its covariances are inflated alike. The start compares each node with the median of
+# five nodes around it, because a curve chosen from the data might follow an outlier and hide it.
 
 
 #: Huber's constant: 95 % efficient for normal noise.
@@ -374,7 +374,7 @@ def robust(curves: Mapping[str, FixedCurve], options: FitOptions) -> tuple[list[
     weighted: list[Weighted] = []
     for count in range(_ROUNDS):
         if count < _SEARCHES:
-            # with the variance of each node so large that it lies within Huber's distance, the search sees no outliers
+            # each node's variance is so large that it is within Huber's distance: the search sees no outliers
             weighted = [
                 smoothness(prepare(item.name, item.fixed, options, trust**2), options)
                 for item, trust in zip(prepared, trusts, strict=True)
@@ -407,7 +407,7 @@ def trust_of(residual: FloatArray, scale: FloatArray) -> FloatArray:
 
 
 def _scale(prepared: Prepared, residual: FloatArray) -> FloatArray:
-    """Standard uncertainty (n,) of each node: its own, or one for all from the residuals."""
+    """Standard uncertainty (n,) of each node: as given, or a common one from the residuals."""
     if prepared.u0 is not None:
         return prepared.u0 / np.sqrt(prepared.smoother.weight / prepared.trust)
     some = residual[residual != 0]
@@ -415,16 +415,16 @@ def _scale(prepared: Prepared, residual: FloatArray) -> FloatArray:
     return np.full(len(residual), max(spread, 1e-9 * float(np.abs(prepared.y).max(initial=0.0)), 1e-12))
 
 
-# Constraints of the user: the whole problem, all curves together, in cvxpy.
+# User constraints: the whole problem, all curves together, in cvxpy.
 #
-# The sum of the curves' costs is a quadratic form (a sum of squares of differences would slow every solver down); zeros,
-# bounds and the user's constraints are added as they are. Where no curves satisfy these, the elastic problem
-# (least sum of violations, zeros and bounds kept) says which of them to relax, and by how much.
+# The sum of the curves' costs is a quadratic form (a sum of squares of differences would slow down every solver);
+# zeros, bounds and the user's constraints are added unchanged. If no curves satisfy these, the elastic problem
+# (smallest sum of violations, zeros and bounds kept) shows which user constraints to relax, and by how much.
 
 
 #: Receives cvxpy variables by error name, returns cvxpy constraints, as a list or by name.
 OwnConstraints = Callable[[Mapping[str, Any]], Iterable[Any] | Mapping[str, Any]]
-#: The user's constraints are kept to this, in um or urad.
+#: Tolerance of the user's constraints, in um or urad.
 TOLERANCE = 1e-6
 _TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _STATES = ("optimal", "optimal_inaccurate")
@@ -433,7 +433,7 @@ _STATES = ("optimal", "optimal_inaccurate")
 def solve_constrained(
     prepared: Sequence[Prepared], mu: Sequence[float], constraints: OwnConstraints
 ) -> list[CurveSolution]:
-    """Fit all curves at given smoothness within their bounds and the user's constraints.
+    """Fit all curves with given smoothness within their bounds and the user's constraints.
 
     Raises
     ------
@@ -442,7 +442,7 @@ def solve_constrained(
     ConvergenceError
         if the solver fails.
     """
-    import scipy.sparse as sp  # as cvxpy, imported here: slow to load, and few fits have constraints of their own
+    import scipy.sparse as sp  # imported here, like cvxpy: slow to load, and few fits have user constraints
 
     cp: Any = import_module("cvxpy")
     inner = {item.name: cp.Variable(len(item.y), name=item.name) for item in prepared}
@@ -451,7 +451,7 @@ def solve_constrained(
     rules = [rule for item in prepared for rule in _rules(item, inner[item.name], shown[item.name])]
     cost = 0.0
     for item, weight in zip(prepared, mu, strict=True):
-        # c^T A c / 2 - c^T W y in units of the weight of its data, so that all curves count alike
+        # c^T A c / 2 - c^T W y in units of the weight of its data, to give all curves equal weight
         x, matrix = inner[item.name], item.smoother.matrix(weight)
         form = 0.5 * cp.quad_form(x, cp.psd_wrap(sp.csc_array(0.5 * (matrix + matrix.T))))
         cost = cost + (form - item.smoother.load(item.y[:, None])[:, 0] @ x) / (
@@ -478,7 +478,7 @@ def solve_constrained(
 
 
 def _rules(item: Prepared, x: Any, shown: Any) -> list[Any]:
-    """Zeros and bounds: ``x`` are the smoother's unknowns (eliminated ones zero), ``shown`` the node values."""
+    """Zeros and bounds: ``x`` contains the smoother's unknowns (eliminated ones zero), ``shown`` the node values."""
     from scipy.sparse import csr_array
 
     turn = csr_array(item.smoother.expand(np.eye(len(item.y))))
@@ -496,7 +496,7 @@ def _rules(item: Prepared, x: Any, shown: Any) -> list[Any]:
 
 
 def _named(cp: Any, given: Any) -> dict[str, Any]:
-    """The user's constraints by name; those of a list are named by their place and text."""
+    """The user's constraints by name; those in a list are named by their position and text."""
     if isinstance(given, Mapping):
         own = {str(name): rule for name, rule in given.items()}
     elif isinstance(given, Iterable):
@@ -512,10 +512,10 @@ def _named(cp: Any, given: Any) -> dict[str, Any]:
 
 
 def _solve(cp: Any, problem: Any) -> None:
-    """Solve to tight tolerances, to looser ones if that fails."""
+    """Solve with tight tolerances, with looser ones if that fails."""
     for settings in (_TIGHT, {}):
         try:
-            with warnings.catch_warnings():  # what is inaccurate is checked by what it keeps
+            with warnings.catch_warnings():  # inaccurate results are checked against the constraints
                 warnings.simplefilter("ignore")
                 problem.solve(solver="CLARABEL", **settings)
         except cp.error.SolverError:
@@ -527,7 +527,7 @@ def _solve(cp: Any, problem: Any) -> None:
 
 
 def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
-    """Name the constraints that must give way and by how much: least sum of violations, zeros and bounds kept."""
+    """Name the constraints to relax and by how much: smallest sum of violations, zeros and bounds kept."""
     slack, elastic = {}, []
     for name, rule in own.items():
         if isinstance(rule, cp.constraints.Inequality):
@@ -569,29 +569,30 @@ def fit(
     covariance: Covariance | Mapping[str, FloatArray] | None = None,
     constraints: OwnConstraints | None = None,
 ) -> FitResult:
-    """Smooth every curve of a table, zero where it has to be, within bounds if these are given.
+    """Smooth every curve of a table, with zeros at its fixed points, within bounds if given.
 
-    First the curves are brought to zero without changing the machine (:func:`compgen.fit.zero_ends`), then each is
-    the minimum of ``sum((u0/u)^2 (c - y)^2) + mu |D2 c|^2`` that stays zero there (Zha & Zhang 2024, section 5).
+    First the curves are zeroed at their fixed points without changing the machine (:func:`compgen.fit.zero_ends`); each
+    fitted curve then minimises ``sum((u0/u)^2 (c - y)^2) + mu |D2 c|^2`` and stays zero there (Zha & Zhang 2024,
+    section 5).
 
     Parameters
     ----------
-    machine : travel, reference point, chain, tool offset and modelled errors count.
-    errors : curves on any nodes, in mm and rad; the result has the same nodes, and the travel ends where these were
+    machine : its travel, reference point, chain, tool offset and modelled errors are used.
+    errors : curves on any nodes, in mm and rad; the result has the same nodes, plus the travel ends if these were
         missing. Uncertainties may be nan (unknown).
     options : smoothness, bounds, robust loss.
-    covariance : that of an identification (:func:`compgen.identify.joint_covariance`), or the covariance (n, n) of a curve's
-        nodes by error name, mm and rad: (y - c)^T V^-1 (y - c) takes the place of the sum. Curves without have
+    covariance : from an identification (:func:`compgen.identify.joint_covariance`), or the covariance (n, n) of a
+        curve's nodes by error name, mm and rad: (y - c)^T V^-1 (y - c) replaces the sum. Curves without one have
         independent nodes with the table's uncertainties.
-    constraints : your own. It is called with the node values of every curve as cvxpy variables in um or urad, by error
-        name, and returns cvxpy constraints, as a list or by name; they may couple curves. The whole problem then goes to
-        cvxpy, with the smoothness that the data ask for without them.
+    constraints : a callable. It receives the node values of every curve as cvxpy variables in um or urad, by error
+        name, and returns cvxpy constraints, as a list or by name; they may couple curves. The whole problem is then
+        solved by cvxpy, with the smoothness chosen from the data without the constraints.
 
     Raises
     ------
     InputError
         for values that are not finite, a squareness that is needed but not in the machine's model, a covariance that
-        does not fit, or constraints that no curves satisfy: the message names them and the least relaxation that helps.
+        does not match, or constraints that cannot be satisfied: the message names them and the smallest relaxation.
     ConvergenceError
         when the bounded fit does not pass its check.
 
@@ -625,7 +626,7 @@ def _fit(
         weighted = [smoothness(item, options) for item in prepared]
     mu = [item.mu for item in weighted]
     for item, weight in zip(prepared, mu, strict=True):
-        # a curve that is zero at two points leaves a direction nothing but zero between them
+        # a monotone curve that is zero at two points is zero between them
         if item.bounds.direction and len(item.fixed.rows) > 1:
             free = item.smoother.solve(weight, item.y[:, None])[:, 0]
             backward = item.bounds.excess(item.fixed.position_mm, free)[3]
@@ -641,7 +642,7 @@ def _fit(
         item.name: finish(item, how, solution) for item, how, solution in zip(prepared, weighted, solved, strict=True)
     }
     reference = ", ".join(f"{value:g}" for value in machine.reference_point_mm)
-    kept = {key: value for key, value in errors.metadata.items() if key != "covariance"}  # that of the unfitted values
+    kept = {key: value for key, value in errors.metadata.items() if key != "covariance"}  # it is of the unfitted values
     table = ErrorTable(
         curves={name: curve for name, (curve, _) in fitted.items()},
         squareness=zeroed.squareness,
@@ -651,11 +652,11 @@ def _fit(
 
 
 def _as_independent(machine: Machine, errors: ErrorTable, known: Container[str]) -> ErrorTable:
-    """Give the points of cubic curves the uncertainty that independent points of the same information would have.
+    """Give the points of cubic curves the uncertainty that independent points with the same information would have.
 
-    A cubic curve is written at more positions than it has coefficients, so that its points repeat each other; taken
-    as independent they would claim too much, and the smoothing would believe them. Curves whose covariance is ``known``
-    stay as they are.
+    A cubic curve is given at more positions than it has coefficients, so its points are redundant; taken as independent
+    they would overstate the information, and the smoothing would trust them too much. Curves whose covariance is
+    ``known`` are not changed.
     """
     if machine.curves != "cubic":
         return errors

@@ -24,7 +24,7 @@ from compgen.kinematics.kernel_switch import lapack
 if TYPE_CHECKING:
     from scipy.sparse import csc_array
 
-# The smoother: minimise sum(w (c - y)^2) + mu |D2 c|^2 with the curve fixed at zero, in banded form.
+# The smoother: minimise sum(w (c - y)^2) + mu |D2 c|^2 with the fixed functionals at zero, in banded form.
 #
 # The fixed functionals are eliminated: each gives one node as a multiple of another one (or as zero), c = Z x. The
 # matrix A = Z^T W Z + mu Z^T D^T D Z keeps a half-bandwidth of at most 4 and Z^T W Z stays diagonal. An eliminated
@@ -35,20 +35,20 @@ if TYPE_CHECKING:
 Step = tuple[int, int | None, float]
 _BAND = 4
 _BLOCK = 512
-#: Refinement ends when a step is smaller than this fraction, and after this many steps: it gains 2 digits or more each.
+#: Refinement ends when a step is below this fraction, or after this many steps; each step gains 2 digits or more.
 SETTLED, REFINEMENTS = 1e-12, 6
 #: mu times the largest eigenvalue of the penalty is kept below this, so that 2 digits and the refinement remain.
 _LARGEST_SPREAD = 1e14
-#: More nodes than this have no dense root of the inverse: the general solvers with their sparse matrices are faster.
+#: No dense root of the inverse for more nodes than this: the general solvers with sparse matrices are faster.
 _LARGEST_DENSE = 301
 
 
 def second_difference(position_mm: FloatArray) -> FloatArray:
     """Coefficients (n - 2, 3) of D2 on nodes (n,): row k acts on c[k], c[k+1], c[k+2].
 
-    With the steps p, q beside a node and the mean spacing h, row = sqrt(h^3 (p + q)/2) * 2/(p + q) *
-    (slope after - slope before). On even nodes this is the plain 1, -2, 1; on others |D2 c|^2 stays the sum that
-    approaches h^3 times the integral of c''^2, however the nodes are spread.
+    With the steps p, q on either side of a node and the mean spacing h, row = sqrt(h^3 (p + q)/2) * 2/(p + q) *
+    (slope after - slope before). On evenly spaced nodes this is 1, -2, 1; on any nodes |D2 c|^2 approaches h^3 times
+    the integral of c''^2.
     """
     step = np.diff(position_mm)
     before, after = step[:-1], step[1:]
@@ -57,11 +57,11 @@ def second_difference(position_mm: FloatArray) -> FloatArray:
 
 
 def eliminate(rows: tuple[Row, ...]) -> tuple[Step, ...]:
-    """Turn functionals that must vanish into eliminations, each by its largest factor; a redundant one is left out."""
+    """Turn functionals that must vanish into eliminations, each by its largest factor; redundant ones are omitted."""
     steps: list[Step] = []
     for row in rows:
         factors: dict[int, float] = {}
-        for given, given_factor in row:  # c[given], written in what earlier eliminations left
+        for given, given_factor in row:  # c[given], expressed in the unknowns left by earlier eliminations
             node, factor = given, given_factor
             for pivot, other, share in steps:
                 if node == pivot:
@@ -79,7 +79,7 @@ def eliminate(rows: tuple[Row, ...]) -> tuple[Step, ...]:
 
 
 def _eliminate_in_band(band: FloatArray, step: Step) -> None:
-    """Replace the symmetric band matrix B by T^T B T, T being one elimination; row and column of the node become 0."""
+    """Replace the symmetric band matrix B by T^T B T, T one elimination; row and column of the node become 0."""
     node, other, share = step
     if other is None:  # the node is zero
         band[:, node] = 0.0
@@ -134,7 +134,7 @@ class Smoother:
 
     @property
     def unknowns(self) -> int:
-        """Number of free unknowns: nodes less fixed functionals."""
+        """Number of free unknowns: nodes minus fixed functionals."""
         return len(self.weight) - len(self.steps)
 
     @property
@@ -144,7 +144,7 @@ class Smoother:
 
     @cached_property
     def eigenvalues(self) -> FloatArray:
-        """Eigenvalues (unknowns,) of the penalty against the weights, ascending; those of straight lines are 0.
+        """Eigenvalues (unknowns,) of the penalty relative to the weights, ascending; 0 for straight lines.
 
         With these g, log|A| = log|Z^T W Z| + sum(log(1 + mu g)) and the trace of the smoother is sum(1/(1 + mu g)).
         """
@@ -160,7 +160,7 @@ class Smoother:
 
     @property
     def largest_mu(self) -> float:
-        """Weight beyond which a curve is straight for all purposes; larger ones are taken as this."""
+        """Weight above which a curve is straight for all purposes; larger ones are set to this."""
         top = float(self.eigenvalues[-1]) if self.rank else 0.0
         if top == 0:
             return 0.0
@@ -231,11 +231,11 @@ class Smoother:
         return self.gather(self.weight[:, None] * y)
 
     def misfit(self, residual: FloatArray) -> float:
-        """Weighted square sum of residuals (n,)."""
+        """Weighted sum of squared residuals (n,)."""
         return float(np.sum(self.weight * residual**2))
 
     def costs(self, y: FloatArray) -> Callable[[float], tuple[float, float]]:
-        """Return the function of mu that gives the weighted square sum of y - c and |D2 c|^2 of the fitted curve c."""
+        """Return the weighted sum of squares of y - c, and |D2 c|^2, for the fitted curve c, as a function of mu."""
 
         def at(mu: float) -> tuple[float, float]:
             c = self.solve(mu, y[:, None])
@@ -244,12 +244,12 @@ class Smoother:
         return at
 
     def inverse_root(self, mu: float) -> FloatArray | None:
-        """F (n, m) with F F^T = Z A^-1 Z^T: Z L^-T of A = L L^T; None where a dense matrix would be too large."""
+        """F (n, m) with F F^T = Z A^-1 Z^T: Z L^-T of A = L L^T; None if a dense matrix would be too large."""
         n = len(self.weight)
         if n > _LARGEST_DENSE:
             return None
         lower = self.factor(mu)
-        upper = np.zeros_like(lower)  # L^T in the order of banded matrices
+        upper = np.zeros_like(lower)  # L^T in banded storage
         for d in range(len(lower)):
             upper[len(lower) - 1 - d, d:] = lower[d, : n - d]
         turned = lapack().dgbsv(0, len(lower) - 1, upper, np.eye(n))[2]
@@ -257,7 +257,7 @@ class Smoother:
 
     def matrix(self, mu: float) -> csc_array:
         """A (n, n) with 1 on the diagonal of eliminated unknowns."""
-        import scipy.sparse as sp  # imported here: slow to load, and the general solvers alone want it
+        import scipy.sparse as sp  # imported here: slow to load, needed only by the general solvers
 
         n = len(self.weight)
         band = mu * self.penalty
@@ -267,7 +267,7 @@ class Smoother:
         return sp.csc_array(lower + lower.T - middle)
 
     def columns(self, mu: float) -> Iterator[tuple[slice, FloatArray]]:
-        """Yield the smoother's matrix S (c = S y) in blocks of columns: (which, (n, block))."""
+        """Yield the smoother's matrix S (c = S y) in blocks of columns: (column slice, (n, block))."""
         n = len(self.weight)
         for start in range(0, n, _BLOCK):
             picked = slice(start, min(start + _BLOCK, n))
@@ -280,17 +280,18 @@ class Smoother:
         return float(np.sum(1 / (1 + mu * self.eigenvalues)))
 
     def residual_degrees(self, mu: float) -> float:
-        """Expected weighted square sum of the residuals of noise of unit weight: trace of (1 - S)^2."""
+        """Expected weighted sum of squared residuals for noise at unit weight: trace of (1 - S)^2."""
         damped = mu * self.eigenvalues
         return float(np.sum((damped / (1 + damped)) ** 2))
 
 
-# How smooth a curve should be: from its uncertainties (REML), or by cross-validation where these are not known (GCV).
+# How smooth a curve should be: from its uncertainties (REML), or by cross-validation if these are not known (GCV).
 #
-# Both with m free unknowns, A = W + mu P (everything in the free unknowns), r = rank P, g the eigenvalues of P against W.
+# Both with m free unknowns, A = W + mu P (all in the free unknowns), r = rank P, g the eigenvalues of P relative to W.
 #
-# REML: data y ~ N(c, u0^2 W^-1), curve D2 c ~ N(0, tau^2 I), no prior on straight lines, mu = u0^2/tau^2. Twice the negative
-# log of the restricted likelihood is, up to a constant (Patterson & Thompson 1971; Wahba 1985, Ann. Statist. 13, 1378),
+# REML: data y ~ N(c, u0^2 W^-1), curve D2 c ~ N(0, tau^2 I), no prior on straight lines, mu = u0^2/tau^2. Twice the
+# negative log of the restricted likelihood is, up to a constant (Patterson & Thompson 1971; Wahba 1985, Ann. Statist.
+# 13, 1378),
 #
 #     J(mu) = sum(log(1 + mu g)) - r log(mu) + [sum(w (y - c)^2) + mu |D2 c|^2] / u0^2
 #
@@ -298,15 +299,15 @@ class Smoother:
 
 
 Method = Literal["REML", "GCV", "given"]
-#: Cross-validation needs this many curvatures; with fewer it does not determine a weight and the data are kept.
+#: Cross-validation needs this many curvatures; with fewer it cannot determine a weight and the data are kept.
 _GCV_LEAST = 3
 _STRAIGHT_TO_ROUNDING = 1e-12
-#: Smaller part of a golden section; steps of Brent's method, which never needs as many.
+#: Smaller part of the golden section; step limit of Brent's method, which never needs as many.
 _GOLDEN, _MOST_STEPS = 0.5 * (3.0 - math.sqrt(5.0)), 500
 
 
 def reml_criterion(smoother: Smoother, y: FloatArray, u0: float) -> Callable[[float], float]:
-    """J (equation above) as a function of mu, for data (n,) with the scale ``u0`` of their uncertainty."""
+    """J (equation above) as a function of mu, for data (n,) whose uncertainty has the scale ``u0``."""
     costs = smoother.costs(y)
 
     def value(mu: float) -> float:
@@ -332,7 +333,7 @@ def gcv_criterion(smoother: Smoother, y: FloatArray) -> Callable[[float], float]
 def choose(smoother: Smoother, y: FloatArray, u0: float | None) -> float:
     """Return mu for data (n,): by REML if ``u0`` is known, by GCV if it is None.
 
-    Data without curvature get the largest mu, too few nodes for cross-validation (or for any curvature) 0.
+    Data without curvature get the largest mu; too few nodes for cross-validation (or for any curvature) get 0.
     """
     if smoother.rank == 0 or (u0 is None and smoother.rank < _GCV_LEAST):
         return 0.0
@@ -344,10 +345,10 @@ def choose(smoother: Smoother, y: FloatArray, u0: float | None) -> float:
 
 
 def _minimise(function: Callable[[float], float], low: float, high: float) -> float:
-    """Lowest point of a function on an interval: a grid of about one decade, then Brent's method around its best.
+    """Minimum of a function on an interval: a grid of about one decade, then Brent's method around its best point.
 
-    Brent (1973), Algorithms for Minimization without Derivatives, chapter 5; step by step as ``minimize_scalar`` of
-    scipy does it ("bounded"), whose module takes as long to load as all curves take to be fitted.
+    Brent (1973), Algorithms for Minimization without Derivatives, chapter 5; the same steps as ``minimize_scalar`` of
+    scipy ("bounded"), whose module takes as long to load as fitting all curves.
     """
     grid = np.linspace(low, high, max(3, int(np.ceil(high - low)) + 1))
     values = [function(point) for point in grid]
@@ -358,10 +359,10 @@ def _minimise(function: Callable[[float], float], low: float, high: float) -> fl
 
 
 def _brent(function: Callable[[float], float], a: float, b: float, tolerance: float) -> tuple[float, float]:
-    """Lowest point of a function between ``a`` and ``b``, and its value there.
+    """Minimum of a function between ``a`` and ``b``, and its value there.
 
-    ``x``, ``w``, ``v`` are the best, second and third point; the parabola through them gives the next one, the golden
-    section where it leaves the interval or does not halve the last step but one.
+    ``x``, ``w``, ``v`` are the best, second and third point. The parabola through them gives the next one, or the
+    golden section if the parabola leaves the interval or does not halve the last step but one.
     """
     x = w = v = a + _GOLDEN * (b - a)
     fx = fw = fv = function(x)
@@ -399,16 +400,16 @@ def _brent(function: Callable[[float], float], a: float, b: float, tolerance: fl
     return x, fx
 
 
-# Curves whose nodes are correlated: the covariance of the identification instead of independent uncertainties.
+# Curves with correlated nodes: the covariance of the identification instead of independent uncertainties.
 #
 #     (y - c)^T W (y - c) + mu |D2 c|^2,   W = u0^2 V^-1
 #
-# over the free nodes, V being their covariance after zeroing. With V/u0^2 = L L^T and the singular values s of D2 L, all
-# that the fit needs is diagonal: the eigenvalues of the penalty against W are s^2, and the smoother is L Q (1 + mu s^2)^-1
-# Q^T L^-1. Dense, O(n^3) once per curve.
+# over the free nodes, V being their covariance after zeroing. With V/u0^2 = L L^T and the singular values s of D2 L,
+# everything the fit needs is diagonal: the eigenvalues of the penalty relative to W are s^2, and the smoother is
+# L Q (1 + mu s^2)^-1 Q^T L^-1. Dense, O(n^3) once per curve.
 
 
-#: Asymmetry and negative eigenvalues up to this fraction of the largest entry are rounding.
+#: Asymmetry and negative eigenvalues up to this fraction of the largest entry are rounding errors.
 _MATRIX_ROUNDING = 1e-9
 
 
@@ -416,8 +417,8 @@ _MATRIX_ROUNDING = 1e-9
 class CorrelatedSmoother(Smoother):
     """A smoother whose weights are a matrix.
 
-    ``nodes`` (m,) are the free ones, ``turn`` (n, m) makes a curve of their values, ``root`` (m, m) is L, ``basis``
-    (m, m) Q, ``strength`` (m,) the s^2 in ascending order.
+    ``nodes`` (m,) are the free ones, ``turn`` (n, m) turns their values into a curve, ``root`` (m, m) is L, ``basis``
+    (m, m) Q, ``strength`` (m,) contains s^2 in ascending order.
     """
 
     nodes: NDArray[np.intp]
@@ -428,7 +429,7 @@ class CorrelatedSmoother(Smoother):
 
     @classmethod
     def of(cls, simple: Smoother, covariance: FloatArray) -> CorrelatedSmoother:
-        """Build it on the zeros and D2 of a simple smoother; ``covariance`` (n, n) is V/u0^2, positive definite."""
+        """Build from the zeros and D2 of a simple smoother; ``covariance`` (n, n) is V/u0^2, positive definite."""
         nodes = np.setdiff1d(np.arange(len(simple.weight)), [node for node, _, _ in simple.steps])
         turn = simple.expand(np.eye(len(simple.weight)))[:, nodes]
         root = np.linalg.cholesky(covariance[np.ix_(nodes, nodes)])
@@ -452,7 +453,7 @@ class CorrelatedSmoother(Smoother):
 
     @property
     def eigenvalues(self) -> FloatArray:
-        """Eigenvalues (m,) of the penalty against W, ascending."""
+        """Eigenvalues (m,) of the penalty relative to W, ascending."""
         return self.strength
 
     def _weighted(self, x: FloatArray) -> FloatArray:
@@ -464,7 +465,7 @@ class CorrelatedSmoother(Smoother):
         return out
 
     def _curves(self, turned: FloatArray, mu: float) -> FloatArray:
-        """Curves (n, k) from components (m, k) along Q, each damped by its strength."""
+        """Curves (n, k) from components (m, k) along Q, each damped according to its strength."""
         return np.asarray(self.turn @ (self.root @ (self.basis @ (turned / (1 + mu * self.strength)[:, None]))))
 
     def apply(self, mu: float, c: FloatArray) -> FloatArray:
@@ -492,7 +493,7 @@ class CorrelatedSmoother(Smoother):
         return float(white @ white)
 
     def costs(self, y: FloatArray) -> Callable[[float], tuple[float, float]]:
-        """Return misfit and |D2 c|^2 as a function of mu; along Q both are sums over the components t of the data.
+        """Return misfit and |D2 c|^2 as a function of mu; both are sums over the data's components t along Q.
 
         With t = Q^T L^-1 y the fitted curve has the components t/(1 + mu s^2), for zeroed data.
         """
@@ -521,7 +522,7 @@ class CorrelatedSmoother(Smoother):
 
 
 def propagated(smoother: Smoother, mu: float, fixed: FixedCurve, covariance: FloatArray) -> FloatArray:
-    """Standard uncertainty (n,) of the fitted curve for a covariance (n, n) of the input, in its unit."""
+    """Standard uncertainty (n,) of the fitted curve for a covariance (n, n) of the input, in the input's unit."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     factor = vectors * np.sqrt(np.maximum(values, 0.0))
     carried = smoother.solve(mu, fixed.zeroing @ factor)
@@ -531,13 +532,13 @@ def propagated(smoother: Smoother, mu: float, fixed: FixedCurve, covariance: Flo
 def curve_covariances(errors: ErrorTable, covariance: Covariance | Mapping[str, FloatArray]) -> dict[str, FloatArray]:
     """Covariance (n, n) of each curve's nodes, mm and rad, checked against the table.
 
-    ``covariance`` is that of an identification, or holds the matrices by error name; curves that it leaves out have
-    independent nodes.
+    ``covariance`` comes from an identification, or contains matrices by error name; curves without one have independent
+    nodes.
 
     Raises
     ------
     InputError
-        for a name that is no curve, other nodes than the table's, or a matrix that is no covariance.
+        for a name that is not a curve, nodes that differ from the table's, or a matrix that is not a covariance.
     """
     if isinstance(covariance, Covariance):
         return _blocks(errors, covariance)

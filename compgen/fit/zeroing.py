@@ -1,4 +1,4 @@
-"""Zero at the reference point or at both ends: what each curve is fixed to, and where the removed motion goes."""
+"""Zeros at the reference point or at both ends: fixed points of each curve, and where the removed motion goes."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics import coefficients, modelled_errors, observable_errors
 
-# Curves that are zero where they have to be: straightness at both travel ends, the others at the reference point.
+# Curves that are zero at their fixed points: straightness at both travel ends, the others at the reference point.
 
 
-#: A node nearer to a position than this is at that position (file positions have six decimals).
+#: A node closer to a position than this is at that position (file positions have six decimals).
 SAME_POSITION_MM = 1e-6
-#: Values below this (mm or rad) are rounding, not something that was moved.
+#: Values below this (mm or rad) are rounding errors, not a removed motion.
 NOTHING = 1e-12
 
 #: A linear functional of the node values: (node, factor) pairs.
@@ -29,12 +29,12 @@ Row = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True)
 class FixedCurve:
-    """A curve that is zero where it has to be, with the functionals that must stay zero.
+    """A curve that is zero at its fixed points, with the functionals that must stay zero.
 
     ``position_mm``, ``value``, ``u`` have shape (n,), in mm or rad; ``u`` is the uncertainty of the input.
-    ``rows`` are the k functionals (zero for ``value``); ``removed`` (k,) is what they gave before and ``shapes`` (n, k)
-    the curves that were taken out per unit of it: value = input - shapes @ removed. ``covariance`` (n, n) is that of the
-    input, None for independent nodes.
+    ``rows`` are the k functionals (zero for ``value``); ``removed`` (k,) contains their values for the input and
+    ``shapes`` (n, k) the curves removed per unit of these: value = input - shapes @ removed. ``covariance`` (n, n)
+    belongs to the input, None for independent nodes.
     """
 
     position_mm: FloatArray
@@ -56,23 +56,23 @@ class FixedCurve:
 
     @property
     def zeroing(self) -> FloatArray:
-        """Matrix (n, n) that takes out of a curve what was taken out of this one; 1 where nothing was."""
+        """Matrix (n, n) that removes from a curve what was removed from this one; identity if nothing was."""
         return np.eye(len(self.value)) - (self.shapes * self.moved) @ self.functional
 
     @property
     def moved(self) -> FloatArray:
-        """1 where something was taken out, 0 where the input was zero already, shape (k,)."""
+        """1 where something was removed, 0 where the input was already zero, shape (k,)."""
         return (np.abs(self.removed) > NOTHING).astype(np.float64)
 
 
 def fixed_points_mm(machine: Machine, name: str) -> tuple[float, ...]:
-    """Axis positions at which a curve is zero: both travel ends for a straightness, else the reference point."""
+    """Axis positions at which a curve is zero: both travel ends for straightness, else the reference point."""
     error = error_named(name)
     return machine.axes[error.axis].range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
 
 
 def interpolation_row(position_mm: FloatArray, at_mm: float) -> Row:
-    """Functional that gives a curve's value at a position: one node, or the two around it; the end node outside."""
+    """Functional for a curve's value at a position: one node, or the two around it; outside, the end node."""
     nearest = int(np.argmin(np.abs(position_mm - at_mm)))
     outside = at_mm < position_mm[0] or at_mm > position_mm[-1]
     if outside or abs(position_mm[nearest] - at_mm) <= SAME_POSITION_MM:
@@ -88,9 +88,9 @@ def apply_row(row: Row, values: FloatArray) -> float:
 
 
 def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArray | None = None) -> FixedCurve:
-    """Bring one curve to zero at its fixed points, in mm or rad; InputError for values that are not finite.
+    """Zero one curve at its fixed points, in mm or rad; InputError for values that are not finite.
 
-    ``covariance`` (n, n) of the given nodes takes the place of their uncertainties.
+    ``covariance`` (n, n) of the given nodes replaces their uncertainties.
     """
     if not (np.isfinite(given.value).all() and np.isfinite(given.position_mm).all()):
         raise InputError("contains a value or position that is not finite; remove that node", field=name)
@@ -99,7 +99,7 @@ def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArra
     curve, axis = given, error_named(name).axis
     low, high = machine.axes[axis].range_mm
     before, after = given.position_mm[0] > low + SAME_POSITION_MM, given.position_mm[-1] < high - SAME_POSITION_MM
-    if before or after:  # nodes at the travel ends that it does not reach, at its end values
+    if before or after:  # add nodes with the end values at travel ends that the curve does not reach
         warnings.warn(
             f"{name} is known from {given.position_mm[0]:g} to {given.position_mm[-1]:g} mm, but {AXES[axis]} travels "
             f"from {low:g} to {high:g} mm; its end values are used beyond",
@@ -118,13 +118,13 @@ def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArra
         if len(row) == 1:
             value[row[0][0]] = 0.0
     if covariance is not None:
-        at = np.abs(position[:, None] - given.position_mm).argmin(axis=1)  # nodes that were added repeat the ends
+        at = np.abs(position[:, None] - given.position_mm).argmin(axis=1)  # added nodes repeat the ends
         covariance = covariance[np.ix_(at, at)]
     return FixedCurve(position, value, curve.u, rows, shapes, removed, covariance)
 
 
 def end_lines(position_mm: FloatArray, rows: tuple[Row, ...]) -> list[tuple[float, float]]:
-    """(constant, slope) of the line that is 1 at one fixed point and 0 at the other; the constant 1 for one point."""
+    """(constant, slope) of the lines that are 1 at one fixed point and 0 at the other; constant 1 for one point."""
     at = [apply_row(row, position_mm) for row in rows]
     if len(at) == 1:
         return [(1.0, 0.0)]
@@ -132,10 +132,10 @@ def end_lines(position_mm: FloatArray, rows: tuple[Row, ...]) -> list[tuple[floa
     return [(at[1] / span, -1 / span), (-at[0] / span, 1 / span)]
 
 
-# What zeroing takes out of the curves, as squareness and a rigid placement of the workpiece.
+# What zeroing removes from the curves, as squareness and a rigid placement of the workpiece.
 #
-# Straightness is zero at both ends of the travel, positioning and angular errors at the reference point. What a curve
-# has there is taken out of it: a line of a straightness, a constant of the others. Through C, these are an affine field
+# Straightness is zero at both ends of the travel, positioning and angular errors at the reference point. The curve's
+# values there are removed: a line from a straightness, a constant from the others. Through C, these are an affine field
 # of the commanded position p,
 #
 #     F(p) = f + M p
@@ -146,17 +146,17 @@ def end_lines(position_mm: FloatArray, rows: tuple[Row, ...]) -> list[tuple[floa
 #
 #     F(p) = squareness(p) + translation + rotation x p
 #
-# and the squareness of the table takes up its part; the rest is a rigid placement of the workpiece (Zha & Zhang 2024,
+# and the squareness of the table absorbs its part; the rest is a rigid placement of the workpiece (Zha & Zhang 2024,
 # section 5, constraints of eq. 25; ``docs/conventions.md``, "Rigid motion").
 
 
 @dataclass(frozen=True)
 class FrameChange:
-    """What the zeroing moved out of the curves: E(input) = E(zeroed) + translation + rotation x position.
+    """Motion removed from the curves by zeroing: E(input) = E(zeroed) + translation + rotation x position.
 
     ``position`` is the commanded one; the tool offset of the machine is part of ``translation_mm``. ``squareness`` is
-    what was added to each squareness error, in rad. ``tool_rotation_rad`` is the sum of the constant angles taken out:
-    for a tool that differs by d from the machine's offset, E(input) - E(zeroed) has another constant,
+    what was added to each squareness error, in rad. ``tool_rotation_rad`` is the sum of the constant angles removed:
+    for a tool that differs by d from the machine's offset, E(input) - E(zeroed) has an additional constant,
     tool_rotation x d (a rigid motion of all tool tips together would have rotation x d).
     """
 
@@ -180,7 +180,7 @@ class FrameChange:
 
 
 def _unit_field(machine: Machine, name: str) -> FloatArray:
-    """Field (3, 4) of one error at the constant value 1: columns f and M of F(p) = f + M p."""
+    """Field (3, 4) of one error with the constant value 1: columns f and M of F(p) = f + M p."""
     field = np.zeros((3, 4))
     for term in coefficients(machine.chain, machine.squareness_reference):
         if term.error == name:
@@ -194,16 +194,16 @@ def _unit_field(machine: Machine, name: str) -> FloatArray:
 
 
 def removed_fields(machine: Machine, name: str, fixed: FixedCurve) -> list[FloatArray]:
-    """Fields (3, 4) that each unit of ``fixed.removed`` takes out of E."""
+    """Fields (3, 4) that each unit of ``fixed.removed`` removes from E."""
     error = error_named(name)
     along = np.zeros((3, 4))
-    along[error.direction, 1 + error.axis] = 1.0  # only straightness loses a slope, and its entry of C is 1
+    along[error.direction, 1 + error.axis] = 1.0  # only straightness loses a slope, and its entry in C is 1
     lines = end_lines(fixed.position_mm, fixed.rows)
     return [constant * _unit_field(machine, name) + slope * along for constant, slope in lines]
 
 
 def target_basis(machine: Machine) -> FloatArray:
-    """Columns (12, 9): fields of the three squareness errors, three rotations and three translations at 1."""
+    """Columns (12, 9): fields of three squareness errors, three rotations and three translations, each with value 1."""
     columns = [_unit_field(machine, name) for name in SQUARENESS_NAMES]
     for axis in range(3):
         turn = np.zeros((3, 4))
@@ -217,7 +217,7 @@ def target_basis(machine: Machine) -> FloatArray:
 
 
 def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[FrameChange, dict[str, float]]:
-    """Split the field that the curves lost into squareness and rigid motion; also the variance that squareness gains."""
+    """Split the field removed from the curves into squareness and rigid motion; also the variance squareness gains."""
     basis = target_basis(machine)
     inverse = np.linalg.pinv(basis)
     total, variance, turn = np.zeros(9), np.zeros(9), np.zeros(3)
@@ -235,7 +235,7 @@ def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[Frame
         gains = np.array(shares).T @ fixed.functional
         if fixed.covariance is not None:
             variance += np.einsum("ij,jk,ik->i", gains, fixed.covariance, gains)
-        else:  # an unknown u counts only where it has a share
+        else:  # an unknown u counts only where it contributes
             variance += np.where(gains != 0, gains**2 * fixed.u**2, 0.0).sum(axis=1)
     change = FrameChange(
         translation_mm=(float(total[6]), float(total[7]), float(total[8])),
@@ -246,16 +246,16 @@ def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[Frame
     return change, dict(zip(SQUARENESS_NAMES, variance[:3].tolist(), strict=True))
 
 
-# How a table is brought to zero where its curves have to be, without changing the machine.
+# How the curves of a table are zeroed at their fixed points without changing the machine.
 
 
-#: A squareness error that is absent stays so for less than this, in rad.
+#: An absent squareness error stays absent if less than this would be added, in rad.
 _ROUNDING = 1e-15
 
 
 @dataclass(frozen=True)
 class Zeroed:
-    """An error table with every curve zero where it has to be, and what that moved."""
+    """An error table with every curve zero at its fixed points, and the motion this removed."""
 
     curves: Mapping[str, FixedCurve]
     squareness: Mapping[str, tuple[float, float]]
@@ -268,19 +268,19 @@ class Zeroed:
 
 
 def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, FloatArray] | None = None) -> Zeroed:
-    """Bring every curve to zero where it has to be; E stays the same over the travel up to a rigid motion.
+    """Zero every curve at its fixed points; E stays the same over the travel up to a rigid motion.
 
     Parameters
     ----------
-    machine : its travel, reference point, chain, tool offset and squareness reference count.
-    errors : curves that end within the travel are extended to its ends by their end values, with a warning.
+    machine : its travel, reference point, chain, tool offset and squareness reference are used.
+    errors : curves that end within the travel are extended to its ends with their end values, with a warning.
     covariance : covariance (n, n) of the nodes by error name, mm and rad; other curves have independent nodes.
 
     Raises
     ------
     InputError
-        for a value that is not finite, or when a squareness error that has to take up a part is not in the
-        machine's model.
+        for a value that is not finite, or if a squareness error that has to absorb a part is not in the machine's
+        model.
     """
     known = covariance or {}
     curves = {name: fix_to_zero(machine, name, curve, known.get(name)) for name, curve in errors.curves.items()}
@@ -289,7 +289,7 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
     for name, value in change.squareness.items():
         if name not in kept and abs(value) > NOTHING:
             raise _no_room(machine, name, value, curves)
-    # the table may tell tools of different offset apart, and what is taken out is not the same for them
+    # the table may distinguish tools of different offset, and the removed motion differs between them
     one_tool = observable_errors(machine)
     told_apart = [name for name in curves if name not in one_tool]
     if told_apart and np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad)).max() > NOTHING:
