@@ -58,8 +58,8 @@ _TEMPORARY = re.compile(r"\.((?:HELD-|NOT-ACCEPTED-)?v([0-9]{4,}))\.tmp")
 def check_folder(store: Store, machine: MachineRecord, folder: Path) -> None:
     """Raise InputError unless the folder belongs to this machine and this store; nothing is changed.
 
-    Called before a measurement is processed and before a decision, so that a wrong store does not continue a history
-    that is not the machine's.
+    Called before a measurement is processed and before a decision, to keep a wrong store from continuing a history that
+    is not the machine's.
     """
     try:
         seen = _look(folder)  # before the store: another process adds to the store first

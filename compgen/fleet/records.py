@@ -96,8 +96,8 @@ class IdentificationRecord:
 class TableRecord:
     """A set of tables of one machine; ``version`` counts from 1.
 
-    ``accepted`` says whether the round trip accepted the files. ``reasons`` are why the policy holds them back, and the
-    reservations of the verdict, which begin with :data:`RESERVATION` and hold nothing back. ``summary`` contains the
+    ``accepted`` says whether the round trip accepted the files. ``reasons`` state why the policy holds them back; those
+    that begin with :data:`RESERVATION` are reservations of the verdict and hold nothing back. ``summary`` contains the
     figures of the judgement, ``state`` follows from the last decision.
     """
 
