@@ -324,6 +324,9 @@ def read_artefacts(files: str | Path | Sequence[str | Path]) -> Artefact:
         nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
         if np.isnan(values["measured_mm"]).all():
             raise InputError(f"has none of {', '.join(MEASURED_COLUMNS)}; at least one is needed", file=table.path)
+        for row, column in np.argwhere(values["u_nominal_mm"] < 0)[:1].tolist():
+            text = f"{values['u_nominal_mm'][row, column] / MM_PER_UM:g} um is not a standard uncertainty; 0 is exact"
+            raise table.fail(row, f"u_{'xyz'[column]}_um", text)
         keys = list(zip(values["feature"], values["setup"].tolist(), strict=True))
         for row, key in enumerate(keys):
             if keys.index(key) < row:

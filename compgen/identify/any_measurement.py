@@ -54,7 +54,7 @@ Measurement: TypeAlias = "OneKind | MixedMeasurement"
 
 
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:
-    """Read measurement files by their columns: ``*.lengths.csv``, ``*.deviations.csv``, ``*.axis.csv``, ``*.sixdof.csv``.
+    """Read measurement files by their columns: lengths, deviations, parts, artefacts, axis runs, circles, six-DOF readings.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def identify_measurement(
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
     from compgen.data.deviations import Artefact, Deviations
-    from compgen.identify.axis_tests import identify_axis_runs
+    from compgen.identify.axis_tests import identify_axis_runs, identify_circles
     from compgen.identify.positions import identify_artefact, identify_deviations
     from compgen.identify.six_dof import identify_sixdof
 
@@ -212,8 +212,6 @@ def identify_measurement(
             )
         if isinstance(measurement, AxisRuns):
             return identify_axis_runs(machine, measurement)
-        from compgen.identify.axis_tests import identify_circles
-
         return identify_circles(machine, measurement)
     if other or chosen.u_deviation_um is not None:
         raise InputError(

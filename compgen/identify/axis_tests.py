@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -170,8 +171,6 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
 
 #: Below this share of their size a combination of columns counts as not determined.
 RCOND = 1e-7
-#: A shorter arc, degrees, cannot separate the offset of the centre from anything else.
-LEAST_ARC_DEG = 90.0
 
 
 @dataclass(frozen=True)
@@ -235,9 +234,9 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     curves = {
         (column.key, column.key): Curve(np.zeros(1), found[k : k + 1], u[k : k + 1])
         for k, column in enumerate(columns)
-        if column.kind == "reversal" and abs(found[k]) > SIGNIFICANT * u[k] and share[k] > 1 - 1e-6
+        if column.kind == "reversal" and share[k] > 1 - 1e-6
     }
-    reversal = {key: curve for key, curve in curves.items() if abs(curve.value[0]) >= MM_PER_UM / 2}
+    reversal = {key: curve for key, curve in curves.items() if worth_a_table(curve)}
     return replace(
         without_adjustment(machine, errors, residual, "scatter", "circles do not show it"),
         degrees_of_freedom=freedom,
@@ -281,8 +280,7 @@ def _positions(machine: Machine, circles: Circles) -> FloatArray:
 
 def _of_planes(circles: Circles) -> list[str]:
     """Squareness errors of the measured planes."""
-    between = {frozenset(PLANES["XY"]): "EC0Y", frozenset(PLANES["ZX"]): "EB0Z", frozenset(PLANES["YZ"]): "EA0Z"}
-    return [between[frozenset(PLANES[name])] for name in circles.planes]
+    return [{"XY": "EC0Y", "YZ": "EA0Z", "ZX": "EB0Z"}[name] for name in circles.planes]
 
 
 def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> list[_Column]:
@@ -300,9 +298,12 @@ def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> lis
             columns.append(_Column("reversal", axis, values))
     feed = circles.covariates.get("feed_mm_min", np.zeros(len(circles)))
     keys = np.column_stack([circles.plane, circles.setup, circles.radius_mm, np.nan_to_num(circles.centre_mm)])
-    for plane, setup, radius, *_ in (row.tolist() for row in np.unique(keys, axis=0)):
-        own = ((keys[:, 0] == plane) & (keys[:, 1] == setup) & (keys[:, 2] == radius)).astype(np.float64)
+    several = len(np.unique(keys[:, 3:], axis=0)) > 1
+    for key in np.unique(keys, axis=0):
+        own = (keys == key).all(axis=1).astype(np.float64)
+        plane, setup, radius, *centre = key.tolist()
         name = f"{list(PLANES)[int(plane)]}, radius {radius:g} mm" + (f", set-up {int(setup)}" if setup else "")
+        name += f", centre {', '.join(f'{value:g}' for value in centre)} mm" if several else ""
         columns += [
             _Column("centre", f"{name}, first axis", own * np.cos(angle)),
             _Column("centre", f"{name}, second axis", own * np.sin(angle)),
@@ -324,15 +325,15 @@ def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> lis
 def _correlated(circles: Circles, residual: FloatArray) -> float:
     """How many successive readings count as one: 1 + twice the sum of correlations along the path, while above 0."""
     total, weight = 0.0, 0
-    for key in np.unique(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]), axis=0):
-        own = np.all(np.column_stack([circles.plane, circles.setup, circles.run, circles.direction]) == key, axis=1)
+    keys = np.column_stack([circles.plane, circles.setup, circles.run, circles.direction])
+    for key in np.unique(keys, axis=0):
+        own = (keys == key).all(axis=1)
         path = residual[own][np.argsort(circles.angle_rad[own])]
         power = float(path @ path)
         if len(path) < 8 or not power:
             continue
-        lags = np.array([path[:-lag] @ path[lag:] for lag in range(1, len(path) // 4)]) / power
-        first = int(np.argmax(lags < 0)) if (lags < 0).any() else len(lags)
-        total += len(path) * (1.0 + 2.0 * float(lags[:first].sum()))
+        lags = (float(path[:-lag] @ path[lag:]) / power for lag in range(1, len(path) // 4))
+        total += len(path) * (1.0 + 2.0 * sum(takewhile(lambda lag: lag >= 0, lags)))
         weight += len(path)
     return max(1.0, total / weight) if weight else 1.0
 

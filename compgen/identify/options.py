@@ -24,7 +24,7 @@ from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State
 from compgen.kinematics.first_order import tool_of
 
 if TYPE_CHECKING:
-    from compgen.data.deviations import Deviations
+    from compgen.data.deviations import Artefact, Deviations
 
 # Stations with known machine coordinates: from a file, or located with the machine assumed perfect.
 #
@@ -287,7 +287,7 @@ def _column(lengths: Lengths) -> FloatArray | None:
     return column
 
 
-def number_in_comment(readings: Lengths | Deviations, key: str) -> float | None:
+def number_in_comment(readings: Lengths | Deviations | Artefact, key: str) -> float | None:
     """Return the number in the comment ``# key = ...`` of the readings; None without one, InputError if not a number."""
     text = readings.metadata.get(key)
     if text is None:
@@ -304,15 +304,20 @@ def deviation_sigma(deviations: Deviations, options: IdentifyOptions) -> tuple[F
 
     The order of precedence is: the option, the columns of the file, its comment, the usual uncertainty.
     """
-    stated = options.u_deviation_um
-    if stated is None:
-        if deviations.u_mm is not None:
-            return deviations.u_mm, "stated"
-        stated = number_in_comment(deviations, "u_deviation_um")
-    if stated is not None and not 0 < stated < np.inf:
-        raise InputError(f"the uncertainty of a deviation is {stated:g} um; it must be above zero")
+    if options.u_deviation_um is None and deviations.u_mm is not None:
+        return deviations.u_mm, "stated"
+    stated = stated_deviation_um(deviations, options, "u_deviation_um")
     u_um = ASSUMED_U_DEVIATION_UM if stated is None else stated
     return np.full(deviations.deviation_mm.shape, u_um * MM_PER_UM), "assumed" if stated is None else "stated"
+
+
+def stated_deviation_um(readings: Deviations | Artefact, options: IdentifyOptions, key: str) -> float | None:
+    """Standard uncertainty of a deviation by the option, else by the comment ``key`` of the file, um; None without both."""
+    stated = options.u_deviation_um
+    stated = number_in_comment(readings, key) if stated is None else stated
+    if stated is not None and not 0 < stated < np.inf:
+        raise InputError(f"the uncertainty of a deviation is {stated:g} um; it must be above zero")
+    return stated
 
 
 # Numbers that somebody read from a granite square, a dial gauge or a certificate: squareness, backlash, scale of an axis.

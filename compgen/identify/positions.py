@@ -38,7 +38,7 @@ from compgen.identify.identification import (
     judged,
     not_among,
 )
-from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions, deviation_sigma
+from compgen.identify.options import ASSUMED_U_DEVIATION_UM, IdentifyOptions, deviation_sigma, stated_deviation_um
 from compgen.identify.reference_conditions import without_effects
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
@@ -467,9 +467,7 @@ def artefact_observations(
     others = np.hstack(
         [*(pose * (artefact.setup[row] == setup)[:, None] for setup in setups), own.reshape(len(row), -1)[:, free]]
     )
-    sigma_um = options.u_deviation_um
-    if sigma_um is None and "u_probe_um" in artefact.metadata:
-        sigma_um = float(artefact.metadata["u_probe_um"])
+    sigma_um = stated_deviation_um(artefact, options, "u_probe_um")
     behind = np.zeros((len(known), others.shape[1]))
     behind[np.arange(len(known)), others.shape[1] - int(free.sum()) + np.searchsorted(np.flatnonzero(free), known)] = (
         1.0

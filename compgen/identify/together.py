@@ -54,11 +54,11 @@ class Source:
         """
         if isinstance(self.measurement, Deviations):
             found = position_observations(machine, layout, self.measurement, options, around)
-            return found if self.alone is None else replace(found, sigma=found.sigma * self.alone.u_scale)
+            return self._as_alone(found)
         if isinstance(self.measurement, Artefact):
             start = np.zeros(layout.size) if around is None else around
             found, _, _ = artefact_observations(machine, layout, self.measurement, options, start)
-            return found if self.alone is None else replace(found, sigma=found.sigma * self.alone.u_scale)
+            return self._as_alone(found)
         if self.alone is None:
             text = f"{self.name}: the readings do not determine the errors and what else is unknown of them"
             raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
@@ -71,6 +71,14 @@ class Source:
                 layout, known.error, known.position_mm, self.alone.errors.values(), known.errors_covariance
             )
         return Observations.of_curves(layout, self.alone.errors)
+
+    def _as_alone(self, found: Observations) -> Observations:
+        """Readings without those rejected alone, with the uncertainties found alone; calibration data follow and stay."""
+        if self.alone is None:
+            return found
+        kept = np.ones(len(found), dtype=bool)
+        kept[: len(self.alone.accepted)] = self.alone.accepted
+        return replace(found.kept(kept), sigma=found.sigma[kept] * self.alone.u_scale)
 
     def summary(self) -> dict[str, object]:
         """Return the entry of the part in ``identify.json``."""
@@ -166,7 +174,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         errors=errors.replace(metadata=known[0].errors.metadata),
         degrees_of_freedom=freedom,
         reduced_chi_square=reduced,
-        u_source="given",
+        u_source="stated",
         u_scale=u_scale,
         misfit=misfit_of(reduced, freedom, u_scale, "stated") if freedom > 0 else None,
         unobservable=(

@@ -134,6 +134,16 @@ def test_files_say_what_is_wrong_with_them(tmp_path, machine, errors):
         read_artefacts(path)
     with pytest.raises(InputError, match="neither true nor false"):
         read_artefacts(written(tmp_path / "a.artefact.csv", rows, "calibrated = perhaps"))
+    with pytest.raises(InputError, match="u_probe_um = 'fine' is not a number"):
+        identify_measurement(
+            machine, open_measurement([written(tmp_path / "c.artefact.csv", rows, "u_probe_um = fine")])
+        )
+    with pytest.raises(InputError, match="-1 um; it must be above zero"):
+        identify_measurement(machine, open_measurement([written(tmp_path / "d.artefact.csv", rows, "u_probe_um = -1")]))
+    text = path.read_text().replace("feature,", "u_x_um,feature,").replace("\nH", "\n-1,H")
+    (tmp_path / "e.artefact.csv").write_text(text)
+    with pytest.raises(InputError, match="-1 um is not a standard uncertainty"):
+        read_artefacts(tmp_path / "e.artefact.csv")
     mirrored = [(name, x, y, z, -mx, my, setup) for name, x, y, z, mx, my, setup in rows]
     with pytest.raises(InputError, match="mirrored"):
         identify_measurement(machine, open_measurement([written(tmp_path / "b.artefact.csv", mirrored)]))

@@ -126,6 +126,21 @@ def test_one_direction_is_said_to_hold_the_servo_mismatch(machine):
     assert found.errors.squareness["EC0Y"][0] == pytest.approx(SQUARENESS["EC0Y"] + sign * 30e-6, abs=2e-6)
 
 
+def test_circles_at_two_places_of_one_set_up_have_a_centre_each(machine):
+    """Both are in one file without set-up numbers; the pivot is off by something else at each."""
+    errors = errors_of(machine)
+    first, second = readings(machine, errors, "XY"), readings(machine, errors, "XY", seed=2)
+    second.centre_mm[:, 0] += 30.0
+    second.deviation_mm[:] += 0.05 * np.cos(second.angle_rad) - 0.02
+    names = ("plane", "angle_rad", "radius_mm", "deviation_mm", "direction", "run", "setup", "centre_mm", "u_mm")
+    both = Circles(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
+    found = identify_circles(machine, both)
+    value, u = found.errors.squareness["EC0Y"]
+    assert abs(value - SQUARENESS["EC0Y"]) < 4 * u + 1e-6
+    assert found.rms_um < 1.2e3 * NOISE_MM
+    assert len(unknowns(found, "centre")) == 4
+
+
 @pytest.mark.parametrize("arc", [(10.0, 240.0), (0.0, 180.0)])
 def test_arcs_tell_squareness_with_a_larger_uncertainty(machine, arc):
     errors = errors_of(machine)

@@ -120,6 +120,23 @@ def test_a_plane_and_runs_determine_what_neither_does_alone(tmp_path, small_mach
     assert np.sqrt(np.mean(compgen.without_rigid_motion(position, left)[:, :2] ** 2)) < 2 * NOISE_MM
 
 
+def test_what_is_rejected_alone_does_not_come_back_in_the_mixture(tmp_path, small_machine, truth):
+    plane = plane_of(small_machine, truth)
+    clean, wrong = plane.deviation_mm.copy(), plane.deviation_mm.copy()
+    wrong[7, 0] += 0.05  # a hole that was read wrong by 50 um
+    runs = written(tmp_path, x_axis_csv=format_axis_runs(runs_of(small_machine, truth, 0)))
+    found = []
+    for values in (clean, wrong):
+        plane.deviation_mm[:] = values
+        (path,) = written(tmp_path, p_deviations_csv=format_deviations(plane))
+        found.append(identify_bare(small_machine, open_measurement([path, *runs])))
+    assert len(found[1].rejected) == 1
+    assert found[1].reduced_chi_square < 1.5
+    for name in ("EXX", "EYX"):
+        first, second = (item.errors.curves[name] for item in found)
+        assert np.max(np.abs(first.value - second.value) / np.maximum(second.u, 1e-6)) < 3.0
+
+
 def test_instruments_that_contradict_each_other_are_named_and_nothing_is_accepted(tmp_path, small_machine, truth):
     wrong = runs_of(small_machine, truth, 0)
     wrong.deviation_mm[:] *= -1.0  # the sign of the laser

@@ -67,6 +67,11 @@ class Observations:
         """Return the number of readings."""
         return len(self.value)
 
+    def kept(self, rows: NDArray[np.bool_]) -> Observations:
+        """Return the readings of some rows, (k,)."""
+        arrays = ("design", "others", "value", "sigma", "at_mm", "shows")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
+
     @classmethod
     def of_values(
         cls,
