@@ -17,11 +17,11 @@ from compgen.controls.shared.grids import equidistant_grid
 from compgen.controls.shared.terms import one_dimensional_name, product_name
 from compgen.controls.siemens_text import LinearTable, exact_grid, exact_values
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, reversal_name
+from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, hat_matrix, reversal_name
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import volume_sample, volumetric_error
+from compgen.kinematics.many_points import gauss_levels, grid_tables
 
 # SINUMERIK CEC tables: the sum of a set, and angular errors as products of two tables.
 #
@@ -351,8 +351,6 @@ def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]
 # combination of sets for the three axes within the number of tables is found exactly.
 
 
-#: Points over the volume at which sets of tables are compared.
-_MOST_POINTS = 6000
 #: Directions of the normal matrix (unit diagonal) below this are not determined.
 _UNDETERMINED = 1e-9
 #: Terms whose natural values move the tool by less than this do not need a table.
@@ -508,9 +506,23 @@ def terms_of_tables(
     return own if left[0] <= _AS_GOOD**2 * left[1] else choice.kept
 
 
+def _times_lever(
+    levels_mm: Sequence[FloatArray], axis: int, values: FloatArray, lever: int | None, origin_mm: float = 0.0
+) -> list[FloatArray]:
+    """Functions of one axis, ``values`` (levels, m), times a lever: their factors (levels, m) over each of X, Y, Z."""
+    factors = [np.ones((len(level), values.shape[1])) for level in levels_mm]
+    factors[axis] = values
+    if lever is not None:
+        factors[lever] = factors[lever] * (levels_mm[lever] - origin_mm)[:, None]
+    return factors
+
+
 @dataclass(frozen=True)
 class _Gains:
     """Least squares of the terms of one output axis; ``taken`` is in mm^2, the mean over the volume.
+
+    Every function in it is a sum of products of functions of one axis, so the mean over the volume of two of them is
+    a sum of products of means over the axes: exact, without a sample of the volume.
 
     ``given`` are terms that are always present and need no table; ``target`` is the mean square to be removed, mm^2.
     """
@@ -526,34 +538,38 @@ class _Gains:
     def of(
         cls, machine: Machine, errors: ErrorTable, terms: Sequence[Term], given: Sequence[Term], output: int
     ) -> _Gains:
-        nodes = tuple(
-            np.unique(
-                np.concatenate([machine.axes[axis].nodes_mm, *(t.nodes_mm for t in [*terms, *given] if t.axis == axis)])
-            )
-            for axis in range(3)
-        )
-        sample = volume_sample(machine, nodes, _MOST_POINTS, machine.emphasis)
-        tool_mm, weight = tool_of(machine, None), sample.weight / np.sum(sample.weight)
-        target = -volumetric_error(machine, errors, sample.position_mm)[:, output]
         own = [term for term in terms if term.carrier[0].output == output]
         # natural values that do not exceed the last decimal need no table
         reach = [1.0 if (lever := t.carrier[0].lever) is None else machine.axes[lever].length_mm for t in own]
         largest = [float(np.max(np.abs(term.start), initial=0.0)) for term in own]
         own = [term for term, size, span in zip(own, largest, reach, strict=True) if size * span > _NOTHING_MM]
         others = [term for term in given if term.carrier[0].output == output]
-        parts: list[FloatArray] = []
+        sides = []
+        for axis, travel in enumerate(machine.axes):
+            bends = [curve.position_mm for name, curve in errors.curves.items() if error_named(name).axis == axis]
+            bends += [term.nodes_mm for term in (*own, *others) if term.axis == axis]
+            ends_mm = np.concatenate([travel.range_mm, machine.emphasis.ends_mm(axis), *bends])
+            # at most of second degree between nodes (an angle times its own travel): three points make products exact
+            sides.append(gauss_levels(np.unique(np.clip(ends_mm, *travel.range_mm)), 3, axis, machine.emphasis))
+        levels_mm = [points for points, _ in sides]
         columns: dict[str, IntArray] = {}
-        first = 0
-        for term in [*own, *others]:
-            carrier = term.carrier_field(sample.position_mm, tool_mm)[:, output]
-            parts.append(term.curve_matrix(sample.position_mm) * carrier[:, None])
-            columns[term.name] = np.arange(first, first + len(term.nodes_mm))
-            first += len(term.nodes_mm)
-        design = np.hstack(parts) if parts else np.zeros((len(target), 0))
-        scale = 1.0 / np.maximum(np.sqrt(np.sum(weight[:, None] * design**2, axis=0)), 1e-12)
-        design = design * scale
-        normal, right = design.T @ (weight[:, None] * design), design.T @ (weight * target)
-        return cls(tuple(own), tuple(others), normal, right, float(weight @ target**2), columns)
+        parts: list[list[FloatArray]] = []
+        size = 0
+        for term in (*own, *others):
+            columns[term.name] = np.arange(size, size := size + len(term.nodes_mm))
+            axis, part = int(term.axis or 0), term.carrier[0]
+            values = part.sign * hat_matrix(term.nodes_mm, levels_mm[axis])
+            parts.append(_times_lever(levels_mm, axis, values, part.lever, part.origin_mm))
+        for axis, table in enumerate(grid_tables(machine, errors, tool_of(machine, None), levels_mm)):
+            for group, lever in enumerate((None, 0, 1, 2)):
+                parts.append(_times_lever(levels_mm, axis, -table[:, group, output, None], lever))
+        gram = np.ones(())
+        for axis, (_, weight) in enumerate(sides):
+            along = np.hstack([part[axis] for part in parts])
+            gram = gram * (along.T @ (weight[:, None] * along))
+        scale = 1.0 / np.maximum(np.sqrt(np.diag(gram)[:size]), 1e-12)
+        normal, right = scale[:, None] * gram[:size, :size] * scale, scale * gram[:size, size:].sum(axis=1)
+        return cls(tuple(own), tuple(others), normal, right, float(gram[size:, size:].sum()), columns)
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Mean square that a set of terms removes, mm^2."""

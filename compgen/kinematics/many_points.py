@@ -72,6 +72,19 @@ class VolumeGrid:
         return full_grid(self.levels_mm).reshape(-1, 3)
 
 
+def gauss_levels(ends_mm: FloatArray, count: int, axis: int, emphasis: Emphasis) -> tuple[FloatArray, FloatArray]:
+    """Return ``count`` Gauss-Legendre points in each interval between ``ends_mm``, and their weights, of sum 1.
+
+    A weighted sum over them is the mean over the axis, exact for functions that are of degree 2 ``count`` - 1 or less
+    in every interval. The weight of the work zone of ``emphasis`` is part of the weights; its ends must be among
+    ``ends_mm``.
+    """
+    points, weight = np.polynomial.legendre.leggauss(count)
+    middle, half = 0.5 * (ends_mm[1:] + ends_mm[:-1])[:, None], 0.5 * np.diff(ends_mm)[:, None]
+    weighted = emphasis.factor(axis, middle) * half * weight
+    return (middle + half * points).ravel(), weighted.ravel() / np.sum(weighted)
+
+
 def volume_grid(machine: Machine, nodes_mm: tuple[FloatArray, ...], most: int = MOST_POINTS) -> VolumeGrid:
     """Return the grid of the nodes and the midpoints between them; thinned evenly if it would exceed ``most``."""
     levels = [
@@ -161,10 +174,7 @@ def _three_grids(
         parts = list(sides)
         for k in {0, 1, 2} - {axis}:  # about ``count`` points over the axis, within and outside of the work zone
             ends = np.unique([*machine.axes[k].range_mm, *emphasis.ends_mm(k)])
-            points, weight = np.polynomial.legendre.leggauss(max(LEAST_ACROSS, count // (len(ends) - 1)))
-            middle, half = 0.5 * (ends[1:] + ends[:-1])[:, None], 0.5 * np.diff(ends)[:, None]
-            weighted = emphasis.factor(k, middle) * half * weight
-            parts[k] = (middle + half * points).ravel(), weighted.ravel() / np.sum(weighted)
+            parts[k] = gauss_levels(ends, max(LEAST_ACROSS, count // (len(ends) - 1)), k, emphasis)
         grid = VolumeGrid((parts[0][0], parts[1][0], parts[2][0]))
         positions.append(grid.position_mm)
         weights.append(np.einsum("i,j,k->ijk", parts[0][1], parts[1][1], parts[2][1]).ravel())

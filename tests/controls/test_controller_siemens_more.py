@@ -395,6 +395,46 @@ def test_the_kept_tables_are_the_best_of_all_sets_by_brute_force(mode, allowed):
     assert own_left <= 1.03 * best  # the sample of the ranking and the points here are not the same
 
 
+def mean_and_square(curve):
+    """Mean of a function that is linear between nodes, and of its square, over the range of its nodes."""
+    gap, a, b = np.diff(curve.position_mm), curve.value[:-1], curve.value[1:]
+    return np.array([np.sum(gap * (a + b) / 2), np.sum(gap * (a * a + a * b + b * b) / 3)]) / np.sum(gap)
+
+
+def test_what_is_left_of_jagged_curves_is_their_standard_deviation_over_the_travel():
+    """41 nodes to an axis, and neighbours that have nothing in common.
+
+    Without X(y), the mean of its curve goes into other tables. Without X(x)*z, so does what depends on x or on z only:
+    (e - mean) (z - mean) is left of e(x) z, and the standard deviation of z is its travel divided by the root of 12.
+    """
+    ranges_mm = ((-350.0, 450.0), (-200.0, 300.0), (-400.0, 50.0))
+    axes = tuple(Axis(range_mm, np.linspace(*range_mm, 41)) for range_mm in ranges_mm)
+    steps_mm = {letter: axis.length_mm / 40 for letter, axis in zip("XYZ", axes, strict=True)}
+    settings = {"sign": "error", "mult_mode": "S2", "step_mm": steps_mm}
+    machine = machine_with("WFYXZT", {"siemens-cec": settings})
+    machine = replace(machine, axes=axes, tool_offset_mm=(0.0, 0.0, -90.0))
+    rng = np.random.default_rng(4)
+
+    def jagged(axis, size):
+        return Curve(axes[axis].nodes_mm, size * rng.normal(size=41), np.full(41, np.nan))
+
+    x, y, z, angle = jagged(0, 0.02), jagged(1, 0.004), jagged(2, 0.02), jagged(0, 30e-6)
+    (mean, square), (mean_rad, square_rad) = mean_and_square(y), mean_and_square(angle)
+    straight = ErrorTable({"EXX": x, "EXY": y, "EXZ": z})
+    terms = controller_named("siemens-cec")(machine).basis(straight)
+    choice = chosen_terms(machine, straight, terms, "S2", 2)
+    left_mm = np.sqrt(square - mean**2)
+    assert choice.dropped == (("X(y)", pytest.approx(left_mm, rel=1e-9)),)
+    assert choice.left_mm == pytest.approx(left_mm, rel=1e-9)
+
+    leaning = ErrorTable({"EXX": x, "EXY": y, "EXZ": z, "EBX": angle})
+    terms = controller_named("siemens-cec")(machine).basis(leaning)
+    choice = chosen_terms(machine, leaning, terms, "S2", 3)
+    left_mm = np.sqrt((square_rad - mean_rad**2) * axes[2].length_mm ** 2 / 12)
+    assert choice.dropped == (("X(x)*z", pytest.approx(left_mm, rel=1e-9)),)
+    assert choice.left_mm == pytest.approx(left_mm, rel=1e-9)
+
+
 @pytest.mark.parametrize("profile", ["828D", "802D sl"])
 @pytest.mark.parametrize("name", ["siemens-cec", "siemens-cec-eec"])
 def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path, profile, name):
