@@ -1,5 +1,6 @@
 # make demo   sets up and runs the main job on the example
 # make test   sets up, checks style and types, runs the tests
+# make extras installs what recal, serve, --cluster, dcc.xml and the compiled kernels need in addition
 # make pins   writes the pinned dependencies again (CONTRIBUTING.md)
 # make bench  prints the ratios against named peers
 # make coverage    runs the tests and prints their branch coverage
@@ -10,7 +11,8 @@ CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
 DOCS := .venv-docs/bin
 
-PIP_INSTALL := -m pip install --quiet --disable-pip-version-check
+# a module is compiled when it is first imported: to compile all of them takes longer than to install them
+PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
 PIP := $(BIN)/python $(PIP_INSTALL)
 PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
@@ -18,12 +20,14 @@ COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-ha
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test lint system bench coverage docs docs-links pins clean
+.PHONY: demo extras test lint system bench coverage docs docs-links pins clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
 	$(BIN)/volcomp run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
 	$(BIN)/python examples/against_truth.py demo-out
+
+extras: .venv/ready-extras
 
 # the tests of a file go to one process, which then prepares once what they share
 test: lint system
@@ -53,14 +57,20 @@ lint: .venv/ready-dev
 	$(PIP) --no-build-isolation --no-deps -e .
 	@touch $@
 
+.venv/ready-extras: .venv/ready requirements-extras.txt
+	$(PIP) --require-hashes -r requirements-extras.txt
+	@touch $@
+
+# these contain the extras
 .venv/ready-dev: .venv/ready requirements-dev.txt
 	$(PIP) --require-hashes -r requirements-dev.txt
 	@touch $@
 
 # the site has an environment of its own: nothing of it is installed for the demo or the tests
-.venv-docs/ready: .venv/bin/python requirements.txt requirements-docs.txt pyproject.toml
+.venv-docs/ready: .venv/bin/python requirements.txt requirements-extras.txt requirements-docs.txt pyproject.toml
 	@[ -x $(DOCS)/python ] || $(BIN)/python -m venv .venv-docs
 	$(PIP_DOCS) --require-hashes -r requirements.txt
+	$(PIP_DOCS) --require-hashes -r requirements-extras.txt
 	$(PIP_DOCS) --require-hashes -r requirements-docs.txt
 	$(PIP_DOCS) --no-build-isolation --no-deps -e .
 	@touch $@
@@ -82,9 +92,10 @@ bench: .venv/ready-dev
 
 # pins stay as they are unless UPGRADE names a package: make pins UPGRADE="--upgrade-package numpy"
 pins:
-	$(COMPILE) $(UPGRADE) --all-extras pyproject.toml requirements.in -o requirements.txt
-	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
-	$(COMPILE) $(UPGRADE) -c requirements.txt requirements-docs.in -o requirements-docs.txt
+	$(COMPILE) $(UPGRADE) pyproject.toml requirements.in -o requirements.txt
+	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt pyproject.toml -o requirements-extras.txt
+	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt -c requirements-extras.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
+	$(COMPILE) $(UPGRADE) -c requirements.txt -c requirements-extras.txt requirements-docs.in -o requirements-docs.txt
 
 clean:
 	rm -rf .venv .venv-docs demo-out docs-out .coverage

@@ -114,17 +114,19 @@ def pins(name):
     return found
 
 
+def named(texts):
+    """The packages that requirements are about, as their pins are named."""
+    return {re.sub("[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", text)[0]).lower() for text in texts}
+
+
 def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    extras = project["project"]["optional-dependencies"].values()
-    wanted = [
-        *project["project"]["dependencies"],
-        *project["build-system"]["requires"],
-        *(x for y in extras for x in y),
-    ]
-    names = {re.sub("[-_.]+", "-", re.match(r"[A-Za-z0-9._-]+", text)[0]).lower() for text in wanted} - {"compgen"}
-    run, dev, docs = (pins(f"requirements{kind}.txt") for kind in ("", "-dev", "-docs"))
-    assert names <= set(run)
+    optional = [text for extra in project["project"]["optional-dependencies"].values() for text in extra]
+    base, extras, dev, docs = (pins(f"requirements{kind}.txt") for kind in ("", "-extras", "-dev", "-docs"))
+    assert named([*project["project"]["dependencies"], *project["build-system"]["requires"]]) <= set(base)
+    assert named(optional) - {"compgen"} <= set(extras) - set(base)
+    run = base | extras
+    assert all(extras[name] == base[name] for name in base.keys() & extras.keys())
     assert {"pytest", "ruff", "mypy"} <= set(dev) - set(run)
     assert all(dev[name] == pin for name, pin in run.items())
     assert all(count >= 1 for _, count in [*dev.values(), *docs.values()])
@@ -139,6 +141,6 @@ def test_make_installs_nothing_without_hashes():
     assert "pip install" not in makefile.replace("-m pip install --quiet --disable-pip-version-check", "", 1)
     assert "PIP_INSTALL" not in re.sub(r"^PIP\w* :=.*$", "", makefile, flags=re.MULTILINE)
     lines = re.findall(r"^\t\$\(PIP(?:_DOCS)?\) (.*)$", makefile, re.MULTILINE)
-    assert len(lines) == 6
+    assert len(lines) == 8
     for line in lines:
         assert line.startswith("--require-hashes -r ") or line == "--no-build-isolation --no-deps -e ."
