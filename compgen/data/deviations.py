@@ -166,8 +166,11 @@ def join_deviations(parts: Sequence[Deviations]) -> Deviations:
 def format_deviations(deviations: Deviations) -> str:
     """Return the text of a ``*.deviations.csv`` file: positions with 6 decimals (1 nm), deviations in um with 4.
 
-    A component must be measured everywhere or nowhere.
+    A component must be measured everywhere or nowhere; where it was not measured it has no uncertainty either.
     """
+    if deviations.u_mm is not None:
+        nowhere = np.isnan(deviations.deviation_mm).all(axis=0)
+        deviations = replace(deviations, u_mm=np.where(nowhere, np.nan, deviations.u_mm))
     return _DEVIATIONS.format(deviations, deviations.metadata)
 
 

@@ -642,6 +642,15 @@ def test_a_deviations_file_comes_back(tmp_path):
     assert found.metadata == {"date": "2024-05-17"}
 
 
+def test_a_component_that_was_not_measured_has_no_uncertainty_in_the_file(tmp_path):
+    path = tmp_path / "a.deviations.csv"
+    deviation_mm = np.array([[1e-3, np.nan, 2e-3], [3e-3, np.nan, 4e-3]])
+    path.write_text(format_deviations(Deviations(np.eye(3)[:2], deviation_mm, np.full((2, 3), 5e-4))))
+    found = read_deviations(path)
+    assert np.allclose(found.deviation_mm, deviation_mm, rtol=0, atol=1e-12, equal_nan=True)
+    assert np.allclose(found.u_mm, [[5e-4, np.nan, 5e-4]] * 2, rtol=0, atol=1e-12, equal_nan=True)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
