@@ -130,6 +130,33 @@ class _Stream:
             total.by_group[:, k] += np.bincount(chunk.group, values, len(self.setups))
         look(chunk, np.where(used, residual, np.nan))
 
+    def optimum(self, state: State, noise: DistanceNoise) -> _Optimum:
+        """Gauss-Newton with one normal matrix, made in the first pass, until no unknown changes and the used readings stay."""
+        archive, layout, setups, count = self.archive, self.layout, self.setups, len(self.archive)
+
+        def names() -> list[str]:
+            return unknown_names(layout, archive.stations, setups[:, 0], np.arange(len(setups)))
+
+        rejected: list[tuple[int, float]] = []
+        sums = self.sums(state, noise, rejected, matrix=True)
+        assert sums.matrix is not None
+        factor, rank = determined_factor(sums.matrix, names, "the readings")
+        levers, previous, used = step_levers(layout, len(sums.gradient)), np.inf, -1.0
+        for passes in range(1, MOST_PASSES + 1):
+            before, used = used, float(sums.by_group[:, 0].sum())
+            if count - used > MOST_REJECTED * count:
+                break
+            step = -factor.solve(sums.gradient)
+            length = float(np.max(np.abs(step) * levers))
+            state = state.moved(step)
+            if length * min(length / previous, 1.0) < TOLERANCE_MM and used == before:
+                return _Optimum(self, noise, state, factor, rank, sums, rejected, passes)
+            previous, sums = length, self.sums(state, noise, rejected, matrix=False)
+        raise ConvergenceError(
+            f"{count - used:.0f} of {count} readings do not fit the model of a sample of them; look for beam breaks (readings "
+            "after one need a separate setup), and check station labels and units"
+        )
+
 
 def identify_archive(
     machine: Machine, archive: LengthArchive, options: IdentifyOptions | None = None
@@ -185,6 +212,8 @@ def identify_archive(
 class _Optimum:
     """The end of the passes over all readings, with the sums there and the listed rejected readings."""
 
+    stream: _Stream
+    noise: DistanceNoise
     state: State
     factor: Factor
     rank: Rank | None
@@ -192,97 +221,72 @@ class _Optimum:
     rejected: list[tuple[int, float]]
     passes: int
 
+    def identification(self, of_sample: Identification) -> Identification:
+        """Return the identification of the sample with the values, uncertainties and counts of all readings."""
+        assert of_sample.adjustment is not None
+        archive, layout, scale_mm = self.stream.archive, self.stream.layout, self.noise.scale_mm
+        readings, squares, _ = self.sums.by_group.T
+        used, size = int(readings.sum()), len(self.sums.gradient)
+        chi_square = 2.0 * self.sums.cost / scale_mm**2 / (used - size)
+        u_scale = uncertainty_scale(chi_square, of_sample.u_source)
+        adjustment = replace(of_sample.adjustment, state=self.state, factor=self.factor, sigma_mm=scale_mm * u_scale)
+        errors = error_table(layout, self.state.errors, adjustment.covariance_factor()[: layout.size])
+        errors = errors.replace(metadata=of_sample.errors.metadata)
+        of_group = [(k, setup) for k, setup in self.stream.setups.tolist()]
+        return replace(
+            of_sample,
+            errors=errors,
+            stations=station_results(archive.stations, of_group, adjustment, layout.size, readings, squares),
+            counted=(len(archive), used),
+            rms_um=float(np.sqrt(squares.sum() / used)) / MM_PER_UM,
+            degrees_of_freedom=used - size,
+            reduced_chi_square=chi_square,
+            u_scale=u_scale,
+            rejected=tuple(_rejected(archive, row, off_mm) for row, off_mm in self.rejected),
+            rank=size if self.rank is None else self.rank.rank,
+            condition=1.0 / self.factor.rcond,
+            iterations=self.passes,
+            worst_u=worst_uncertainty(errors),
+            adjustment=adjustment,
+            details={
+                "sample_readings": len(of_sample.residual_mm),
+                "passes": self.passes,
+                "robust_limit": self.noise.limit if np.isfinite(self.noise.limit) else None,
+                "from_the_sample": "residuals, whiteness, causes of a misfit, beam breaks",
+            },
+        )
 
-def _optimum(stream: _Stream, state: State, noise: DistanceNoise) -> _Optimum:
-    """Gauss-Newton with one normal matrix, made in the first pass, until no unknown changes and the set of readings is stable."""
-    archive, layout, setups, count = stream.archive, stream.layout, stream.setups, len(stream.archive)
 
-    def names() -> list[str]:
-        return unknown_names(layout, archive.stations, setups[:, 0], np.arange(len(setups)))
-
-    rejected: list[tuple[int, float]] = []
-    sums = stream.sums(state, noise, rejected, matrix=True)
-    assert sums.matrix is not None
-    factor, rank = determined_factor(sums.matrix, names, "the readings")
-    levers, previous, used = step_levers(layout, len(sums.gradient)), np.inf, -1.0
-    for passes in range(1, MOST_PASSES + 1):
-        before, used = used, float(sums.by_group[:, 0].sum())
-        if count - used > MOST_REJECTED * count:
-            break
-        step = -factor.solve(sums.gradient)
-        length = float(np.max(np.abs(step) * levers))
-        state = state.moved(step)
-        if length * min(length / previous, 1.0) < TOLERANCE_MM and used == before:
-            return _Optimum(state, factor, rank, sums, rejected, passes)
-        previous, sums = length, stream.sums(state, noise, rejected, matrix=False)
-    raise ConvergenceError(
-        f"{count - used:.0f} of {count} readings do not fit the model of a sample of them; look for beam breaks (readings "
-        "after one need a separate setup), and check station labels and units"
-    )
+def _noise(sample: Lengths, found: Identification, *, reject: bool) -> DistanceNoise:
+    """Uncertainty of a reading, and what is a gross error, as the identification of the sample shows them."""
+    assert found.adjustment is not None
+    constant_mm, proportional = found.u_length_um * MM_PER_UM, found.u_length_um_per_m * MM_PER_UM / 1000.0
+    dead_length_mm = found.adjustment.state.dead_length_mm[found.adjustment.group]
+    distance_mm = sample.length_mm + found.residual_mm + dead_length_mm
+    standardised = found.residual_mm / (constant_mm + proportional * distance_mm)
+    limit = LIMIT * standardised_spread(standardised) if reject else np.inf
+    return DistanceNoise(constant_mm, proportional, found.adjustment.sigma_mm / found.u_scale, limit)
 
 
 def _with_all(
     machine: Machine, archive: LengthArchive, sample: Lengths, found: Identification, *, reject: bool
 ) -> Identification:
-    """Bring the identification of the sample to the optimum of all readings: Gauss-Newton with one normal matrix."""
+    """Bring the identification of the sample to the optimum of all readings."""
     assert found.adjustment is not None
-    layout, state, tool_mm = found.layout, found.adjustment.state, common_tool(machine, None)
-    setups = np.array([(archive.stations.index(item.station), item.setup) for item in found.stations], dtype=np.int64)
     if any(item.segment for item in found.stations):
         raise ConvergenceError(
             "the sample of the readings shows beam breaks, after which the dead length of a station differs; give "
             "the readings after each a separate setup"
         )
+    layout, tool_mm = found.layout, common_tool(machine, None)
+    setups = np.array([(archive.stations.index(item.station), item.setup) for item in found.stations], dtype=np.int64)
     model = path_model(layout, tool_mm, setups[:, 0]) if use_compiled(len(archive), 0) else None
+    noise = _noise(sample, found, reject=reject)
     stream = _Stream(archive, layout, tool_mm, setups, model)
-    scale_mm = found.adjustment.sigma_mm / found.u_scale
-    constant_mm, proportional = found.u_length_um * MM_PER_UM, found.u_length_um_per_m * MM_PER_UM / 1000.0
-    distance = sample.length_mm + found.residual_mm + state.dead_length_mm[found.adjustment.group]
-    standardised = found.residual_mm / (constant_mm + proportional * distance)
-    limit = LIMIT * standardised_spread(standardised) if reject else np.inf
-    noise = DistanceNoise(constant_mm, proportional, scale_mm, limit)
-    optimum = _optimum(stream, state, noise)
-    state, factor, sums, used = optimum.state, optimum.factor, optimum.sums, int(optimum.sums.by_group[:, 0].sum())
-    size = len(sums.gradient)
-    freedom = used - size
-    chi_square = 2.0 * sums.cost / scale_mm**2 / freedom
-    u_scale = uncertainty_scale(chi_square, found.u_source)
-    adjustment = replace(found.adjustment, state=state, factor=factor, sigma_mm=scale_mm * u_scale)
-    errors = error_table(layout, state.errors, adjustment.covariance_factor()[: layout.size])
-    errors = errors.replace(metadata=found.errors.metadata)
-    of_group = [(k, setup) for k, setup in setups.tolist()]
-    stations = station_results(
-        archive.stations, of_group, adjustment, layout.size, sums.by_group[:, 0], sums.by_group[:, 1]
-    )
+    everything = stream.optimum(found.adjustment.state, noise).identification(found)
     kept, group = found.accepted, found.adjustment.group
-    everything = replace(
-        found,
-        errors=errors,
-        stations=stations,
-        counted=(len(archive), used),
-        rms_um=float(np.sqrt(sums.by_group[:, 1].sum() / used)) / MM_PER_UM,
-        degrees_of_freedom=freedom,
-        reduced_chi_square=chi_square,
-        u_scale=u_scale,
-        rejected=tuple(_rejected(archive, row, off_mm) for row, off_mm in optimum.rejected),
-        rank=size if optimum.rank is None else optimum.rank.rank,
-        condition=1.0 / factor.rcond,
-        iterations=optimum.passes,
-        worst_u=worst_uncertainty(errors),
-        adjustment=adjustment,
-        details={
-            "sample_readings": len(sample),
-            "passes": optimum.passes,
-            "robust_limit": limit if np.isfinite(limit) else None,
-            "from_the_sample": "residuals, whiteness, causes of a misfit, beam breaks",
-        },
-    )
-    return judged(
-        everything,
-        lambda: residual_series(
-            sample, kept, found.residual_mm[kept], np.full(np.count_nonzero(kept), scale_mm), group[kept]
-        ),
-    )
+    sigma_mm = np.full(np.count_nonzero(kept), noise.scale_mm)
+    return judged(everything, lambda: residual_series(sample, kept, found.residual_mm[kept], sigma_mm, group[kept]))
 
 
 def _rejected(archive: LengthArchive, row: int, off_mm: float) -> Rejected:
