@@ -154,6 +154,18 @@ def test_the_grid_agrees_with_cross_products_on_every_chain(chain, reference, to
 
 
 @pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("chain", ["WFYXZT", "WFZXYT"])  # the second has errors of Z whose lever is y
+@pytest.mark.parametrize("count", [1, 3, 4, 5, 9, 13])
+def test_rows_of_a_grid_along_z_may_have_any_length(chain, count):
+    """Kernels write four points at a time, and what is left of a row one by one."""
+    machine, errors = machine_of(chain), errors_of(6)
+    levels = [np.linspace(*range_mm, n) for range_mm, n in zip(RANGES_MM, (2, 3, count), strict=True)]
+    points = np.stack(np.meshgrid(*levels, indexing="ij"), axis=-1)
+    due = by_cross_products(machine, errors, points.reshape(-1, 3), None).reshape(points.shape)
+    np.testing.assert_allclose(volumetric_error_on_grid(machine, errors, levels), due, rtol=0, atol=ROUNDING_MM)
+
+
+@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize(("chain", "reference", "tool", "nodes"), CASES)
 def test_the_exact_model_agrees_with_the_whole_chain_on_every_chain(chain, reference, tool, nodes):
     machine, errors, points = machine_of(chain, reference), errors_of(nodes=nodes), points_of(25)
