@@ -88,7 +88,7 @@ VARIABLES = {
     "SN_CEC_TABLE_WEIGHT": 1,
 }
 MODE_OF_A_FILE = (
-    "the file multiplies tables, and the machine file does not state how the control combines them: state "
+    "the file multiplies tables, but the machine file does not say how the control combines them: set "
     'mult_mode = "S1", "S2", "S3" or "S4" in the section of the control'
 )
 #: (output, axis) of every table without products.
@@ -262,9 +262,8 @@ class SiemensCec(Controller[CecSettings, CecTables]):
                 travel = unknown if points.approach is None else np.sign(points.approach[:, entry.input_axis])
                 if np.any(travel == 0):
                     message = (
-                        f"a table acts in one direction of {AXES[entry.input_axis]} only, and some points do not say from "
-                        "where they were approached: there it is taken as not acting; give approach_x, approach_y, "
-                        "approach_z"
+                        f"a table acts in one direction of {AXES[entry.input_axis]} only, but some points have no approach "
+                        "direction: the table is taken as inactive there; give approach_x, approach_y, approach_z"
                     )
                     warnings.warn(message, CompgenWarning, stacklevel=2)
                 outputs[index] = np.where(travel == entry.direction, outputs[index], 0.0)
@@ -279,7 +278,7 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         settings = self.settings
         found = set_violations(self.machine, tables.tables, settings.max_points, settings.tables_available)
         found += [
-            f"table {index} belongs to other axes (kept_tables of the machine file) and would be overwritten"
+            f"table {index} belongs to another axis (kept_tables in the machine file) and would be overwritten"
             for index in sorted(set(tables.tables) & set(settings.kept_tables))
         ]
         return found + stated_limit_violations(self.machine, tables.tables, settings)
@@ -368,21 +367,21 @@ def foreign_cec_tables(
     found, apart = {}, set()
     for index, part in sorted(parts.items()):
         if part.is_zero and part.scalar("$AN_CEC_STEP").number() == 0:
-            findings.count("tables that are not in use (step 0)")
+            findings.count("unused tables (step 0)")
             continue
         axes = [_axis_name_of(part.scalar(f"$AN_CEC_{side}_AXIS")) for side in ("INPUT", "OUTPUT")]
         if set(axes) <= set(settings.axis_names):
             travel_mm = machine.axes[settings.axis_names.index(axes[0])].range_mm
             table = noted_table(part, "$AN_CEC", travel_mm, findings)
             if "$AN_CEC_MULT_BY_TABLE" not in part.scalars:
-                findings.count("tables without MULT_BY_TABLE (0 taken)")
+                findings.count("tables without MULT_BY_TABLE (taken as 0)")
             found[index] = _cec_table(part, table, settings.axis_names, 1)
         else:
             apart.add(index)
             findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
     if missing := sorted(apart - set(settings.kept_tables)):
         findings.notes.append(
-            "new tables may not take their places: an export with --active keeps them, or one with kept_tables = "
+            "new tables must not overwrite them: export with --active, or set kept_tables = "
             f"{missing} in the machine file"
         )
     # products that cannot be evaluated: an axis is missing, or no mode is stated
@@ -393,15 +392,16 @@ def foreign_cec_tables(
             continue
         if {index, number - 1} & set(found) and {index, number - 1} & apart:
             raise factor.fail(
-                f"table {index} is multiplied by table {number - 1}, and one of the two belongs to an axis that the "
-                "machine file does not have"
+                f"table {index} is multiplied by table {number - 1}, but one of the two belongs to an axis that is not in "
+                "the machine file"
             )
         if index in found and not settings.mode_stated:
             raise factor.fail(MODE_OF_A_FILE)
     if not found:
-        listed = f"; of other axes: {'; '.join(findings.apart)}" if apart else ""
+        listed = f"; tables of other axes: {'; '.join(findings.apart)}" if apart else ""
         raise next(iter(parts.values())).source.fail(
-            f"contains no table over and into the axes {', '.join(settings.axis_names)} of the machine file{listed}"
+            f"contains no table whose input and output axes are in the machine file ({', '.join(settings.axis_names)})"
+            f"{listed}"
         )
     return CecTables(_switched(found, given, settings, findings), tuple(sorted(apart)))
 
@@ -411,8 +411,8 @@ def _switched(
 ) -> dict[int, CecTable]:
     """Apply SD41300 and SD41310 to the tables; tables into an axis whose MD32710 is 0 in an archive are off."""
     result = dict(found)
-    own = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
-    for (variable, index), item in {**given.machine_data, **own}.items():
+    among_tables = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
+    for (variable, index), item in {**given.machine_data, **among_tables}.items():
         number = int(index[0]) if len(index) == 1 and index[0].isdigit() else -1
         if number not in result:
             continue
@@ -424,10 +424,11 @@ def _switched(
         name = settings.axis_names[entry.output_axis]
         if entry.enabled and given.switched_off("MA_CEC_ENABLE", (name,)):
             result[number] = replace(entry, enabled=False)
-            findings.notes.append(f"$MA_CEC_ENABLE[{name}] is 0 in the archive: its tables do not act")
+            findings.notes.append(f"$MA_CEC_ENABLE[{name}] is 0 in the archive: the tables into {name} have no effect")
     off = [str(number) for number, entry in result.items() if not entry.enabled]
     if off:
-        findings.notes.append(f"table{'s' * (len(off) > 1)} {', '.join(off)} switched off, without effect")
+        verb = "tables {} are switched off and have" if len(off) > 1 else "table {} is switched off and has"
+        findings.notes.append(f"{verb.format(', '.join(off))} no effect")
     return result
 
 
@@ -452,5 +453,5 @@ def _cec_table(
 def _axis_name_of(item: Assignment) -> str:
     match = _AXIS_VALUE.fullmatch(item.value)
     if match is None:
-        raise item.fail(f'{item.value[:40]!r} is not an axis; write (AX1) or "AX1"')
+        raise item.fail(f'{item.value[:40]!r} is not an axis name; write (AX1) or "AX1"')
     return match.group(1) or match.group(2)

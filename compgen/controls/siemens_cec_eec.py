@@ -39,7 +39,7 @@ from compgen.data.toml_files import Section
 #: Sections of the machine file that describe the same control: they supply keys missing in the section of this one.
 OTHER_SECTIONS = ("siemens-cec", "siemens-eec")
 #: Keys that both kinds of tables have, with separate values: the keys of the encoder tables have this prefix.
-PREFIX, OWN_KEYS = "eec_", ("max_points", "step_mm", "decimals")
+PREFIX, PREFIXED = "eec_", ("max_points", "step_mm", "decimals")
 #: Residual that a CEC table of an axis over itself may leave after cancelling (rounding), mm.
 ROUNDING_MM = 2e-6
 
@@ -71,8 +71,7 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         section = machine.controller_settings(cls.name)
         for other in OTHER_SECTIONS:
             for key, value in machine.controller_settings(other).data.items():
-                own = PREFIX + key if other == "siemens-eec" and key in OWN_KEYS else key
-                section.data.setdefault(own, value)
+                section.data.setdefault(PREFIX + key if other == "siemens-eec" and key in PREFIXED else key, value)
         return section
 
     @classmethod
@@ -88,8 +87,8 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         """Return positioning, and the terms that the cross tables contain, unless a better set fits in the control."""
         choice, mode = self._choice(errors), self.settings.mult_mode
         terms = self._cec.terms(errors, _CROSS)
-        held = terms_of_tables(self.machine, errors, terms, mode, choice, term_names(tables.cec.tables))
-        return self._pitch(errors) + held
+        cross = terms_of_tables(self.machine, errors, terms, mode, choice, term_names(tables.cec.tables))
+        return self._pitch(errors) + cross
 
     def left_out(self, errors: ErrorTable) -> list[str]:
         """Return which CEC tables do not fit in the control, which products are not written, and what remains."""
@@ -173,22 +172,22 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         multipliers = {entry.multiplier - 1 for entry in entries.values() if entry.multiplier}
         # axes with an encoder table whose CEC tables over themselves do not cancel (mean of both directions)
         for axis in sorted({axis for axis, _ in tables.eec.tables}):
-            own = {
+            over_itself = {
                 index: entry
                 for index, entry in entries.items()
                 if entry.input_axis == entry.output_axis == axis
                 and (first_stays or not entry.multiplier)
                 and (multiplier_stays or index not in multipliers)
             }
-            if not own:
+            if not over_itself:
                 continue
-            where = np.unique(np.concatenate([entry.table.nodes_mm for entry in own.values()]))
-            total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in own.values())
+            where = np.unique(np.concatenate([entry.table.nodes_mm for entry in over_itself.values()]))
+            total = sum(entry.at(where) * (0.5 if entry.direction else 1.0) for entry in over_itself.values())
             largest = float(np.max(np.abs(total)))
             if largest > ROUNDING_MM:
                 found.append(
-                    f"the positioning of {settings.axis_names[axis]} is in its encoder table and, with up to "
-                    f"{largest / MM_PER_UM:.3f} um, in the CEC tables {sorted(own)} as well: it would be corrected twice"
+                    f"the positioning error of {settings.axis_names[axis]} is in its encoder table and, with up to "
+                    f"{largest / MM_PER_UM:.3f} um, also in the CEC tables {sorted(over_itself)}: it would be corrected twice"
                 )
         return found
 

@@ -178,7 +178,7 @@ def folded_tables(
     products: dict[tuple[int, int], list[Term]] = {}
     for term in terms:
         if term.axis is None:
-            raise ValueError(f"{term.name}: a CEC table is a function of an axis")
+            raise ValueError(f"{term.name}: a CEC table is a function of one axis")
         part = term.carrier[0]
         if part.lever is None:
             counts = np.rint(sign * part.sign * np.asarray(values[term.name]) * 10**MM_DECIMALS).astype(np.int64)
@@ -238,7 +238,7 @@ def _numbered(work: _Set, nodes: Mapping[int, FloatArray]) -> dict[int, CecTable
     for (output, axis), units in ordinary.items():
         folds = work.folds.get((output, axis), [])
         decimals = FACTOR_DECIMALS if folds else MM_DECIMALS
-        label = one_dimensional_name(output, axis) + (f", less {' and '.join(folds)}" if folds else "")
+        label = one_dimensional_name(output, axis) + (f", minus {' and '.join(folds)}" if folds else "")
         numbers = exact_values(units // 10 ** (FACTOR_DECIMALS - decimals), decimals)
         table = LinearTable(*exact_grid(nodes[axis]), values=numbers)
         tables.append(CecTable(axis, output, table, decimals=decimals, label=label))
@@ -331,15 +331,16 @@ def reversal_statement(tables: CecMap, names: tuple[str, ...]) -> str:
             value = float(max(entry.table.values, key=abs))
             base, output = names[entry.input_axis], names[entry.output_axis]
             return (
-                f" Direction: table {index} acts after positive travel of {base} only; it puts {value:+.6f} mm into the "
-                f"sum of {output} there, its partner with DIRECTION -1 the opposite after negative travel."
+                f" Direction: table {index} acts only after positive travel of {base} and adds {value:+.6f} mm (its "
+                f"largest value) to the sum of {output}; its partner with DIRECTION -1 adds the opposite after negative "
+                "travel."
             )
     return ""
 
 
 def backlash_rows(tables: CecMap, names: tuple[str, ...]) -> list[dict[str, str]]:
     """Return the machine data that must be zero because unidirectional tables contain the same effect."""
-    meaning = "the tables with DIRECTION 1 and -1 hold the reversal; with both it would be corrected twice"
+    meaning = "the tables with DIRECTION 1 and -1 already correct the reversal; another value would correct it twice"
     axes = sorted({entry.input_axis for entry in tables.values() if entry.direction})
     return [parameter_row(f"MD32450 $MA_BACKLASH[{names[axis]}]", "0", meaning) for axis in axes]
 
@@ -387,8 +388,8 @@ class Choice:
         if not self.dropped:
             return []
         return [
-            f"{self.needed} tables would be needed, {self.allowed} may be used: not corrected are "
-            f"{_named(self.dropped) or 'tables of less than 0.01 um'}; together they leave "
+            f"{self.needed} tables are needed, but only {self.allowed} may be used; not corrected: "
+            f"{_named(self.dropped) or 'tables of less than 0.01 um'}; together these leave "
             f"{self.left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
         ]
 
@@ -464,7 +465,7 @@ def without_products(
     if not named:
         return []
     return [
-        f"no products of tables are written: not corrected are {named}; together they leave "
+        f"no products of tables are written; not corrected: {named}; together these leave "
         f"{left_mm / MM_PER_UM:.2f} um rms over the volume (first order)"
     ]
 

@@ -103,7 +103,8 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             "overwrites": [
                 "Encoder tables ($AA_ENC_COMP) of other axes: none.",
                 *(
-                    f"The encoder table of {settings.axis_names[axis]}, measuring system {encoder + 1}, whatever it holds now."
+                    f"The encoder table of {settings.axis_names[axis]}, measuring system {encoder + 1}, whatever it contains "
+                    "now."
                     for axis, encoder in sorted(tables.tables)
                 ),
             ],
@@ -125,9 +126,9 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         value = float(table.values[node])
         return (
             "A table value is the measured error, actual minus nominal, in mm. The control adds it to the ACTUAL "
-            f"position, so a positive value moves the axis in the negative direction. Here: at {AXES[axis]} = "
-            f"{table.nodes_mm[node]:.3f} mm the table holds {value:+.6f} mm, the axis {settings.axis_names[axis]} is "
-            f"moved by {-value:+.6f} mm."
+            f"position, so a positive value moves the axis in the negative direction. Example: at {AXES[axis]} = "
+            f"{table.nodes_mm[node]:.3f} mm the table value is {value:+.6f} mm, so the control moves the axis "
+            f"{settings.axis_names[axis]} by {-value:+.6f} mm."
         )
 
     def _parameters(self, tables: EecTables) -> list[dict[str, str]]:
@@ -135,9 +136,9 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         for (axis, encoder), table in sorted(tables.tables.items()):
             name, count = self.settings.axis_names[axis], len(table.values)
             points = f"MD38000 $MA_MM_ENC_COMP_MAX_POINTS[{encoder},{name}]"
-            memory = f"reserved nodes; {count * BYTES_PER_VALUE} bytes of static memory, which the change re-formats"
+            memory = f"nodes to reserve ({count * BYTES_PER_VALUE} bytes); a change re-formats the static memory"
             rows.append(parameter_row(points, f">= {count}", f"{memory}: save all data first"))
-            meaning = "0 while the file is loaded; 1 makes the table act and write-protects it"
+            meaning = "0 while the file is loaded; 1 activates the table and write-protects it"
             rows.append(parameter_row(f"MD32700 $MA_ENC_COMP_ENABLE[{encoder}] of {name}", "0, then 1", meaning))
         return rows
 
@@ -149,21 +150,21 @@ class SiemensEec(Controller[EecSettings, EecTables]):
             at_reference = float(table.at(np.array([self.machine.reference_point_mm[axis]]))[0])
             if abs(at_reference) > self.resolution_mm():
                 found.append(
-                    f"{name}: the table holds {at_reference:+.6f} mm at the reference point; the axis jumps by it when "
-                    "the compensation is enabled"
+                    f"{name}: the table value at the reference point is {at_reference:+.6f} mm; the axis jumps by this "
+                    "amount when the compensation is enabled"
                 )
             if len(table.values) > small and settings.max_points > small:
-                found.append(f"{name}: {len(table.values)} nodes; a SINUMERIK 808D holds {small}")
+                found.append(f"{name}: {len(table.values)} nodes; a SINUMERIK 808D takes at most {small}")
             if encoder != settings.active[axis]:
                 found.append(
-                    f"{name}: the table of measuring system {encoder + 1} holds the same errors as that of measuring "
-                    f"system {settings.active[axis] + 1}; it is right only if they were measured with either, or the "
-                    "errors are those of the guideway"
+                    f"{name}: the table of measuring system {encoder + 1} contains the same errors as that of measuring "
+                    f"system {settings.active[axis] + 1}; this is correct only if measurements with both systems gave "
+                    "these errors, or if the errors come from the guideway"
                 )
         if not settings.eec_nodes_known:
             found.append(
-                f"how many nodes this model holds is not documented; {settings.max_points} are taken as the limit, the "
-                "smallest number documented for any model: state max_points"
+                f"the number of nodes of this model is not documented; the limit is taken as {settings.max_points}, the "
+                "smallest number documented for any model: set max_points"
             )
         return found
 
@@ -213,8 +214,8 @@ class SiemensEec(Controller[EecSettings, EecTables]):
         """
         rows = []
         for axis, name in enumerate(self.settings.axis_names):
-            meaning = f"minus the mean reversal value of {AXES[axis]}; these tables act in both directions alike. If a "
-            meaning += "value was active while the machine was measured, add this one to it"
+            meaning = f"minus the mean reversal value of {AXES[axis]}; these tables are the same for both directions. "
+            meaning += "If a value was active while the machine was measured, add this one to it"
             mean_mm = reversal.mean_mm(axis)
             for encoder in self.settings.encoders[axis] if abs(mean_mm) >= WORTH_MM else ():
                 rows.append(parameter_row(f"MD32450 $MA_BACKLASH[{encoder},{name}]", f"{-mean_mm:.4f} mm", meaning))
@@ -275,17 +276,17 @@ def foreign_eec_tables(
     tables = {}
     for (name, encoder), part in sorted(parts.items()):
         axis = settings.axis_names.index(name) if name in settings.axis_names else None
-        own = axis is not None and encoder in settings.encoders[axis]
-        if part.is_zero and (not own or part.scalar("$AA_ENC_COMP_STEP").number() == 0):
+        stated = axis is not None and encoder in settings.encoders[axis]
+        if part.is_zero and (not stated or part.scalar("$AA_ENC_COMP_STEP").number() == 0):
             findings.count("encoder tables of zeros, of other axes or measuring systems")
         elif axis is None:
             findings.apart.append(f"encoder table of {name} (encoder {encoder}, up to {part.largest})")
         elif given.switched_off("MA_ENC_COMP_ENABLE", (str(encoder), name)):
-            findings.notes.append(f"$MA_ENC_COMP_ENABLE[{encoder},{name}] is 0 in the archive: its table does not act")
-        elif not own:
+            findings.notes.append(f"$MA_ENC_COMP_ENABLE[{encoder},{name}] is 0 in the archive: its table has no effect")
+        elif not stated:
             raise part.scalar("$AA_ENC_COMP_STEP").fail(
-                f"the control holds a table of up to {part.largest} for encoder {encoder} of {name}; the machine "
-                f"file has encoder = {list(settings.encoders[axis])}: state the one that is in use, e.g. encoder = "
+                f"the control has a table (up to {part.largest}) for encoder {encoder} of {name}, but the machine "
+                f"file has encoder = {list(settings.encoders[axis])}: set the encoder that is in use, e.g. encoder = "
                 f"{{ {AXES[axis]} = {encoder} }}"
             )
         else:
@@ -293,7 +294,7 @@ def foreign_eec_tables(
     if not tables:
         said = [*findings.apart, *findings.notes]
         raise next(iter(parts.values())).source.fail(
-            f"contains no table that acts for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
+            f"contains no active table for the axes {', '.join(settings.axis_names)} and measuring systems of the machine "
             f"file{': ' if said else ''}{'; '.join(said)}"
         )
     return EecTables(dict(sorted(tables.items())))
@@ -305,12 +306,12 @@ def eec_tables_from(items: Sequence[Assignment], settings: EecSettings) -> EecTa
     for item in items:
         encoder = item.index_number(0, 1)
         axis = axis_of(item, item.index[-1], settings.axis_names)
-        own = settings.encoders[axis]
-        if encoder not in own:
-            stated = own[0] if len(own) == 1 else list(own)
-            raise item.fail(f"belongs to encoder {encoder}; the machine file has encoder = {stated}")
+        stated = settings.encoders[axis]
+        if encoder not in stated:
+            shown = stated[0] if len(stated) == 1 else list(stated)
+            raise item.fail(f"belongs to encoder {encoder}, but the machine file has encoder = {shown}")
         if item.variable in SWITCHES:
             continue
-        what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(own) > 1 else "")
+        what = f"table of {settings.axis_names[axis]}" + (f", encoder {encoder}" if len(stated) > 1 else "")
         parts.setdefault((axis, encoder), TableParts(what, item.source)).add(item)
     return EecTables({key: part.table("$AA_ENC_COMP") for key, part in sorted(parts.items())})

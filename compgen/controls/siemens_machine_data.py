@@ -75,8 +75,8 @@ USUAL = "840D sl"
 DEFAULT_MAX_SUM_MM, DEFAULT_MAX_VELO_PERCENT = 1.0, 10.0
 
 _NOT_DOCUMENTED = (
-    "no public document says that this model has cross-error compensation; if yours has, state tables_available and "
-    "max_points as its start-up list shows them"
+    "no public document says that this model has cross-error compensation; if yours has it, set tables_available and "
+    "max_points to the numbers in its machine data"
 )
 
 
@@ -85,15 +85,15 @@ _NOT_DOCUMENTED = (
 
 
 _NAME = re.compile(r"[A-Z_][A-Z0-9_]{0,31}")
-#: The vendor's documents do not state the sign; two independent traces lead to this one (``preflight.SIGN_TRACES``).
+#: The vendor's documents do not state the sign; two independent indications lead to this one (``format.toml``).
 INFERRED_SIGN = "error"
 _MODE_MISSING = (
-    "is missing. With products = true the file multiplies tables, and no readable document says what the two factors do "
-    "by themselves: a file made for another mode than that of the control leaves several times the error. Do the test "
-    'with constants of the preflight list (sum 0.56: "S1", 0.06: "S2", 0.26: "S3", 0.36: "S4") and write e.g. '
-    'mult_mode = "S1", or write products = false'
+    "is missing. With products = true the file multiplies tables, but no available document says whether the two factors "
+    "also act directly: a file made for the wrong mode leaves several times the error. Do the test with constant tables "
+    'of the preflight list (sum 0.56: "S1", 0.06: "S2", 0.26: "S3", 0.36: "S4") and set e.g. mult_mode = "S1", or set '
+    "products = false"
 )
-_STEP, _STEP_MEANING = multiple_of(POSITION_QUANTUM_MM), "distance of the nodes, e.g. { X = 50.0 }; at most 6 decimals"
+_STEP, _STEP_MEANING = multiple_of(POSITION_QUANTUM_MM), "node spacing, e.g. { X = 50.0 }; at most 6 decimals"
 _OF_AXIS = [{"enum": [0, 1]}, {**array_schema({"enum": [0, 1]}, 1), "uniqueItems": True}]
 Encoders = tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 
@@ -152,12 +152,12 @@ class SiemensSettings:
     profile: str = setting(
         choice(*PROFILES),
         USUAL,
-        meaning='model of the control, for its capacity: "840D sl", "828D", "808D", "802D sl"; keys below override it',
+        meaning='model, sets the capacity: "840D sl", "828D", "808D", "802D sl"; the keys below override it',
     )
     axis_names: tuple[str, str, str] = axis_setting(
         _axis_name,
         ("AX1", "AX2", "AX3"),
-        differ="two axes have one name ({}); each needs its own",
+        differ="two axes have the same name ({}); each needs a different name",
         meaning="names of the axes on the control",
     )
     loss_mm: float = loss_setting()
@@ -194,28 +194,28 @@ class CecSettings(SiemensSettings):
         meaning='what two multiplied tables A, B give: "S1" A + B + AB, "S2" AB, "S3" A + AB, "S4" B + AB',
     )
     products: bool = setting(
-        flag, None, meaning="write angular errors as products of tables; by default where mult_mode is stated"
+        flag, None, meaning="write angular errors as products of tables; default: true if mult_mode is set"
     )
     axis_style: str = setting(choice("paren", "quote"), "paren", meaning='"paren" writes (AX1), "quote" writes "AX1"')
     step_mm: tuple[float | None, float | None, float | None] = axis_setting(_STEP, meaning=_STEP_MEANING)
     nc_axes: int | None = setting(
-        whole(FEWEST_AXES, 93), None, meaning="axes of the whole control (840D sl): it has two cross tables for each"
+        whole(FEWEST_AXES, 93), None, meaning="axes of the control (840D sl), which has two cross tables for each"
     )
     max_points: int = setting(whole(3, 100_000), PROFILES[USUAL].cec_nodes, meaning="nodes per table, at least 3")
     tables_available: int | None = setting(
-        whole(1, 1000), None, meaning="number of tables of the control; from the profile, or stated: a limit"
+        whole(1, 1000), None, meaning="number of tables of the control, a limit; default: that of the profile"
     )
     tables_reserved: int = setting(
-        whole(0, 1000), 0, meaning="cross tables that are kept free, e.g. two for each reversal"
+        whole(0, 1000), 0, meaning="number of cross tables to keep free, e.g. two for each reversal"
     )
     kept_tables: tuple[int, ...] = setting(
         _table_indices, (), meaning="indices of cross tables of other axes, e.g. [6, 7]: never written"
     )
     max_sum_mm: tuple[float, float, float] | None = setting(
-        _per_axis, None, meaning="MD32720: one number, or { X = ..., Y = ..., Z = ... }; stated, it is a limit"
+        _per_axis, None, meaning="MD32720: one number, or { X = ..., Y = ..., Z = ... }; if set, a limit"
     )
     max_velo_percent: tuple[float, float, float] | None = setting(
-        _per_axis, None, meaning="MD32730: one number, or { X = ..., Y = ..., Z = ... }; stated, it is a limit"
+        _per_axis, None, meaning="MD32730: one number, or { X = ..., Y = ..., Z = ... }; if set, a limit"
     )
     max_speed_mm_min: tuple[float, float, float] = setting(
         _per_axis, (1.0, 1.0, 1.0), meaning="MD32000, largest speeds of the axes; only their ratio matters"
@@ -258,7 +258,7 @@ class EncoderSettings(SiemensSettings):
         _encoders,
         None,
         key="active_encoder",
-        meaning="the measuring system that the position control uses, one number or by axis; default the first",
+        meaning="measuring system that the position control uses, one number or by axis; default: the first",
     )
     eec_nodes_known: bool = True
 
@@ -280,7 +280,7 @@ class CecEecSettings(CecSettings, EncoderSettings):
         whole(3, 100_000), PROFILES[USUAL].eec_nodes, meaning="nodes per encoder table, at least 3"
     )
     eec_step_mm: tuple[float | None, float | None, float | None] = axis_setting(
-        _STEP, meaning="distance of the nodes of the encoder tables"
+        _STEP, meaning="node spacing of the encoder tables"
     )
     eec_decimals: int = setting(whole(3, 9), 6, meaning="decimals of the values of the encoder tables in mm, 3 to 9")
 
@@ -321,10 +321,10 @@ def checked_encoder_settings(settings: Encoder, section: Section, machine: Machi
     settings = unless_stated(settings, section, **{f"{prefix}max_points": profile.eec_nodes})
     _check_steps(settings, section, machine, prefix)
     stated: Any = settings.active
-    active = [own[:1] for own in settings.encoders] if stated is None else stated
-    for letter, one, own in zip(AXES, active, settings.encoders, strict=True):
-        if len(one) != 1 or one[0] not in own:
-            raise section.fail("active_encoder", f"expected one of the encoders of {letter}, {list(own)}")
+    active = [systems[:1] for systems in settings.encoders] if stated is None else stated
+    for letter, one, systems in zip(AXES, active, settings.encoders, strict=True):
+        if len(one) != 1 or one[0] not in systems:
+            raise section.fail("active_encoder", f"expected one of the encoders of {letter}, {list(systems)}")
     known = profile.eec_nodes_documented or f"{prefix}max_points" in section
     x, y, z = (one[0] for one in active)
     return replace(settings, active=(x, y, z), eec_nodes_known=known)
@@ -333,7 +333,7 @@ def checked_encoder_settings(settings: Encoder, section: Section, machine: Machi
 def _check_steps(settings: SiemensSettings, section: Section, machine: Machine, prefix: str) -> None:
     """Refuse steps that give more nodes than the control takes, and ``program_enables`` with an INI file."""
     if settings.program_enables and settings.container == "ini":
-        raise section.fail("program_enables", 'needs container = "program": an INI file switches nothing on')
+        raise section.fail("program_enables", 'needs container = "program": an INI file does not switch tables on')
     most, key = getattr(settings, f"{prefix}max_points"), f"{prefix}step_mm"
     for letter, axis, step in zip(AXES, machine.axes, getattr(settings, key), strict=True):
         if step is not None and axis.length_mm / step > most - 1:
@@ -353,12 +353,12 @@ _MOST_ACROSS = 21
 def _positions(machine: Machine, tables: CecMap, axis: int, most: int | None) -> FloatArray:
     """Nodes of all tables over an axis within its travel, plus the ends; thinned to ``most``, table extremes kept."""
     low, high = machine.axes[axis].range_mm
-    own = [entry.table for entry in tables.values() if entry.input_axis == axis]
-    nodes = np.concatenate([[low, high], *(table.nodes_mm for table in own)])
+    over_axis = [entry.table for entry in tables.values() if entry.input_axis == axis]
+    nodes = np.concatenate([[low, high], *(table.nodes_mm for table in over_axis)])
     nodes = np.unique(np.round(np.clip(nodes, low, high), 6))
     if most is None or len(nodes) <= most:
         return nodes
-    extremes = [table.nodes_mm[[np.argmin(table.numbers), np.argmax(table.numbers)]] for table in own]
+    extremes = [table.nodes_mm[[np.argmin(table.numbers), np.argmax(table.numbers)]] for table in over_axis]
     picked = nodes[np.unique(np.linspace(0, len(nodes) - 1, most).round().astype(int))]
     return np.unique(np.clip(np.concatenate([picked, *extremes]), low, high))
 
@@ -419,20 +419,22 @@ def set_violations(machine: Machine, tables: CecMap, max_points: int, tables_ava
         what = f"table {index} ({AXES[entry.output_axis]} over {AXES[entry.input_axis]})"
         found += table_violations(machine, entry.input_axis, entry.table, max_points, what)
         if entry.direction not in (-1, 0, 1):
-            found.append(f"{what}: DIRECTION is {entry.direction}; 0, 1 and -1 are allowed")
+            found.append(f"{what}: DIRECTION is {entry.direction}; expected 0, 1 or -1")
         other = tables.get(entry.multiplier - 1)
         if entry.multiplier and other is None:
             found.append(f"{what}: MULT_BY_TABLE names table number {entry.multiplier}, which does not exist")
         elif other is not None and other.table.modulo != entry.table.modulo:
-            found.append(f"{what}: it and its multiplier {entry.multiplier - 1} are not both cyclic or both not")
+            found.append(
+                f"{what}: either this table or its multiplier {entry.multiplier - 1} is cyclic; both must be, or neither"
+            )
         if (entry.multiplier or index in factors) and (entry.weight != 1 or not entry.enabled):
             found.append(
-                f"{what} is a factor of a product, with SD41300 = {int(entry.enabled)} and SD41310 = {entry.weight}; what "
-                "the product is then is not documented: both must be 1"
+                f"{what} is a factor of a product, with SD41300 = {int(entry.enabled)} and SD41310 = {entry.weight}; this "
+                "case is not documented: both must be 1"
             )
     needed = max(tables) + 1
     if tables_available is not None and needed > tables_available:
-        found.append(f"{needed} tables are needed, the control has {tables_available}")
+        found.append(f"{needed} tables are needed, but the control has only {tables_available}")
     return found
 
 
@@ -461,7 +463,7 @@ def stated_limit_violations(machine: Machine, tables: CecMap, settings: CecSetti
             percent = speed_percent(slopes, axis, settings.max_speed_mm_min)
             if percent > allowed:
                 found.append(
-                    f"the sum into {settings.axis_names[axis]} changes by up to {percent:.4f} % of the axis' largest "
+                    f"the sum into {settings.axis_names[axis]} changes by up to {percent:.4f} % of the axis' maximum "
                     f"speed; MD32730 allows {allowed:g} %"
                 )
     return found
@@ -503,15 +505,17 @@ def cec_sign_statement(names: Sequence[str], subtracts: bool, sums: Sums, *, sta
     output = max(range(3), key=lambda axis: abs(sums[axis][0]))
     value, place = sums[output]
     rule = (
-        'sign = "error": the sum of the tables is the error of the axis, the control SUBTRACTS it from the command.'
+        'sign = "error": the sum of the tables is the error of the axis; the control SUBTRACTS it from the command.'
         if subtracts
-        else 'sign = "correction": the sum of the tables is the correction, the control ADDS it to the command.'
+        else 'sign = "correction": the sum of the tables is the correction; the control ADDS it to the command.'
     )
-    rule += "" if stated else " This sign is inferred, not stated in the machine file: check it at the machine first."
+    rule += (
+        "" if stated else " This sign is inferred; the machine file does not state it: check it at the machine first."
+    )
     moved = -value if subtracts else value
     return (
-        f"{rule} Values in mm. Here: at X {place[0]:.3f} Y {place[1]:.3f} Z {place[2]:.3f} mm the sum into "
-        f"{names[output]} is {value:+.6f} mm, the axis is moved by {moved:+.6f} mm."
+        f"{rule} Values are in mm. Example: at X {place[0]:.3f} Y {place[1]:.3f} Z {place[2]:.3f} mm the sum into "
+        f"{names[output]} is {value:+.6f} mm, so the control moves the axis by {moved:+.6f} mm."
     )
 
 
@@ -521,13 +525,13 @@ def cec_parameters(
     """Return the machine data and setting data, with the values that these tables need."""
     rows = [
         parameter_row(
-            f"MD18342 $MN_MM_CEC_MAX_POINTS[{index}]", str(len(entry.table.values)), "nodes of the table, exactly"
+            f"MD18342 $MN_MM_CEC_MAX_POINTS[{index}]", str(len(entry.table.values)), "number of nodes, exactly"
         )
         for index, entry in sorted(tables.items())
     ]
     rows += [
         parameter_row(f"SD41300 $SN_CEC_TABLE_ENABLE[{_indices_in_words(tables)}]", "1", "every table is evaluated"),
-        parameter_row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{_indices_in_words(tables)}]", "1.0", "weights stay 1"),
+        parameter_row(f"SD41310 $SN_CEC_TABLE_WEIGHT[{_indices_in_words(tables)}]", "1.0", "all weights are 1"),
         parameter_row("MD10240, MD10260, MD32711", "metric", "the tables are in mm"),
     ]
     slopes = largest_slopes(machine, tables, mode)
@@ -541,13 +545,13 @@ def cec_parameters(
             parameter_row(
                 f"MD32720 $MA_CEC_MAX_SUM[{name}]",
                 f">= {np.ceil(needed_mm * 1e4) / 1e4:.4f} mm",
-                f"the sum reaches {needed_mm:.6f} mm; what is above this limit is cut off (alarm 20124)",
+                f"the sum reaches {needed_mm:.6f} mm; the control clips it at this limit (alarm 20124)",
             ),
             parameter_row(
                 f"MD32730 $MA_CEC_MAX_VELO[{name}]",
                 f">= {100.0 * sum(slopes[output].tolist()):.4f} %",
-                f"largest change of the sum, mm per mm of travel of the base axes: {by_base}; the percentage holds if all "
-                "bases run as fast as this axis' own maximum MD32000, else scale it by v_base / MD32000",
+                f"largest change of the sum, mm per mm of travel of the base axes: {by_base}; the percentage assumes that "
+                "all base axes run at the maximum speed MD32000 of this axis; otherwise scale it by v_base / MD32000",
             ),
         ]
     return rows
@@ -572,10 +576,10 @@ def cec_overwrites(tables: CecMap, kept: Sequence[int]) -> list[str]:
         first = f"Of other axes: nothing. Tables kept (kept_tables): {', '.join(map(str, sorted(kept)))}."
     else:
         first = (
-            "Of other axes: NOT KNOWN. A table of a rotary or further axis that has one of the indices below is lost: give "
-            "the archive of the control with --active, or state kept_tables in the machine file."
+            "Of other axes: NOT KNOWN. A table of a rotary or additional axis that has one of the indices below is lost: "
+            "give the archive of the control with --active, or set kept_tables in the machine file."
         )
-    return [first, f"Tables {_indices_in_words(tables)}, whatever they hold now."]
+    return [first, f"Tables {_indices_in_words(tables)}, whatever they contain now."]
 
 
 def cec_warnings(
@@ -603,8 +607,8 @@ def cec_warnings(
     for axis, total in enumerate(map(float, sum_into_axes(tables, settings.mult_mode, at_reference))):
         if abs(total) > NOTICEABLE_JUMP_MM:
             found.append(
-                f"{names[axis]}: the sum at the reference point is {total:+.6f} mm ({AXES[axis]}); the axis jumps by it "
-                "when the compensation is enabled"
+                f"{names[axis]}: the sum at the reference point is {total:+.6f} mm ({AXES[axis]}); the axis jumps by this "
+                "amount when the compensation is enabled"
             )
     return found
 
@@ -614,21 +618,21 @@ def cec_reservations(tables: CecMap, settings: CecSettings) -> list[str]:
     found = []
     if not settings.sign_stated:
         found.append(
-            'sign = "error" (the control subtracts the tables) is inferred from two traces, not stated in the machine file '
-            "nor by the vendor: do the dial-gauge check of preflight.md first, then state sign"
+            'sign = "error" (the control subtracts the tables) is inferred from two indications; neither the machine file '
+            "nor the vendor states it: do the dial-gauge check in preflight.md first, then set sign"
         )
     if not settings.products and not settings.mode_stated:
         found.append(
-            "mult_mode is not stated: what the control makes of two multiplied tables is not known, so none are multiplied "
-            "and angular errors stay. Find it with the test of preflight.md and state it, or write products = false"
+            "mult_mode is not set: how the control combines two multiplied tables is not known, so none are multiplied "
+            "and angular errors stay. Find the mode with the test in preflight.md and set it, or set products = false"
         )
     small, usual = PROFILES["828D"], PROFILES[USUAL]
     needed, nodes = max(tables) + 1, max(len(entry.table.values) for entry in tables.values())
     sure = usual.tables_per_axis * FEWEST_AXES
     if settings.tables_available is None and (needed > sure or nodes > (small.cec_nodes or 0)):
         found.append(
-            f"these are {needed} tables with up to {nodes} nodes, and how many the control has is not stated: an 840D sl "
-            f"has two for each of its axes ({sure} with {FEWEST_AXES}), an 828D {small.cec_tables} of {small.cec_nodes} "
-            "nodes; what has no room does not act. State nc_axes or tables_available"
+            f"{needed} tables with up to {nodes} nodes are needed, but the machine file does not say how many the control "
+            f"has: an 840D sl has two for each of its axes ({sure} with {FEWEST_AXES} axes), an 828D has {small.cec_tables} "
+            f"of {small.cec_nodes} nodes. Tables that do not fit have no effect. Set nc_axes or tables_available"
         )
     return found

@@ -120,7 +120,7 @@ def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int
             elif item.variable not in SWITCHES and on:
                 switch = next(iter(on.values()))
                 raise item.fail(
-                    f"is written while {switch.label} is 1 (line {switch.line}): the control write-protects its tables then"
+                    f"is written while {switch.label} is 1 (line {switch.line}): the control then write-protects its tables"
                 )
             if item.variable in SWITCHES:
                 seen[item.variable, item.index] = item
@@ -164,7 +164,7 @@ def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterato
     if not ended:
         raise source.fail("the end mark M17 is missing: the file is truncated", number)
     if dotted:
-        message = f"{source.path}: indices are separated by '.'; read as ',' (write a comma: the control needs it)"
+        message = f"{source.path}: indices are separated by '.'; read as ',' (write a comma: the control requires it)"
         warnings.warn(message, CompgenWarning, stacklevel=3)
 
 
@@ -258,7 +258,7 @@ class TableParts:
         """Return the assignment of one scalar variable; InputError if it is missing from the files."""
         if name not in self.scalars:
             raise self.source.fail(
-                f"{self.what}: {name} is missing (the control would keep an older value): is the file truncated?"
+                f"{self.what}: {name} is missing (the control would keep its old value): is the file truncated?"
             )
         return self.scalars[name]
 
@@ -304,12 +304,12 @@ class TableParts:
         surplus = next((node for n, node in self.nodes.items() if n >= count), None)
         if surplus is not None:
             raise surplus.fail(
-                f"MIN, MAX and STEP of {self.what} give the nodes 0 ... {count - 1}; this one is too many"
+                f"MIN, MAX and STEP of {self.what} give the nodes 0 ... {count - 1}; this node is not one of them"
             )
         missing = next((n for n in range(count) if n not in self.nodes), None)
         if missing is not None:
             raise self.source.fail(
-                f"{self.what}: node {missing} of 0 ... {count - 1} is missing (the control would keep an older value): "
+                f"{self.what}: node {missing} of 0 ... {count - 1} is missing (the control would keep its old value): "
                 f"is the file truncated?"
             )
         values = tuple(self.nodes[n].number() for n in range(count))
@@ -330,11 +330,11 @@ def table_violations(machine: Machine, axis: int, table: LinearTable, most: int,
     found = []
     if table.intervals.denominator != 1:
         found.append(
-            f"{what}: MIN + k STEP never meets MAX ({table.start_mm} + k {table.step_mm}, {table.last_mm} mm); the "
-            f"control's behaviour is not documented"
+            f"{what}: MIN + k STEP never meets MAX ({table.start_mm} + k {table.step_mm}, {table.last_mm} mm); "
+            f"the control's behaviour is not documented"
         )
     if len(table.values) > most:
-        found.append(f"{what} has {len(table.values)} nodes, the control takes {most}")
+        found.append(f"{what} has {len(table.values)} nodes; the control takes at most {most}")
     if table.modulo:
         if table.values[0] != table.values[-1]:
             found.append(f"{what} is cyclic, but its first and last value differ")
@@ -407,21 +407,21 @@ def noted_table(part: TableParts, prefix: str, travel_mm: tuple[float, float], f
     table, surplus, doubt_um = part.foreign_table(prefix)
     modulo = part.scalars.get(f"{prefix}_IS_MODULO")
     if modulo is None:
-        findings.count("tables without IS_MODULO (0 taken)")
+        findings.count("tables without IS_MODULO (taken as 0)")
     elif modulo.number() == -1:
         inside = float(table.start_mm) <= travel_mm[0] and travel_mm[1] <= float(table.last_mm)
         if not (inside or part.is_zero):
             raise modulo.fail(
-                f"-1 is neither 0 nor 1, and the travel {travel_mm[0]:g} ... {travel_mm[1]:g} mm leaves the table, so "
-                "that it matters: write what the control has"
+                f"-1 is neither 0 nor 1, and the value matters because the travel {travel_mm[0]:g} ... {travel_mm[1]:g} mm "
+                "extends beyond the table: write the value that the control uses"
             )
-        findings.count("times IS_MODULO = -1 (taken as 0)")
+        findings.count("tables with IS_MODULO = -1 (taken as 0)")
     if surplus:
         findings.count("reserved nodes beyond MAX", surplus)
     if doubt_um >= WORTH_SAYING_UM:
         findings.notes.append(
-            f"{part.what}: MIN + k STEP does not meet MAX; between the last node before MAX and MAX the control may differ "
-            f"by up to {doubt_um:.1f} um from the straight line taken here"
+            f"{part.what}: MIN + k STEP does not meet MAX; between the last node before MAX and MAX the control may "
+            f"differ by up to {doubt_um:.1f} um from the straight line assumed here"
         )
     return table
 
@@ -478,11 +478,11 @@ def foreign_assignments(
                 first = items.setdefault(key, item)
                 if first is not item and first.value != item.value:
                     raise item.fail(
-                        f"is given a second value; the first is in {first.source.path.name}, line {first.line}"
+                        f"is assigned a second value; the first is in {first.source.path.name}, line {first.line}"
                     )
     if not any(item.variable not in SWITCHES for item in items.values()):
-        wanted = " or ".join(f"${name}" for name in tables if name in ("AN_CEC", "AA_ENC_COMP"))
-        raise files[0].fail(f"contains no table ({wanted})")
+        expected = " or ".join(f"${name}" for name in tables if name in ("AN_CEC", "AA_ENC_COMP"))
+        raise files[0].fail(f"contains no table; expected {expected}")
     return ArchiveAssignments(list(items.values()), machine_data)
 
 
@@ -514,14 +514,14 @@ def _parts(source: SourceFile, findings: Findings) -> tuple[list[_ArchivePart], 
     writing = [f"{part.name}.{part.kind}" for part in others if part.writes_tables]
     few = ", ".join(writing[:3]) + (f" and {len(writing) - 3} more" if len(writing) > 3 else "")
     if writing and not any(part.writes_tables for part in chosen):
-        raise source.fail(f"only programs hold tables ({few}): give such a program as a separate file")
+        raise source.fail(f"only programs contain tables ({few}): give such a program as a separate file")
     if others := [part for part in others if part.name]:
-        named = f" (programs that write tables, not run here: {few})" if writing else ""
+        named = f" (including programs that write tables, not evaluated: {few})" if writing else ""
         findings.count(f"other files of the archive{named}", len(others))
     last = found[-1]
     ends = (_END_WORD.fullmatch(line.partition(";")[0].strip().upper()) for _, line in last.lines)
     if last.kind == "INI" and not any(ends):
-        message = f"the archive ends within {last.name}.INI: it is truncated, and its switches are not all there"
+        message = f"the archive ends within {last.name}.INI: it is truncated, and some of its switches are missing"
         raise source.fail(message, last.lines[-1][0])
     return chosen, True
 
@@ -542,11 +542,11 @@ def _assignments_of_part(
         if match is None:
             # other statements must not change a table: refuse inch, jumps, calculations, anything that mentions a table
             if _INCH_WORD.fullmatch(code):
-                raise source.fail(f"{code!r}: the file is in inch; tables are read in mm only", number)
+                raise source.fail(f"{code!r}: the file is in inches; only tables in mm are read", number)
             if not _IDLE_WORD.fullmatch(code) and (not archive or _MENTIONS_TABLE.search(code)):
                 raise source.fail(
                     f"{one_line(code)[:60]!r} is not understood, and it could change a table; give the archive of the "
-                    "control, or its NC_CEC.INI or AX_EEC.INI, or take the line out if it has no bearing on the tables",
+                    "control, or its NC_CEC.INI or AX_EEC.INI, or remove the line if it does not affect the tables",
                     number,
                 )
             if archive:
@@ -558,7 +558,7 @@ def _assignments_of_part(
                 any_table, ended = True, False
             yield item
     if any_table and not ended:
-        raise source.fail("the end mark (M17, M30) behind the tables is missing: the file is truncated", number)
+        raise source.fail("the end mark (M17, M30) after the tables is missing: the file is truncated", number)
 
 
 def _item(
@@ -581,16 +581,16 @@ def _item(
     elif variable in HARMLESS:
         allowed = HARMLESS[variable]
         if allowed is not None and item.value not in allowed and value not in allowed:
-            raise item.fail(f"{one_line(value)[:30]!r} is not understood; {' or '.join(allowed[:1])} is")
+            raise item.fail(f"{one_line(value)[:30]!r} is not supported; expected {' or '.join(allowed[:1])}")
         what = "machine data other than the tables"
     elif _OTHER_CEC.fullmatch(variable) and item.value in ("0", "0.0", "FALSE"):
         what = "machine data other than the tables"
     elif variable in _TABLE_VARIABLES:
         what = "values of tables of the other kind (CEC, EEC)"
     elif "CEC" in variable or "ENC_COMP" in variable:
-        raise item.fail("is not known here, and it could change a table")
+        raise item.fail("is an unknown variable that could change a table")
     elif variable.startswith("MA_BACKLASH"):
-        what = "lines of $MA_BACKLASH, which is not a table and is not removed"
+        what = "lines of $MA_BACKLASH, which is not a table: its effect is not removed"
     else:
         what = "other machine data"
     findings.count(what)

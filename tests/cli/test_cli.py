@@ -444,7 +444,7 @@ def test_siemens_cec_without_the_mode_of_its_products_asks_for_it(
     before = listing(tmp_path)
     words = ("--controller", "isg-csv", "--controller", "siemens-cec", "--out", tmp_path / "out")
     code, stdout, stderr = call("run", machine, small_lengths_file, *words)
-    check_refused(code, stdout, stderr, 'write e.g. mult_mode = "S1", or write products = false')
+    check_refused(code, stdout, stderr, 'set e.g. mult_mode = "S1", or set products = false')
     assert listing(tmp_path) == before
 
 

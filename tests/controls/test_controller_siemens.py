@@ -177,7 +177,10 @@ def test_an_axis_that_goes_too_far_gets_a_positive_table_value_and_is_pulled_bac
     correction = control(machine, own).emulate(parsed(control, machine, own, text), points)
     np.testing.assert_allclose(correction, [[-0.010, 0.0, 0.0]], atol=ARITHMETIC)
     statement = control(machine, own).context(tables)["sign_statement"]
-    assert "at X = 1000.000 mm the table holds +0.010000 mm, the axis AX1 is moved by -0.010000 mm" in statement
+    assert (
+        "at X = 1000.000 mm the table value is +0.010000 mm, so the control moves the axis AX1 by -0.010000 mm"
+        in statement
+    )
 
 
 @pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT"])
@@ -219,7 +222,7 @@ def test_encoder_tables_that_are_short_long_or_uneven_are_violations(tmp_path):
     found = control(machine, own).violations(parsed(control, machine, own, text))
     assert len(found) == 3
     assert "never meets MAX" in found[0]
-    assert "has 5 nodes, the control takes 4" in found[1]
+    assert "has 5 nodes; the control takes at most 4" in found[1]
     assert "covers 0 ... 201 mm of X, the travel is -1000 ... 1000 mm" in found[2]
 
 
@@ -511,8 +514,8 @@ def test_a_reversal_is_a_pair_of_halves_that_says_when_it_acts(tmp_path, sign, p
     assert sorted(behind) == [0, 4, 5, 6]
     names = ("AX1", "AX2", "AX3")
     assert reversal_statement(pair, names) == (
-        f" Direction: table 0 acts after positive travel of AX2 only; it puts {plus:+.6f} mm into the sum of AX3 there, "
-        "its partner with DIRECTION -1 the opposite after negative travel."
+        f" Direction: table 0 acts only after positive travel of AX2 and adds {plus:+.6f} mm (its largest value) to the sum "
+        "of AX3; its partner with DIRECTION -1 adds the opposite after negative travel."
     )
     assert reversal_statement({2: MIXED[2]}, names) == ""
     tiny = ReversalCurves({(1, 2): Curve(np.zeros(1), np.array([0.00009]), np.zeros(1))})
@@ -542,7 +545,7 @@ def test_a_table_for_one_direction_acts_only_after_travel_in_that_direction(simp
     with pytest.warns(CompgenWarning, match="approach_x"):
         moved = control(machine, own).emulate(tables, Points(np.zeros((1, 3)), approach=np.zeros((1, 3))))
     assert not np.any(moved)
-    with pytest.warns(CompgenWarning, match="taken as not acting"):
+    with pytest.warns(CompgenWarning, match="taken as inactive there"):
         assert not np.any(control(machine, own).emulate(tables, Points(np.zeros((1, 3)))))
 
 
@@ -563,7 +566,7 @@ def test_the_sign_statement_says_where_the_axis_goes(tmp_path, sign, moved):
     own = control.read_settings(machine)
     tables = parsed(control, machine, own, constant(0, "0.05") + "M17\n")
     statement = control(machine, own).context(tables)["sign_statement"]
-    assert f"the sum into AX1 is +0.050000 mm, the axis is moved by {moved} mm" in statement
+    assert f"the sum into AX1 is +0.050000 mm, so the control moves the axis by {moved} mm" in statement
     assert f'| {moved[:-3]} mm | `sign = "{sign}"` |' in preflight(control, machine, own, tables)
 
 
@@ -692,7 +695,7 @@ def test_the_slope_along_one_axis_counts_where_the_other_factor_is_largest(simpl
 )
 def test_indices_are_named_without_those_of_other_axes(indices, words):
     tables = {index: table_of(0, 0, 0.1) for index in indices}
-    assert cec_overwrites(tables, ())[1] == f"Tables {words}, whatever they hold now."
+    assert cec_overwrites(tables, ())[1] == f"Tables {words}, whatever they contain now."
 
 
 @pytest.mark.parametrize(
@@ -729,7 +732,10 @@ def test_a_step_may_use_every_node_that_the_control_takes(simple):
     ("table", "words"),
     [
         (table_of(0, 0, 0.00049), ""),
-        (table_of(0, 0, 0.00051), "AX1: the sum at the reference point is +0.000510 mm (X); the axis jumps by it"),
+        (
+            table_of(0, 0, 0.00051),
+            "AX1: the sum at the reference point is +0.000510 mm (X); the axis jumps by this amount",
+        ),
         (fine_table(1, 0, {57: 0.99}), ""),
         (
             fine_table(1, 0, {57: 1.01}),
@@ -749,8 +755,9 @@ def test_what_the_smallest_controls_hold_needs_no_statement(simple, tables, node
     """840D sl with three axes: six tables; 828D: 200 nodes. The machine file says nothing of either."""
     _, _, own = simple()
     held = {index: fine_table(0, 1, {}, nodes) for index in range(tables)}
-    found = [text for text in cec_reservations(held, own) if "how many the control has is not stated" in text]
-    assert [f"these are {tables} tables with up to {nodes} nodes" in text for text in found] == [True] * said
+    found = [text for text in cec_reservations(held, own) if "does not say how many the control has" in text]
+    expected = f"{tables} tables with up to {nodes} nodes are needed"
+    assert [text.startswith(expected) for text in found] == [True] * said
 
 
 @pytest.mark.parametrize(("available", "broken"), [(3, True), (4, False)])
@@ -758,7 +765,7 @@ def test_the_highest_index_is_the_number_of_tables(simple, available, broken):
     machine, _, own = simple(f"tables_available = {available}")
     tables = {3: fine_table(0, 1, {5: 0.1})}
     found = set_violations(machine, tables, 2000, own.tables_available)
-    assert found == ([f"4 tables are needed, the control has {available}"] if broken else [])
+    assert found == ([f"4 tables are needed, but the control has only {available}"] if broken else [])
     (use,) = [item for item in cec_usage(machine, tables, own) if item.name == "tables"]
     assert (use.used, use.allowed) == (4, available)
 
@@ -773,11 +780,11 @@ def test_a_stated_limit_is_broken_only_beyond_it(simple, limit_mm, broken):
     ("own", "text", "message"),
     [
         ("", constant(0, "0.1", 3), "MULT_BY_TABLE names table number 3, which does not exist"),
-        ("", constant(0, "0.1").replace("DIRECTION[0]=0", "DIRECTION[0]=2"), "DIRECTION is 2; 0, 1 and -1 are allowed"),
+        ("", constant(0, "0.1").replace("DIRECTION[0]=0", "DIRECTION[0]=2"), "DIRECTION is 2; expected 0, 1 or -1"),
         (
             "",
             constant(0, "0.1", 2) + constant(1, "0.1").replace("MODULO[1]=0", "MODULO[1]=1"),
-            "it and its multiplier 1 are not both cyclic",
+            "either this table or its multiplier 1 is cyclic; both must be, or neither",
         ),
         ("", constant(0, "0.1").replace("=1000.0", "=1000.5"), "never meets MAX"),
         (
@@ -785,11 +792,11 @@ def test_a_stated_limit_is_broken_only_beyond_it(simple, limit_mm, broken):
             constant(0, "0.1").replace("2000.0", "1900.0").replace("=1000.0", "=900.0"),
             "the travel is -1000 ... 1000",
         ),
-        ("tables_available = 2", constant(2, "0.1"), "3 tables are needed, the control has 2"),
+        ("tables_available = 2", constant(2, "0.1"), "3 tables are needed, but the control has only 2"),
         (
             "max_points = 3",
             constant(0, "0.1").replace("2000.0", "500.0") + "".join(f"$AN_CEC[0,{n}]=0.1\n" for n in range(2, 5)),
-            "has 5 nodes, the control takes 3",
+            "has 5 nodes; the control takes at most 3",
         ),
     ],
 )
@@ -803,7 +810,7 @@ def test_a_broken_rule_of_the_control_is_one_violation_that_names_it(simple, own
 # --- settings ------------------------------------------------------------------------------------------------------
 
 
-def test_the_sign_is_inferred_and_said_with_both_traces_unless_it_is_stated(tmp_path):
+def test_the_sign_is_inferred_and_said_with_both_indications_unless_it_is_stated(tmp_path):
     control = controller_named("siemens-cec")
     for own, inferred in (("", True), ('sign = "error"', False), ('sign = "correction"', False)):
         machine = make_machine(tmp_path, own)
@@ -811,9 +818,9 @@ def test_the_sign_is_inferred_and_said_with_both_traces_unless_it_is_stated(tmp_
         assert settings_.subtracts == (own != 'sign = "correction"')
         made = export(machine, random_errors(machine), "siemens-cec")
         assert ("is inferred" in made.manifest["sign_statement"]) == inferred
-        assert any("inferred from two traces" in text for text in made.warnings) == inferred
-        for trace in ("calibration cycle", "p. 236"):
-            assert trace in made.preflight
+        assert any("inferred from two indications" in text for text in made.warnings) == inferred
+        for indication in ("calibration cycle", "p. 236"):
+            assert indication in made.preflight
     assert "calibration cycle" in " ".join(load_format("siemens-cec-eec").unverified)
 
 
@@ -828,9 +835,9 @@ def test_without_a_mode_no_products_are_written_and_what_stays_is_said_in_the_ve
     read = read_tables(machine, made.write(tmp_path / "out"), "siemens-cec")
     points = random_points(machine, 4000)
     rest = volumetric_error(machine, errors, points.position_mm) + read.controller.emulate(read.tables, points)
-    said = float(re.search(r"together they leave ([\d.]+) um", left).group(1))
+    said = float(re.search(r"together these leave ([\d.]+) um", left).group(1))
     assert said == pytest.approx(1e3 * np.sqrt(np.mean(np.sum(rest**2, axis=1))), rel=0.1)
-    assert any("mult_mode is not stated" in note for note in result.notes)
+    assert any("mult_mode is not set" in note for note in result.notes)
 
 
 @pytest.mark.parametrize("own", ["products = true", 'sign = "error"\nproducts = true'])
@@ -870,7 +877,7 @@ def test_a_number_of_tables_that_nobody_stated_is_in_the_verdict(tmp_path, own, 
         ('sign = "minus"', "expected one of 'error', 'correction'"),
         ('sign = "error"\nmult_mode = "S5"', "one of 'S1', 'S2', 'S3', 'S4'"),
         ('sign = "error"\nmultmode = "S1"', "is not a known key; did you mean 'mult_mode'"),
-        ('sign = "error"\naxis_names = { X = "AX2" }', "two axes have one name"),
+        ('sign = "error"\naxis_names = { X = "AX2" }', "two axes have the same name"),
         ('sign = "error"\naxis_names = { X = "AX 2" }', "an axis name of letters"),
         ('sign = "error"\naxis_names = { x = "AX1" }', "did you mean 'X'"),
         ('sign = "error"\nstep_mm = { X = 0.0000001 }', "a multiple of 0.000001 mm"),
@@ -935,7 +942,7 @@ GOOD = "%_N_NC_CEC_INI\nCHANDATA(1)\n" + constant(0, "0.1") + "M17\n"
         ("$AN_CEC[0,1]=0.1\n", "", "node 1 of 0 ... 1 is missing", None),
         ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,0]=0.1\n", "is assigned a second time; the first is in line 3", 4),
         ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,00]=0.1\n", "is assigned a second time", 4),
-        ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,1]=0.1\n$AN_CEC[0,2]=0.1\n", "this one is too many", 5),
+        ("$AN_CEC[0,1]=0.1\n", "$AN_CEC[0,1]=0.1\n$AN_CEC[0,2]=0.1\n", "this node is not one of them", 5),
         ("$AN_CEC_STEP[0]=2000.0\n", "", "$AN_CEC_STEP is missing", None),
         ("$AN_CEC_INPUT_AXIS[0]=(AX1)\n", "", "$AN_CEC_INPUT_AXIS is missing", None),
         ("$AN_CEC_IS_MODULO[0]=0\n", "", "$AN_CEC_IS_MODULO is missing", None),
@@ -953,7 +960,7 @@ GOOD = "%_N_NC_CEC_INI\nCHANDATA(1)\n" + constant(0, "0.1") + "M17\n"
         ("[0,1]=0.1", "[0,]=0.1", "$AN_CEC has 2 indices", 4),
         ("[0,1]=0.1", "[0,1=0.1", "is not an assignment", 4),
         ("(AX1)\n$AN_CEC_OUT", "(AX9)\n$AN_CEC_OUT", "no axis of the machine file is named 'AX9'", 5),
-        ("(AX1)\n$AN_CEC_OUT", "AX1\n$AN_CEC_OUT", "'AX1' is not an axis; write (AX1)", 5),
+        ("(AX1)\n$AN_CEC_OUT", "AX1\n$AN_CEC_OUT", "'AX1' is not an axis name; write (AX1)", 5),
         ("STEP[0]=2000.0", "STEP[0]=0.0", "0.0 is not above zero", 7),
         ("STEP[0]=2000.0", "STEP[0]=0.000000000000001", "node 2 of 0 ...", None),
         ("MAX[0]=1000.0", "MAX[0]=-1000.0", "-1000.0 is not above the position -1000.0", 9),
@@ -981,7 +988,7 @@ def test_malformed_text_is_an_error_at_its_line(simple, old, new, message, line)
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[0,1,X1]=0.004000", "[1,1,X1]=0.004000", "belongs to encoder 1; the machine file has encoder = 0"),
+        ("[0,1,X1]=0.004000", "[1,1,X1]=0.004000", "belongs to encoder 1, but the machine file has encoder = 0"),
         ("[0,1,X1]=0.004000", "[0,1,U1]=0.004000", "no axis of the machine file is named 'U1'"),
         ("$AA_ENC_COMP[0,1,X1]=0.004000\n", "", "table of X1: node 1 of 0 ... 4 is missing"),
         ("$AA_ENC_COMP_IS_MODULO[0,X1]=0\n", "", "$AA_ENC_COMP_IS_MODULO is missing"),

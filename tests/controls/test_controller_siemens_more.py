@@ -161,7 +161,7 @@ def test_no_cross_table_holds_positioning_and_one_that_does_is_a_violation():
     _, _, doubled = parsed(machine, "siemens-cec-eec", both)
     found = control(machine, settings).violations(doubled)
     assert len(found) == 3
-    assert "the positioning of AX1 is in its encoder table and" in found[0]
+    assert "the positioning error of AX1 is in its encoder table and" in found[0]
     assert "corrected twice" in found[0]
 
 
@@ -180,7 +180,7 @@ def test_folds_of_products_are_no_double_positioning_but_a_changed_one_is():
     changed = replace(entry, table=replace(entry.table, values=values))
     wrong = replace(tables, cec=replace(tables.cec, tables={**tables.cec.tables, index: changed}))
     (found,) = control(machine, settings).violations(wrong)
-    assert "with up to 1.000 um, in the CEC tables" in found
+    assert "with up to 1.000 um, also in the CEC tables" in found
 
 
 def test_a_reversal_stands_in_pairs_of_cross_tables_beside_encoder_tables_without_being_double():
@@ -447,8 +447,8 @@ def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path
     entries = (tables.cec if name.endswith("eec") else tables).tables
     assert len(entries) <= PROFILES[profile].cec_tables
     assert all(len(entry.table.values) <= PROFILES[profile].cec_nodes for entry in entries.values())
-    (note,) = [text for text in made.warnings if "not corrected are" in text]
-    assert re.search(r"tables would be needed, \d may be used: not corrected are .*\(\d+\.\d\d um rms\)", note)
+    (note,) = [text for text in made.warnings if "not corrected: " in text]
+    assert re.search(r"tables are needed, but only \d may be used; not corrected: .*\(\d+\.\d\d um rms\)", note)
     assert note in made.preflight
     result = verify(machine, read_tables(machine, made.write(tmp_path), name), errors)
     assert result.reasons == ()
@@ -459,7 +459,7 @@ def test_a_model_with_few_tables_gets_accepted_ones_and_says_what_stays(tmp_path
         rms(exact_error(machine, errors, position)),
     )
     assert left < before
-    said = float(re.search(r"together they leave ([\d.]+) um", note).group(1)) * 1e-3
+    said = float(re.search(r"together these leave ([\d.]+) um", note).group(1)) * 1e-3
     assert said == pytest.approx(left, rel=0.1)
 
 
@@ -502,11 +502,11 @@ def test_what_has_no_room_is_named_with_its_rms_the_largest_first(shape, steps):
         for name, size in sizes.items()
     }
     (note,) = [
-        text for text in export(machine, ErrorTable(curves), "siemens-cec").warnings if "not corrected are" in text
+        text for text in export(machine, ErrorTable(curves), "siemens-cec").warnings if "not corrected: " in text
     ]
     found = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
     assert [name for name, _ in found] == ["Y(x)", "X(z)"]
-    together = re.search(r"together they leave ([\d.]+) um rms over the volume", note).group(1)
+    together = re.search(r"together these leave ([\d.]+) um rms over the volume", note).group(1)
     due = [10.0, 5.0, np.hypot(10.0, 5.0)] / np.sqrt(3.0)
     # the figures are taken at a thinned sample of the volume, which is right to half a percent here
     assert [float(text) for text in (*(text for _, text in found), together)] == pytest.approx(due, rel=0.01)
@@ -526,7 +526,7 @@ def test_what_encoder_tables_hold_is_not_missed_by_a_cross_table_that_has_no_roo
             "EXZ": Curve(z, 5e-3 * shape, unknown),
         }
     )
-    (note,) = [text for text in export(machine, errors, "siemens-cec-eec").warnings if "not corrected are" in text]
+    (note,) = [text for text in export(machine, errors, "siemens-cec-eec").warnings if "not corrected: " in text]
     ((name, size),) = re.findall(r"(\w\(\w\)) \(([\d.]+) um rms\)", note)
     assert name == "X(z)"
     assert float(size) == pytest.approx(5.0 / np.sqrt(3.0), rel=0.1)  # 9.5 with the mean of 9 um
@@ -634,7 +634,10 @@ def test_an_encoder_table_of_a_small_control_keeps_its_number_of_nodes():
     assert settings.max_points == 200
     assert max(len(table.values) for table in tables.tables.values()) <= 200
     machine = machine_with(own={"siemens-eec": {"profile": "802D sl"}})
-    assert any("not documented; 200 are taken" in text for text in export(machine, errors, "siemens-eec").warnings)
+    assert any(
+        "is not documented; the limit is taken as 200" in text
+        for text in export(machine, errors, "siemens-eec").warnings
+    )
 
 
 # --- sub-programs --------------------------------------------------------------------------------------------------
@@ -705,15 +708,15 @@ def test_switch_and_weight_of_a_table_count(switch, moved):
     ("mode", "text", "doubled"),
     [
         # what the mode leaves of 0.2 mm times 0.3 mm beside the product
-        ("S1", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 500.000 um, in the CEC tables [0, 1]"),
+        ("S1", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 500.000 um, also in the CEC tables [0, 1]"),
         ("S2", constant(0, "0.2", 2) + constant(1, "0.3"), ""),
-        ("S3", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 200.000 um, in the CEC tables [0]"),
-        ("S4", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 300.000 um, in the CEC tables [1]"),
+        ("S3", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 200.000 um, also in the CEC tables [0]"),
+        ("S4", constant(0, "0.2", 2) + constant(1, "0.3"), "with up to 300.000 um, also in the CEC tables [1]"),
         # the mean of both directions
         (
             "S1",
             constant(0, "0.2") + constant(1, "0.3", direction=-1),
-            "with up to 350.000 um, in the CEC tables [0, 1]",
+            "with up to 350.000 um, also in the CEC tables [0, 1]",
         ),
         ("S1", constant(0, "0.3", direction=1) + constant(1, "-0.3", direction=-1), ""),
     ],
@@ -727,7 +730,7 @@ def test_positioning_in_both_kinds_of_tables_is_what_the_mode_leaves_of_it(mode,
     control, settings, tables = parsed(machine, "siemens-cec-eec", files)
     found = [item for item in control(machine, settings).violations(tables) if "corrected twice" in item]
     assert len(found) == bool(doubled)
-    assert all("the positioning of AX1 is in its encoder table and, " + doubled in item for item in found)
+    assert all("the positioning error of AX1 is in its encoder table and, " + doubled in item for item in found)
 
 
 def test_a_switch_or_a_step_is_no_table():

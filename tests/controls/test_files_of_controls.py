@@ -114,7 +114,13 @@ def test_the_archive_of_a_control_gives_the_tables_that_act(tmp_path):
     np.testing.assert_allclose(moved, [[0, -5, 0], [0, 3.75, 0], [0, 1, 0]], atol=1e-9)
     said = "\n".join(tables.remarks)
     assert "table 7 (AX5 into AX1, up to 0.001 mm or degrees)" in said
-    for words in ("other files of the archive", "SAG.SPF", "$MA_BACKLASH", "reserved nodes beyond MAX", "not in use"):
+    for words in (
+        "other files of the archive",
+        "SAG.SPF",
+        "$MA_BACKLASH",
+        "reserved nodes beyond MAX",
+        "unused tables (step 0)",
+    ):
         assert words in said
     assert "table 2: MIN + k STEP does not meet MAX" in said  # 950 of 0, 100, ... 1000: half of 2 um
     assert "up to 1.0 um" in said
@@ -143,9 +149,9 @@ def test_what_the_archive_switches_off_does_not_act(tmp_path, line, instead, mov
         ("$AN_CEC[2,3]=0.005", "$AN_CEC[2,3] 0.005", "not understood, and it could change a table"),
         ("$AN_CEC[2,3]=0.005\n", "", "node 3 of 0 ... 10 is missing"),
         ("$AN_CEC[2,3]=0.005", "$AN_CEC[2,3]=0.005\n$AN_CEC[2,3]=0.004", "second value"),
-        ("$AN_CEC_TYPE[2]=0", "$AN_CEC_TYPE[2]=1", "is not understood; 0 is"),
+        ("$AN_CEC_TYPE[2]=0", "$AN_CEC_TYPE[2]=1", "is not supported; expected 0"),
         ("$AN_CEC_TYPE[2]=0", "$AN_CEC_MAGIC[2]=1", "could change a table"),
-        ("$AN_CEC_MULT_BY_TABLE[2]=0", "$AN_CEC_MULT_BY_TABLE[2]=8", "multiplied by table 7.*does not have"),
+        ("$AN_CEC_MULT_BY_TABLE[2]=0", "$AN_CEC_MULT_BY_TABLE[2]=8", "multiplied by table 7.*not in the machine file"),
         ("$AN_CEC_IS_MODULO[2]=0", "$AN_CEC_IS_MODULO[2]=7", "IS_MODULO"),
         ("METRIC\n\nCHANDATA", "INCH\n\nCHANDATA", "the file is in inch"),
         ("M17\n", "", "truncated"),
@@ -241,7 +247,7 @@ def test_tables_of_another_measuring_system_are_asked_about_if_they_act(tmp_path
         + "M17\n"
     )
     content = archive([("AX_EEC", "INI", text), ("INITIAL", "INI", INITIAL)])
-    with pytest.raises(InputError, match="for encoder 1 of AX1; the machine file has encoder = .0.") as caught:
+    with pytest.raises(InputError, match="for encoder 1 of AX1, but the machine file has encoder = .0.") as caught:
         read(tmp_path, content, "siemens-eec")
     assert caught.value.line
     own = "[controllers.siemens-eec]\nencoder = { X = 1 }\n"
@@ -249,7 +255,7 @@ def test_tables_of_another_measuring_system_are_asked_about_if_they_act(tmp_path
     assert added(machine_with(tmp_path, own), tables, [[475, 0, 0]])[0, 0] == pytest.approx(-3.0)
     assert any("encoder table of AX4" in remark for remark in tables.remarks)
     off = archive([("AX_EEC", "INI", text), ("INITIAL", "INI", INITIAL.replace("ENABLE[1,AX1]=1", "ENABLE[1,AX1]=0"))])
-    with pytest.raises(InputError, match="does not act"):
+    with pytest.raises(InputError, match="its table has no effect"):
         read(tmp_path, off, "siemens-eec", own)
 
 
@@ -575,7 +581,7 @@ def test_an_active_archive_keeps_the_tables_of_other_axes(tmp_path, controller):
     assert "$AN_CEC_STEP[7]" not in text
     told = (out / "preflight.md").read_text()
     assert "Tables kept (kept_tables): 1, 7" in told
-    assert "SD41300 = 0 for every other one but 1, 7" in told
+    assert "SD41300 = 0 for every other one except 1, 7" in told
     assert "index 0, input" in told and "table 2 with both nodes 0.3" in told and "MULT_BY_TABLE[0] = 3" in told
     assert "$SN_CEC_TABLE_ENABLE[0, 2" in told
 
