@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.accuracy.evaluate import Accuracy
 from compgen.accuracy.field import Figure, range_weight
@@ -28,20 +29,33 @@ def accuracy_of_circles(circles: Circles) -> Accuracy:
     calibrated = circles.metadata.get("radius") == "calibrated"
     if not calibrated:
         statements.append("F: not given; it needs a calibrated radius (comment # radius = calibrated)")
-    keys = np.column_stack([circles.plane, circles.setup])
-    for plane, setup in np.unique(keys, axis=0).tolist():
-        own = (keys == (plane, setup)).all(axis=1)
-        name = list(PLANES)[plane] + (f" {setup + 1}" if len(np.unique(keys[circles.plane == plane, 1])) > 1 else "")
+    for name, own in circle_groups(circles).items():
         groups[name] = _figures(circles, own, calibrated=calibrated)
     return Accuracy(groups, (*statements, "checked against worked examples, not certified"))
 
 
-def _figures(circles: Circles, own: np.ndarray, *, calibrated: bool) -> dict[str, Figure]:
-    """Figures of one set-up."""
-    angle, direction, run = circles.angle_rad[own], circles.direction[own], circles.run[own]
+def circle_groups(circles: Circles) -> dict[str, NDArray[np.bool_]]:
+    """Return the readings (n,) that belong together by plane and set-up: ``"XY"``, or ``"XY 1"``, ``"XY 2"`` ..."""
+    keys, groups = np.column_stack([circles.plane, circles.setup]), {}
+    for plane, setup in np.unique(keys, axis=0).tolist():
+        several = len(np.unique(keys[circles.plane == plane, 1])) > 1
+        name = list(PLANES)[plane] + (f" {setup + 1}" if several else "")
+        groups[name] = np.asarray((keys == (plane, setup)).all(axis=1))
+    return groups
+
+
+def about_centre(circles: Circles, own: NDArray[np.bool_]) -> FloatArray:
+    """Return the radial deviations (mm) of the readings of one set-up about their least-squares centre."""
+    angle = circles.angle_rad[own]
     centre = np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))])
     offset = np.linalg.lstsq(centre, circles.deviation_mm[own], rcond=1e-9)[0]
-    radial = circles.deviation_mm[own] - centre[:, :2] @ offset[:2]
+    return np.asarray(circles.deviation_mm[own] - centre[:, :2] @ offset[:2])
+
+
+def _figures(circles: Circles, own: NDArray[np.bool_], *, calibrated: bool) -> dict[str, Figure]:
+    """Figures of one set-up."""
+    angle, direction, run = circles.angle_rad[own], circles.direction[own], circles.run[own]
+    radial = about_centre(circles, own)
     found: dict[str, Figure] = {}
     ways = {}
     for sign, text in ((1, "counter-clockwise"), (-1, "clockwise")):

@@ -63,6 +63,21 @@ class Figure:
         """Expanded uncertainty U (k = 2)."""
         return COVERAGE * self.u
 
+    def against(self, tolerance: float) -> str:
+        """Return whether the figure keeps a tolerance in its unit, by the rule of ISO 14253-1 with U (k = 2).
+
+        ``"within"`` and ``"exceeded"`` are proven: the whole interval is on that side. ``"not proven"``: the interval
+        contains the tolerance. Without a known uncertainty the value alone decides, and the answer says so.
+
+        >>> [Figure(value, 0.5, "um", "E").against(8.0) for value in (6.0, 7.5, 9.5)]
+        ['within', 'not proven', 'exceeded']
+        """
+        if math.isnan(self.u):
+            return ("within" if self.value <= tolerance else "exceeded") + ", uncertainty not known"
+        if abs(self.value - tolerance) < self.expanded:
+            return "not proven"
+        return "within" if self.value <= tolerance else "exceeded"
+
     def summary(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""
         found: dict[str, Any] = {

@@ -65,8 +65,8 @@ NOT_KNOWN = KnownReversal(None, "reversal: unknown: errors are means of both dir
 class Side:
     """One side as read: ``kind`` in words, and the data of that kind.
 
-    ``deviations`` and ``lengths`` are identified when errors are requested (:meth:`errors`); ``predicted`` is a field at
-    points.
+    ``deviations`` and ``lengths`` are identified when errors are requested (:meth:`errors`); ``readings`` are those of
+    ``runs``; ``predicted`` is a field at points.
     """
 
     machine: Machine
@@ -76,6 +76,7 @@ class Side:
     deviations: Deviations | None = None
     lengths: Lengths | None = None
     runs: dict[str, RunStatistics] | None = None
+    readings: AxisRuns | None = None
     diagonals: dict[str, DiagonalRun] | None = None
     circles: Circles | None = None
     predicted: ErrorField | None = None
@@ -138,7 +139,7 @@ def read_side(
     if isinstance(measurement, ErrorTable):
         return Side(machine, source, "errors", source=error_source(machine, measurement))
     if isinstance(measurement, AxisRuns):
-        return Side(machine, source, "axis runs", runs=axis_statistics(measurement))
+        return Side(machine, source, "axis runs", runs=axis_statistics(measurement), readings=measurement)
     if isinstance(measurement, Circles):
         return Side(machine, source, "circles", circles=measurement)
     if isinstance(measurement, Deviations):

@@ -28,6 +28,8 @@ from compgen.data.names import AXES
 from compgen.errors import InputError
 from compgen.foreign import native_format, open_measurement
 from compgen.pipeline import provenance_of, write_all
+from compgen.report.dcc.laboratory import read_certificate
+from compgen.report.sheets import rows_with_tolerance, sheet_page
 from compgen.report.terminal import accuracy_table, comparison_table
 from compgen.tables import read_tables
 
@@ -47,6 +49,23 @@ def evaluation_options(*without: str) -> Callable[[Command], Command]:
         return options_of(CompareOptions, "options", without=without, read={"edition": int})(decorated)  # type: ignore[no-any-return]
 
     return decorate
+
+
+class Tolerance(click.ParamType[Any]):
+    """``FIGURE=UM`` or ``GROUP.FIGURE=UM``, as the key of :func:`rows_with_tolerance` and um."""
+
+    name = "tolerance"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Return figure and um; fails for anything else."""
+        key, _, number = str(value).partition("=")
+        try:
+            tolerance = float(number.removesuffix("um"))
+        except ValueError:
+            tolerance = math.nan
+        if not key or not (math.isfinite(tolerance) and tolerance > 0.0):
+            self.fail(f"{value!r} is not a tolerance; expected FIGURE=UM above zero, for example A=8", param, ctx)
+        return key.replace(".", " ", 1), tolerance
 
 
 def _budget(**values: float) -> SetupBudget:
@@ -83,11 +102,26 @@ def _reader(axis: str | None, *paths: Path) -> Reader:
 @machine_argument
 @click.argument("file", type=PATH)
 @evaluation_options("align")
+@click.option(
+    "--tolerance",
+    "tolerances",
+    multiple=True,
+    metavar="FIGURE=UM",
+    type=Tolerance(),
+    help="Tolerance of a figure in um, for the sheet: A=8, or of one axis or circle: X.A=8 (may be given several times).",
+)
+@click.option(
+    "--certificate",
+    type=PATH,
+    help="Laboratory, customer, persons, instruments and conditions for the sheet (TOML; see docs/report.md).",
+)
 @out_option
 @json_option
 def accuracy_command(
     machine: Machine,
     file: Path,
+    tolerances: tuple[tuple[str, float], ...],
+    certificate: Path | None,
     options: CompareOptions,
     remove_rigid_motion: bool,
     instrument: Path | None,
@@ -102,13 +136,16 @@ def accuracy_command(
     FILE: *.axis.csv gives ISO 230-2 and VDI/DGQ 3441, *.diagonals.csv ISO 230-6, *.circle.csv ISO 230-4; errors
     (reversal from NAME.reversal.csv in the same folder, or a folder that identify or run wrote), tracer lengths,
     measured positions and six-DOF readings (identified first) give ISO 230-1 volumetric ranges, ISO 230-6
-    diagonals, straightness, squareness. Values in um and urad. Writes accuracy.json and accuracy.txt to DIR.
+    diagonals, straightness, squareness. Values in um and urad. Writes accuracy.json and accuracy.txt to DIR, and for
+    axis runs and circles sheet.html, to print: a page for each axis or circle.
 
     \b
     Example:
       volcomp accuracy zha-gantry identified/identified.errors.csv --out accuracy/
+      volcomp accuracy zha-gantry X.axis.csv --tolerance A=8 --certificate certificate.toml --out accuracy/
     """
     OutputFolder(out)
+    laboratory = read_certificate(certificate) if certificate else None
     options = _completed(options, machine, budget, rigid=remove_rigid_motion)
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
@@ -124,7 +161,18 @@ def accuracy_command(
             assert known.source is not None
             found = accuracy_of_errors(known.source, options.alignment or "axes", options.line, known.reversal)
     data = {**found.summary(), "inputs": _inputs(machine, side.path)}
-    files = {"accuracy.json": json_text(data), "accuracy.txt": _plain(accuracy_table(found))}
+    files = {"accuracy.txt": _plain(accuracy_table(found))}
+    rows = rows_with_tolerance(found, dict(tolerances))
+    if side.readings is not None or side.circles is not None:
+        files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory)
+    elif laboratory is not None:
+        raise InputError("is for the sheet of axis runs or circles; this file has none", field="--certificate")
+    if tolerances:
+        data["tolerances"] = {
+            name: {row.key: {"tolerance_um": row.tolerance, "verdict": row.verdict} for row in group if row.verdict}
+            for name, group in rows.items()
+        }
+    files["accuracy.json"] = json_text(data)
     write_all(out, files)
     answer(as_json, data, accuracy_table(found))
     return 0

@@ -6,31 +6,20 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from compgen.data.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.data.files import OutputFolder
-from compgen.data.messages import number_text
 from compgen.data.names import COVERAGE
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
 from compgen.report.html.pictures import describe_error
-from compgen.resources import data_folder
-from compgen.tables.render import KeptTemplates
+from compgen.report.html.write import page_environment
 
 
 def history_page(drift: Drift) -> str:
     """Return the text of the page; it loads nothing from elsewhere and runs no script."""
-    environment = Environment(
-        loader=FileSystemLoader(data_folder("templates") / "_report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        optimized=False,
-        bytecode_cache=KeptTemplates("history"),
-    )
-    environment.filters |= {"number": number_text, "probability": probability, "moment": moment_of, "zip": zip}
+    environment = page_environment("history")
+    environment.filters |= {"probability": probability, "moment": moment_of, "zip": zip}
     style, _, policy = page_assets()
     return environment.get_template("history.html.j2").render(
         drift=drift.summary(), pictures=draw_history(drift), style=style, policy=policy

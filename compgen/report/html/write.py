@@ -479,7 +479,7 @@ def render_page(
         control K.
     seconds : how long the drawing took; None omits it.
     """
-    environment = _environment()
+    environment = page_environment("report")
     style, script, policy = page_assets("charts.js", "script.js")
     drawn = [picture for group in pictures.values() for picture in group]
     return environment.get_template("page.html.j2").render(
@@ -497,7 +497,8 @@ def render_page(
     )
 
 
-def _environment() -> Environment:
+def page_environment(kind: str) -> Environment:
+    """Return the templates of pages: every text is escaped; compiled templates are kept for each ``kind``."""
     environment = Environment(
         loader=FileSystemLoader(data_folder("templates") / "_report"),
         autoescape=True,
@@ -505,7 +506,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         optimized=False,
-        bytecode_cache=KeptTemplates("report"),
+        bytecode_cache=KeptTemplates(kind),
     )
     environment.filters |= {
         "um": um,

@@ -1,0 +1,284 @@
+"""Sheets of tests as people print them: one page an axis (ISO 230-2) or a circle (ISO 230-4), as one HTML file."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.accuracy.circularity import about_centre, circle_groups
+from compgen.accuracy.evaluate import Accuracy
+from compgen.accuracy.field import Figure
+from compgen.accuracy.positioning import EDITIONS
+from compgen.accuracy.sides import Side
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.charts import DASHED, Picture, Plot, legend, limits_of, page_assets, svg
+from compgen.data.circles import PLANES, Circles
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
+from compgen.report.dcc.laboratory import Certificate, Condition
+from compgen.report.html.write import page_environment
+
+#: Targets that a page has room for; more are in ``accuracy.json`` only.
+MOST_TARGETS = 24
+#: Picture of an axis, and the part of it for the deviations; the ranges of A, E and M are drawn to the right of it.
+WIDE, WIDE_BOX = (680.0, 300.0), (50.0, 14.0, 556.0, 262.0)
+#: Picture of a circle, and the part of it for the polar diagram.
+ROUND, ROUND_BOX = (680.0, 420.0), (130.0, 5.0, 540.0, 415.0)
+#: Share of the radius of the picture at which the nominal circle is drawn.
+NOMINAL = 0.62
+
+
+@dataclass(frozen=True)
+class SheetRow:
+    """One figure of a sheet with its tolerance in um; ``verdict`` is empty without a tolerance."""
+
+    key: str
+    figure: Figure
+    tolerance: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the tolerance is kept."""
+        return "" if self.tolerance is None else self.figure.against(self.tolerance)
+
+
+def rows_with_tolerance(found: Accuracy, tolerances: Mapping[str, float]) -> dict[str, list[SheetRow]]:
+    """Return the figures of each group with the tolerances (um) of the figures that have one.
+
+    ``"A"`` is the tolerance of A of every axis, ``"X A"`` that of X alone and comes before it.
+
+    Raises
+    ------
+    InputError
+        for a tolerance of a figure that this measurement does not have.
+    """
+    known = {key for name, group in found.groups.items() for figure in group for key in (figure, f"{name} {figure}")}
+    for key in tolerances:
+        if key not in known:
+            figures = dict.fromkeys(figure for group in found.groups.values() for figure in group)
+            text = f"{key} is not a figure of this measurement; use one of {', '.join(figures)}"
+            raise InputError(text, field="--tolerance")
+    return {
+        name: [SheetRow(key, item, tolerances.get(f"{name} {key}", tolerances.get(key))) for key, item in group.items()]
+        for name, group in found.groups.items()
+    }
+
+
+def sheet_page(
+    machine: Machine,
+    side: Side,
+    found: Accuracy,
+    rows: Mapping[str, list[SheetRow]],
+    edition: int,
+    certificate: Certificate | None = None,
+) -> str:
+    """Return the text of ``sheet.html``: one printed page for each axis of axis runs, or each circle.
+
+    Parameters
+    ----------
+    machine : the machine.
+    side : the measurement, axis runs or circles.
+    found : its figures.
+    rows : the figures of each page with their tolerances (:func:`rows_with_tolerance`).
+    edition : of ISO 230-2.
+    certificate : laboratory, customer, persons and conditions, if known.
+    """
+    sheets = []
+    for name, group in rows.items():
+        sheet: dict[str, Any] = {"name": name, "rows": group, "targets": (), "omitted": 0}
+        if side.readings is not None:
+            own = side.readings.axis == AXES.index(name)
+            targets = found.targets[name]
+            count = len(targets["position_mm"])
+            sheet["title"] = f"Positioning of {name}, ISO 230-2:{edition}"
+            sheet["picture"] = draw_positioning(name, side.readings, own, targets, EDITIONS[edition])
+            sheet["omitted"] = count if count > MOST_TARGETS else 0
+            if not sheet["omitted"]:
+                sheet["targets"] = [{key: float(v[k]) for key, v in targets.items()} for k in range(count)]
+            measured: AxisRuns | Circles = side.readings
+        else:
+            assert side.circles is not None
+            own = circle_groups(side.circles)[name]
+            sheet["title"] = f"Circular test {name}, radius {side.circles.radius_mm[own][0]:g} mm, ISO 230-4"
+            sheet["picture"] = draw_circle(name, side.circles, own)
+            measured = side.circles
+        sheet["facts"] = [*facts_of(machine, certificate), *conditions_of(measured, own, certificate)]
+        sheets.append(sheet)
+    style, _, policy = page_assets()
+    return page_environment("sheet").get_template("sheet.html.j2").render(
+        sheets=sheets, title=f"{machine.name}: {side.path.name}", file=side.path.name, statements=found.statements,
+        certificate=certificate, style=style, policy=policy,
+    )  # fmt: skip
+
+
+# What the head of a sheet says: machine, people, instruments and conditions.
+
+
+def facts_of(machine: Machine, certificate: Certificate | None) -> list[tuple[str, str]]:
+    """Return machine, laboratory, customer, persons and instruments as (name, text)."""
+    if certificate is None:
+        return [("Machine", machine.name)]
+    thing = certificate.machine
+    serial = f"serial number {thing.serial_number}"
+    facts = [
+        ("Machine", _joined(thing.name or machine.name, thing.manufacturer, thing.model, serial)),
+        ("Customer", _joined(certificate.customer.name, certificate.customer.city)),
+        ("Laboratory", _joined(certificate.laboratory.name, certificate.laboratory.city, certificate.laboratory_code)),
+        ("Carried out by", "; ".join(_joined(person.name, person.role) for person in certificate.persons)),
+        ("Number and dates", f"{certificate.number}; {span(certificate.begin, certificate.end)}"),
+    ]  # fmt: skip
+    for item in certificate.equipment:
+        of = item.certificate_number and f"certificate {item.certificate_number}"
+        facts.append(("Instrument", _joined(item.name, item.model, f"serial number {item.serial_number}", of)))
+    return facts
+
+
+def _joined(*parts: str) -> str:
+    return ", ".join(part for part in parts if part)
+
+
+def conditions_of(
+    measured: AxisRuns | Circles, own: NDArray[np.bool_], certificate: Certificate | None
+) -> list[tuple[str, str]]:
+    """Return what the files say about the measurement, temperatures at its begin and end, and stated conditions."""
+    stated = {key: value for key, value in measured.metadata.items() if value and key not in ("machine", "seed")}
+    facts = [(key.replace("_", " ").capitalize(), value) for key, value in stated.items()]
+    for name, values in measured.covariates.items():
+        known = values[own][np.isfinite(values[own])]
+        if len(known) and name.startswith("temp_"):
+            place = name.removeprefix("temp_").removesuffix("_c").replace("_", " ")
+            text = f"{known[0]:.2f} °C before, {known[-1]:.2f} °C after"
+            facts.append((f"Temperature {place}", f"{text}; {known.min():.2f} to {known.max():.2f} °C"))
+        elif len(known) and name == "feed_mm_min":
+            facts.append(("Feed", f"{span(f'{known.min():g}', f'{known.max():g}')} mm/min"))
+    return [*facts, *((item.name, range_of(item)) for item in (certificate.conditions if certificate else ()))]
+
+
+def range_of(item: Condition) -> str:
+    """Return a condition with its unit, e.g. ``"19.6 to 20.4 °C"``."""
+    signs = {"\\degreeCelsius": "°C", "\\percent": "%", "\\hecto\\pascal": "hPa"}
+    return f"{span(f'{item.lowest:g}', f'{item.highest:g}')} {signs.get(item.unit, item.unit)}"
+
+
+def span(first: object, last: object) -> str:
+    """Return ``"first to last"``, or one of them if they are the same."""
+    return " to ".join(dict.fromkeys((str(first), str(last))))
+
+
+# Deviations over the targets, with the means, the band of k s, and the ranges that the figures are.
+
+
+def draw_positioning(
+    axis: str, runs: AxisRuns, own: NDArray[np.bool_], targets: Mapping[str, FloatArray], k: float
+) -> Picture:
+    """Return the picture of one axis: readings, means of both directions, mean +- k s, and where A, E, M, B, R come from."""
+    x, zeros = targets["position_mm"], np.zeros(len(targets["position_mm"]))
+    means = {way: targets[f"mean_{way}_um"] for way in ("up", "down")}
+    spread = {way: k * np.nan_to_num(targets[f"s_{way}_um"]) for way in means}
+    reading = runs.deviation_mm[own] / MM_PER_UM
+    edges = [means[way] + sign * spread[way] for way in means for sign in (-1, 1)]
+    limits = limits_of(reading, *edges, margin=0.1, zero=True)
+    plot = Plot(limits_of(x, margin=0.04), limits, WIDE_BOX, x_label=f"{axis} (mm)", y_label="deviation (µm)")
+    plot.across(0.0)
+    shift = 0.004 * (plot.x[1] - plot.x[0])  # the directions side by side
+    for way, role, side in (("up", "c0", -shift), ("down", "c1", shift)):
+        chosen = own & (np.sign(runs.direction) == (1 if way == "up" else -1))
+        plot.dots(runs.position_mm[chosen] + side, runs.deviation_mm[chosen] / MM_PER_UM, role, size=2.2)
+        if np.isfinite(means[way]).any():
+            plot.line(x, means[way], role, width=1.8)
+            plot.spread(x + side, means[way] - spread[way], means[way] + spread[way], role)
+            for sign in (-1, 1):
+                plot.line(x, means[way] + sign * spread[way], role, width=0.7, dash=DASHED)
+    ranges = Plot((0.0, 3.0), limits, (WIDE_BOX[2] + 6.0, WIDE_BOX[1], WIDE[0] - 4.0, WIDE_BOX[3]), bare=True)
+    middle = targets["mean_um"]
+    repeated = np.isfinite([targets[f"s_{way}_um"] for way in means]).any()
+    shown = [("A", edges if repeated else []), ("E", list(means.values())), ("M", [middle])]
+    for place, (name, values) in enumerate(shown):
+        known = np.concatenate([*values, zeros[:0]])
+        known = known[np.isfinite(known)]
+        if not len(known):
+            continue
+        low, high = float(known.min()), float(known.max())
+        for value in (low, high):
+            ranges.line((place + 0.3, place + 0.7), (value, value), "ink", width=1.0)
+            plot.across(value, "grid", dash=DASHED)
+        ranges.spread([place + 0.5], [low], [high], "ink")
+        ranges.text(place + 0.5, high, f"{name} {high - low:.1f}", anchor="middle", shift=(0.0, -4.0))
+    if np.isfinite(targets["B_um"]).all():
+        at = int(np.argmax(np.abs(targets["B_um"])))
+        plot.spread(x[[at]] - 3 * shift, [means["up"][at]], [means["down"][at]], "ink", width=1.6)
+        plot.text(float(x[at]) - 3 * shift, float(middle[at]), "B ", anchor="end", shift=(-2.0, 3.0))
+    if np.isfinite(targets["R_um"]).all():
+        at = int(np.argmax(targets["R_um"]))
+        ends = widest_at(means, spread, at)
+        plot.spread(x[[at]] + 3 * shift, [ends[0]], [ends[1]], "ink", width=1.6)
+        plot.text(float(x[at]) + 3 * shift, ends[1], "R", shift=(2.0, 8.0))
+    names = legend(WIDE_BOX[0] + 4, WIDE[1] - 6, [("c0", f"positive approach, mean and ±{k:g} s")])
+    names += legend(WIDE_BOX[0] + 330, WIDE[1] - 6, [("c1", f"negative approach, mean and ±{k:g} s")])
+    key, title = f"positioning-{axis}", f"Deviation of {axis} over its targets"
+    note = f"right: the ranges A, E and M; in the picture: the places of B and R; ± {k:g} s dashed"
+    return Picture(key, title, svg(key, f"{title}; {note}", [plot, ranges], WIDE, more=names), note=note)
+
+
+def widest_at(means: Mapping[str, FloatArray], spread: Mapping[str, FloatArray], at: int) -> tuple[float, float]:
+    """Return the ends of the interval whose length is R_i: of both directions together, or of one that is wider."""
+    ends = {way: (float(means[way][at] - spread[way][at]), float(means[way][at] + spread[way][at])) for way in means}
+    low, high = sorted(ends.values(), key=sum)
+    return max([(low[0], high[1]), *ends.values()], key=lambda pair: pair[1] - pair[0])
+
+
+# The polar diagram of a circular test.
+
+
+def draw_circle(name: str, circles: Circles, own: NDArray[np.bool_]) -> Picture:
+    """Return the polar diagram: radial deviations about the least-squares centre, enlarged, over the nominal circle."""
+    radial = about_centre(circles, own) / MM_PER_UM
+    angle, direction, run = circles.angle_rad[own], circles.direction[own], circles.run[own]
+    # a round number of um for a division, three of which contain all readings
+    third = float(np.max(np.abs(radial))) / 3.0 or 1.0
+    power = 10.0 ** math.floor(math.log10(third))
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= 0.999 * third)
+    per_um = (0.88 - NOMINAL) / (3.0 * step)
+    plot = Plot((-1.0, 1.0), (-1.0, 1.0), ROUND_BOX, bare=True)
+    turn = np.linspace(0.0, 2.0 * np.pi, 361)
+    for division in range(-3, 4):
+        radius = NOMINAL + division * step * per_um
+        role, width = ("muted", 1.1) if division == 0 else ("grid", 0.6)
+        plot.line(radius * np.cos(turn), radius * np.sin(turn), role, width=width)
+    first, second = (AXES[k] for k in PLANES[name.split()[0]])
+    for text, x, y in ((f"+{first}", 1, 0), (f"−{first}", -1, 0), (f"+{second}", 0, 1), (f"−{second}", 0, -1)):
+        plot.line((0.0, 0.9 * x), (0.0, 0.9 * y), "grid", width=0.6)
+        plot.text(0.95 * x, 0.95 * y, text, anchor="middle", shift=(0.0, 3.0))
+    for sign, role in ((1, "c0"), (-1, "c1")):
+        for number in np.unique(run[direction == sign]).tolist():
+            for arc in _arcs(angle, np.flatnonzero((direction == sign) & (run == number))):
+                place = NOMINAL + radial[arc] * per_um
+                plot.line(place * np.cos(angle[arc]), place * np.sin(angle[arc]), role, width=1.3)
+    for division in (-3, 0, 3):  # on top of the lines
+        at = (NOMINAL + division * step * per_um) * math.sqrt(0.5)
+        plot.text(at, at, f"{division * step:+g} µm" if division else "0", shift=(2.0, -2.0))
+    drawn = [(1, ("c0", "counter-clockwise")), (-1, ("c1", "clockwise"))]
+    names = legend(8.0, 20.0, [item for sign, item in drawn if (direction == sign).any()])
+    magnification = per_um / MM_PER_UM * float(circles.radius_mm[own][0]) / NOMINAL
+    scale = f"about the centre of least squares, {step:g} µm per division, magnification {magnification:.0f}"
+    key, title = f"circle-{name.replace(' ', '-')}", f"Radial deviation {name}"
+    return Picture(key, title, svg(key, f"{title}, {scale}", [plot], ROUND, more=names), note=scale)
+
+
+def _arcs(angle: FloatArray, rows: NDArray[np.int64]) -> Iterable[NDArray[np.int64]]:
+    """Yield the readings of one path in the order of their angles; a full circle is closed, gaps stay open."""
+    rows = rows[np.argsort(angle[rows] % (2 * np.pi))]
+    gaps = np.diff(angle[rows] % (2 * np.pi), append=angle[rows[0]] % (2 * np.pi) + 2 * np.pi)
+    ends = np.flatnonzero(gaps > max(3.0 * float(np.median(gaps)), math.radians(3.0)))
+    if not len(ends):
+        yield np.append(rows, rows[0])
+        return
+    rows = np.roll(rows, -(int(ends[-1]) + 1))
+    yield from np.split(rows, (ends + 1 - (int(ends[-1]) + 1)) % len(rows))[: len(ends) + 1]
