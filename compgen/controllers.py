@@ -117,7 +117,7 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     def with_reversal(self, machine: Machine, settings: Settings, tables: Tables, reversal: ReversalCurves) -> Tables:
         """Return the tables with the reversal in them."""
-        raise TypeError(f"{self.name} has no tables of one direction")
+        raise TypeError(f"{self.name} has no direction-dependent tables")
 
     def backlash_parameters(
         self, machine: Machine, settings: Settings, reversal: ReversalCurves

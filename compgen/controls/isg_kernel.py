@@ -96,7 +96,7 @@ def check_name(source: SourceFile, line: int, name: str) -> None:
     if name not in KNOWN_NAMES and name not in _LETTERS:
         hint = nearest(name[:20], [*ISO_NAMES, *TOOL_NAMES, *ARGUMENTS])
         raise source.fail(
-            f"{name[:40]!r} is not a parameter or argument of the control (its error 70468); {hint}", line
+            f"{name[:40]!r} is not a parameter or argument of the control (error 70468 on the control); {hint}", line
         )
 
 
@@ -116,7 +116,7 @@ def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGr
         if item.name in seen:
             first = seen[item.name]
             message = f"{item.name} is given a second time; the first is in {first.source.path.name}:{first.line}"
-            raise item.source.fail(f"{message}, and what the control does then is not documented", item.line)
+            raise item.source.fail(f"{message}. What the control does then is not documented", item.line)
         seen[item.name] = item
     fields = {ISO_NAMES[name]: item.field for name, item in seen.items() if name in ISO_NAMES}
     constants = {name: _constant(item) for name, item in seen.items() if name in (*TOOL_NAMES, *LOGICAL_NAMES)}
@@ -127,7 +127,9 @@ def collect(parameters: Sequence[ErrorParameter]) -> tuple[dict[str, ParameterGr
         warnings.warn(message, CompgenWarning, stacklevel=2)
     for name, item in rest.items():
         if name not in rotary and name not in _ORIENTATION_NAMES and np.any(item.field.values != 0.0):
-            message = f"{item.name} is not zero, but the model has only {', '.join(ISO_NAMES)}; express it by these"
+            message = (
+                f"{item.name} is not zero, but the model has only {', '.join(ISO_NAMES)}; express it by these errors"
+            )
             raise item.source.fail(message, item.line)
     if not fields:
         raise parameters[0].source.fail("contains none of the 21 errors of three linear axes", parameters[0].line)
@@ -215,7 +217,7 @@ def parse_list(source: SourceFile) -> ListFile:
     files = {int(key[5:-1]): value for key, (value, _) in entries.items() if key.startswith("file[")}
     formats = {int(key[12:-1]): value.upper() for key, (value, _) in entries.items() if key.startswith("file_format[")}
     if not files:
-        raise source.fail("refers to no parameter file: file[0] is missing; is the list truncated?")
+        raise source.fail("names no parameter file: file[0] is missing; is the list truncated?")
     known = choice("GRID", "AUTO")  # the interpolation of other modes is not publicly documented
     axes = tuple(_take(source, entries, letter, _whole(1, 65535), None) for letter in "xyz")
     return ListFile(
@@ -284,7 +286,7 @@ def axis_letters(value: object) -> str:
 def folder_of_control(value: object) -> str:
     """A folder on the control, ending with a slash; empty for none."""
     if not isinstance(value, str) or len(value) > 200 or any(not "!" <= char <= "~" or char == "#" for char in value):
-        raise ValueError("expected a folder on the control: printable ASCII without blanks and '#'")
+        raise ValueError("expected a folder on the control: printable ASCII without blanks or '#'")
     if not value or value[-1] in "\\/":
         return value
     return value + ("\\" if "\\" in value or ":" in value else "/")
@@ -298,19 +300,21 @@ class IsgSettings:
         whole(1, 65535),
         (1, 2, 3),
         differ="gives ({}) for X, Y, Z; three different numbers are needed",
-        meaning="logical axis numbers in the control",
+        meaning="logical axis numbers on the control",
     )
     reversed_axes: str = setting(
         axis_letters,
         "",
-        meaning='axes, e.g. "XZ", on which the check at the machine found that the control adds the error',
+        meaning='axes, e.g. "XZ", for which the check at the machine showed that the control adds the error',
     )
-    negate: str = setting(axis_letters, "", meaning="axes that the list file negates; if not given, reversed_axes")
+    negate: str = setting(axis_letters, "", meaning="axes that the list file negates; default: reversed_axes")
     chain_direction: Direction = setting(
-        choice("workpiece_to_tool", "tool_to_workpiece"), "workpiece_to_tool", meaning="how the control reads chain"
+        choice("workpiece_to_tool", "tool_to_workpiece"),
+        "workpiece_to_tool",
+        meaning="direction in which the control reads chain",
     )
     use_axis_offsets: int = setting(
-        whole(0, 1), 0, meaning="as the list file has it; 1 is a violation, because its effect is not documented"
+        whole(0, 1), 0, meaning="value in the list file; 1 is a violation, because its effect is not documented"
     )
     max_records: int = setting(whole(1, MOST_LINES), 2000, meaning="vol_comp[0].max_records of the control")
     path: str = setting(
@@ -446,7 +450,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             listing=listing,
             remarks=tuple(
                 f"{source.path.name}:{part.exponent_line} has a number with an exponent; no public document says that "
-                f"the control reads it: write plain decimals"
+                f"the control accepts this. Write plain decimals"
                 for source, part in zip(sources, parts, strict=True)
                 if part.exponent_line is not None
             ),
@@ -489,7 +493,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         found = list(tables.remarks)
         if tables.records > settings.max_records:
             found.append(
-                f"{tables.records} records, max_records is {settings.max_records}: the control refuses the file; raise "
+                f"{tables.records} records, but max_records is {settings.max_records}: the control refuses the file. Raise "
                 f"vol_comp[0].max_records in the start-up list and max_records in the machine file"
             )
         uncovered: dict[str, list[str]] = {}  # one message per axis and range, with the errors that it applies to
@@ -500,13 +504,15 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         found += [f"{', '.join(listed)}:{message}" for message, listed in uncovered.items()]
         for k, name in enumerate(LOGICAL_NAMES):
             if name in tables.constants and tables.constants[name] != settings.logical_axes[k]:
-                found.append(f"{name} = {tables.constants[name]:g}, the machine file says {settings.logical_axes[k]}")
+                found.append(
+                    f"{name} = {tables.constants[name]:g}, but the machine file says {settings.logical_axes[k]}"
+                )
         return found + self._list_violations(tables)
 
     def _list_violations(self, tables: IsgTables) -> list[str]:
         """Return where the list file differs from the one that the machine file requires, or from the given files."""
         if tables.listing is None:
-            return [f"{len(tables.files)} parameter files, the control takes {MOST_FILES}"] * (
+            return [f"{len(tables.files)} parameter files; the control accepts {MOST_FILES}"] * (
                 len(tables.files) > MOST_FILES
             )
         listing, required = tables.listing, self._list_of(self.parameter_file, self.file_format)
@@ -517,14 +523,16 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             *zip(AXES, listing.logical_axes, required.logical_axes, strict=True),
         ]
         found = [
-            f"list file: {key} is {given if given is not None else 'missing'}, the machine file makes it {needed}"
+            f"list file: {key} is {given if given is not None else 'missing'}; the machine file requires {needed}"
             for key, given, needed in pairs
             if given != needed
         ]
         if len(listing.files) > MOST_FILES or max(listing.files) >= MOST_FILES:
-            found.append(f"list file: {len(listing.files)} files; the control takes {MOST_FILES}, file[0] ... file[9]")
+            found.append(
+                f"list file: {len(listing.files)} files; the control accepts {MOST_FILES}, file[0] ... file[9]"
+            )
         if listing.use_axis_offsets:
-            found.append("list file: use_axis_offsets 1 shifts the positions in a way that is not documented in public")
+            found.append("list file: use_axis_offsets 1 shifts the positions in a way that is not publicly documented")
         named = {base_name(path).lower(): index for index, path in listing.files.items()}
         given = {base_name(name).lower() for name in tables.files}
         found += [f"list file: file[{named[name]}] is {name}, which was not given" for name in sorted({*named} - given)]
@@ -532,7 +540,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         for name in sorted(given & {*named}):
             declared = listing.formats.get(named[name], "ISG_CSV")
             if declared != self.file_format:
-                found.append(f"list file: {name} is declared {declared}, it is {self.file_format}")
+                found.append(f"list file: {name} is declared {declared}, but it is {self.file_format}")
         return found
 
     def usage(self, tables: IsgTables) -> list[Usage]:
@@ -561,7 +569,10 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         worst = np.argmax(np.abs(added), axis=0)
         reference = "the reference direction is X, as in the machine file"
         if self.machine.squareness_reference == "Y":
-            reference = "the machine file takes Y as the reference: its squareness of X and Y is a slope in EYX here, C0Y is zero"
+            reference = (
+                "the machine file has Y as the reference direction: here its squareness of X and Y is a slope in EYX, and C0Y "
+                "is zero"
+            )
         return {
             "sign_statement": self._sign_statement(listing),
             "chain_statement": self._chain_statement(listing),
@@ -600,18 +611,18 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         settings = self.settings
         text = (
             "Values are errors as ISO 230-1 defines them (actual minus commanded tool position relative to the workpiece), "
-            "in mm and rad; the control takes them off its command. EXX = 0.005 mm at X = 100 mm says that the tool stands "
-            "0.005 mm too far in +X there, and the control must then command X = 99.995 mm."
+            "in mm and rad; the control subtracts them from its command. EXX = 0.005 mm at X = 100 mm means that the tool is "
+            "0.005 mm too far in +X there, so the control must command X = 99.995 mm."
         )
         if settings.reversed_axes:
-            text += f" On {settings.reversed_axes} the check at the machine found the opposite."
+            text += f" For {settings.reversed_axes} the check at the machine showed the opposite."
         return text + (f" The list file negates {listing.negate}." if listing.negate else "")
 
     def _chain_statement(self, listing: ListFile) -> str:
         settings = self.settings
         return (
-            f"chain {listing.chain} is meant {_DIRECTIONS[settings.chain_direction]}, {listing.workpiece_axes} of these axes "
-            f"carry the workpiece"
+            f"chain {listing.chain} lists the axes {_DIRECTIONS[settings.chain_direction]}; number of axes that carry the "
+            f"workpiece: {listing.workpiece_axes}"
         )
 
     def _parameters(self, tables: IsgTables, listing: ListFile) -> list[dict[str, object]]:
@@ -621,7 +632,7 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             (
                 "vol_comp[0].max_records",
                 settings.max_records,
-                f"start-up list: at least the {tables.records} records here",
+                f"start-up list: at least the {tables.records} records of this export",
             ),
             *(
                 (letter, number or "", f"list file: logical axis number of {letter}")
@@ -629,34 +640,34 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
             ),
             ("chain", listing.chain, f"list file: order of the axes {_DIRECTIONS[settings.chain_direction]}"),
             ("workpiece_axes", listing.workpiece_axes, "list file: how many axes of the chain carry the workpiece"),
-            ("negate", listing.negate or "not set", "list file: axes whose compensation is turned around"),
+            ("negate", listing.negate or "not set", "list file: axes whose compensation is reversed"),
             ("interpolation", listing.interpolation, "list file: linear between the positions of the grid"),
-            ("use_axis_offsets", listing.use_axis_offsets, "list file: 0, positions are machine coordinates"),
+            ("use_axis_offsets", listing.use_axis_offsets, "list file: 0 means that positions are machine coordinates"),
         ]
         return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
 
     def _warnings(self, listing: ListFile) -> list[str]:
         found = [
-            f"{self._chain_statement(listing)}. The documents do not say which end comes first; check it at the "
-            f"machine, and set chain_direction in the machine file if it is the other one."
+            f"{self._chain_statement(listing)}. The documents do not say which end comes first: check it at the "
+            f"machine, and change chain_direction in the machine file if it is the other end."
         ]
         if any(self.machine.tool_offset_mm) and not self.settings.write_tool_position:
             offset = ", ".join(f"{value:g}" for value in self.machine.tool_offset_mm)
             found.append(
-                f"The lever arms hold the tool offset ({offset}) mm. The control must know it too, from its tool data or "
-                f"from P0X, P0Y, P0Z in a parameter file of format ISG_CSV; which of them acts is not documented in public."
+                f"The lever arms include the tool offset ({offset}) mm. The control must know it too, from its tool data or "
+                f"from P0X, P0Y, P0Z in a parameter file of format ISG_CSV; which of them it uses is not publicly documented."
             )
-        turned = "".join(
+        differing = "".join(
             letter for letter in "XYZ" if (letter in listing.negate) != (letter in self.settings.reversed_axes)
         )
-        if turned:
+        if differing:
             found.append(
-                f"negate and reversed_axes in the machine file differ on {turned}: the control then moves WITH the error. "
-                f"Set reversed_axes to what the check at the machine showed and leave negate out."
+                f"negate and reversed_axes in the machine file differ for {differing}: the control then ADDS the error. Set "
+                f"reversed_axes to what the check at the machine showed, and remove negate."
             )
         if self.settings.use_axis_offsets:
             found.append(
-                "use_axis_offsets 1: what the control then shifts is not documented in public and not emulated."
+                "use_axis_offsets 1: the shift that the control then applies is not publicly documented and not emulated."
             )
         return found
 
@@ -706,7 +717,7 @@ def _block(source: SourceFile, block: list[_Row]) -> list[ErrorParameter]:
         raise source.fail(f"the block {' '.join(names)[:60]!r} has no rows; is the file truncated?", header_line)
     for line, words in rows:
         if len(words) != len(names):
-            raise source.fail(f"has {len(words)} columns, its header in line {header_line} has {len(names)}", line)
+            raise source.fail(f"has {len(words)} columns, but its header in line {header_line} has {len(names)}", line)
     matrix = np.array(
         [[floating(source, line, word, name) for word, name in zip(words, names, strict=True)] for line, words in rows]
     )
@@ -736,7 +747,7 @@ def _check_header(source: SourceFile, line: int, names: list[str]) -> None:
         check_name(source, line, name)
     twice = doubled(names)
     if twice is not None:
-        raise source.fail(f"the header names {twice} twice (the control's error 70469)", line)
+        raise source.fail(f"the header names {twice} twice (error 70469 on the control)", line)
     if all(len(name) == 1 for name in names):
         raise source.fail("the header has arguments only; expected at least one error parameter", line)
 
@@ -872,7 +883,7 @@ def _take_line(source: SourceFile, sections: list[_Section], line: int, text: st
 
 def _take_entry(source: SourceFile, section: _Section, line: int, text: str) -> None:
     if section.grid or section.value is not None:
-        raise source.fail(f"[{section.name}] has its value already; expected a new [NAME], got {text[:40]!r}", line)
+        raise source.fail(f"[{section.name}] already has a value; expected a new [NAME], got {text[:40]!r}", line)
     value = _VALUE.fullmatch(text)
     if value:
         section.value = floating(source, line, value.group(1), section.name)

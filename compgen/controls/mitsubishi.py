@@ -84,15 +84,13 @@ class ParameterEntry:
     def whole(self, low: int, high: int) -> int:
         """Return the value as a whole number within limits."""
         if not _WHOLE.fullmatch(self.value) or not low <= int(self.value) <= high:
-            raise self.fail(f"{one_line(self.value)[:30]!r} is given; expected a whole number from {low} to {high}")
+            raise self.fail(f"expected a whole number from {low} to {high}, got {one_line(self.value)[:30]!r}")
         return int(self.value)
 
     def interval_mm(self) -> Decimal:
         """Return the value as a division interval, mm."""
         if not _DECIMAL.fullmatch(self.value) or not Decimal(self.value):
-            raise self.fail(
-                f"{one_line(self.value)[:30]!r} is given; expected an interval in mm as a plain decimal number"
-            )
+            raise self.fail(f"expected an interval in mm as a plain decimal number, got {one_line(self.value)[:30]!r}")
         return Decimal(self.value)
 
 
@@ -123,7 +121,7 @@ def _row(file: SourceFile, line: int, text: str) -> ParameterEntry:
     cells = [cell.strip() for cell in text.split(",", 2)]
     number = cells[0].removeprefix("#").strip()
     if not re.fullmatch(r"\d{1,6}", number, re.ASCII):
-        raise file.fail(f"{one_line(cells[0])[:30]!r} is not the number of a parameter such as #4101", line)
+        raise file.fail(f"{one_line(cells[0])[:30]!r} is not a parameter number such as #4101", line)
     if len(cells) < 3:
         raise file.fail(
             f"#{number}: expected number, value and meaning, separated by commas (is the file truncated?)", line
@@ -141,19 +139,22 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
     inside = [number for number, text in enumerate(lines, start=1) if text]
     if len(inside) < 2 or lines[inside[0] - 1] != "%" or lines[inside[-1] - 1] != "%":
         raise file.fail(
-            "the '%' at its beginning or end is missing: is the file truncated?", inside[-1] if inside else 1
+            "the '%' at the beginning or end of the file is missing; is the file truncated?",
+            inside[-1] if inside else 1,
         )
-    found, passed_over = [], 0
+    found, skipped = [], 0
     for line in inside[1:-1]:
         text = lines[line - 1]
         if text == "%":
-            raise file.fail("a '%' within the file; it ends there", line)
+            raise file.fail("'%' is only allowed as the first and the last line; it ends the file", line)
         record = _RECORD.fullmatch(text) if len(text) <= MOST_IN_LINE else None
         number = int(record[1]) if record else 0
         if number in (SYSTEM, *range(BASE, FIRST_NUMBER), *range(FIRST_NUMBER, MOST_NUMBER + 1)):
             assert record is not None
             if record[2]:
-                raise file.fail(f"#{number} has the word {record[2][:10]}; compensation parameters have none", line)
+                raise file.fail(
+                    f"#{number} has the word {record[2][:10]}; compensation parameters have no such word", line
+                )
             found.append(ParameterEntry(number, record[3].strip(), file, line))
         elif number == UNIT and record is not None:
             if all(entry.number != UNIT for entry in found):
@@ -161,8 +162,8 @@ def file_entries(file: SourceFile) -> tuple[list[ParameterEntry], int]:
         elif re.match(r"N\s*[45]\d{3}(?!\d)", text):
             raise file.fail(f"{one_line(text[:30])!r} is not understood; expected a record such as N4101P-2", line)
         else:
-            passed_over += not text.startswith(";")
-    return found, passed_over
+            skipped += not text.startswith(";")
+    return found, skipped
 
 
 def by_number(entries: Sequence[ParameterEntry]) -> dict[int, ParameterEntry]:
@@ -229,7 +230,7 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
         raise file.fail("is not a parameter file of the control (ALL.PRM): the first line is not '%'", 1)
     entries = by_number(file_entries(file)[0])
     if SYSTEM not in entries:
-        raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
+        raise file.fail(f"#{SYSTEM} (absolute or incremental system) is missing", 1)
     sets = []
     for index in range(SETS):  # a set without axes is empty, whatever its numbers; the others may be of a rotary axis
         shift = SET_STEP * index
@@ -239,7 +240,7 @@ def read_control_file(paths: Sequence[Path]) -> ControlFile:
         if not any(names):
             continue
         if len(present) < len(expected) or not all(names):
-            message = f"set {index + 1} is not complete; expected #{BASE + shift} to #{INTERVAL + shift}"
+            message = f"set {index + 1} is incomplete; expected #{BASE + shift} to #{INTERVAL + shift}"
             raise present[0].fail(message)
         reference, negative, positive, scale = (entry.whole(0, 99999) for entry in present[2:6])
         low, high = sorted((negative, positive))
@@ -291,48 +292,51 @@ class MitsubishiSettings:
         read_control_file,
         several=True,
         key="style_from",
-        meaning="the control's own parameter file (ALL.PRM): mode, unit, sets, numbers, intervals and scales are kept, "
-        "those of other axes never overwritten",
+        meaning="parameter file of this control (ALL.PRM): the export keeps its mode, unit, sets, numbers, intervals and "
+        "scales, and never overwrites those of other axes",
     )
     absolute: bool | None = setting(
         word_for({"incremental": False, "absolute": True}),
         None,
         key="mode",
-        meaning="system of the values (#4000), which holds for all axes: increments or absolute. Needed for an export without "
-        "style_from",
+        meaning="system of the values (#4000), the same for all axes: incremental or absolute. An export without style_from "
+        "requires it",
     )
     setting_unit_um: float = setting(
-        toml_files.positive, 1.0, meaning="setting unit of the control; one count is half of it, times scale"
+        toml_files.positive, 1.0, meaning="setting unit of the control; one count is half of it times scale"
     )
     scale: int | None = setting(
         whole(1, 99),
         None,
-        meaning="compensation scale factor (sc) of every set; that of the control's file, else 1, if not stated",
+        meaning="compensation scale factor (sc) of every set; default: that of the control's file, otherwise 1",
     )
     adds: bool = setting(
         word_for({"correction": True, "error": False}),
         key="stores",
         stated="correction",
-        meaning="what the numbers are: correction (added) or error",
+        meaning="what the values are: the correction, which the control adds, or the error, which it subtracts",
     )
     across: tuple[tuple[int, int], ...] = setting(
         _across,
         key="relative_errors",
         stated=True,
-        meaning="also correct axes as a function of another one (straightness, squareness): true, false, or a list, e.g. "
+        meaning="tables of one axis as a function of another (straightness, squareness): true, false, or a list, e.g. "
         '["Y(x)"]',
     )
     interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
-        multiple_of(INTERVAL_QUANTUM_MM), meaning="division interval of each base axis; chosen if it is not stated"
+        multiple_of(INTERVAL_QUANTUM_MM),
+        meaning="division interval of each base axis; chosen automatically if not stated",
     )
-    loss_mm: float = loss_setting("loss by interpolation, um at the tool, that is worth no shorter interval")
+    loss_mm: float = loss_setting(
+        "interpolation loss between division points that does not justify a shorter interval, um at the tool"
+    )
     first_number: int = setting(
-        whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER, meaning="first number of a value that is free"
+        whole(FIRST_NUMBER, MOST_NUMBER), FIRST_NUMBER, meaning="first free number for a compensation value"
     )
     last_number: int = setting(
-        whole(FIRST_NUMBER, MOST_NUMBER), LAST_NUMBER, meaning="last number of a value that is free"
+        whole(FIRST_NUMBER, MOST_NUMBER), LAST_NUMBER, meaning="last free number for a compensation value"
     )
-    first_set: int = setting(whole(1, SETS), 1, meaning="first set of parameters that is free, 1 to 10")
+    first_set: int = setting(whole(1, SETS), 1, meaning="first free set of parameters, 1 to 10")
     axis_names: tuple[str, str, str] = axis_setting(
         _name, AXES, differ="{}: expected three different names", meaning="names of X, Y, Z on the control"
     )
@@ -349,7 +353,7 @@ class MitsubishiSettings:
 
     def scale_of(self, pair: tuple[int, int]) -> int:
         """Scale of a table (output, base axis): from the machine file, else from the control's set, else 1."""
-        own = self.own_set(pair)
+        own = self.set_in_file(pair)
         return self.scale or (own.scale if own is not None and own.scale else 1)
 
     def count_mm(self, pair: tuple[int, int]) -> float:
@@ -361,14 +365,14 @@ class MitsubishiSettings:
         """(output, base axis) of the tables: positioning of the three axes first."""
         return [*((axis, axis) for axis in range(3)), *self.across]
 
-    def own_set(self, pair: tuple[int, int]) -> ControlSet | None:
+    def set_in_file(self, pair: tuple[int, int]) -> ControlSet | None:
         """Return the set in the control's file for a table (output, base axis)."""
         output, base = (self.axis_names[axis] for axis in pair)
         return next((item for item in self.sample.sets if (item.output, item.base) == (output, base)), None)
 
     def kept(self, pair: tuple[int, int]) -> ControlSet | None:
         """Return the control's set whose numbers and interval a table keeps, unless another interval is stated."""
-        own, stated = self.own_set(pair), self.interval_mm[pair[1]]
+        own, stated = self.set_in_file(pair), self.interval_mm[pair[1]]
         same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
         return own if same else None
 
@@ -397,18 +401,19 @@ def read_mitsubishi_settings(machine: Machine) -> MitsubishiSettings:
     if sample.file is not None and settings.absolute != sample.absolute:
         stated = "absolute" if settings.absolute else "incremental"
         raise section.fail(
-            "mode", f"{stated!r} is stated, but {sample.file.path} has #4000 = {int(not sample.absolute)}"
+            "mode", f"the machine file says {stated!r}, but {sample.file.path} has #4000 = {int(not sample.absolute)}"
         )
     if settings.last_number - settings.first_number + 1 < 3 * len(settings.pairs):
-        raise section.fail("last_number", f"leaves too few numbers from {settings.first_number} on")
-    new = [pair for pair in settings.pairs if settings.own_set(pair) is None]
+        raise section.fail("last_number", f"leaves too few numbers from #{settings.first_number} on")
+    new = [pair for pair in settings.pairs if settings.set_in_file(pair) is None]
     free = settings.free_sets()
     if len(new) > len(free):
-        others = "".join(f", set {item.index + 1} of {item.base}" for item in sample.others(settings.axis_names))
+        others = ", ".join(f"set {item.index + 1} of {item.base}" for item in sample.others(settings.axis_names))
+        used = f" (other axes use {others})" if others else ""
         raise section.fail(
             "first_set",
-            f"{len(new)} new sets are needed and {len(free)} of the {SETS} sets of the control are free{others}; state which "
-            'tables are wanted, e.g. relative_errors = ["Y(x)", "X(y)"], or false for positioning alone',
+            f"{len(new)} new sets are needed, but only {len(free)} of the {SETS} sets of the control are free{used}; select the "
+            'tables, e.g. relative_errors = ["Y(x)", "X(y)"], or false for positioning only',
         )
     return settings
 
@@ -513,56 +518,58 @@ def parse_tables(settings: MitsubishiSettings, files: Sequence[SourceFile]) -> M
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
-        raise InputError("no set sheet or parameter file is given", file=files[0].path if files else None)
-    own = [file for file in texts if is_parameter_file(file)]
+        raise InputError("no set sheet or parameter file was given", file=files[0].path if files else None)
+    parameter_files = [file for file in texts if is_parameter_file(file)]
     sheets = [file for file in texts if not is_parameter_file(file)]
-    if len(own) > 1:
-        raise own[1].fail("a second parameter file; expected one")
-    if not own:
+    if len(parameter_files) > 1:
+        raise parameter_files[1].fail("is a second parameter file; give only one")
+    if not parameter_files:
         return _sets_of(settings, sheets[0], by_number([entry for file in sheets for entry in sheet_entries(file)]))
-    entries, passed_over = file_entries(own[0])
-    found = _sets_of(settings, own[0], by_number(entries), passed_over)
+    entries, skipped = file_entries(parameter_files[0])
+    found = _sets_of(settings, parameter_files[0], by_number(entries), skipped)
     if sheets and parse_tables(settings, sheets).sets != found.sets:
-        raise own[0].fail(f"does not contain the same tables as {sheets[0].path.name}")
+        raise parameter_files[0].fail(f"does not contain the same tables as {sheets[0].path.name}")
     return found
 
 
 def _sets_of(
-    settings: MitsubishiSettings, file: SourceFile, entries: dict[int, ParameterEntry], passed_over: int | None = None
+    settings: MitsubishiSettings, file: SourceFile, entries: dict[int, ParameterEntry], skipped: int | None = None
 ) -> MitsubishiTables:
-    """Tables from the entries of a sheet or, if ``passed_over`` is not None, of a parameter file of the control."""
+    """Tables from the entries of a sheet or, if ``skipped`` is not None, of a parameter file of the control."""
     if SYSTEM not in entries:
-        raise file.fail(f"#{SYSTEM} (absolute or increment system) is missing", 1)
+        raise file.fail(f"#{SYSTEM} (absolute or incremental system) is missing", 1)
     absolute = entries[SYSTEM].whole(0, 1) == 0
     if settings.absolute is not None and absolute != settings.absolute:
         stated = "absolute" if settings.absolute else "incremental"
         raise entries[SYSTEM].fail(
-            f"{int(not absolute)} is the {'absolute' if absolute else 'increment'} system, but mode = {stated!r} is stated or is "
-            "that of the control's file"
+            f"{int(not absolute)} selects the {'absolute' if absolute else 'incremental'} system, but the machine file or the "
+            f"control's file requires mode = {stated!r}"
         )
     sets, others = [], []
     for number in range(1, SETS + 1):
-        table, name = _set_table(settings, entries, number, absolute, passed_over is not None)
+        table, name = _set_table(settings, entries, number, absolute, skipped is not None)
         sets += [] if table is None else [table]
         others += [] if name is None else [(f"set {number} of {name[0]}", *name[1])]
     if not sets:
-        raise file.fail(f"contains no set of the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
-    if passed_over is None:
+        raise file.fail(f"contains no set for the axes {', '.join(settings.axis_names)} (#4001, #4011, ...)", 1)
+    if skipped is None:
         return MitsubishiTables(tuple(sets))
     system = "absolute values" if absolute else "increments"
-    said = [
-        f"#{SYSTEM} = {int(not absolute)}: {system}; unit: the machine is taken to be metric, the setting unit "
+    remarks = [
+        f"#{SYSTEM} = {int(not absolute)}: {system}; assumed: a metric machine with the setting unit "
         f"{settings.setting_unit_um:g} um"
     ]
-    said += [
-        f"{set_name(table)}: the value {table.at_reference} at the reference number #{table.reference} shifts the zero of the "
-        "axis by a constant, which is not counted"
+    remarks += [
+        f"{set_name(table)}: the value {table.at_reference} at the reference number #{table.reference} only shifts the zero "
+        "of the axis by a constant and is not part of the table"
         for table in sets
         if absolute and table.at_reference
     ]
-    said += [f"{name}, numbers {first} to {last}: not of the machine file, kept apart" for name, first, last in others]
-    said += [f"passed over: {passed_over} lines that cannot change a table"] if passed_over else []
-    return MitsubishiTables(tuple(sets), others=tuple(others), remarks=tuple(said))
+    remarks += [
+        f"{name}, numbers {first} to {last}: not in the machine file, kept separate" for name, first, last in others
+    ]
+    remarks += [f"skipped: {skipped} lines that cannot change a table"] if skipped else []
+    return MitsubishiTables(tuple(sets), others=tuple(others), remarks=tuple(remarks))
 
 
 def _set_table(
@@ -573,27 +580,29 @@ def _set_table(
     In a parameter file of the control, a set without axes is empty, whatever its numbers.
     """
     shift = SET_STEP * (number - 1)
-    due = {parameter: entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)}
-    present = {parameter: entry for parameter, entry in due.items() if entry is not None}
+    expected = {parameter: entries.get(parameter + shift) for parameter in range(BASE, INTERVAL + 1)}
+    present = {parameter: entry for parameter, entry in expected.items() if entry is not None}
     names = [present[parameter].value for parameter in (BASE, OUTPUT) if parameter in present]
     if not any(names if is_file else [entry.value for entry in present.values()]):
         return None, None
     first_entry = next(iter(present.values()))
-    missing = [f"#{parameter + shift}" for parameter, entry in due.items() if entry is None or not entry.value]
+    missing = [f"#{parameter + shift}" for parameter, entry in expected.items() if entry is None or not entry.value]
     if missing:
-        raise first_entry.file.fail(f"{', '.join(missing)} of set {number} missing", first_entry.line)
+        raise first_entry.file.fail(f"set {number} is incomplete: {', '.join(missing)} missing", first_entry.line)
     strange = [name for name in names if name not in settings.axis_names]
     if strange:
         name = one_line(strange[0])[:10]
         if not is_file:
-            message = f"set {number} belongs to the axis {name}, not of the machine file: not used"
+            message = f"set {number} belongs to axis {name}, which is not in the machine file; the set is not used"
             warnings.warn(message, CompgenWarning, stacklevel=6)
         numbers = [present[key].whole(0, 99999) for key in (NEGATIVE, POSITIVE, REFERENCE)]
         return None, (name, (min(numbers), max(numbers)))
     first, last = (present[key].whole(FIRST_NUMBER, MOST_NUMBER) for key in (NEGATIVE, POSITIVE))
     reference = present[REFERENCE].whole(FIRST_NUMBER, MOST_NUMBER)
     if not first <= reference <= last:
-        raise present[REFERENCE].fail(f"the reference number {reference} is none of {first} to {last} of its set")
+        raise present[REFERENCE].fail(
+            f"the reference number {reference} is outside the numbers {first} to {last} of its set"
+        )
     table = SetTable(
         base=settings.axis_names.index(names[0]),
         output=settings.axis_names.index(names[1]),
@@ -608,11 +617,11 @@ def _set_table(
     return table, None
 
 
-def _values(entries: dict[int, ParameterEntry], first: int, last: int, who: ParameterEntry) -> tuple[int, ...]:
+def _values(entries: dict[int, ParameterEntry], first: int, last: int, entry: ParameterEntry) -> tuple[int, ...]:
     missing = [number for number in range(first, last + 1) if number not in entries]
     if missing:
         some = ", ".join(f"#{number}" for number in missing[:5])
-        raise who.fail(f"points {first} to {last} are given, {some} ({len(missing)} in all) missing")
+        raise entry.fail(f"the set has the numbers {first} to {last}; missing: {some} ({len(missing)} in all)")
     return tuple(entries[number].whole(LOWEST_VALUE, HIGHEST_VALUE) for number in range(first, last + 1))
 
 
@@ -627,15 +636,15 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
         if wide:
             most = max(map(abs, wide))
             cure = f"; set scale = {-(-most * table.scale // HIGHEST_VALUE)} or more" if table.absolute else ""
-            found.append(f"{what}: the value {most} lies outside {LOWEST_VALUE} ... {HIGHEST_VALUE}{cure}")
+            found.append(f"{what}: the value {most} is outside {LOWEST_VALUE} ... {HIGHEST_VALUE}{cure}")
         if table.last > settings.last_number:
-            found.append(f"{what}: numbers go up to {table.last}, the last free one is {settings.last_number}")
+            found.append(f"{what}: numbers go up to {table.last}; the last free number is {settings.last_number}")
         if table.scale == 0:
-            found.append(f"{what}: the scale is 0, which leaves nothing of the table")
+            found.append(f"{what}: the scale is 0, so the table has no effect")
         kept = settings.kept_at_reference((table.output, table.base))
         if table.at_reference != kept:
-            own = " as in the control's file" if kept else ""
-            found.append(f"{what}: the value at the reference number {table.reference} must be {kept}{own}")
+            kept_from = " as in the control's file" if kept else ""
+            found.append(f"{what}: the value at the reference number {table.reference} must be {kept}{kept_from}")
     for one, other in combinations(tables.sets, 2):
         if one.first <= other.last and other.first <= one.last:
             found.append(f"the numbers of {set_name(one)} and {set_name(other)} overlap")
@@ -650,7 +659,7 @@ def sheet_violations(machine: Machine, settings: MitsubishiSettings, tables: Mit
             if table.first <= last and table.last >= first:
                 found.append(f"the numbers of {set_name(table)} overwrite those of {name}, {first} to {last}")
     missing = [AXES[axis] for axis in range(3) if not any(t.base == t.output == axis for t in tables.sets)]
-    found += [f"{letter} has no table over its own travel" for letter in missing]
+    found += [f"{letter} has no positioning table" for letter in missing]
     return found + [shortfall_text(settings, item) for item in tables.shortfalls if item.missed_counts > 1.0]
 
 
@@ -660,12 +669,12 @@ def set_name(table: SetTable) -> str:
 
 
 def shortfall_text(settings: MitsubishiSettings, item: SetShortfall) -> str:
-    """Say that the range of the values keeps a table from reaching the request, and what helps."""
+    """Say by how much a table misses the request because of the range of its values, and what helps."""
     count_um = settings.count_mm((item.output, item.base)) / MM_PER_UM
     return (
         f"the table {one_dimensional_name(item.output, item.base)} is too steep for {HIGHEST_VALUE} counts of "
-        f"{count_um:g} um per division: it misses by up to {item.missed_counts * count_um:.1f} um; a larger scale or a "
-        "shorter interval_mm is needed"
+        f"{count_um:g} um per division: it is off by up to {item.missed_counts * count_um:.1f} um; use a larger scale or a "
+        "shorter interval_mm"
     )
 
 
@@ -686,8 +695,8 @@ def sheet_usage(settings: MitsubishiSettings, tables: MitsubishiTables) -> list[
 #: Name and meaning of the seven parameters of a set, in the order of their numbers.
 MEANINGS = (
     ("cmpax", "base axis"),
-    ("drcax", "axis that is compensated"),
-    ("rdvno", "number at the reference point"),
+    ("drcax", "compensated axis"),
+    ("rdvno", "number of the reference point"),
     ("mdvno", "farthest number on the negative side"),
     ("pdvno", "farthest number on the positive side"),
     ("sc", "compensation scale factor"),
@@ -735,9 +744,9 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             return None
         return self.machine.controller_settings(self.name).fail(
             "mode",
-            "is missing: #4000 holds for the tables of ALL axes, and values of the wrong system are summed up. Give the "
-            "control's own parameter file (--style-from ALL.PRM), or look at #4000 and state mode = 'incremental' (1) or "
-            "'absolute' (0)",
+            "is missing: #4000 applies to the tables of ALL axes, and the control misreads values of the other system. Give "
+            "the control's parameter file (--style-from ALL.PRM), or read #4000 at the control and set mode = 'incremental' "
+            "(1) or 'absolute' (0)",
         )
 
     def basis(self, errors: ErrorTable) -> list[Term]:
@@ -749,8 +758,8 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             if kept is not None:
                 if not kept.first <= kept.reference <= kept.last:
                     raise kept.entry.fail(
-                        f"set {kept.index + 1} has the reference number {kept.reference} and the numbers {kept.first} to "
-                        f"{kept.last}, which cannot be kept: state interval_mm in the machine file for new ones"
+                        f"set {kept.index + 1} has the reference number {kept.reference} outside its numbers {kept.first} to "
+                        f"{kept.last} and cannot be kept; set interval_mm in the machine file to get new numbers"
                     )
                 reference = Decimal(repr(self.machine.reference_point_mm[pair[1]]))
                 start = reference + (kept.first - kept.reference) * kept.interval_mm
@@ -775,12 +784,12 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             term = terms[one_dimensional_name(output, base)]
             at = int(np.argmin(np.abs(term.nodes_mm - self.machine.reference_point_mm[base])))
             corrections = np.asarray(values[term.name])
-            wanted = settings.sign * (corrections - corrections[at]) / settings.count_mm(pair)
+            requested = settings.sign * (corrections - corrections[at]) / settings.count_mm(pair)
             # sums allow steps of any size; violations report values out of range
-            limit = int(2 * np.max(np.abs(wanted))) + 2 if settings.absolute else HIGHEST_VALUE
-            best = best_integers(wanted, travel_weights(self.machine, base, term.nodes_mm), at, limit)
+            limit = int(2 * np.max(np.abs(requested))) + 2 if settings.absolute else HIGHEST_VALUE
+            best = best_integers(requested, travel_weights(self.machine, base, term.nodes_mm), at, limit)
             numbers = values_of(best.counts, at, settings.kept_at_reference(pair), absolute=settings.absolute)
-            kept, own = settings.kept(pair), settings.own_set(pair)
+            kept, own = settings.kept(pair), settings.set_in_file(pair)
             first = lowest_free(taken, settings.first_number, len(numbers)) if kept is None else kept.first
             self._check_free(pair, first, first + len(numbers) - 1)
             taken.append((first, first + len(numbers) - 1))
@@ -871,7 +880,7 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
                 lines[entry.line - 1] = f"N{number}P{value}{behind}"
         if new:
             raise settings.sample.file.fail(
-                f"has no #{next(iter(new))}, which the tables need; state last_number or first_set"
+                f"has no #{next(iter(new))}, which the tables need; set last_number or first_set in the machine file"
             )
         return SourceFile(settings.sample.file.path, "\n".join(lines))
 
@@ -884,11 +893,14 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         ]
         if sample.file is None:
             found = [
-                "Of other axes: NOT KNOWN, the control's own file was not given (`--style-from ALL.PRM`). Sets and numbers below "
-                f"that another axis uses are lost, and #{SYSTEM} changes how the values of every axis are read."
+                "Of other axes: NOT KNOWN, because the control's parameter file was not given (`--style-from ALL.PRM`). If "
+                f"another axis uses one of the sets or numbers below, its data are lost; #{SYSTEM} changes how the control "
+                "reads the values of every axis."
             ]
         else:
-            found = [f"Of other axes: nothing. {'; '.join(others) + ' stay' if others else 'No other axis has a set'}."]
+            found = [
+                f"Of other axes: nothing. {'Kept: ' + '; '.join(others) if others else 'No other axis has a set'}."
+            ]
         for table in tables.sets:
             first = BASE + SET_STEP * table.index
             numbers = f"#{table.first} to #{table.last}"
@@ -915,12 +927,12 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
                     f"{constant:g} um in all values of {table.name}, which shifts the zero "
                     "of the axis as before"
                 )
-            own = self.settings.own_set((table.output, table.base))
+            own = self.settings.set_in_file((table.output, table.base))
             old = None if own is None else sample.entries.get(own.reference)
             if table.absolute and not table.at_reference and old is not None and not _same(old.value or "0", "0"):
                 found.append(
                     f"The value at the reference number #{old.number} was {old.value} and is now 0: "
-                    f"{AXES[table.output]} shifts by a constant, set the workpiece up anew"
+                    f"{AXES[table.output]} shifts by a constant; set the workpiece zero again"
                 )
         cleared = [f"set {item.index + 1} ({item.output} over {item.base})" for item in self._no_longer_used(tables)]
         if cleared:
@@ -936,8 +948,8 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
     def _rows(self, tables: MitsubishiTables) -> tuple[list[dict[str, str]], list[dict[str, str]]]:
         """Rows of the sheet: set parameters and values."""
         names, absolute = self.settings.axis_names, tables.sets[0].absolute
-        known = "as the control has it" if self.settings.sample.file is not None else "must be the control's own value"
-        system = f"Pinc: {'absolute values' if absolute else 'increments'}; holds for the sets of ALL axes and {known}"
+        known = "is the control's value" if self.settings.sample.file is not None else "must be the control's value"
+        system = f"Pinc: {'absolute values' if absolute else 'increments'}; applies to the sets of ALL axes, {known}"
         parameters, values = [_setting_row(SYSTEM, str(int(not absolute)), system)], []
         for table in tables.sets:
             numbers = (table.reference, table.first, table.last, table.scale)
@@ -982,27 +994,27 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
         )
         if tables.sets[0].absolute:
             return (
-                f"The numbers are {stored}, as sums up to their division point, zero at the reference point (#4000 = 0); "
-                f"{count}. An axis that stands {20 * count_um:g} um too low at a point gets {20 * settings.sign:+d} there (scale "
-                f"{scales[0]})."
+                f"The values are {stored} at their division point, zero at the reference point (absolute values, #4000 = 0); "
+                f"{count}. An axis whose actual position at a point is {20 * count_um:g} um too low gets "
+                f"{20 * settings.sign:+d} there (scale {scales[0]})."
             )
         return (
-            f"The numbers are {stored}, as steps from one division point to the next away from the reference point (#4000 = 1); "
-            f"{count}. An axis that travels {20 * count_um:g} um too short over one interval, in either direction away from the "
-            f"reference point, gets {20 * settings.sign:+d} there (scale {scales[0]})."
+            f"The values are {stored}, as steps from one division point to the next away from the reference point (increments, "
+            f"#4000 = 1); {count}. An axis that travels {20 * count_um:g} um too little over one interval, in either direction "
+            f"away from the reference point, gets {20 * settings.sign:+d} there (scale {scales[0]})."
         )
 
     def _warnings(self, tables: MitsubishiTables) -> list[str]:
         system = (
-            f"#{SYSTEM} holds for the tables of ALL axes. Read it at the control first: if it is not "
+            f"#{SYSTEM} applies to the tables of ALL axes. Read it at the control first: if it is not "
             f"{int(not tables.sets[0].absolute)}, do not enter the sheet; set mode in the machine file and export again."
         )
         return [
-            "The parameter numbers are those that are remembered of the M series; no document was read. Compare them with "
-            "the parameter manual of the control before anything is entered.",
+            "The parameter numbers of the M series are from memory; no document was read. Compare them with the parameter "
+            "manual of the control before you enter anything.",
             *([] if self.settings.sample.file is not None else [system]),
             "The direction of the values on the negative side follows from the formula of the manual, not from an example: "
-            "check it at one division on each side (part 3).",
+            "check it at one division on each side (section 3).",
             *(shortfall_text(self.settings, item) for item in tables.shortfalls if item.missed_counts <= 1.0),
         ]
 
@@ -1031,13 +1043,13 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     def _check_free(self, pair: tuple[int, int], first: int, last: int) -> None:
         """Reject numbers used by a set of another table in the control's file."""
-        own = self.settings.own_set(pair)
+        own = self.settings.set_in_file(pair)
         for item in self.settings.sample.sets:
             low, high = item.span
             if item is not own and first <= high and last >= low:
                 raise item.entry.fail(
                     f"set {item.index + 1} ({item.output} over {item.base}) uses the numbers {low} to {high}; {first} to {last} "
-                    f"of {one_dimensional_name(*pair)} would overwrite them. State interval_mm for new numbers"
+                    f"of {one_dimensional_name(*pair)} would overwrite them. Set interval_mm to get new numbers"
                 )
 
     def _grid(self, errors: ErrorTable, axis: int) -> EquidistantGrid:
@@ -1064,9 +1076,9 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
                 output=output,
             )
 
-        asked = settings.interval_mm[axis]
-        if asked is not None:
-            return grid_of(asked)
+        requested_mm = settings.interval_mm[axis]
+        if requested_mm is not None:
+            return grid_of(requested_mm)
         grid = grid_of(None)
         largest = 0.0  # change of a correction over one interval, in counts; it is proportional to the interval
         if not settings.absolute:

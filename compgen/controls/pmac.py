@@ -205,7 +205,7 @@ class _DownloadReader:
             self._define(line, rest, define)
         elif variable:
             number, value = int(variable.group(1)), int(variable.group(2))
-            self._once(line, f"I{number}", f"I{number} is set")
+            self._once(line, f"I{number}", f"I{number} is set a second time")
             if number == 51 and value in (0, 1):
                 self.enabled = value == 1
             elif number % 100 == 86 and 1 <= number // 100 <= _MOST_MOTOR and abs(value) <= _LARGEST:
@@ -225,13 +225,14 @@ class _DownloadReader:
     def _once(self, line: int, key: str, what: str) -> None:
         first = self.seen.setdefault(key, line)
         if first != line:
-            raise self.source.fail(f"{what} a second time; the first is in line {first}", line)
+            raise self.source.fail(f"{what}; the first is in line {first}", line)
 
     def _define(self, line: int, text: str, match: re.Match[str]) -> None:
         if self.motor is None:
             raise self.source.fail("no motor is addressed; expected #1 (or another) before DEFINE", line)
         backlash, two = bool(match.group(1)), bool(match.group(3))
-        self._once(line, f"{'BL' if backlash else ''}#{self.motor}", f"motor {self.motor} gets a table")
+        kind = "BLCOMP" if backlash else "COMP"
+        self._once(line, f"{kind}#{self.motor}", f"motor {self.motor} has a second {kind} table")
         shape = (int(match.group(2)),) + ((int(match.group(3)[1:]),) if two else ())
         words = [word.strip() for word in match.group(4).upper().split(",")]
         spans = words[-2:] if two else words[-1:]
@@ -246,18 +247,18 @@ class _DownloadReader:
         ):
             raise self.source.fail(f"{text[:80]!r} has wrong arguments; expected {_SYNTAX[backlash, two]}", line)
         if min(shape) < 1 or min(map(int, spans)) < 1 or len(spans) != 1 + two:
-            raise self.source.fail(f"{text[:80]!r}: sizes and spans are whole numbers above zero", line)
+            raise self.source.fail(f"{text[:80]!r}: sizes and spans must be whole numbers above zero", line)
         named = [(self._motor(line, found.group(1)), found.group(2) == "D") for found in sources if found]
         self.open = _Open(line, text, self.motor, backlash, shape, named, [int(word) for word in spans])
         if self.open.count > _MOST_ENTRIES:
-            raise self.source.fail(f"{self.open.count} entries; at most {_MOST_ENTRIES} are read", line)
+            raise self.source.fail(f"the table has {self.open.count} entries; at most {_MOST_ENTRIES} are read", line)
 
     def _entries(self, line: int, text: str) -> None:
         table = self.open
         assert table is not None
         for word in text.split():
             if not _WHOLE.fullmatch(word) or abs(int(word)) > _LARGEST:
-                done = f"{len(table.entries)} of {table.count} entries of the table in line {table.line} are there"
+                done = f"{len(table.entries)} of {table.count} entries of the table in line {table.line} were read before it"
                 shown = one_line(word)[:30]
                 raise self.source.fail(f"{shown!r} is not a whole number of 1/16 counts; {done}", line)
             if len(table.entries) == table.count:
@@ -306,7 +307,7 @@ def _joined(readers: Sequence[_DownloadReader]) -> PmacTables:
         for table in (*reader.tables, *reader.backlash):
             first = owners.setdefault((isinstance(table, BacklashTable), table.motor), reader.source)
             if first is not reader.source:
-                raise reader.source.fail(f"motor {table.motor} has a table in {first.path.name} already")
+                raise reader.source.fail(f"motor {table.motor} already has a table in {first.path.name}")
     switches = [reader.enabled for reader in readers if reader.enabled is not None]
     return PmacTables(
         tables=tuple(table for reader in readers for table in reader.tables),
@@ -323,7 +324,7 @@ def parse_foreign_pmac(files: Sequence[SourceFile]) -> tuple[PmacTables, list[st
     Motion and PLC programs and commands unrelated to tables are skipped; a line with a table or its
     switch that is not understood is an InputError.
     """
-    readers, passed = [], 0
+    readers, skipped = [], 0
     for source in files:
         reader, program = _DownloadReader(source), False
         text = source.text.replace("\r\n", "\n").replace("\r", "\n")
@@ -337,12 +338,12 @@ def parse_foreign_pmac(files: Sequence[SourceFile]) -> tuple[PmacTables, list[st
             elif code and not program and (address := _ADDRESS.fullmatch(code)):
                 reader.take(line, address.group())
             elif code:
-                passed += 1
+                skipped += 1
         readers.append(_complete(reader, len(text.split("\n"))))
-    remarks = [f"passed over: commands and programs without a table ({passed} lines)"] if passed else []
+    remarks = [f"skipped: commands and programs without a table ({skipped} lines)"] if skipped else []
     tables = _joined(readers)
     if tables.enabled is None:
-        remarks.append("no file sets I51: the tables are taken as switched on")
+        remarks.append("no file sets I51: the tables are assumed to be switched on")
     return tables, remarks
 
 
@@ -358,7 +359,7 @@ def _read(source: SourceFile) -> _DownloadReader:
             f"declares {declared.group(1)} tables but contains {count}: it is truncated or was edited by hand"
         )
     if declared and (reader.enabled is None or not source.text.endswith("\n")):
-        raise source.fail("has no I51 at its end: it is truncated")
+        raise source.fail("has no I51 at its end: the file is truncated")
     return reader
 
 
@@ -377,8 +378,8 @@ def _complete(reader: _DownloadReader, line: int) -> _DownloadReader:
 
 
 _COUNTS_MISSING = (
-    "is missing: tables are in counts of the motors, and only the machine builder's data say how many make a mm; write e.g. "
-    "counts_per_mm = { X = 1000.0, Y = 1000.0, Z = 2000.0 } (negative where the motor counts against the axis)"
+    "is missing: the tables are in counts of the motors, and only the machine builder's data give the counts per mm; set e.g. "
+    "counts_per_mm = { X = 1000.0, Y = 1000.0, Z = 2000.0 } (negative where a motor counts opposite to its axis)"
 )
 
 
@@ -403,7 +404,7 @@ def _scales(value: Any) -> tuple[float, float, float]:
 class PmacSettings:
     """Settings ``[controllers.pmac]``; ``desired``: tables are functions of the commanded position of their source."""
 
-    motors_available: int = setting(whole(3, 32), 32, meaning="motors that can own a table (Turbo PMAC 32, PMAC 8)")
+    motors_available: int = setting(whole(3, 32), 32, meaning="motors that can have a table (Turbo PMAC 32, PMAC 8)")
     motors: tuple[int, int, int] = axis_setting(
         whole(1, 32),
         (1, 2, 3),
@@ -414,14 +415,14 @@ class PmacSettings:
         toml_files.number, (0.0, 0.0, 0.0), meaning="machine coordinates of the motors' zero"
     )
     counts_per_mm: tuple[float, float, float] = setting(
-        _scales, meaning="counts of a motor per mm, negative if it counts against its axis"
+        _scales, meaning="counts of a motor per mm, negative if it counts opposite to its axis"
     )
     two_dimensional: bool = setting(toml_files.flag, False, meaning="write angular errors as two-dimensional tables")
     desired: bool = setting(
         word_for({"desired": True, "actual": False}),
         key="source_position",
         stated="desired",
-        meaning="whether tables go over the desired or the actual position of their source",
+        meaning="position of the source motor that the tables are functions of: desired (commanded) or actual",
     )
     max_entries: int = setting(whole(8, 100_000), 20_000, meaning="largest number of entries of one table")
     loss_mm: float = loss_setting()
@@ -628,9 +629,9 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         letters = {motor: AXES[axis] for axis, motor in enumerate(self.settings.motors)}
         return {
             "sign_statement": (
-                "Entries are 1/16 count of the target motor, and the control ADDS them to its commanded position: 160 adds 10 "
-                "counts. The first entry stands one spacing above the motor's zero, negative positions stand at the far end "
-                "of the table, the last entry is the value at zero."
+                "Entries are in 1/16 count of the target motor. The control ADDS them to its commanded position: 160 adds 10 "
+                "counts. The first entry is for the position one spacing above the motor's zero. Negative positions are at the "
+                "far end of the table; the last entry is the value at zero."
             ),
             "parameters": self._parameters(tables),
             "warnings": self._warnings(tables),
@@ -661,19 +662,19 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         """Read download files; motors that are not axes in the machine file cannot be sources or targets."""
         settings = self.settings
         if not files:
-            raise InputError("no file was given; comp.pmc is one")
+            raise InputError("no file was given; give a download file such as comp.pmc")
         tables = parse_pmac(files)
         for table in (*tables.tables, *tables.backlash):
             unknown = sorted(_motors(table) - set(settings.motors))
             if unknown:
                 raise files[0].fail(
                     f"the table of motor {table.motor} uses motor {unknown[0]}, which is not an axis of the machine file "
-                    f"(motors {settings.motors})"
+                    f"(motors {', '.join(map(str, settings.motors))})"
                 )
         return tables
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[PmacTables, list[str]]:
-        """Read a download file or backup of a real control; tables of other motors are kept apart and named."""
+        """Read a download file or backup of a real control; tables of other motors are kept separate and named."""
         tables, remarks = parse_foreign_pmac(files)
         known = set(self.settings.motors)
         apart = [t for t in (*tables.tables, *tables.backlash) if not _motors(t) <= known]
@@ -685,9 +686,9 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         )
         if apart:
             named = "; ".join(f"motor {t.motor} (uses {_listed(_motors(t))})" for t in apart)
-            remarks.append(f"tables of motors that are no axis of the machine file, kept apart: {named}")
+            remarks.append(f"tables of motors that are not axes of the machine file, kept separate: {named}")
         if not kept.tables and not kept.backlash:
-            raise files[0].fail(f"contains no table of the motors {_listed(known)}; {remarks[-1]}")
+            raise files[0].fail(f"contains no table for the motors {_listed(known)}; {remarks[-1]}")
         return kept, remarks
 
     def emulate(self, tables: PmacTables, points: Points) -> FloatArray:
@@ -718,8 +719,8 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         travel = travel_of(points, axis)
         if np.any(travel == 0):
             message = (
-                f"motor {motor} has backlash compensation, and some points do not say from where they were approached: "
-                "half of it is taken off there; give approach_x, approach_y, approach_z"
+                f"motor {motor} has backlash compensation, but some points do not state the direction of approach: half of "
+                "the backlash is subtracted there. Give approach_x, approach_y, approach_z"
             )
             warnings.warn(message, CompgenWarning, stacklevel=3)
         return np.asarray(size * 0.5 * (1.0 - np.sign(travel * self.settings.counts_per_mm[axis])))
@@ -727,12 +728,12 @@ class Pmac(Controller[PmacSettings, PmacTables]):
     def violations(self, tables: PmacTables) -> list[str]:
         """Return tables out of order, too long, shorter than the travel, or not enabled."""
         settings = self.settings
-        found = [] if tables.enabled else ["I51 is not 1: the tables do not act"]
+        found = [] if tables.enabled else ["I51 is not 1: the tables have no effect"]
         for kind, group in (("COMP", tables.tables), ("BLCOMP", tables.backlash)):
             owners = [table.motor for table in group]
             if owners != sorted(owners, reverse=True):
                 found.append(
-                    f"{kind} tables are defined in the order {owners}; expected from the highest motor down (ERR003)"
+                    f"{kind} tables are defined in the order of motors {owners}; expected from the highest motor down (ERR003)"
                 )
             if owners and max(owners) > settings.motors_available:
                 found.append(
@@ -746,7 +747,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         settings = self.settings
         found = []
         if (size := _entries(table)) > settings.max_entries:
-            found.append(f"the table of motor {table.motor} has {size} entries, max_entries is {settings.max_entries}")
+            found.append(f"the table of motor {table.motor} has {size} entries; max_entries is {settings.max_entries}")
         for motor, span in _spans(table):
             axis = settings.motors.index(motor)
             low, high = self.machine.axes[axis].range_mm
@@ -754,18 +755,18 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             needed = max(ends[1], 0.0) - min(ends[0], 0.0)
             if needed > span * (1.0 + _SPAN_SLACK):
                 found.append(
-                    f"the table of motor {table.motor} spans {span} counts of motor {motor}, the travel needs "
-                    f"{needed:g}: positions roll over within the travel"
+                    f"the table of motor {table.motor} spans {span} counts of motor {motor}, but the travel "
+                    f"needs {needed:g}: positions roll over within the travel"
                 )
         # at roll-over the last entry equals the value at zero, and the far edges equal the zero edges
         if isinstance(table, CompTable1D):
             if table.entries[-1]:
                 found.append(
-                    f"the table of motor {table.motor} ends with {table.entries[-1]}: the value jumps at zero; expected 0"
+                    f"the table of motor {table.motor} ends with {table.entries[-1]}; expected 0: the value jumps at zero"
                 )
         elif not np.array_equal(table.values, np.pad(table.values[:-1, :-1], ((0, 1), (0, 1)), mode="wrap")):
             found.append(
-                f"the far edges of the table of motor {table.motor} are not its zero edges: the value jumps at zero"
+                f"the far edges of the table of motor {table.motor} differ from its zero edges: the value jumps at zero"
             )
         return found
 
@@ -901,7 +902,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         for letter, motor, counts, home in zip(
             AXES, self.settings.motors, self.settings.counts_per_mm, self.settings.home_mm, strict=True
         ):
-            meaning = f"the tables assume {counts:g} counts per mm of {letter}, and zero at {letter} = {home:g} mm"
+            meaning = f"the tables assume {counts:g} counts per mm of {letter}, and the motor's zero at {letter} = {home:g} mm"
             rows.append((f"#{motor} -> {letter}", f"{counts:g}", meaning))
         return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
 
@@ -913,12 +914,12 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         first = "Of motors that are not X, Y or Z: nothing."
         if others:
             first = (
-                f"Motors that are not X, Y or Z and get a table: {', '.join(map(str, others))}. NOT KNOWN whether they have one: "
-                "list them first, a table that is there is lost."
+                f"Of motors that are not X, Y or Z: NOT KNOWN. These get a table: {', '.join(map(str, others))}. List "
+                "their tables first: an existing one is lost."
             )
         found = [first, f"The tables of motors {', '.join(f'{motor} ({names[motor]})' for motor in own)}."]
         variables = [
-            "I51 (it acts on the tables of all motors)",
+            "I51 (switches the tables of all motors)",
             *(f"I{motor}86" for motor in sorted(tables.constants)),
         ]
         return [*found, f"The variables {', '.join(variables)}."]
@@ -928,16 +929,16 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         owners = [table.motor for table in tables.tables if table.motor not in self.settings.motors]
         if owners:
             found.append(
-                f"the file keeps tables of X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which the machine "
-                "file does not have as axes: a table that one of them has on the control is lost"
+                f"the file stores tables for X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which are not axes "
+                "of the machine file: a table that one of these motors already has on the control is lost"
             )
         if any(isinstance(table, CompTable2D) for table in tables.tables):
             found.append(
-                "tables of two dimensions: the order of the arguments was put together from the remarks of the manuals "
-                "(row motor, column motor, target, row span, column span); check it with section 3 of the preflight list"
+                "two-dimensional tables: the order of the arguments (row motor, column motor, target, row span, column span) "
+                "was inferred from remarks in the manuals; check it with section 3 of the preflight list"
             )
         if any(value < 0 for value in tables.constants.values()):
-            found.append("a backlash Ixx86 is negative: the position reached in positive direction is the larger one")
+            found.append("a backlash Ixx86 is negative: the position reached in positive travel is the larger one")
         return found
 
     def _with_backlash(

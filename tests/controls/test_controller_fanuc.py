@@ -355,7 +355,7 @@ def block(**changes):
         ("", {"reference": 1020, "first": 1015}, "beyond the last number 1023"),
         ("", {"magnification": 0}, "switches the table off"),
         ("max_feed_mm_min = 1000000.0", {}, "shorter than"),
-        ("", {"values": (1,) * 10}, "covers -700 ... 300 mm of X, the travel is -300 ... 500 mm"),
+        ("", {"values": (1,) * 10}, "covers -700 ... 300 mm of X; the travel is -300 ... 500 mm"),
         ("", {"reference": 5}, "covers -200 ... 1000 mm of X"),
     ],
 )
@@ -525,7 +525,7 @@ def test_huge_garbage_is_refused_within_a_second(tmp_path, seed):
     for head in ("%\n", "%\nN03620", "%\n" + seed):
         with pytest.raises(InputError):
             parse(machine, head + garbage)
-    with pytest.raises(InputError, match="such a file has at most 4000000"):
+    with pytest.raises(InputError, match="a file of this kind has at most 4000000"):
         parse(machine, garbage * 2)
     assert time.process_time() - start < 4.0
 

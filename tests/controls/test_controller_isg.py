@@ -224,7 +224,7 @@ def test_negate_flips_and_set_to_zero_blanks_the_result():
     listing = texts["volcomp0.lis"].replace("entries: 9", "entries: 11") + "negate YX\nset_to_zero Z\n"
     changed = added("isg-csv", machine, texts | {"volcomp0.lis": listing}, position)
     np.testing.assert_array_equal(changed, plain * [-1.0, -1.0, 0.0])
-    assert "list file: negate is XY, the machine file makes it nothing" in complaints(
+    assert "list file: negate is XY; the machine file requires nothing" in complaints(
         "isg-csv", machine, texts | {"volcomp0.lis": listing}
     )
 
@@ -248,7 +248,7 @@ def test_negate_alone_turns_the_compensation_around_and_is_warned_of():
     due = added("isg-csv", plain, exported("isg-csv", plain, errors), position) * [1.0, -1.0, 1.0]
     np.testing.assert_array_equal(added("isg-csv", negated, exported("isg-csv", negated, errors), position), due)
     context = context_of("isg-csv", negated, built("isg-csv", negated, errors))
-    assert any("differ on Y" in text for text in context["warnings"])
+    assert any("differ for Y: the control then ADDS the error" in text for text in context["warnings"])
 
 
 # --- round trip --------------------------------------------------------------------------------------------------
@@ -377,7 +377,7 @@ def test_the_column_file_has_the_blocks_in_order_and_the_units():
 def test_errors_that_are_absent_are_named_in_the_file():
     machine = machine_with()
     text = exported("isg-csv", machine, random_errors(machine, names=CURVE_NAMES[:17]))["volcomp0.csv"]
-    assert "// Errors that are zero and left out: ECZ\n" in text
+    assert "// Errors left out because they are zero: ECZ\n" in text
 
 
 def test_a_machine_with_reference_y_says_where_its_squareness_went():
@@ -425,7 +425,7 @@ def test_a_file_that_is_cut_anywhere_is_refused(name):
 def test_travel_that_is_not_covered_is_named():
     machine = machine_with()
     assert complaints("isg-csv", machine, {"a.csv": "X EXX EYX\n-300 0 0\n499 0.001 0\n#\nC0Y\n0\n"}) == [
-        "EXX, EYX: covers -300 ... 499 mm of X, the travel is -300 ... 500 mm"
+        "EXX, EYX: covers -300 ... 499 mm of X; the travel is -300 ... 500 mm"
     ]
 
 
@@ -437,7 +437,7 @@ def test_more_records_than_the_control_takes_is_a_violation(name):
     assert complaints(name, exact, exported(name, exact, errors)) == []
     found = complaints(name, short, exported(name, short, errors))
     assert len(found) == 1
-    assert f"{tables.records} records, max_records is {tables.records - 1}" in found[0]
+    assert f"{tables.records} records, but max_records is {tables.records - 1}" in found[0]
 
 
 def test_records_are_the_rows_of_numbers_in_the_file():
@@ -452,14 +452,14 @@ def test_records_are_the_rows_of_numbers_in_the_file():
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("chain               XYZ", "chain YXZ", "chain is YXZ, the machine file makes it XYZ"),
-        ("workpiece_axes      2", "workpiece_axes 0", "workpiece_axes is 0, the machine file makes it 2"),
-        ("Y                   2", "Y 5", "Y is 5, the machine file makes it 2"),
+        ("chain               XYZ", "chain YXZ", "chain is YXZ; the machine file requires XYZ"),
+        ("workpiece_axes      2", "workpiece_axes 0", "workpiece_axes is 0; the machine file requires 2"),
+        ("Y                   2", "Y 5", "Y is 5; the machine file requires 2"),
         ("volcomp0.csv", "other.csv", r"file\[0\] is other.csv, which was not given"),
         ("volcomp0.csv", "other.csv", "volcomp0.csv is not named in the list file"),
-        ("ISG_CSV", "ETALON_EXCHANGE", "declared ETALON_EXCHANGE, it is ISG_CSV"),
+        ("ISG_CSV", "ETALON_EXCHANGE", "declared ETALON_EXCHANGE, but it is ISG_CSV"),
         ("use_axis_offsets    0", "use_axis_offsets 1", "use_axis_offsets 1"),
-        ("file[0]  ", "file[10] ", "the control takes 10"),
+        ("file[0]  ", "file[10] ", "the control accepts 10"),
     ],
 )
 def test_a_list_file_that_disagrees_is_a_violation(old, new, words):
@@ -485,12 +485,12 @@ def test_more_than_ten_parameter_files_is_a_violation():
     for name in names[:11]:
         low, high = TRAVELS["XYZ".index(name[2])]
         texts[f"{name}.csv"] = f"{name[2]} {name}\n{low} 0\n{high} 0\n"
-    assert complaints("isg-csv", machine_with(), texts) == ["11 parameter files, the control takes 10"]
+    assert complaints("isg-csv", machine_with(), texts) == ["11 parameter files; the control accepts 10"]
 
 
 def test_logical_numbers_in_the_parameter_file_must_be_those_of_the_machine_file():
     found = complaints("isg-csv", machine_with(), {"a.csv": "LNX LNY C0Y\n1 7 0\n"})
-    assert found == ["LNY = 7, the machine file says 2"]
+    assert found == ["LNY = 7, but the machine file says 2"]
 
 
 # --- malformed text ----------------------------------------------------------------------------------------------
@@ -510,7 +510,7 @@ CSV = "// head\nX EXX EYX\n-300 0.001 0.002\n500 0.003 0.004\n#\nC0Y\n0.00001\n"
         (CSV.replace("X EXX EYX", "EZX EXX EYX"), 4, "second row without an argument"),
         (CSV.replace("X EXX EYX", "X Y Z"), 2, "arguments only"),
         (CSV.replace("X EXX EYX\n", ""), 2, "expected a header with names"),
-        (CSV.replace("0.003 0.004", "0.003"), 4, "has 2 columns, its header in line 2 has 3"),
+        (CSV.replace("0.003 0.004", "0.003"), 4, "has 2 columns, but its header in line 2 has 3"),
         (CSV.replace("0.003 0.004", "0.003 0.004 0"), 4, "has 4 columns"),
         (CSV.replace("0.003", "0,003"), 4, "'0,003' is not a finite number; the decimal mark"),
         (CSV.replace("0.003", "nan"), 4, "'nan' is not a finite number"),
@@ -520,7 +520,7 @@ CSV = "// head\nX EXX EYX\n-300 0.001 0.002\n500 0.003 0.004\n#\nC0Y\n0.00001\n"
         (CSV.replace("0.003", "0x1"), 4, "not a finite number"),
         (CSV.replace("0.003", "0.00\N{ARABIC-INDIC DIGIT THREE}"), 4, "printable ASCII"),
         (CSV.replace("0.003", "0.003\0"), 4, "printable ASCII"),
-        (CSV.replace("500 ", "-300 "), 4, "is given again"),
+        (CSV.replace("500 ", "-300 "), 4, "is given twice"),
         (CSV.replace("C0Y\n0.00001\n", "EXX\n0.1\n"), 6, "EXX is given a second time; the first is in a.csv:2"),
         (CSV.replace("C0Y\n0.00001\n", "C0Y\n"), 6, "no rows"),
         (CSV.replace("C0Y\n0.00001\n", "C0Y\n0.1\n0.2\n"), 8, "second row"),
@@ -558,12 +558,12 @@ ETALON = "// head\n[C0Y]\nVALUE = 0.00001\n[EXX]\nGridpoints = {\n-300 0.001\n50
         (ETALON.replace("VALUE = 0.00001", "VALUE = 0,00001"), 3, "decimal mark"),
         (ETALON.replace("VALUE = 0.00001", "VALUE = nan"), 3, "not a finite number"),
         (ETALON.replace("VALUE = 0.00001", "VALUE 0.00001"), 3, "'VALUE = number' or"),
-        (ETALON.replace("VALUE = 0.00001\n", "VALUE = 1\nVALUE = 2\n"), 4, "has its value already"),
+        (ETALON.replace("VALUE = 0.00001\n", "VALUE = 1\nVALUE = 2\n"), 4, "already has a value"),
         (ETALON.replace("VALUE = 0.00001\n", ""), 2, "has no values"),
         (ETALON.replace("Gridpoints", "Points"), 5, "'VALUE = number' or"),
         (ETALON.replace("500 0.002", "500 0.002 1"), 7, "two numbers"),
         (ETALON.replace("500 0.002", "500"), 7, "two numbers"),
-        (ETALON.replace("500 0.002", "-300.0 0.002"), 7, "is given again"),
+        (ETALON.replace("500 0.002", "-300.0 0.002"), 7, "is given twice"),
         (ETALON.replace("500 0.002", "[EYX]"), 7, "two numbers"),
         (ETALON.replace("500 0.002", "500 0.002 } }"), 7, "two numbers"),
     ],
@@ -730,7 +730,7 @@ def test_the_preflight_states_what_must_be_set_and_checked(name):
         "| `X` | 4 |",
         "| `chain` | XYZ |",
         "| `workpiece_axes` | 2 |",
-        "must then command X = 99.995 mm",
+        "so the control must command X = 99.995 mm",
         "tool offset (3, -40, -155) mm",
         "#VOLCOMP OFF [ID0]",
         "chain_direction",

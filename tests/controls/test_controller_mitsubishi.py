@@ -219,13 +219,19 @@ def test_limits_of_a_foreign_sheet_are_named(tmp_path):
     machine = machine_of(tmp_path)
     text = SAMPLE.replace("#4103,0", "#4103,5").replace("#4014,4106", "#4014,4105").replace("#4006,1", "#4006,0")
     found = " ".join(CONTROL(machine).violations(parse(machine, text)))
-    for part in ("value at the reference number 4103 must be 0", "overlap", "scale is 0", "covers", "Y has no table"):
+    for part in (
+        "value at the reference number 4103 must be 0",
+        "overlap",
+        "scale is 0",
+        "covers",
+        "Y has no positioning table",
+    ):
         assert part in found
 
 
 def test_a_set_of_an_axis_that_is_not_in_the_machine_file_is_left_out_with_a_warning(tmp_path):
     machine = machine_of(tmp_path)
-    with pytest.warns(CompgenWarning, match="set 2 belongs to the axis A"):
+    with pytest.warns(CompgenWarning, match="set 2 belongs to axis A, which is not in the machine file"):
         tables = parse(machine, SAMPLE.replace("#4011,Y", "#4011,A"))
     assert [(table.base, table.output) for table in tables.sets] == [(0, 0)]
 
@@ -245,12 +251,12 @@ def test_order_crlf_blank_lines_and_missing_signs_do_no_harm(tmp_path):
         ("#4102,20,", "#4102,-129,", 18, "whole number from -128 to 127"),
         ("#4102,20,", "#4102,2e1,", 18, "whole number"),
         ("#4102,20,", "#4102,nan,", 18, "whole number"),
-        ("#4102,20,", "#4102;20;", 18, "not the number"),
+        ("#4102,20,", "#4102;20;", 18, "not a parameter number"),
         ("#4102,20,", "#4103,20,", 19, "second time"),
-        ("#4102,20,X at -100\n", "", 7, "#4102 \\(1 in all\\) missing"),
+        ("#4102,20,X at -100\n", "", 7, "missing: #4102 \\(1 in all\\)"),
         ("#4102,20,X at -100", "#4102,2", 18, "is the file truncated"),
-        ("#4003,4103", "#4003,4106", 5, "none of 4101 to 4105"),
-        ("#4003,4103", "#4003,", 3, "#4003 of set 1 missing"),
+        ("#4003,4103", "#4003,4106", 5, "outside the numbers 4101 to 4105"),
+        ("#4003,4103", "#4003,", 3, "set 1 is incomplete: #4003 missing"),
         ("#4003,4103", "#4003,40", 5, "4101 to 5999"),
         ("#4007,100.0", "#4007,1e2", 9, "interval in mm"),
         ("#4007,100.0", "#4007,0.0", 9, "interval in mm"),
@@ -355,9 +361,9 @@ def test_absolute_values_of_a_backup_are_sums_and_other_axes_are_kept_apart(tmp_
     found = added(machine, read.tables, [[value, 10.0, -500.0] for value in x])
     np.testing.assert_allclose(found[:, 0], np.array([-4, -3, 0, 2.5, 5, 7, 9]) * UM, atol=ROUNDING_MM)
     assert read.remarks[0].startswith("#4000 = 0: absolute values")
-    assert read.remarks[1] == "set 4 of A, numbers 4401 to 4416: not of the machine file, kept apart"
-    assert read.remarks[2] == "set 6 of C, numbers 4501 to 4524: not of the machine file, kept apart"
-    assert read.remarks[3] == "passed over: 5 lines that cannot change a table"
+    assert read.remarks[1] == "set 4 of A, numbers 4401 to 4416: not in the machine file, kept separate"
+    assert read.remarks[2] == "set 6 of C, numbers 4501 to 4524: not in the machine file, kept separate"
+    assert read.remarks[3] == "skipped: 5 lines that cannot change a table"
 
 
 def test_the_mode_sets_and_numbers_of_the_backup_are_kept(tmp_path, backup_file, make_errors):
@@ -380,7 +386,7 @@ def test_the_mode_sets_and_numbers_of_the_backup_are_kept(tmp_path, backup_file,
     sheet = CONTROL(machine).parse([SourceFile(Path("S.CSV"), made.files["SETSHEET.CSV"])])
     np.testing.assert_array_equal(added(machine, tables, positions), added(machine, sheet, positions))
     told = made.preflight.split("## What the files overwrite")[1]
-    assert told.index("Of other axes: nothing. set 4 (A over A") < told.index("Set 1 (#4001")
+    assert told.index("Of other axes: nothing. Kept: set 4 (A over A") < told.index("Set 1 (#4001")
 
 
 @pytest.mark.parametrize(("system", "chain"), [(0, "WXYFZT"), (1, "WFYXZT")])
@@ -410,7 +416,7 @@ def test_the_values_of_both_systems_by_hand(tmp_path):
 def test_an_export_asks_for_the_mode_and_writes_nothing(tmp_path, make_errors):
     machine = machine_of(tmp_path)
     machine.controllers["mitsubishi"].data.pop("mode")
-    with pytest.raises(InputError, match="#4000 holds for the tables of ALL axes"):
+    with pytest.raises(InputError, match="#4000 applies to the tables of ALL axes"):
         export(machine, make_errors(machine), "mitsubishi")
     assert parse(machine, SAMPLE).sets[0].absolute is False
     assert parse(machine, SAMPLE.replace("#4000,1", "#4000,0")).sets[0].absolute is True
@@ -430,7 +436,7 @@ def test_a_sum_out_of_range_names_the_scale_that_holds_it(tmp_path):
     errors = ErrorTable({"EXX": Curve(nodes, -1e-4 * (nodes + 100.0) * 3, np.full(3, np.nan))})
     machine = machine_of(tmp_path, f'mode = "absolute"\n{ONLY_OWN}')
     assert any(
-        "the value 360 lies outside -128 ... 127; set scale = 3" in v
+        "the value 360 is outside -128 ... 127; set scale = 3" in v
         for v in export(machine, errors, "mitsubishi").violations
     )
     wider = machine_of(tmp_path, f'mode = "absolute"\n{ONLY_OWN}\nscale = 3')
@@ -467,7 +473,7 @@ def test_a_constant_at_the_reference_point_stays(tmp_path, make_errors):
     read = compgen.read_tables(machine, [tmp_path / "ALL.PRM"], "mitsubishi")
     found = added(machine, read.tables, [[-100.0, 0, -500.0], [0.0, 0, -500.0], [100.0, 0, -500.0]])
     np.testing.assert_allclose(found[:, 0], np.array([0.0, 3.0, -2.0]) * UM, atol=ROUNDING_MM)
-    assert any("the value 2 at the reference number #4103 shifts the zero" in remark for remark in read.remarks)
+    assert any("the value 2 at the reference number #4103 only shifts the zero" in remark for remark in read.remarks)
     changed = CONTROL(machine).parse(
         [SourceFile(Path("S.CSV"), made.files["SETSHEET.CSV"].replace("\n#4103,2,", "\n#4103,0,"))]
     )
@@ -517,13 +523,17 @@ def test_a_set_of_ours_that_is_no_longer_used_is_switched_off(tmp_path, make_err
     ("change", "options", "words"),
     [
         (lambda t: t, 'mode = "incremental"\n' + ONLY_OWN, "#4000 = 0"),
-        (lambda t: t, "", "9|8 new sets are needed and 7 of the 10 sets"),
+        (
+            lambda t: t,
+            "",
+            "8 new sets are needed, but only 7 of the 10 sets of the control are free \\(other axes use set 4 of A",
+        ),
         (lambda t: t[: t.rindex("%")], ONLY_OWN, "is the file truncated"),
         (lambda t: t.replace("N4000P0\r\n", ""), ONLY_OWN, "#4000 .* is missing"),
         (lambda t: t.replace("N4102P-3", "N4102P-3\r\nN4102P1"), ONLY_OWN, "second time"),
         (lambda t: t.replace("N4102P-3", "N4102A1P-3"), ONLY_OWN, "the word A1"),
         (lambda t: t.replace("N4102P-3", "N4102 = -3"), ONLY_OWN, "is not understood"),
-        (lambda t: t.replace("N4012P\r", "N4012PY\r"), ONLY_OWN, "set 2 is not complete"),
+        (lambda t: t.replace("N4012P\r", "N4012PY\r"), ONLY_OWN, "set 2 is incomplete"),
         (lambda t: t.replace("N4003P4103", "N4003P4110"), ONLY_OWN, "cannot be kept"),
         (
             lambda t: t.replace("N4035P4416", "N4035P4416").replace("N4034P4401", "N4034P4105"),

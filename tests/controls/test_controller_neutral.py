@@ -153,7 +153,7 @@ JSON = json.dumps(
         (FIELD.replace("x_mm", "x_in"), "x_mm"),
         (FIELD.rsplit("\n", 2)[0] + "\n", "declares 8 rows but contains 7"),
         (FIELD.replace("# rows = 8\n", "").rsplit("\n", 2)[0] + "\n", "do not fill the grid"),
-        (FIELD.replace("1,1,1,48", "1,0,1,48"), "is given again"),
+        (FIELD.replace("1,1,1,48", "1,0,1,48"), "is given twice"),
         (FIELD.replace("48", "4.8.0"), "not a number"),
         (FIELD.replace("48", "nan"), "finite"),
         (CURVES.replace("EC0Y", "EC0X"), "EC0X"),

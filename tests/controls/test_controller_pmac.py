@@ -337,7 +337,7 @@ def test_entries_stand_ten_to_a_line_and_rows_without_the_zero_at_their_corner()
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (GOLDEN, "spans 4000 counts of motor 1, the travel needs 800000"),
+        (GOLDEN, "spans 4000 counts of motor 1, but the travel needs 800000"),
         (GOLDEN.replace("I51=1\n", ""), "I51 is not 1"),
         (GOLDEN.replace("80 0\n", "80 5\n"), "ends with 5"),
         ("#1 DEFINE COMP 2,8000000\n0 0\n#2 DEFINE COMP 2,8000000\n0 0\nI51=1\n", "ERR003"),
@@ -415,7 +415,7 @@ def test_counts_per_mm_are_mandatory_and_say_why():
         (GOLDEN.replace("8,4000", "8,#2,#3,#1,4000"), 2, "wrong arguments"),
         (GOLDEN.replace("8,4000", "0,4000"), 2, "above zero"),
         (GOLDEN.replace("COMP 8", "COMP 2.3"), 2, "wrong arguments"),
-        (GOLDEN + GOLDEN.replace("I51=1\n", ""), 6, "motor 1 gets a table a second time"),
+        (GOLDEN + GOLDEN.replace("I51=1\n", ""), 6, "motor 1 has a second COMP table; the first is in line 2"),
         (GOLDEN.replace("I51=1", "I52=1"), 4, "is not part of compensation"),
         (GOLDEN.replace("I51=1", "MOVE"), 4, "not understood"),
         ("; tables: 2\n" + GOLDEN, None, "declares 2 tables but contains 1"),

@@ -223,7 +223,7 @@ def test_encoder_tables_that_are_short_long_or_uneven_are_violations(tmp_path):
     assert len(found) == 3
     assert "never meets MAX" in found[0]
     assert "has 5 nodes; the control takes at most 4" in found[1]
-    assert "covers 0 ... 201 mm of X, the travel is -1000 ... 1000 mm" in found[2]
+    assert "covers 0 ... 201 mm of X; the travel is -1000 ... 1000 mm" in found[2]
 
 
 # --- cross-error compensation: golden ------------------------------------------------------------------------------

@@ -362,7 +362,7 @@ def test_the_active_tables_of_an_archive_are_said_once(tmp_path):
     (tmp_path / "control.arc").write_bytes(cec_archive())
     with pytest.warns(CompgenWarning) as said:
         active = read_active(machine_with(tmp_path), [tmp_path / "control.arc"], "siemens-cec")
-    assert sum("kept apart: table 7" in str(warning.message) for warning in said) == 1
+    assert sum("kept separate: table 7" in str(warning.message) for warning in said) == 1
     assert active.paths == (tmp_path / "control.arc",)
 
 
@@ -682,8 +682,8 @@ def test_words_that_could_change_a_table_are_refused(tmp_path, line):
         (
             "pmac",
             [
-                "- Motors that are not X, Y or Z and get a table: 4.",
-                "NOT KNOWN whether they have one",
+                "- Of motors that are not X, Y or Z: NOT KNOWN. These get a table: 4.",
+                "an existing one is lost",
                 "motors 1 (X), 2 (Y), 3 (Z)",
                 "I51",
             ],

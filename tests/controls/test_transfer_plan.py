@@ -67,12 +67,12 @@ def test_a_single_other_number_is_named_with_its_place(exported):
     assert len(places) > 20
     for where in (places[0], places[len(places) // 2], places[-1]):
         (text,) = contradictions(controller, {**files, name: json.dumps(changed(plan, where))})
-        assert text.startswith(f"{name}: {where[0]}") and "but the tables exported with it say" in text
+        assert text.startswith(f"{name}: {where[0]}") and "but the tables of the same export give" in text
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("{", "is not JSON"), ("[1]", "a plan is an object"), ("{}", "missing"), ('{"a": 1, "a": 2}', "is given twice")],
+    [("{", "is not JSON"), ("[1]", "expected an object"), ("{}", "missing"), ('{"a": 1, "a": 2}', "is given twice")],
 )
 def test_what_is_no_plan_is_named(exported, text, message):
     controller, files, name = exported

@@ -224,7 +224,7 @@ class Controller(ABC, Generic[Settings, Tables]):
         return plan_contradictions(files, lambda: self.context(tables)["plan"]) if self.has_plan else []
 
     def remarks(self, tables: Tables, files: Sequence[SourceFile]) -> list[str]:
-        """Return, in words, what was assumed, skipped or kept apart (tables of other axes) when reading these files.
+        """Return, in words, what was assumed, skipped or kept separate (tables of other axes) when reading these files.
 
         For someone reading the backup of a control. Lines not understood that could change a table are not
         remarks: ``parse`` rejects them. The default is the ``remarks`` of the tables, if any.
@@ -260,7 +260,7 @@ class Controller(ABC, Generic[Settings, Tables]):
 
     def with_reversal(self, tables: Tables, reversal: ReversalCurves) -> Tables:
         """Return the tables including the reversal; only for ``bidirectional`` controls."""
-        raise TypeError(f"{self.name} has no tables of one direction")
+        raise TypeError(f"{self.name} has no direction-dependent tables")
 
     def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
         """Return the control's backlash parameters (name, value, meaning) for a reversal that is in no table."""
@@ -318,7 +318,7 @@ def coverage_violations(machine: Machine, axis: int, first_mm: float, last_mm: f
     low, high = machine.axes[axis].range_mm
     if first_mm <= low + 1e-6 and last_mm >= high - 1e-6:
         return []
-    return [f"{what} covers {first_mm:g} ... {last_mm:g} mm of {'XYZ'[axis]}, the travel is {low:g} ... {high:g} mm"]
+    return [f"{what} covers {first_mm:g} ... {last_mm:g} mm of {'XYZ'[axis]}; the travel is {low:g} ... {high:g} mm"]
 
 
 # Plans for a binary transfer (``*.plan.json``) in addition to the control's text: both must contain the same numbers.
@@ -337,24 +337,24 @@ def plan_contradictions(files: Sequence[SourceFile], expected: Callable[[], Mapp
     One sentence for each unusable plan: not JSON, not an object, or the first number that differs, with its place.
     """
     plans = [file for file in files if file.path.suffix.lower() == ".json"]
-    wanted = json.loads(json.dumps(dict(expected()))) if plans else {}
-    return [f"{file.path.name}: {text}" for file in plans if (text := _contradiction(file.text, wanted))]
+    of_tables = json.loads(json.dumps(dict(expected()))) if plans else {}
+    return [f"{file.path.name}: {text}" for file in plans if (text := _contradiction(file.text, of_tables))]
 
 
-def _contradiction(text: str, wanted: Mapping[str, Any]) -> str:
+def _contradiction(text: str, expected: Mapping[str, Any]) -> str:
     try:
         found = json.loads(text, object_pairs_hook=_once)
     except (ValueError, RecursionError) as problem:
         return f"is not JSON: {problem}"
     if not isinstance(found, dict):
-        return f"contains {_short(found)}, a plan is an object with {', '.join(wanted)}"
-    differing = list(_differences({key: found.get(key) for key in wanted}, wanted, ""))
+        return f"contains {_short(found)}; expected an object with {', '.join(expected)}"
+    differing = list(_differences({key: found.get(key) for key in expected}, expected, ""))
     if not differing:
         return ""
     where, given, right = differing[0]
     more = f" (and {len(differing) - 1} more)" if len(differing) > 1 else ""
-    says = f"{where} is {_short(given)}, but the tables exported with it say {_short(right)}{more}"
-    return f"{says}: leave the plan out, or export again"
+    says = f"{where} is {_short(given)}, but the tables of the same export give {_short(right)}{more}"
+    return f"{says}. Leave the plan out, or export again"
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -364,15 +364,15 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return found
 
 
-def _differences(given: Any, due: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
-    if isinstance(given, dict) and isinstance(due, dict):
-        for key in [*due, *(key for key in given if key not in due)]:
-            yield from _differences(given.get(key), due.get(key), f"{where}.{key}" if where else key)
-    elif isinstance(given, list) and isinstance(due, list) and len(given) == len(due):
-        for place, (one, other) in enumerate(zip(given, due, strict=True)):
+def _differences(given: Any, expected: Any, where: str) -> Iterator[tuple[str, Any, Any]]:
+    if isinstance(given, dict) and isinstance(expected, dict):
+        for key in [*expected, *(key for key in given if key not in expected)]:
+            yield from _differences(given.get(key), expected.get(key), f"{where}.{key}" if where else key)
+    elif isinstance(given, list) and isinstance(expected, list) and len(given) == len(expected):
+        for place, (one, other) in enumerate(zip(given, expected, strict=True)):
             yield from _differences(one, other, f"{where}[{place}]")
-    elif given != due or isinstance(given, bool) != isinstance(due, bool):
-        yield where, given, due
+    elif given != expected or isinstance(given, bool) != isinstance(expected, bool):
+        yield where, given, expected
 
 
 def _short(value: Any) -> str:

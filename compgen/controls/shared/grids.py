@@ -107,7 +107,7 @@ class EquidistantGrid:
 
 
 def loss_setting(
-    meaning: str = "loss by interpolation between nodes, um at the tool, that is worth no further node",
+    meaning: str = "interpolation loss between nodes that does not justify another node, um at the tool",
 ) -> Any:
     """Declare ``loss_um``: the interpolation loss, as a tool displacement, not worth another node; in mm."""
     default = NEGLIGIBLE_LOSS_MM / MM_PER_UM
@@ -131,7 +131,7 @@ def uneven_nodes_mm(
     Travel ends are nodes, and so is the reference point if a curve has a node there.
     """
     candidates = curve_nodes_mm(machine, errors, axis, most)
-    curves = [_Held.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis)]
+    curves = [_ToleratedCurve.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis)]
     if not curves:
         return candidates
     values = np.array([item.curve.at(candidates) for item in curves])
@@ -168,7 +168,9 @@ def equidistant_grid(
     low, high = machine.axes[axis].range_mm
     if step_mm is not None:
         return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
-    curves = [_Held.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)]
+    curves = [
+        _ToleratedCurve.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)
+    ]
     curves = curves if products else [replace(item, bent=False) for item in curves]
     tried: list[tuple[float, EquidistantGrid]] = []
     for grid in _candidates(machine, errors, axis, anchor, most):
@@ -215,7 +217,7 @@ def _curves_of(
 
 
 @dataclass(frozen=True)
-class _Held:
+class _ToleratedCurve:
     """A curve that tables must fit to within ``tolerance`` (mm or rad); with ``bent`` also curve times position.
 
     An angular error whose lever contains the travel of its axis acts as curve times position, not linear between
@@ -228,7 +230,7 @@ class _Held:
     bent_tolerance: float
 
     @classmethod
-    def of(cls, machine: Machine, name: str, curve: Curve, loss_mm: float) -> _Held:
+    def of(cls, machine: Machine, name: str, curve: Curve, loss_mm: float) -> _ToleratedCurve:
         error = error_named(name)
         ends = np.abs(np.concatenate([machine.lower_mm, machine.upper_mm, machine.tool_offset_mm]))
         lever_mm = 1.0 if error.kind == "linear" else max(1.0, float(np.max(ends)))
@@ -249,8 +251,8 @@ class _Held:
         return max(loss, missed / self.bent_tolerance)
 
 
-def _missed(nodes_mm: FloatArray, where_mm: FloatArray, at_nodes: FloatArray, wanted: FloatArray) -> float:
-    return float(np.max(np.abs(np.interp(where_mm, nodes_mm, at_nodes) - wanted)))
+def _missed(nodes_mm: FloatArray, where_mm: FloatArray, at_nodes: FloatArray, exact: FloatArray) -> float:
+    return float(np.max(np.abs(np.interp(where_mm, nodes_mm, at_nodes) - exact)))
 
 
 def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, most: int) -> list[EquidistantGrid]:
@@ -413,9 +415,9 @@ def grid_order(
     repeated = np.flatnonzero(np.diff(cells[order]) == 0)
     if repeated.size:
         row = int(order[repeated[0] + 1])
-        raise source.fail(f"the position {[float(column[row]) for column in arguments]} is given again", lines[row])
+        raise source.fail(f"the position {[float(column[row]) for column in arguments]} is given twice", lines[row])
     if len(lines) != int(np.prod(shape)):
         sizes = " x ".join(map(str, shape))
-        message = f"{len(lines)} rows do not fill the grid of {sizes} positions that their arguments name"
-        raise source.fail(f"{message}; interpolation GRID needs every combination once", lines[-1])
+        message = f"{len(lines)} rows do not fill the grid of {sizes} positions"
+        raise source.fail(f"{message}; every combination of the arguments needs exactly one row", lines[-1])
     return nodes, order

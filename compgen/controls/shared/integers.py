@@ -86,7 +86,7 @@ def travel_weights(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatAr
 
 
 def nearest_polyline(
-    nodes_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray, reference: int
+    nodes_mm: FloatArray, position_mm: FloatArray, requested: FloatArray, weight: FloatArray, reference: int
 ) -> tuple[FloatArray, FloatArray]:
     """Project a curve given at any positions (m,) onto polylines that are zero at node ``reference``.
 
@@ -101,42 +101,42 @@ def nearest_polyline(
     free = np.arange(len(nodes_mm)) != reference
     root = np.sqrt(weight)
     values = np.zeros(len(nodes_mm))
-    values[free] = np.linalg.lstsq(matrix[:, free] * root[:, None], wanted * root, rcond=None)[0]
+    values[free] = np.linalg.lstsq(matrix[:, free] * root[:, None], requested * root, rcond=None)[0]
     return values, sections
 
 
-def best_integers(wanted: FloatArray, sections: FloatArray, reference: int, limit: int | None) -> IntegerCurve:
+def best_integers(requested: FloatArray, sections: FloatArray, reference: int, limit: int | None) -> IntegerCurve:
     """Return the whole numbers closest to a polyline, exact by dynamic programming.
 
     Parameters
     ----------
-    wanted : requested values v (n,) of the polyline at the nodes in counts, zero at the reference node.
+    requested : values v (n,) of the polyline at the nodes in counts, zero at the reference node.
     sections : G of the sections, shape (n-1, 3), from :func:`section_weights` or :func:`nearest_polyline`.
     reference : index of the node where the table is zero.
     limit : largest step between neighbouring nodes in counts, or None.
     """
-    counts = np.zeros(len(wanted), dtype=np.int64)
-    right, limited_right = _side(wanted[reference:], sections[reference:], limit)
-    left, limited_left = _side(wanted[reference::-1], sections[:reference][::-1, ::-1], limit)
+    counts = np.zeros(len(requested), dtype=np.int64)
+    right, limited_right = _side(requested[reference:], sections[reference:], limit)
+    left, limited_left = _side(requested[reference::-1], sections[:reference][::-1, ::-1], limit)
     counts[reference:], counts[reference::-1] = right, left
     limited = limited_left or limited_right
     steps = np.abs(np.diff(counts))
     total = float(np.sum(sections @ np.array([1.0, 2.0, 1.0])))
     return IntegerCurve(
         counts=counts,
-        rms=float(np.sqrt(_square(counts - wanted, sections) / total)) if total else 0.0,
-        largest=float(np.max(np.abs(counts - wanted))),
+        rms=float(np.sqrt(_square(counts - requested, sections) / total)) if total else 0.0,
+        largest=float(np.max(np.abs(counts - requested))),
         limited=limited,
         full_sections=tuple(np.flatnonzero(steps == limit).tolist()) if limited else (),
     )
 
 
-def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[IntArray, bool]:
+def _side(requested: FloatArray, sections: FloatArray, limit: int | None) -> tuple[IntArray, bool]:
     """Return the best counts (n,) from the reference node (first, count 0) outwards, and if the limit is active."""
-    low = np.ceil(wanted - HALF - NOISE).astype(np.int64)
-    high = np.floor(wanted + HALF + NOISE).astype(np.int64)
+    low = np.ceil(requested - HALF - NOISE).astype(np.int64)
+    high = np.floor(requested + HALF + NOISE).astype(np.int64)
     low[0] = high[0] = 0
-    found = _cheapest(wanted, sections, low, high, limit)
+    found = _cheapest(requested, sections, low, high, limit)
     if found is not None or limit is None:
         assert found is not None  # without a limit every whole number can be reached
         return found, False
@@ -144,22 +144,22 @@ def _side(wanted: FloatArray, sections: FloatArray, limit: int | None) -> tuple[
     # any table A at least as good as the rounded one R, convexity gives (A-u)^T M (A-u) <= J(R) - J(u) + gap, with gap
     # the most that the gradient at u could still gain over all curves within the limit. Both sections of a node add
     # at least their smallest eigenvalue to M.
-    curve, gap = _reachable(wanted, sections, limit)
+    curve, gap = _reachable(requested, sections, limit)
     rounded = np.floor(curve + 0.5).astype(np.int64)
     rounded[0] = 0
     for k in range(1, len(rounded)):  # no step larger than the limit
         rounded[k] = np.clip(rounded[k], rounded[k - 1] - limit, rounded[k - 1] + limit)
-    room = max(_square(rounded - wanted, sections) - _square(curve - wanted, sections) + gap, 0.0)
+    room = max(_square(rounded - requested, sections) - _square(curve - requested, sections) + gap, 0.0)
     mean, half = 0.5 * (sections[:, 0] + sections[:, 2]), 0.5 * (sections[:, 0] - sections[:, 2])
     least = np.maximum(mean - np.hypot(half, sections[:, 1]), 0.0)
     stiffness = np.concatenate([[0.0], least]) + np.concatenate([least, [0.0]])
     radius = np.sqrt(room * (1.0 + NOISE) / np.maximum(stiffness, 1e-300)) + 1.0
-    low, high = np.empty(len(wanted), dtype=np.int64), np.empty(len(wanted), dtype=np.int64)
+    low, high = np.empty(len(requested), dtype=np.int64), np.empty(len(requested), dtype=np.int64)
     low[0] = high[0] = 0
-    for k in range(1, len(wanted)):
+    for k in range(1, len(requested)):
         low[k] = max(np.ceil(max(curve[k] - radius[k], -1e15)), low[k - 1] - limit)
         high[k] = min(np.floor(min(curve[k] + radius[k], 1e15)), high[k - 1] + limit)
-    best = _cheapest(wanted, sections, low, high, limit)
+    best = _cheapest(requested, sections, low, high, limit)
     assert best is not None  # the windows contain the rounded curve from which they were made
     return best, True
 
@@ -172,17 +172,17 @@ def _square(deviation: FloatArray, sections: FloatArray) -> float:
 
 
 def _cheapest(
-    wanted: FloatArray, sections: FloatArray, low: IntArray, high: IntArray, limit: int | None
+    requested: FloatArray, sections: FloatArray, low: IntArray, high: IntArray, limit: int | None
 ) -> IntArray | None:
     """Return the counts within ``low`` ... ``high`` (n,) with the smallest J, or None if the limit allows none."""
     cost, choices = np.zeros(high[0] - low[0] + 1), []
-    for k in range(1, len(wanted)):
+    for k in range(1, len(requested)):
         reach = limit if limit is not None else int(max(high[k] - low[k - 1], high[k - 1] - low[k], 0))
         states = np.arange(low[k], high[k] + 1)
         before = states[:, None] + np.arange(-reach, reach + 1)
         index = before - low[k - 1]
         inside = (index >= 0) & (index < len(cost))
-        first, last = before - wanted[k - 1], (states - wanted[k])[:, None]
+        first, last = before - requested[k - 1], (states - requested[k])[:, None]
         g0, g1, g2 = sections[k - 1]
         total = np.where(inside, cost[np.clip(index, 0, len(cost) - 1)], np.inf)
         total = total + g0 * first**2 + 2.0 * g1 * first * last + g2 * last**2
@@ -191,19 +191,19 @@ def _cheapest(
         if not np.any(np.isfinite(cost)):
             return None
         choices.append(before[np.arange(len(states)), choice])
-    counts = np.empty(len(wanted), dtype=np.int64)
+    counts = np.empty(len(requested), dtype=np.int64)
     counts[-1] = low[-1] + int(np.argmin(cost))
-    for k in range(len(wanted) - 1, 0, -1):
+    for k in range(len(requested) - 1, 0, -1):
         counts[k - 1] = choices[k - 1][counts[k] - low[k]]
     return counts
 
 
-def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:
+def _reachable(requested: FloatArray, sections: FloatArray, limit: int) -> tuple[FloatArray, float]:
     """Return a real-valued curve (n,) of small J with steps within the limit, and a bound on the remaining gain."""
     import osqp  # imported here: slow to load, and only steep curves need it
     from scipy.sparse import csc_matrix, dia_matrix
 
-    count = len(wanted) - 1
+    count = len(requested) - 1
     scale = 1.0 / float(np.max(sections))
     both, cross = sections[:, 2] + np.append(sections[1:, 0], 0.0), sections[1:, 1]
     bands = scale * np.array([np.append(cross, 0.0), both, np.append(0.0, cross)])
@@ -213,10 +213,10 @@ def _reachable(wanted: FloatArray, sections: FloatArray, limit: int) -> tuple[Fl
     bounds = np.full(count, float(limit))
     solver = osqp.OSQP()
     options = {"verbose": False, "eps_abs": 1e-6, "eps_rel": 1e-9, "max_iter": 20_000, "polishing": True}
-    solver.setup(upper, -matrix @ wanted[1:], difference, -bounds, bounds, **options)
+    solver.setup(upper, -matrix @ requested[1:], difference, -bounds, bounds, **options)
     found = np.asarray(solver.solve(raise_error=False).x, dtype=np.float64)
     steps = np.clip(np.diff(np.nan_to_num(found), prepend=0.0), -limit, limit)
-    gradient = 2.0 * np.cumsum((matrix @ (np.cumsum(steps) - wanted[1:]))[::-1])[::-1] / scale
+    gradient = 2.0 * np.cumsum((matrix @ (np.cumsum(steps) - requested[1:]))[::-1])[::-1] / scale
     gap = float(np.sum(np.abs(gradient) * limit + gradient * steps))
     return np.concatenate([[0.0], np.cumsum(steps)]), max(gap, 0.0)
 

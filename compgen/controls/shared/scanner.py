@@ -38,10 +38,10 @@ class Findings:
 
     def statements(self) -> list[str]:
         """Return the summary with at most one line of each kind."""
-        passed = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
-        found = [f"passed over or filled in: {passed}"] if passed else []
+        skipped = ", ".join(f"{what} ({number})" for what, number in self.counts.items())
+        found = [f"skipped or filled in: {skipped}"] if skipped else []
         if self.apart:
-            found.append("tables of axes that the machine file does not have, kept apart: " + "; ".join(self.apart))
+            found.append("tables of axes that are not in the machine file, kept separate: " + "; ".join(self.apart))
         return found + list(dict.fromkeys(self.notes))
 
 
@@ -62,7 +62,7 @@ _DECLARED = re.compile(r"(?://|#|;)\s{0,9}(?:records|entries|tables):\s{0,9}([0-
 def check_size(source: SourceFile, most: int) -> None:
     """Reject a text that is longer than any file of its kind."""
     if len(source.text) > most:
-        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}", 1)
+        raise source.fail(f"has {len(source.text)} characters; a file of this kind has at most {most}", 1)
 
 
 def _check_lines(source: SourceFile) -> None:
@@ -81,12 +81,12 @@ def plain_lines(source: SourceFile, most: int, longest: int) -> list[str]:
     _check_lines(source)
     text = source.text.replace("\r\n", "\n").replace("\r", "\n")
     if strange := re.search(r"[^\t\n -~]", text):
-        message = f"contains the character {ascii(strange.group())}; the file is printable ASCII text"
+        message = f"contains the character {ascii(strange.group())}; only printable ASCII is allowed"
         raise source.fail(message, text.count("\n", 0, strange.start()) + 1)
     lines = text.split("\n")
     for number, line in enumerate(lines, start=1):
         if len(line) > longest:
-            raise source.fail(f"the line has {len(line)} characters; at most {longest} are possible", number)
+            raise source.fail(f"the line has {len(line)} characters; at most {longest} are allowed", number)
     return lines
 
 
