@@ -29,7 +29,9 @@ TEMPORARY = ".tmp"
 FOLDERS, LOCK = "compgen-", ".lock"
 #: Newer files may be about to be locked, s.
 NEW_S = 2.0
-#: Temporary files of this process, each with the open file that keeps its lock.
+#: An empty temporary folder without a lock that is older than this belongs to nobody, s.
+EMPTY_S = 3600.0
+#: Temporary files and folders of this process, each with the open file that keeps its lock.
 _locks: dict[Path, int] = {}
 
 
@@ -200,7 +202,8 @@ def _write_temporary(target: Path, content: bytes) -> Path:
         with os.fdopen(handle, "wb") as stream:
             stream.write(content)
             stream.flush()
-            os.fsync(stream.fileno())
+            if _locks.keys().isdisjoint(target.parents):  # what is in a working folder is not meant to last
+                os.fsync(stream.fileno())
         mask = os.umask(0)
         os.umask(mask)
         path.chmod(0o666 & ~mask)
@@ -246,25 +249,47 @@ def _abandoned(path: Path) -> bool:
 
 @contextlib.contextmanager
 def working_folder(name: str = "") -> Iterator[Path]:
-    """Yield a temporary folder that is removed at the end, and by the next process if this one is killed."""
+    """Yield a temporary folder that is removed at the end, and by the next process if this one is killed.
+
+    Its files need not survive a power failure, so they are not forced to the disk.
+    """
     remove_abandoned_folders()
-    with tempfile.TemporaryDirectory(prefix=f"{FOLDERS}{name}") as text:
-        lock = os.open(Path(text) / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            _locked(lock)
-            yield Path(text)
-        finally:
-            os.close(lock)
+    folder = Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}"))
+    _locks[folder] = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        _locked(_locks[folder])
+        yield folder
+    finally:
+        _remove_folder(folder)
+        _unlock(folder)
+
+
+def _remove_folder(folder: Path) -> None:
+    """Remove a working folder, its lock last: what a process killed here leaves is still recognised as abandoned."""
+    with contextlib.suppress(OSError):
+        for entry in list(os.scandir(folder)):
+            if entry.is_dir(follow_symlinks=False):
+                shutil.rmtree(entry.path, ignore_errors=True)
+            elif entry.name != LOCK:
+                os.unlink(entry.path)
+        (folder / LOCK).unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def remove_abandoned_folders() -> None:
     """Remove this user's temporary folders whose processes were killed."""
     with contextlib.suppress(OSError):
-        for path in Path(tempfile.gettempdir()).glob(f"{FOLDERS}*"):
+        for entry in list(os.scandir(tempfile.gettempdir())):
+            if not entry.name.startswith(FOLDERS):
+                continue
             with contextlib.suppress(OSError):
-                mine = not hasattr(os, "geteuid") or path.lstat().st_uid == os.geteuid()
-                if mine and path.is_dir() and not path.is_symlink() and _abandoned(path / LOCK):
-                    shutil.rmtree(path, ignore_errors=True)
+                found = entry.stat(follow_symlinks=False)
+                mine = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
+                if mine and entry.is_dir(follow_symlinks=False):
+                    if _abandoned(Path(entry.path) / LOCK):
+                        _remove_folder(Path(entry.path))
+                    elif time.time() - found.st_mtime > EMPTY_S:
+                        os.rmdir(entry.path)  # refused unless it is empty: killed before or after there was a lock
 
 
 def write_file(path: str | Path, content: str | bytes) -> Path:

@@ -16,7 +16,7 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from compgen.data.files import FOLDERS, read_bytes, working_folder
+from compgen.data.files import FOLDERS, read_bytes, remove_abandoned_folders, working_folder
 from compgen.data.machine import load_machine
 from compgen.data.messages import visible
 from compgen.errors import CompgenError, InputError
@@ -140,6 +140,7 @@ def run_jobs(
     """
     chosen = [job.machine(name) for name in names] if names else list(job.machines.values())
     chosen = inbox.with_twins(chosen, job.machines.values())
+    remove_abandoned_folders()
     with closing(open_store(job.store, clock=clock)) as store:
         if mapper is map:
             return RunOutcome(tuple(_passed(lambda: nullcontext(store), item, stop) for item in chosen))

@@ -17,7 +17,7 @@ from apscheduler.triggers.combining import OrTrigger
 from apscheduler.triggers.cron import CronTrigger
 from apscheduler.triggers.interval import IntervalTrigger
 
-from compgen.data.files import read_bytes
+from compgen.data.files import read_bytes, remove_abandoned_folders
 from compgen.errors import CompgenError
 from compgen.fleet import logs
 from compgen.fleet.job import DAYS, WATCH_POLL_S, Cron, Every, Job, MachineJob, Schedule, job_of_text
@@ -81,6 +81,7 @@ class Watch:
     def run(self, *, signals: bool = True) -> None:
         """Run until :meth:`stop`, SIGTERM or SIGINT; InputError if the job file is invalid at the start."""
         self._load()
+        remove_abandoned_folders()
         if signals:
             for number in (signal.SIGTERM, signal.SIGINT):
                 signal.signal(number, self.stop)

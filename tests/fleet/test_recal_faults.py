@@ -17,6 +17,7 @@ from collections import Counter
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -836,3 +837,33 @@ def test_temporary_files_and_folders_of_killed_runs_are_removed_by_the_next_and_
     assert other.read_text() == "of somebody else"
     assert target.read_text() == "whole"
     assert sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("compgen-")) == []
+
+
+@pytest.mark.parametrize("moment", ["before the lock", "while it is removed", "before it is removed"])
+def test_a_run_with_nothing_to_do_removes_the_working_folder_of_a_killed_one(site, tmp_path, monkeypatch, moment):
+    site.measure()
+    assert site.run() == 0
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    killed = lambda *_, **__: os.kill(os.getpid(), 9)  # noqa: E731
+    child = os.fork()
+    if child == 0:
+        if moment == "before the lock":
+            files.os = SimpleNamespace(**{**vars(os), "open": killed})
+        with files.working_folder("recal-") as folder:
+            (folder / "out").mkdir()
+            (folder / "a").write_bytes(b"half")
+            if moment == "while it is removed":
+                shutil.rmtree = killed
+            else:
+                killed()
+    assert os.waitpid(child, 0)[1] == 9
+    (left,) = tmp_path.glob("compgen-recal-*")
+    foreign = tmp_path / "compgen-of-somebody-else"  # not made by this program: it has no lock
+    foreign.mkdir()
+    (foreign / "a").write_text("kept")
+    for path in (left / ".lock", left, foreign):
+        if path.exists():
+            os.utime(path, (time.time() - 4000,) * 2)
+    assert site.run() == 0
+    assert not left.exists()
+    assert (foreign / "a").read_text() == "kept"
