@@ -362,7 +362,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
 
     machine = store.machine(name)
     table = decisions.only_pending(store, machine)
-    measured = store.measurement_behind(table)
+    measured = store.measurement_behind(machine, table)
     what = f"{name}: version {table.version} ({table.state}) from {visible(measured.name, flat=True)}, measured "
     what += measured.measured_at.isoformat(timespec="minutes")
     if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):

@@ -104,13 +104,11 @@ def take(
 
     With ``again`` a measurement that is done may also be claimed.
     """
-    results = database.identifications
 
     def action(connection: sa.Connection) -> Claim | None:
         now = store.now(connection)
         last = _last(connection, measurement.id)
-        identified = sa.select(results.c.id).where(results.c.measurement_id == measurement.id)
-        done = not again and connection.execute(identified).first() is not None
+        done = not again and connection.execute(_IDENTIFIED, {"measurement": measurement.id}).first() is not None
         counts = last is not None and last.owner != owner and last.kind != "release"
         if last is not None and counts and _alive(str(last.owner)) is not False:
             # until its time is over; a clock that was set back extends it by at most its length
@@ -260,10 +258,21 @@ def _last_claims(store: Store) -> list[Any]:
     return store.read(lambda connection: list(connection.execute(sa.select(table).where(table.c.id.in_(last)))))
 
 
-def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[tuple[object, ...]] | None:
-    table = database.claims
-    query = sa.select(table).where(table.c.measurement_id == measurement_id)
-    return connection.execute(query.order_by(table.c.sequence.desc()).limit(1)).first()
+#: A measurement's results.
+_IDENTIFIED = sa.select(database.identifications.c.id).where(
+    database.identifications.c.measurement_id == sa.bindparam("measurement")
+)
+#: The last row of a measurement's chain.
+_LAST = (
+    sa.select(database.claims)
+    .where(database.claims.c.measurement_id == sa.bindparam("measurement"))
+    .order_by(database.claims.c.sequence.desc())
+    .limit(1)
+)
+
+
+def _last(connection: sa.Connection, measurement_id: int) -> sa.Row[Any] | None:
+    return connection.execute(_LAST, {"measurement": measurement_id}).first()
 
 
 def _alive(owner: str) -> bool | None:
@@ -304,7 +313,7 @@ def _add(
 ) -> Claim:
     row = {"measurement_id": measurement_id, "sequence": sequence, "kind": kind, "owner": owner, "at": now}
     until = now + timedelta(seconds=LEASE_S if lease_s is None else lease_s)
-    connection.execute(sa.insert(database.claims).values(**row, until=until))
+    connection.execute(sa.insert(database.claims), {**row, "until": until})
     return Claim(measurement_id, sequence, owner)
 
 
@@ -384,9 +393,13 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
         "at": now,
     }
     table_id = inserted(connection, database.tables, table)
-    for file, digest in zip(new.files, put_blobs(connection, [file.content for file in new.files]), strict=True):
-        row = {"table_id": table_id, "controller": file.controller, "name": file.name, "sha256": digest}
-        connection.execute(sa.insert(database.table_files).values(**row))
+    digests = put_blobs(connection, [file.content for file in new.files])
+    rows = [
+        {"table_id": table_id, "controller": file.controller, "name": file.name, "sha256": digest}
+        for file, digest in zip(new.files, digests, strict=True)
+    ]
+    if rows:
+        connection.execute(sa.insert(database.table_files), rows)
     attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
     _add_attempt(store, connection, machine, claim, attempt)
     return table_id
@@ -439,7 +452,7 @@ def _add_attempt(
     store: Store, connection: sa.Connection, machine: MachineRecord, claim: Claim, attempt: Mapping[str, object]
 ) -> None:
     about = {"machine_id": machine.id, "measurement_id": claim.measurement_id, "owner": claim.owner}
-    connection.execute(sa.insert(database.attempts).values(**about, **attempt, at=store.now(connection)))
+    connection.execute(sa.insert(database.attempts), {**about, **attempt, "at": store.now(connection)})
 
 
 def clean(value: Any) -> Any:

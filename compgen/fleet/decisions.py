@@ -190,12 +190,18 @@ def _check_seen(
         )
 
 
+_LOCK = sa.select(database.machines.c.id).where(database.machines.c.id == sa.bindparam("machine")).with_for_update()
+_DECIDED = (
+    sa.select(database.decisions)
+    .where(database.decisions.c.machine_id == sa.bindparam("machine"))
+    .order_by(database.decisions.c.sequence)
+)
+
+
 def locked_decisions(connection: sa.Connection, machine: MachineRecord) -> list[DecisionRecord]:
     """Return the decisions of a machine; nobody else can decide until this transaction ends."""
-    connection.execute(sa.select(database.machines.c.id).where(database.machines.c.id == machine.id).with_for_update())
-    table = database.decisions
-    query = sa.select(table).where(table.c.machine_id == machine.id).order_by(table.c.sequence)
-    return [DecisionRecord(*row) for row in connection.execute(query)]
+    connection.execute(_LOCK, {"machine": machine.id})
+    return [DecisionRecord(*row) for row in connection.execute(_DECIDED, {"machine": machine.id})]
 
 
 def add_decision(
@@ -208,9 +214,7 @@ def add_decision(
     reason: str,
 ) -> DecisionRecord:
     """Add one decision; its time is never earlier than the previous decision's, whatever the clock says."""
-    table = database.decisions
-    own = table.c.machine_id == machine.id
-    last = connection.execute(sa.select(table).where(own).order_by(table.c.sequence.desc()).limit(1)).first()
+    last = next(iter(connection.execute(_DECIDED, {"machine": machine.id}).all()[-1:]), None)
     now = store.now(connection)
     row = {
         "machine_id": machine.id,
@@ -221,9 +225,8 @@ def add_decision(
         "reason": reason,
         "at": now if last is None else max(now, last.at),
     }
-    connection.execute(sa.insert(table).values(**row))
-    stored = sa.select(table).where(own, table.c.sequence == row["sequence"])
-    return DecisionRecord(*connection.execute(stored).one())
+    connection.execute(sa.insert(database.decisions), row)
+    return DecisionRecord(*connection.execute(_DECIDED, {"machine": machine.id}).all()[-1])  # as it is stored
 
 
 def _open(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[list[DecisionRecord], int, bool]:

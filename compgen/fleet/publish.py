@@ -352,7 +352,7 @@ def _note(store: Store, machine: MachineRecord, table: TableRecord) -> bytes:
 
 def _about(store: Store, machine: MachineRecord, table: TableRecord) -> dict[str, Any]:
     """Return the contents of ``version.json``."""
-    measurement = store.measurement_behind(table)
+    measurement = store.measurement_behind(machine, table)
     return {
         "machine": machine.name,
         "version": table.version,

@@ -266,7 +266,9 @@ class _Pass:
     def _waiting(self, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
         """Return measurements without a result, in order of measurement; failed ones only if the settings changed."""
         attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
-        done = self.store.identified(self.machine) | {i.measurement_id for i in attempts if i.outcome == "failed"}
+        done = {*self.store.measured(self.machine).values()} | {
+            i.measurement_id for i in attempts if i.outcome == "failed"
+        }
         return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
 
     def process_all(self, settings: str) -> None:

@@ -16,7 +16,7 @@ from contextlib import closing, suppress
 from contextvars import ContextVar
 from copy import copy
 from datetime import UTC, datetime
-from functools import wraps
+from functools import lru_cache, wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
@@ -48,10 +48,48 @@ Clock = Callable[[], datetime]
 #: The store whose reads currently share one connection, that connection, and what was read through it.
 _together: ContextVar[tuple[Store, sa.Connection, dict[Any, Any]] | None] = ContextVar("compgen_store", default=None)
 
+# Queries that every pass over a machine makes, each built once: building one takes longer than running it. Their
+# parameters are named after the arguments of ``Store._rows``.
+
+_MACHINE = sa.select(database.machines).where(database.machines.c.name == sa.bindparam("name"))
+_BLOB = sa.select(database.blobs.c.deflated).where(database.blobs.c.sha256 == sa.bindparam("sha256"))
+_ATTEMPTS: sa.Select[Any] = sa.select(database.attempts).order_by(database.attempts.c.id)
+_EVENTS: sa.Select[Any] = sa.select(database.events).order_by(database.events.c.id)
+_DECISIONS: sa.Select[Any] = sa.select(database.decisions).order_by(
+    database.decisions.c.machine_id, database.decisions.c.sequence
+)
+_MEASUREMENTS: sa.Select[Any] = sa.select(database.measurements).order_by(
+    database.measurements.c.measured_at, database.measurements.c.id
+)
+#: Measurement, name and SHA-256 of its files, of all machines; the second can be restricted to some measurements.
+_FILES: sa.Select[Any] = sa.select(
+    *(database.measurement_files.c[name] for name in ("measurement_id", "name", "sha256"))
+).order_by(database.measurement_files.c.id)
+_FILES_OF = _FILES.join(
+    database.measurements, database.measurements.c.id == database.measurement_files.c.measurement_id
+)
 #: Identifications, each with the time of its measurement.
 _IDENTIFICATIONS: sa.Select[Any] = sa.select(database.identifications, database.measurements.c.measured_at).join(
     database.measurements, database.measurements.c.id == database.identifications.c.measurement_id
 )
+#: Number of each identification and of its measurement.
+_MEASURED: sa.Select[Any] = sa.select(database.identifications.c.id, database.identifications.c.measurement_id)
+#: Sets of tables with and without their figures.
+_TABLES: dict[bool, sa.Select[Any]] = {
+    figures: sa.select(*(column for column in database.tables.c if figures or column.name != "summary")).order_by(
+        database.tables.c.machine_id, database.tables.c.version
+    )
+    for figures in (True, False)
+}
+_TABLE_FILES: sa.Select[Any] = sa.select(
+    *(database.table_files.c[name] for name in ("table_id", "controller", "name", "sha256"))
+).join(database.tables, database.tables.c.id == database.table_files.c.table_id)
+
+
+@lru_cache(maxsize=64)
+def _where(query: sa.Select[Any], table: sa.Table, *columns: str) -> sa.Select[Any]:
+    """Restrict a query to given values of columns of ``table``, which are the parameters ``machine`` and so on."""
+    return query.where(*(table.c[name] == sa.bindparam(name.removesuffix("_id")) for name in columns))
 
 
 def at_one_moment(
@@ -194,7 +232,7 @@ class Store:
         if found is not None:
             return found
         with suppress(sa.exc.IntegrityError):  # another process was faster
-            self.write(lambda c: c.execute(sa.insert(database.machines).values(name=name, at=self.now(c))))
+            self.write(lambda c: c.execute(sa.insert(database.machines), {"name": name, "at": self.now(c)}))
         return self.machine(name)
 
     def machine(self, name: str) -> MachineRecord:
@@ -239,28 +277,25 @@ class Store:
         self, machine: MachineRecord | None = None, *, sha256: str | None = None
     ) -> list[MeasurementRecord]:
         """Return the measurements of a machine (or of all) in the order of measurement."""
-        table, listed = database.measurements, database.measurement_files
-        query = _where(sa.select(table).order_by(table.c.measured_at, table.c.id), table, machine)
-        inner = sa.select(listed.c.measurement_id, listed.c.name, listed.c.sha256).order_by(listed.c.id)
-        if machine is not None or sha256 is not None:
-            inner = _where(inner.join(table, table.c.id == listed.c.measurement_id), table, machine)
-        if sha256 is not None:
-            query, inner = query.where(table.c.sha256 == sha256), inner.where(table.c.sha256 == sha256)
+        table = database.measurements
+        columns = [name for name, value in (("machine_id", machine), ("sha256", sha256)) if value is not None]
+        values = {} if sha256 is None else {"sha256": sha256}
         files: dict[int, list[tuple[str, str]]] = {}
-        for measurement_id, name, digest in self._rows(inner):
+        inner = _where(_FILES_OF, table, *columns) if columns else _FILES
+        for measurement_id, name, digest in self._rows(inner, machine, **values):
             files.setdefault(measurement_id, []).append((name, digest))
-        return [MeasurementRecord(**row._mapping, files=tuple(files.get(row.id, ()))) for row in self._rows(query)]
+        rows = self._rows(_where(_MEASUREMENTS, table, *columns), machine, **values)
+        return [MeasurementRecord(**row._mapping, files=tuple(files.get(row.id, ()))) for row in rows]
 
     def contents_of(self, measurement: MeasurementRecord) -> dict[str, bytes]:
         """Return the contents of a measurement's files by name."""
         return {name: self.blob(digest) for name, digest in measurement.files}
 
-    def measurement_behind(self, table: TableRecord) -> MeasurementRecord:
-        """Return the measurement from which a set of tables was made, without its files."""
-        measured, found = database.measurements, database.identifications
-        query = sa.select(measured).join(found, found.c.measurement_id == measured.c.id)
-        (row,) = self._rows(query.where(found.c.id == table.identification_id))
-        return MeasurementRecord(**row._mapping, files=())
+    @at_one_moment
+    def measurement_behind(self, machine: MachineRecord, table: TableRecord) -> MeasurementRecord:
+        """Return the measurement from which a machine's set of tables was made."""
+        behind = self.measured(machine)[table.identification_id]
+        return next(item for item in self.measurements(machine) if item.id == behind)
 
     def same_files_of_others(self, machine: MachineRecord, measurement: MeasurementRecord) -> list[tuple[str, str]]:
         """Return (machine, measurement in words) of other machines that also received one of the measurement's files.
@@ -290,10 +325,10 @@ class Store:
         return others
 
     @read_once
-    def identified(self, machine: MachineRecord) -> set[int]:
-        """Return the ids of the machine's measurements that have a result."""
-        table = database.identifications
-        return {row[0] for row in self._rows(_where(sa.select(table.c.measurement_id), table, machine))}
+    def measured(self, machine: MachineRecord) -> dict[int, int]:
+        """Return the id of the measurement behind each of the machine's identifications, by its id."""
+        query = _where(_MEASURED, database.identifications, "machine_id")
+        return {identification: measurement for identification, measurement in self._rows(query, machine)}
 
     @at_one_moment
     def newest_entry(self, machine: MachineRecord) -> datetime | None:
@@ -304,20 +339,19 @@ class Store:
     @read_once
     def attempts(self, machine: MachineRecord | None = None) -> list[AttemptRecord]:
         """Return all attempts to process measurements, oldest first."""
-        query = sa.select(database.attempts).order_by(database.attempts.c.id)
-        return [AttemptRecord(*row) for row in self._rows(_where(query, database.attempts, machine))]
+        return [AttemptRecord(*row) for row in self._of_machine(_ATTEMPTS, database.attempts, machine)]
 
     # --- identified errors and tables -------------------------------------------------------------------------------
 
     def identifications(self, machine: MachineRecord | None = None) -> list[IdentificationRecord]:
         """Return the identified errors of a machine (or of all) in the order of measurement."""
-        table, measured = database.identifications, database.measurements
-        query = _where(_IDENTIFICATIONS, table, machine).order_by(measured.c.measured_at, table.c.id)
-        return [IdentificationRecord(**row._mapping) for row in self._rows(query)]
+        rows = self._of_machine(_IDENTIFICATIONS, database.identifications, machine)
+        found = [IdentificationRecord(**row._mapping) for row in rows]
+        return sorted(found, key=lambda item: (item.measured_at, item.id))
 
     def identification(self, identification_id: int) -> IdentificationRecord:
         """Return the identified errors with this id."""
-        rows = self._rows(_IDENTIFICATIONS.where(database.identifications.c.id == identification_id))
+        rows = self._rows(_where(_IDENTIFICATIONS, database.identifications, "id"), id=identification_id)
         if not rows:
             raise InputError(f"the store has no identification {identification_id}")
         return IdentificationRecord(**rows[0]._mapping)
@@ -344,11 +378,8 @@ class Store:
         decided: dict[int, list[DecisionRecord]] = {}
         for decision in self.decisions(machine):
             decided.setdefault(decision.machine_id, []).append(decision)
-        table = database.tables
-        columns = [column for column in table.c if figures or column.name != "summary"]
-        query = _where(sa.select(*columns), table, machine).order_by(table.c.machine_id, table.c.version)
         found = []
-        for row in self._rows(query):
+        for row in self._of_machine(_TABLES[figures], database.tables, machine):
             state = state_of(row.id, decided.get(row.machine_id, []))
             found.append(TableRecord(**{"summary": {}, **row._mapping}, state=state))
         return found
@@ -360,20 +391,15 @@ class Store:
     @read_once
     def file_hashes(self, machine: MachineRecord) -> dict[int, list[tuple[str, str, str]]]:
         """Return control, name and SHA-256 of the files of a machine's sets of tables, by id, in a fixed order."""
-        files, tables = database.table_files, database.tables
-        query = sa.select(files.c.table_id, files.c.controller, files.c.name, files.c.sha256)
-        query = query.join(tables, tables.c.id == files.c.table_id).where(tables.c.machine_id == machine.id)
         found: dict[int, list[tuple[str, str, str]]] = {}
-        for table_id, *file in self._rows(query):
+        for table_id, *file in self._of_machine(_TABLE_FILES, database.tables, machine):
             found.setdefault(table_id, []).append((file[0], file[1], file[2]))
         return {table_id: sorted(listed) for table_id, listed in found.items()}
 
     @read_once
     def decisions(self, machine: MachineRecord | None = None) -> list[DecisionRecord]:
         """Return all decisions in order: who, what, when, why."""
-        table = database.decisions
-        query = _where(sa.select(table), table, machine).order_by(table.c.machine_id, table.c.sequence)
-        return [DecisionRecord(*row) for row in self._rows(query)]
+        return [DecisionRecord(*row) for row in self._of_machine(_DECISIONS, database.decisions, machine)]
 
     # --- events and contents ----------------------------------------------------------------------------------------
 
@@ -396,16 +422,20 @@ class Store:
 
     def events(self, machine: MachineRecord | None = None) -> list[EventRecord]:
         """Return the events of a machine (or all), oldest first."""
-        query = sa.select(database.events).order_by(database.events.c.id)
-        return [EventRecord(*row) for row in self._rows(_where(query, database.events, machine))]
+        return [EventRecord(*row) for row in self._of_machine(_EVENTS, database.events, machine)]
 
     def blob(self, sha256: str) -> bytes:
         """Return contents by their SHA-256; StoreError if they are damaged."""
-        query = sa.select(database.blobs.c.deflated).where(database.blobs.c.sha256 == sha256)
-        return inflated(sha256, self.read(lambda connection: connection.execute(query).scalar()))
+        return inflated(sha256, self.read(lambda connection: connection.execute(_BLOB, {"sha256": sha256}).scalar()))
 
-    def _rows(self, query: sa.Select[Any]) -> list[Any]:
-        return self.read(lambda connection: list(connection.execute(query).all()))
+    def _of_machine(self, query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> list[Any]:
+        """Rows of a query that belong to a machine, by the column of ``table``, or to all."""
+        return self._rows(query if machine is None else _where(query, table, "machine_id"), machine)
+
+    def _rows(self, query: sa.Select[Any], machine: MachineRecord | None = None, **values: object) -> list[Any]:
+        """Rows of a query with its parameters."""
+        given = values if machine is None else {"machine": machine.id, **values}
+        return self.read(lambda connection: list(connection.execute(query, given).all()))
 
 
 class _StoreFile:
@@ -515,12 +545,8 @@ def open_store(url: str, *, clock: Clock | None = None) -> Store:
     return Store(engine, url, clock, number)
 
 
-def _where(query: sa.Select[Any], table: sa.Table, machine: MachineRecord | None) -> sa.Select[Any]:
-    return query if machine is None else query.where(table.c.machine_id == machine.id)
-
-
 def _machine_named(connection: sa.Connection, name: str) -> MachineRecord | None:
-    row = connection.execute(sa.select(database.machines).where(database.machines.c.name == name)).first()
+    row = connection.execute(_MACHINE, {"name": name}).first()
     return None if row is None else MachineRecord(*row)
 
 

@@ -387,9 +387,9 @@ def test_a_result_that_comes_between_two_reads_is_in_both_or_in_none(store, monk
     other = open_store(store.url)
     real, numbers = Store._rows, iter(range(2, 1000))
 
-    def rows(self, query):
+    def rows(self, query, *given, **values):
         """Every read is followed by a new result with its decisions of somebody else."""
-        found = real(self, query)
+        found = real(self, query, *given, **values)
         if self is store:
             processed(other, machine, next(numbers), approve=True)
         return found
