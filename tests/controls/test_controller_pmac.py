@@ -257,6 +257,17 @@ def test_a_ring_holds_the_travel_and_one_node_beyond_it_negative_ones_at_the_far
     )
 
 
+@pytest.mark.parametrize(("counts", "step"), [(1000.0, 100_000), (-1250.0, 125_000), (999.994, 100_000)])
+def test_a_step_is_a_whole_number_of_counts_the_next_one_if_it_is_broken(counts, step):
+    """Errors that bend every 100 mm, from the motor's zero on, need nodes there and nowhere else."""
+    machine = machine_with(tool=(0.0, 0.0, 0.0), counts_per_mm={**COUNTS, "X": counts}, home_mm={"X": 0.0})
+    nodes = np.linspace(*TRAVELS[0], 9)
+    bent = compgen.Curve(nodes, 0.05 * np.array([0, 1, 0, 0, 1, 0, -1, 1, 0.0]), np.full(9, np.nan))
+    _, tables = made(machine, compgen.ErrorTable({"EXX": bent}))
+    pitch = next(table for table in tables.tables if table.motor == 1)
+    assert pitch.length / len(pitch.entries) == step
+
+
 def test_the_seam_of_a_table_belongs_to_zero():
     """A position that rounding moves just below zero is the end of the last cell, and nothing lies behind it."""
     entries = np.array([160, 80, 0, 16])
