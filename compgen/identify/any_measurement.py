@@ -186,39 +186,51 @@ def identify_measurement(
                 message += "in mm, a thousand times too small for um? Give them in um"
             file = measurement.origin[0][0] if measurement.origin else None
             raise InputError(f"{message}, or add --small-deviations if they are right", file=file)
-    stated = chosen.u_length_um is not None or chosen.u_length_um_per_m is not None
-    other = stated or chosen.method != "joint" or chosen.stations is not None
-    other = other or chosen.systematic != SystematicInputs()
+    _check_options(measurement, chosen)
     if isinstance(measurement, Deviations):
-        if other:
-            raise InputError(
-                "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
-                "deviations, for which use --u-deviation-um"
-            )
         return identify_deviations(machine, measurement, chosen)
     if isinstance(measurement, Artefact):
-        if other:
-            raise InputError(
-                "--method, --stations, --u-length-... apply to tracer lengths; the files contain an artefact, which takes "
-                "--u-deviation-um"
-            )
         return identify_artefact(machine, measurement, chosen)
-    if isinstance(measurement, AxisRuns | Circles):
-        if other or chosen.u_deviation_um is not None:
-            what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
-            raise InputError(
-                f"--method, --stations, --u-... apply to other kinds of measurement; the files contain {what}, whose "
-                "uncertainty comes from their scatter"
-            )
-        if isinstance(measurement, AxisRuns):
-            return identify_axis_runs(machine, measurement)
+    if isinstance(measurement, AxisRuns):
+        return identify_axis_runs(machine, measurement)
+    if isinstance(measurement, Circles):
         return identify_circles(machine, measurement)
-    if other or chosen.u_deviation_um is not None:
-        raise InputError(
+    return identify_sixdof(machine, measurement)
+
+
+def _check_options(measurement: OneKind, options: IdentifyOptions) -> None:
+    """InputError for options of lengths or of deviations that the kind of measurement does not take."""
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.circles import Circles
+    from compgen.data.deviations import Artefact, Deviations
+
+    stated = options.u_length_um is not None or options.u_length_um_per_m is not None
+    other = stated or options.method != "joint" or options.stations is not None
+    other = other or options.systematic != SystematicInputs()
+    if isinstance(measurement, Deviations):
+        text = (
+            "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
+            "deviations, for which use --u-deviation-um"
+        )
+    elif isinstance(measurement, Artefact):
+        text = (
+            "--method, --stations, --u-length-... apply to tracer lengths; the files contain an artefact, which takes "
+            "--u-deviation-um"
+        )
+    elif isinstance(measurement, AxisRuns | Circles):
+        what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
+        text = (
+            f"--method, --stations, --u-... apply to other kinds of measurement; the files contain {what}, whose "
+            "uncertainty comes from their scatter"
+        )
+    else:
+        text = (
             "--method, --stations, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "
             "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
         )
-    return identify_sixdof(machine, measurement)
+    takes_u = isinstance(measurement, Deviations | Artefact)
+    if other or (options.u_deviation_um is not None and not takes_u):
+        raise InputError(text)
 
 
 def identify_mixed(

@@ -24,7 +24,7 @@ from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenWarning, UndeterminedError
-from compgen.identify.adjust.determined import Observations, determined_values, least_squares, stacked
+from compgen.identify.adjust.determined import Determined, Observations, determined_values, least_squares, stacked
 from compgen.identify.adjust.residual_tests import misfit_of
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.identify.covariance import joint_covariance, values_with_factor
@@ -141,30 +141,43 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
     )
 
 
-def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
-    """One least-squares adjustment of everything, and how the parts agree."""
-    layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
-    layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
+def _solved(
+    machine: Machine, layout: ErrorParameters, parts: Sequence[Source], options: IdentifyOptions
+) -> tuple[list[Observations], Determined]:
+    """Return the readings of each part, and what all of them determine together.
+
+    Positions in a frame of unknown pose are linear around approximate errors only: those of a first solution.
+    """
     around = None
     for _ in range(2 if any(isinstance(part.measurement, Deviations | Artefact) for part in parts) else 1):
         found = [part.observed(machine, layout, options, around) for part in parts]
         everything = stacked(found)
         solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
         around = solution.on(layout)
+    return found, solution
+
+
+def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
+    """One least-squares adjustment of everything, and how the parts agree."""
+    layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
+    layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
+    found, solution = _solved(machine, layout, parts, options)
     agreement = _agreement(layout, parts, found)
-    freedom = solution.freedom
-    reduced = float(np.sum((solution.residual / everything.sigma) ** 2)) / freedom if freedom > 0 else 1.0
+    freedom, sigma = solution.freedom, np.concatenate([readings.sigma for readings in found])
+    reduced = float(np.sum((solution.residual / sigma) ** 2)) / freedom if freedom > 0 else 1.0
     u_scale = uncertainty_scale(reduced, "stated")
     errors, factor = values_with_factor(solution.layout, solution.unknowns, u_scale * solution.factor)
     known = [part.alone for part in parts if part.alone is not None]
-    texts = []
-    for name, numbers in agreement.items():
-        beyond = ", ".join(f"{error} ({value:.1f})" for error, value in numbers.items() if value > 1.0)
-        if beyond:
-            texts.append(
-                f"{name} disagrees with the other measurements beyond the uncertainty of both in {beyond} (En, 1 is the "
-                "limit); look at calibration, set-up, signs and the time between the measurements"
-            )
+    beyond = {
+        name: ", ".join(f"{error} ({value:.1f})" for error, value in numbers.items() if value > 1.0)
+        for name, numbers in agreement.items()
+    }
+    texts = [
+        f"{name} disagrees with the other measurements beyond the uncertainty of both in {listed} (En, 1 is the limit); "
+        "look at calibration, set-up, signs and the time between the measurements"
+        for name, listed in beyond.items()
+        if listed
+    ]
     for text in texts:
         warnings.warn(text, CompgenWarning, stacklevel=4)
     common = _common(parts, known)

@@ -562,18 +562,7 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
     for _ in range(MOST_ROUNDS):
         used = keep & locatable_readings(readings, poses.of, keep)
         located = locate_points(readings, poses, np.flatnonzero(used))
-        turn, calibration = located.placement.rotation, located.calibration
-        problem = SeparationProblem(
-            parameters=readings.layout,
-            position_mm=located.position_mm,
-            tool_mm=located.tool_mm,
-            bases=readings.layout.bases(located.position_mm),
-            measured_mm=located.measured_mm,
-            information=turn @ calibration.information @ turn.T,
-            lever=turn @ calibration.lever,
-            station_information=calibration.station_information,
-        )
-        solution = _solve(problem, located, readings)
+        problem, solution = _solve(located, readings)
         joint = _joint(problem, solution, located, float(readings.sigma_mm.min()))
         state = joint.state
         # also of the unused readings
@@ -587,18 +576,18 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
         if np.array_equal(again, keep):
             break
         keep = again
-    lengths, rejected = readings.lengths, []
-    for row in lonely.tolist():
-        rejected.append(
-            Rejected(
-                row,
-                lengths.stations[lengths.station[row]],
-                str(lengths.point[row]),
-                float(-residual[row]) / MM_PER_UM,
-                "fewer than three stations see its point, so it cannot be located; the joint method uses the reading",
-                *(lengths.origin[row] if lengths.origin else ("", 0)),
-            )
+    lengths = readings.lengths
+    rejected = [
+        Rejected(
+            row,
+            lengths.stations[lengths.station[row]],
+            str(lengths.point[row]),
+            float(-residual[row]) / MM_PER_UM,
+            "fewer than three stations see its point, so it cannot be located; the joint method uses the reading",
+            *(lengths.origin[row] if lengths.origin else ("", 0)),
         )
+        for row in lonely.tolist()
+    ]
     return TwoSteps(
         solution=joint,
         accepted=used,
@@ -608,8 +597,19 @@ def solve_in_two_steps(readings: TracerReadings, *, reject: bool) -> TwoSteps:
     )
 
 
-def _solve(problem: SeparationProblem, located: Located, readings: TracerReadings) -> LeastSquaresSolution:
+def _solve(located: Located, readings: TracerReadings) -> tuple[SeparationProblem, LeastSquaresSolution]:
     """Step 3: eq. 21-28."""
+    turn, calibration = located.placement.rotation, located.calibration
+    problem = SeparationProblem(
+        parameters=readings.layout,
+        position_mm=located.position_mm,
+        tool_mm=located.tool_mm,
+        bases=readings.layout.bases(located.position_mm),
+        measured_mm=located.measured_mm,
+        information=turn @ calibration.information @ turn.T,
+        lever=turn @ calibration.lever,
+        station_information=calibration.station_information,
+    )
 
     def names() -> list[str]:
         stations = [f"{name} {letter}" for name in readings.lengths.stations for letter in "xyz"]
@@ -618,7 +618,7 @@ def _solve(problem: SeparationProblem, located: Located, readings: TracerReading
 
     what = f"the {len(located.position_mm)} located points"
     factor, _ = determined_factor(problem.normal_matrix(problem.start), names, what, suspicious=0.0)
-    return solve(problem, problem.start, factor)
+    return problem, solve(problem, problem.start, factor)
 
 
 def _joint(

@@ -427,6 +427,29 @@ class _Expected:
     group: IntArray
     close_mm: FloatArray
 
+    @classmethod
+    def of(
+        cls,
+        lengths: Lengths,
+        layout: ErrorParameters,
+        state: State,
+        group: IntArray,
+        residual_mm: FloatArray,
+        sigma_mm: FloatArray,
+    ) -> _Expected:
+        poses = distinct_poses(lengths.position_mm, tool_of(layout.machine, lengths.tool_mm))
+        tip = layout.tips(state.errors, poses.position_mm, poses.tool_mm)
+        station_of = np.zeros(len(state.dead_length_mm), dtype=np.int64)
+        station_of[group] = lengths.station
+        return cls(
+            distance_mm=np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2),
+            dead_mm=state.dead_length_mm,
+            station_of=station_of,
+            pose=poses.of,
+            group=group,
+            close_mm=CLOSE * sigma_mm * max(standardised_spread(residual_mm / sigma_mm), 0.1),
+        )
+
 
 def explain_rejected(
     lengths: Lengths,
@@ -449,7 +472,7 @@ def explain_rejected(
     """
     if not len(rejected):
         return ()
-    expected = _expected(lengths, layout, state, group, residual_mm, sigma_mm)
+    expected = _Expected.of(lengths, layout, state, group, residual_mm, sigma_mm)
     rows = rejected.tolist()
     broken: dict[int, str] = {}  # rows of rejected segments, with the reason
     for segment in segments:
@@ -484,28 +507,6 @@ def explain_rejected(
             )
         )
     return tuple(found)
-
-
-def _expected(
-    lengths: Lengths,
-    layout: ErrorParameters,
-    state: State,
-    group: IntArray,
-    residual_mm: FloatArray,
-    sigma_mm: FloatArray,
-) -> _Expected:
-    poses = distinct_poses(lengths.position_mm, tool_of(layout.machine, lengths.tool_mm))
-    tip = layout.tips(state.errors, poses.position_mm, poses.tool_mm)
-    station_of = np.zeros(len(state.dead_length_mm), dtype=np.int64)
-    station_of[group] = lengths.station
-    return _Expected(
-        distance_mm=np.linalg.norm(tip[:, None, :] - state.stations_mm[None], axis=2),
-        dead_mm=state.dead_length_mm,
-        station_of=station_of,
-        pose=poses.of,
-        group=group,
-        close_mm=CLOSE * sigma_mm * max(standardised_spread(residual_mm / sigma_mm), 0.1),
-    )
 
 
 def _exchanges(lengths: Lengths, expected: _Expected, rows: Sequence[int], residual_mm: FloatArray) -> dict[int, str]:
