@@ -38,6 +38,7 @@ def option(
     within: tuple[int, int] | None = None,
     factory: Callable[[], Any] | None = None,
     required: bool = False,
+    in_job: Callable[[Any], Any] | None = None,
 ) -> Any:
     """Return the field of an options dataclass; it becomes an option of the command line.
 
@@ -50,8 +51,10 @@ def option(
     choices : the allowed values, if the type of the field does not list them.
     within : the lowest and the highest whole number.
     required : the field has no default, and the option must be given.
+    in_job : check of the value in a job file, where the field is also a key of a machine; None: it is not.
     """
-    declared: Mapping[str, Any] = {"text": text, "name": name, "metavar": metavar, "choices": choices, "within": within}
+    words: Mapping[str, Any] = {"text": text, "name": name, "metavar": metavar}
+    declared: Mapping[str, Any] = {**words, "choices": choices, "within": within, "in_job": in_job}
     start: dict[str, Any] = {} if required else {"default": default}
     return field(metadata=declared, **({"default_factory": factory} if factory is not None else start))
 

@@ -209,18 +209,18 @@ def _path(value: Any) -> Path:
     return Path(toml_files.text_of_path(value))
 
 
-#: Keys of ``[identify]``, each with its check.
-_IDENTIFY: Mapping[str, Callable[[Any], Any]] = {
-    "u_length_um": toml_files.not_negative,
-    "u_length_um_per_m": toml_files.not_negative,
-    "u_deviation_um": toml_files.not_negative,
-    "temperature": toml_files.flag,
-    "small_deviations": toml_files.flag,
-}
 #: Keys of ``[tolerances]``: the error or "volume", and its unit in mm or rad.
 _TOLERANCES: Mapping[str, tuple[str, float]] = {
     f"{name}_{error_named(name).unit}": (name, error_named(name).si_per_unit) for name in ERROR_NAMES
 } | {"volume_um": ("volume", MM_PER_UM)}
+
+
+def _identify_checks() -> dict[str, Callable[[Any], Any]]:
+    """Keys of ``[identify]``, each with its check: the options of an identification that depend on the machine."""
+    from compgen.identify.options import IdentifyOptions  # imported here: it needs numpy
+
+    checks = {item.name: item.metadata.get("in_job") for item in fields(IdentifyOptions)}
+    return {name: check for name, check in checks.items() if check is not None}
 
 
 @dataclass(frozen=True)
@@ -345,7 +345,7 @@ class MachineJob:
     )
     policy: Policy = table_setting(Policy)
     identify: Mapping[str, Any] = part_setting(
-        lambda: toml_files.table_schema({key: accepted(check) for key, check in _IDENTIFY.items()}),
+        lambda: toml_files.table_schema({key: accepted(check) for key, check in _identify_checks().items()}),
         factory=dict,
         meaning="How measurements are identified, as the options of `volcomp identify`.",
     )
@@ -527,7 +527,7 @@ def _mappings(keys: Section) -> dict[str, Mapping[str, Any]]:
     section.finish()
     tolerances = {_TOLERANCES[key][0]: size * _TOLERANCES[key][1] for key, size in given.items() if size is not None}
     section = keys.section("identify", required=False)
-    found: dict[str, Any] = {name: section.take(name, check, None) for name, check in _IDENTIFY.items()}
+    found: dict[str, Any] = {name: section.take(name, check, None) for name, check in _identify_checks().items()}
     section.finish()
     found["temperature"] = found["temperature"] is not False
     found["small_deviations"] = found["small_deviations"] or None  # keeps the hash unchanged

@@ -277,15 +277,7 @@ def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
     old_errors = case.store.errors_of(last)
     if not set(old_errors.names) <= set(result.identification.errors.names):
         return  # already held for that; an incomplete set of errors has no field to compare
-    points = Points(volume_points(machine))
-    adds = {version: _added(machine, tables, points) for version, tables in were_active.items()}
-    added = {f"version {version}": field for version, field in adds.items()}
-    order, on = list(adds), active_of(case.past.tables)
-    active = None if on is None else on.version
-    if taken in adds:  # the clock may be slow: a later version may already have been on
-        later = order[order.index(taken) + 1 :]
-        added |= {f"version {version} instead of version {taken}": adds[version] - adds[taken] for version in later}
-    missing = {f"version {version}": adds[version] for version in order if version in (taken, active)}
+    added, missing = _added(case, were_active)
     old = (old_errors, case.store.covariance_of(last))
     found = likeness(machine, _identified(result), old, added, missing)
     if found is None:
@@ -317,12 +309,24 @@ def _were_active(case: Case) -> tuple[dict[int, ReadTables], IdentificationRecor
     return found, case.store.identification(known[-1].identification_id) if found else None
 
 
-def _added(machine: Machine, tables: ReadTables, points: Points) -> FloatArray:
-    """What the tables add to the commands, mean of both directions of travel, (n, 3), mm."""
-    sides = [np.full_like(points.position_mm, side) for side in (1.0, -1.0)]
-    return np.asarray(
-        0.5 * sum(tables.correction(machine, Points(points.position_mm, approach=side)) for side in sides)
-    )
+def _added(case: Case, were_active: Mapping[int, ReadTables]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
+    """What tables add to the commands that may have been on by mistake, and that may have been off, in words.
+
+    Each is the mean of both directions of travel at points of the volume, (n, 3), mm.
+    """
+    machine, taken, on = case.machine, case.version_taken, active_of(case.past.tables)
+    points_mm = volume_points(machine)
+    sides = [Points(points_mm, approach=np.full_like(points_mm, side)) for side in (1.0, -1.0)]
+    adds = {
+        version: np.asarray(0.5 * sum(tables.correction(machine, side) for side in sides))
+        for version, tables in were_active.items()
+    }
+    added = {f"version {version}": field for version, field in adds.items()}
+    if taken in adds:  # the clock may be slow: a later version may already have been on
+        later = list(adds)[list(adds).index(taken) + 1 :]
+        added |= {f"version {version} instead of version {taken}": adds[version] - adds[taken] for version in later}
+    active = None if on is None else on.version
+    return added, {f"version {version}": field for version, field in adds.items() if version in (taken, active)}
 
 
 def judge_twins(judgement: Judgement, case: Case) -> None:

@@ -16,7 +16,7 @@ from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import Machine
 from compgen.data.messages import nearest
 from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
-from compgen.data.toml_files import option
+from compgen.data.toml_files import flag, not_negative, option
 from compgen.errors import InputError
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start
@@ -185,8 +185,12 @@ class IdentifyOptions:
     0.25
     """
 
-    u_length_um: float | None = option(None, "Constant part of the standard uncertainty of a length, um.")
-    u_length_um_per_m: float | None = option(None, "Part of the standard uncertainty that grows with the length, um/m.")
+    u_length_um: float | None = option(
+        None, "Constant part of the standard uncertainty of a length, um.", in_job=not_negative
+    )
+    u_length_um_per_m: float | None = option(
+        None, "Part of the standard uncertainty that grows with the length, um/m.", in_job=not_negative
+    )
     reject: bool = option(True, "Reject no reading, however far it is from the model.", name="--keep-all")
     systematic: SystematicInputs = SystematicInputs()
     method: Method = option(
@@ -204,12 +208,14 @@ class IdentifyOptions:
         None,
         "Standard uncertainty of a measured deviation (*.deviations.csv), um; default: from the file, otherwise 1 um scaled by "
         "the residuals.",
+        in_job=not_negative,
     )
     temperature: bool = option(
         True,
         "Leave the scales at their measured temperature; by default they are corrected to 20 degC if the file has "
         "temp_x_c, temp_y_c, temp_z_c and the machine file expansion_um_per_m_k.",
         name="--no-temperature",
+        in_job=flag,
     )
     part_scale: Literal["known", "free"] = option(
         "known",
@@ -226,6 +232,7 @@ class IdentifyOptions:
         False,
         "Accept deviations that are all zero, or all below 0.1 um; without it they are refused, because then "
         "nothing was measured, or the values are in mm.",
+        in_job=flag,
     )
 
 
