@@ -105,14 +105,14 @@ def volume_style_of(file: SourceFile) -> VolumeStyle:
         if form_of(record) != form:
             raise record.fail(f"its words differ from those of line {data[0].line}; the style is not clear")
         if record.number != before.number + 1:
-            raise record.fail(f"does not follow N{before.number}; expected the records of one table, in their order")
+            raise record.fail(f"does not follow N{before.number}; expected the records of one table in order")
     style = spacing_of(frame_of(file, records, data), data)
     texts = [text for record in data for letter, text in record.words() if letter in "PXYZ"]
     style = replace(whole_numbers_of(style, texts), point_digits=width_of(data, 5), digits=width_of(parameters, 5))
     notes = (
-        f"records of the form {FORMS[form]}, the first is N{data[0].number}, {len(data)} of them",
+        f"{len(data)} records of the form {FORMS[form]}, starting with N{data[0].number}",
         f"parameters {'are' if parameters else 'are not'} in the same file",
-        "the order of the points cannot be determined from the sample; `order` in the machine file states it",
+        "the order of the points cannot be determined from the sample; set `order` in the machine file",
     )
     return VolumeStyle(style, form, data[0].number, bool(parameters), notes)
 
@@ -154,7 +154,7 @@ class VolumeSettings(FanucSettings):
     sample: VolumeStyle | None = file_setting(
         read_volume_style,
         key="style_from",
-        meaning="a file of three-dimensional data punched from the user's own control, whose style is followed",
+        meaning="a file of three-dimensional data punched out by your control; the export follows its style",
     )
     magnification: tuple[int, int, int] = axis_setting(
         whole(1, 100),
@@ -162,10 +162,10 @@ class VolumeSettings(FanucSettings):
         meaning="magnification of the values of an axis, e.g. { X = 2 }; one count is magnification times detection unit",
     )
     interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
-        multiple_of(STEP_QUANTUM), meaning="distance of the vertices, e.g. { X = 50.0 }; chosen if not stated"
+        multiple_of(STEP_QUANTUM), meaning="vertex spacing, e.g. { X = 50.0 }; default: chosen automatically"
     )
     loss_mm: float = loss_setting(
-        "loss by interpolation between vertices, um at the tool, that is worth no further one"
+        "interpolation loss between vertices that does not justify another vertex, um at the tool"
     )
     most_points: int = setting(whole(2, 1000), 25, meaning="largest number of vertices along an axis")
     most_in_all: int = setting(whole(8, 50_000), 15625, meaning="largest number of vertices")
@@ -174,7 +174,7 @@ class VolumeSettings(FanucSettings):
     order: tuple[int, int, int] = setting(
         word_for({"".join(AXES[axis] for axis in order): order for order in permutations(range(3))}),
         stated="XYZ",
-        meaning="axes in the order of the point numbers, the one that runs fastest first",
+        meaning="axes in the order of the point numbers, fastest-varying axis first",
     )
 
     def count_mm(self, axis: int) -> float:
@@ -274,7 +274,7 @@ def _row(file: SourceFile, text: str, line: int) -> Row:
     found = _ROW.fullmatch(text) if len(text) < 200 else None
     if found is None:
         what = one_line(text[:60])
-        raise file.fail(f"{what!r} is not a row of point number, three positions and three whole counts", line)
+        raise file.fail(f"{what!r} is not a row; expected a point number, three positions and three whole counts", line)
     x, y, z = (Decimal(found[k]) for k in (2, 3, 4))
     p, q, r = (int(value) for value in found[5].split(",")[1:])
     return int(found[1]), (x, y, z), (p, q, r), line
@@ -378,8 +378,8 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             ],
             "warnings": self._warnings(),
             "overwrites": [
-                "Of other axes: nothing, if the numbers below are right. The table of three-dimensional compensation that the "
-                "control has for its axes is lost as a whole.",
+                "Of other axes: nothing, if the numbers below are right. The table of three-dimensional compensation "
+                "in the control is replaced as a whole.",
                 f"Parameters {', '.join(map(str, parameters))}",
                 f"Points 1 to {len(vertices)}, three values each",
             ],
@@ -421,19 +421,19 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         texts = [file for file in files if file.path.suffix.lower() == ".csv"]
         punched = [file for file in files if file.path.suffix.lower() not in (".csv", ".json")]
         if len(texts) > 1:
-            raise texts[1].fail("is a second table; give one")
+            raise texts[1].fail("is a second table; give only one")
         table = self._read_csv(texts[0]) if texts else None
         for file in punched:
             read = self._read_records(file, table)
             if table is not None and not np.array_equal(read.counts, table.counts):
                 place = tuple(int(k) for k in np.argwhere(np.any(read.counts != table.counts, axis=3))[0])
                 raise file.fail(
-                    f"vertex {place} has {read.counts[place].tolist()}, the CSV {table.counts[place].tolist()}"
+                    f"vertex {place} has {read.counts[place].tolist()}, but the CSV has {table.counts[place].tolist()}"
                 )
             table = read
         if table is None:
             raise InputError(
-                "no table is given; expected VOLUME.csv (or a punched file with parameters 10800 to 10814)"
+                "no table was given; expected VOLUME.csv (or a punched file with parameters 10800 to 10814)"
             )
         return table
 
@@ -454,18 +454,18 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
                     np.ceil(tables.magnification[axis] * max(low / settings.value_low, high / settings.value_high))
                 )
                 messages.append(
-                    f"the values of {AXES[axis]} go from {low} to {high}, the range is {settings.value_low} to "
+                    f"the values of {AXES[axis]} go from {low} to {high}, but must be within {settings.value_low} to "
                     f"{settings.value_high}; set magnification.{AXES[axis]} = {needed} or more (coarser counts)"
                 )
             if grid.count > settings.most_points:
                 messages.append(
-                    f"{grid.count} vertices along {AXES[axis]}, at most {settings.most_points} are possible"
+                    f"{grid.count} vertices along {AXES[axis]}; at most {settings.most_points} are possible"
                 )
             first, last = float(grid.start), float(grid.last)
             messages += coverage_violations(self.machine, axis, first, last, "the grid")
         total = int(np.prod(tables.counts.shape[:3]))
         if total > settings.most_in_all:
-            messages.append(f"{total} vertices, at most {settings.most_in_all} are possible")
+            messages.append(f"{total} vertices; at most {settings.most_in_all} are possible")
         return messages
 
     def table_nodes_mm(self, tables: VolumeTable) -> tuple[FloatArray, ...]:
@@ -495,12 +495,12 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         keys, rows = _rows(file)
         text, line = keys.get("magnification", ("", None))
         if not re.fullmatch(r"\d{1,3} \d{1,3} \d{1,3}", text):
-            raise file.fail("the line '# magnification = 1 1 1' (of X, Y and Z) is missing or wrong", line)
+            raise file.fail("the line '# magnification = 1 1 1' (for X, Y and Z) is missing or wrong", line)
         grids = []
         for axis, letter in enumerate(AXES):
             nodes = sorted({row[1][axis] for row in rows})
             if len(nodes) < 2:
-                raise file.fail(f"has one position of {letter}; expected at least two")
+                raise file.fail(f"has only one position of {letter}; expected at least two")
             if any(after - before != nodes[1] - nodes[0] for before, after in pairwise(nodes)):
                 raise file.fail(f"the positions of {letter} are not evenly spaced")
             grids.append(EquidistantGrid(nodes[0], nodes[1] - nodes[0], len(nodes)))
@@ -523,12 +523,14 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         table = VolumeTable(tuple(grids), counts, tuple(map(int, text.split())))
         by_number = {row[0]: row for row in rows}
         for number, place in table.numbered(self.settings.order):
-            due = tuple(grids[k].start + place[k] * grids[k].step for k in range(3))
+            expected = tuple(grids[k].start + place[k] * grids[k].step for k in range(3))
             if number not in by_number:
                 raise file.fail(f"point {number} is missing")
-            if by_number[number][1] != due:
+            if by_number[number][1] != expected:
                 order = "".join(AXES[k] for k in self.settings.order)
-                raise file.fail(f"point {number} is not where order = {order!r} has it", by_number[number][3])
+                raise file.fail(
+                    f"point {number} is not at the position that order = {order!r} gives", by_number[number][3]
+                )
         return table
 
     def _read_records(self, file: SourceFile, beside: VolumeTable | None) -> VolumeTable:
@@ -544,7 +546,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             parameters[record.number] = words[0][1], record
         shape = self._frame(file, parameters) if parameters else beside
         if shape is None:
-            raise file.fail("contains no parameters 10800 to 10814; give VOLUME.csv as well, which has the grid")
+            raise file.fail("contains no parameters 10800 to 10814; also give VOLUME.csv, which contains the grid")
         values = self._values(file, data)
         size = int(np.prod(shape.counts.shape[:3]))
         if len(values) != size:
@@ -573,7 +575,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             text, record = parameters[10812 + axis]
             step = Decimal(text)
             if not 0 < step < 100000:
-                raise record.fail(f"the interval {text} mm is not possible")
+                raise record.fail(f"the interval {text} mm is not possible; expected a positive number")
             start = Decimal(repr(self.machine.reference_point_mm[axis])) - (reference - 1) * step
             grids.append(EquidistantGrid(start, step, count))
             magnification.append(whole(10809 + axis, 1, 100))
@@ -637,22 +639,25 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
 
     def _sign_statement(self, table: VolumeTable) -> str:
         settings = self.settings
-        stored = "the correction, which the control is taken to add" if settings.stores == "correction" else "the error"
+        stored = "correction, which the control is assumed to add"
+        if settings.stores == "error":
+            stored = "error, which the control is assumed to subtract"
         place = tuple(int(k) for k in np.unravel_index(int(np.argmax(np.abs(table.counts))), table.counts.shape))
         index, axis = (place[0], place[1], place[2]), place[3]
         value = int(table.counts[place])
         moved = settings.sign * value * table.magnification[axis] * settings.detection_unit_um
         at = _place(table, index).replace(",", ", ")
         return (
-            f"The values are {stored}; one count is magnification times {settings.detection_unit_um:g} um. At the vertex X, Y, Z "
-            f"= {at} mm the value {value:+d} of {AXES[axis]} moves {AXES[axis]} by {moved:+g} um. Between vertices trilinear, "
-            "outside the grid held (assumed)."
+            f"The values are the {stored}; one count is magnification times {settings.detection_unit_um:g} um. Example: at "
+            f"the vertex X, Y, Z = {at} mm the value {value:+d} of {AXES[axis]} moves {AXES[axis]} by {moved:+g} um. "
+            "Assumed: trilinear between vertices; outside the grid the value at its surface."
         )
 
     def _warnings(self) -> list[str]:
         found = [
-            "Sign, order of the points, parameter numbers and what lies outside the grid are not settled by public documents: "
-            "check single vertices first (part 3), and read the applied compensation back (FOCAS cnc_rdvolccomp).",
+            "Public documents do not settle the sign, the order of the points, the parameter numbers and the behaviour "
+            "outside the grid: first check single vertices (part 3), and read back the applied compensation (FOCAS "
+            "cnc_rdvolccomp).",
             "These files replace stored pitch error and straightness compensation: X, Y and Z must not be corrected twice.",
         ]
         if self.settings.sample is not None:

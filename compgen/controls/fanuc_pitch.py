@@ -145,17 +145,17 @@ def reference_node(machine: Machine, axis: int, nodes_mm: FloatArray) -> int:
 
 
 def _block(
-    machine: Machine, settings: PitchSettings, axis: int, wanted: RequestedPitch, reversal: ReversalCurves | None
+    machine: Machine, settings: PitchSettings, axis: int, requested: RequestedPitch, reversal: ReversalCurves | None
 ) -> tuple[PitchBlock, list[PitchShortfall]]:
     """Table of one axis with numbers from 0, and what the step limit costs it."""
-    nodes_mm = wanted.nodes_mm
+    nodes_mm = requested.nodes_mm
     below = reference_node(machine, axis, nodes_mm)
     half = np.zeros(len(nodes_mm))
     curve = None if reversal is None else reversal.curves.get((axis, axis))
     if settings.bidirectional and curve is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
         half = 0.5 * settings.sign * curve.at(nodes_mm) / settings.count_mm(axis)
     towards = settings.reference_return[axis]
-    both = {1: wanted.counts - half, -1: wanted.counts + half}
+    both = {1: requested.counts - half, -1: requested.counts + half}
     home = both[towards][below]
     both = {way: part - home for way, part in both.items()}
     at_reference = int(np.floor(both[-towards][below] + 0.5))
@@ -229,8 +229,8 @@ def pitch_points(machine: Machine) -> tuple[PointGrid | None, ...]:
     blocks: list[PitchBlock | None] = []
     for axis in range(3):
         nodes_mm = pitch_grid(machine, settings, ErrorTable({}), axis).nodes_mm if known[axis] else np.zeros(0)
-        wanted = RequestedPitch(nodes_mm, np.zeros(len(nodes_mm)))
-        blocks.append(_block(machine, settings, axis, wanted, None)[0] if known[axis] else None)
+        requested = RequestedPitch(nodes_mm, np.zeros(len(nodes_mm)))
+        blocks.append(_block(machine, settings, axis, requested, None)[0] if known[axis] else None)
     fixed = [settings.kept[axis] is not None or settings.first_numbers[axis] is not None for axis in range(3)]
     return tuple(
         PointGrid(block.reference, block.first, block.last, block.interval_mm)
@@ -289,15 +289,15 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PitchTables:
         """Find the best whole cumulative curves within the limit, and give the axes consecutive point numbers."""
         terms = {term.name: term for term in basis}
-        wanted: list[RequestedPitch | None] = [None, None, None]
+        requested: list[RequestedPitch | None] = [None, None, None]
         for axis in range(3):
             name = one_dimensional_name(axis, axis)
             if name in terms:
                 nodes_mm, curve = terms[name].nodes_mm, np.asarray(values[name], dtype=np.float64)
                 below = reference_node(self.machine, axis, nodes_mm)
                 counts = self.settings.sign * (curve - curve[below]) / self.settings.count_mm(axis)
-                wanted[axis] = RequestedPitch(nodes_mm, counts)
-        return self._tables_of(wanted)
+                requested[axis] = RequestedPitch(nodes_mm, counts)
+        return self._tables_of(requested)
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Return the reversal of each axis along itself if ``bidirectional`` is set, else none."""
@@ -306,7 +306,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
 
     def with_reversal(self, tables: PitchTables, reversal: ReversalCurves) -> PitchTables:
         """Return the tables of both directions, each with the best whole numbers for its curve."""
-        return self._tables_of(tables.wanted, reversal)
+        return self._tables_of(tables.requested, reversal)
 
     def context(self, tables: PitchTables) -> dict[str, Any]:
         """Return the context beyond the common one; ``plan`` maps point number -> value for a binary transfer."""
@@ -368,8 +368,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 unknown.append(AXES[axis])
         if unknown:
             message = (
-                f"the tables of {', '.join(unknown)} differ between the directions of travel, and some points do not say "
-                "from where they were approached: there the mean is taken; give approach_x, approach_y, approach_z"
+                f"the tables of {', '.join(unknown)} differ between the directions of travel, but some points have no "
+                "approach direction: the mean is taken there; give approach_x, approach_y, approach_z"
             )
             warnings.warn(message, CompgenWarning, stacklevel=2)
         return added
@@ -391,9 +391,9 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         """
         settings = self.settings
         meanings = {
-            1851: "backlash compensation in detection units: minus the mean reversal value; these tables act in both "
-            "directions alike. If a value was active while the machine was measured, add this one to it",
-            1852: "the same in rapid traverse, if the control keeps it apart (1800#4, RBK = 1)",
+            1851: "backlash compensation in detection units: minus the mean reversal value; these tables are the same "
+            "for both directions. If a value was active while the machine was measured, add this one to it",
+            1852: "the same in rapid traverse, if the control has a separate value (1800#4, RBK = 1)",
         }
         return [
             {
@@ -419,12 +419,12 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         return 0.5 * max(self.settings.count_mm(axis) for axis in range(3))
 
     def _tables_of(
-        self, wanted: Sequence[RequestedPitch | None], reversal: ReversalCurves | None = None
+        self, requested: Sequence[RequestedPitch | None], reversal: ReversalCurves | None = None
     ) -> PitchTables:
         """Return the best whole tables for requested curves, each with its reversal along itself, and their numbers."""
         blocks: list[PitchBlock | None] = [None, None, None]
         shortfalls: list[PitchShortfall] = []
-        for axis, curve in enumerate(wanted):
+        for axis, curve in enumerate(requested):
             if curve is not None:
                 blocks[axis], limited = _block(self.machine, self.settings, axis, curve, reversal)
                 shortfalls += limited
@@ -433,7 +433,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         for item in shortfalls:  # their sections count from 0, the control's from the first point number
             numbers = placed[item.axis].curve_numbers  # type: ignore[union-attr]
             numbered.append(replace(item, sections=tuple(int(numbers[k + 1]) for k in item.sections)))
-        return PitchTables(tuple(placed), shortfalls=tuple(numbered), wanted=tuple(wanted))
+        return PitchTables(tuple(placed), shortfalls=tuple(numbered), requested=tuple(requested))
 
     def _values_of(self, block: PitchBlock) -> dict[int, str]:
         """Parameter number -> value as text for one axis."""
@@ -501,8 +501,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 else "no file of this control was given"
             )
             found = [
-                f"Of other axes: NOT KNOWN, {given} (`--style-from`). An axis whose 3621 to 3622 meet the points below loses its "
-                "table."
+                f"Of other axes: NOT KNOWN, {given} (`--style-from`). An axis whose points (3621 to 3622) overlap "
+                "those below loses its table."
             ]
         for axis, block in present:
             number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"
@@ -543,14 +543,15 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             {
                 "name": "3602#0 (APE)",
                 "value": "total" if settings.total else "incremental",
-                "meaning": "type of the values; which bit value means which is to be read in the parameter manual",
+                "meaning": "type of the values; the parameter manual says which bit value means which",
             },
             {
                 "name": "3605, interpolated type",
                 "value": "on" if settings.interpolation == "linear" else "off",
                 "meaning": f"interpolated pitch compensation; the files were checked as {settings.interpolation}. "
-                "Bit 1 is set on a 30i that was seen, bit 2 (IPP) is remembered: read the parameter manual, and leave the bits "
-                f"as the backup has them{shown}",
+                "Which bit switches it on is not certain (bit 1 is set in the backup of a 30i; bit 2, IPP, "
+                "is from memory): read the parameter manual, and leave the bits as they are in the "
+                f"backup{shown}",
             },
         ]
         return rows + (self._directional_rows(present) if settings.bidirectional else [])
@@ -565,14 +566,15 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
                 {
                     "name": f"1006#5 (ZMI) {name}",
                     "value": "0" if towards else "1",
-                    "meaning": f"reference return in {'positive' if towards else 'negative'} direction, as the tables take it; "
-                    "if the control has another value, set reference_return in the machine file: the reversal would double",
+                    "meaning": f"reference return in {'positive' if towards else 'negative'} direction, as the tables "
+                    "assume; if the control has another value, set reference_return in the machine file, "
+                    "else the reversal doubles",
                 },
                 *(
                     {
                         "name": f"{number} {name}",
                         "value": "0",
-                        "meaning": "the tables of both directions hold the backlash",
+                        "meaning": "the tables of both directions already correct the backlash",
                     }
                     for number in (1851, 1852)
                 ),
@@ -581,60 +583,63 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
 
     def _sign_statement(self) -> str:
         settings = self.settings
-        stored = "the correction, which the control adds" if settings.stores == "correction" else "the error"
+        stored = "correction, which the control adds"
+        if settings.stores == "error":
+            stored = "error, which the control subtracts"
         kind = (
             "A value is the sum up to its point"
             if settings.total
-            else "A value is the change over its section, seen in the positive direction"
+            else "A value is the change over its section in the positive direction"
         )
         count_um, other = settings.count_mm(0) / MM_PER_UM, ""
         if len(set(settings.magnifications)) > 1:
             other = " of X; " + ", ".join(f"{settings.count_mm(k) / MM_PER_UM:g} um of {AXES[k]}" for k in (1, 2))
         text = (
-            f"The numbers are {stored}; one count is {count_um:g} um{other} (magnification "
+            f"The numbers are the {stored}; one count is {count_um:g} um{other} (magnification "
             f"{', '.join(map(str, dict.fromkeys(settings.magnifications)))} times detection unit "
-            f"{settings.detection_unit_um:g} um). {kind}. An X axis that travels {2 * count_um:g} um too "
+            f"{settings.detection_unit_um:g} um). {kind}. Example: an X axis that travels {2 * count_um:g} um too "
             f"short over a section in the positive direction gets {2 * settings.sign:+d} there."
         )
         if not settings.bidirectional:
             return text
         return (
-            f"{text} Points from 3621 to 3622 act in travel in positive direction, as many from 3626 on in negative direction, "
-            "their values seen in the positive direction as well. With a reference return in positive direction an axis that "
-            f"stops {settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after negative travel gets "
-            f"{settings.sign:+d} in 3627."
+            f"{text} The points from 3621 to 3622 act in positive travel; as many points from 3626 on act in negative "
+            "travel, and their values are also changes in the positive direction. With a reference return in positive "
+            f"direction, an axis that stops {settings.count_mm(0) / MM_PER_UM:g} um farther after positive than after "
+            f"negative travel gets {settings.sign:+d} in 3627."
         )
 
     def _warnings(self, present: list[tuple[int, PitchBlock]]) -> list[str]:
         settings = self.settings
-        found = ["The sign of the values is not settled by public documents: check it at one section first (part 3)."]
+        found = ["Public documents do not settle the sign of the values: check it on one section first (part 3)."]
         for axis, block in present:
             if settings.kept[axis] is not None:
                 found.append(
-                    f"The points {block.first} to {block.last} of {AXES[axis]}, their interval {block.interval_mm:f} mm and the "
-                    f"magnification {block.magnification} are those of the sample; interval_mm or first_numbers in the machine "
-                    "file lay them out anew."
+                    f"The points {block.first} to {block.last} of {AXES[axis]}, their interval {block.interval_mm:f} "
+                    f"mm and the magnification {block.magnification} are those of the sample; for a new layout set "
+                    "interval_mm or first_numbers in the machine file."
                 )
         if settings.sample.notes:
             found.append("The style was taken from the sample: " + "; ".join(settings.sample.notes) + ".")
         if settings.bidirectional:
             found.append(
-                "Bi-directional: 3627 (value at the reference point reached against the reference return) and the numbers of "
-                "the points for negative travel are not settled by public documents; check both directions at the machine."
+                "Bi-directional: public documents do not settle 3627 (value at the reference point when it is reached "
+                "against the reference return) and the point numbers for negative travel; check both directions at the "
+                "machine."
             )
         if settings.interpolation == "staircase":
             worst_mm = max(
                 (int(np.max(np.abs(np.diff(b.curve)))) * settings.count_mm(k) for k, b in present), default=0.0
             )
             found.append(
-                f"Where inside a section the plain type puts its pulses out is not documented: between section ends the "
-                f"correction may be off by up to {fixed(worst_mm / MM_PER_UM, 1)} um."
+                "It is not documented where inside a section the plain type outputs its pulses: between section ends "
+                f"the correction may be off by up to {fixed(worst_mm / MM_PER_UM, 1)} um."
             )
         if settings.max_feed_mm_min is None and present:
             shortest = min(float(block.interval_mm) for _, block in present)
             found.append(
-                f"max_feed_mm_min is not in the machine file. By the rule interval >= feed / 7500 the shortest interval of "
-                f"{shortest:g} mm allows {7500 * shortest:.0f} mm/min."
+                "max_feed_mm_min is not set in the machine file. By the rule interval >= feed / 7500 the shortest "
+                f"interval of {shortest:g} mm allows {7500 * shortest:.0f} mm/min."
             )
         return found
 

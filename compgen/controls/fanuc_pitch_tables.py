@@ -75,11 +75,11 @@ class PitchSettings(PunchedSettings):
 
     interval_mm: tuple[float | None, float | None, float | None] = axis_setting(
         toml_files.positive,
-        meaning="length of a section, e.g. { X = 50.0 }; that of the sample, else chosen, if not stated",
+        meaning="length of a section, e.g. { X = 50.0 }; default: that of the sample, else chosen automatically",
     )
     first_numbers: tuple[int | None, int | None, int | None] = axis_setting(
         whole(0, MOST_NUMBER),
-        meaning="first point number of the block of an axis, e.g. { X = 100 }; those of the sample are kept, the others "
+        meaning="first point number of the block of an axis, e.g. { X = 100 }; default: that of the sample, else "
         "assigned",
     )
     magnification: int | None = setting(
@@ -96,17 +96,17 @@ class PitchSettings(PunchedSettings):
     interpolation: str = setting(
         choice("linear", "staircase"),
         "linear",
-        meaning="how a value acts inside a section; a staircase puts the whole value out at the beginning",
+        meaning='how a value acts inside a section; "staircase" outputs the whole value at its beginning',
     )
     max_feed_mm_min: float | None = setting(
         toml_files.positive,
         None,
-        meaning="fastest feed; stated, a section must be at least feed / 7500 mm long",
+        meaning="fastest feed; if set, a section must be at least feed / 7500 mm long",
     )
     increment_limit: int = setting(whole(1, 127), 7, meaning="largest change over a section in counts, 1 to 127")
     loss_mm: float = loss_setting()
     first_number: int = setting(
-        whole(0, MOST_NUMBER), 1, meaning="first compensation point number that may be used; 0 is left out by default"
+        whole(0, MOST_NUMBER), 1, meaning="first compensation point number that may be used; by default 0 is not used"
     )
     last_number: int = setting(
         whole(0, MOST_NUMBER),
@@ -117,7 +117,7 @@ class PitchSettings(PunchedSettings):
         _spans,
         (),
         key="reserved_numbers",
-        meaning="blocks of point numbers of other axes, which are left free, e.g. [[60, 68]]",
+        meaning="blocks of point numbers of other axes, e.g. [[60, 68]]: never written",
     )
     bidirectional: bool = setting(
         toml_files.flag,
@@ -133,8 +133,8 @@ class PitchSettings(PunchedSettings):
     reference_return: tuple[int, int, int] = axis_setting(
         word_for({"positive": 1, "negative": -1}),
         (1, 1, 1),
-        meaning='direction of the reference return, e.g. { X = "negative" }; "positive" where not stated. If it is wrong, '
-        "the reversal doubles",
+        meaning='direction of the reference return, e.g. { X = "negative" }; default "positive". A wrong direction '
+        "doubles the reversal",
     )
     kept: tuple[PointGrid | None, ...] = (None, None, None)
 
@@ -197,8 +197,9 @@ def _kept(settings: PitchSettings) -> tuple[PointGrid | None, ...]:
         grid = axis.grid
         if not grid.first - 1 <= grid.reference <= grid.last:
             raise axis.record.fail(
-                f"axis A{number} has the reference point {grid.reference} (3620) and the points {grid.first} to {grid.last}; "
-                "these points cannot be kept: state first_numbers and interval_mm in the machine file for new ones"
+                f"axis A{number} has the reference point {grid.reference} (3620) and the points {grid.first} to "
+                f"{grid.last}; these points cannot be kept: for new ones set first_numbers and interval_mm in the "
+                "machine file"
             )
         found.append(grid)
     return tuple(found)
@@ -214,11 +215,11 @@ def _check_together(section: toml_files.Section, settings: PitchSettings) -> Non
         if settings.magnifications != (1, 1, 1):
             raise section.fail(
                 "magnification",
-                "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (a larger "
-                "increment_limit or shorter sections hold steep curves)",
+                "whether 3627 is multiplied by it is not documented; with bidirectional = true it must be 1 (for steep "
+                "curves use a larger increment_limit or shorter sections)",
             )
         if settings.negative_last_number < settings.negative_first_number:
-            raise section.fail("negative_last_number", f"lies below {settings.negative_first_number}")
+            raise section.fail("negative_last_number", f"is below {settings.negative_first_number}")
     for letter, number in () if settings.bidirectional else zip(AXES, settings.axis_numbers, strict=True):
         if (settings.sample.bits(3605, number) or "0").endswith("1"):
             raise settings.sample.parameters[3605, number][1].fail(
@@ -230,12 +231,13 @@ def _check_together(section: toml_files.Section, settings: PitchSettings) -> Non
     if settings.number_base < 10000 and not settings.style.q_word:
         raise section.fail(
             "number_base",
-            f"{settings.number_base} makes pitch data look like parameters; 10000 or more, or q_word = true, is needed",
+            f"{settings.number_base} makes pitch data look like parameters; set 10000 or more, or q_word = true",
         )
     for axis, interval_mm in zip(AXES, settings.interval_mm, strict=True):
         if interval_mm is not None and Decimal(repr(interval_mm)) % settings.interval_quantum_mm:
             message = (
-                f"{axis} = {interval_mm:g} mm cannot be written; multiples of {settings.interval_quantum_mm} mm can"
+                f"{axis} = {interval_mm:g} mm cannot be written; expected a multiple of {settings.interval_quantum_mm} "
+                "mm"
             )
             raise section.fail("interval_mm", message)
 
@@ -345,7 +347,7 @@ class PitchTables:
     """Tables of X, Y, Z (None: the axis has none); ``others`` contains (axis number, first, last) of other axes.
 
     ``turns`` contains (axis number, sum of the values over a revolution) for rotary ones of these. ``shortfalls`` and
-    ``wanted`` are known only for tables that were built: text does not tell what was requested. ``remarks`` are
+    ``requested`` are known only for tables that were built: text does not tell what was requested. ``remarks`` are
     those from reading text.
     """
 
@@ -353,7 +355,7 @@ class PitchTables:
     others: tuple[tuple[int, int, int], ...] = ()
     turns: tuple[tuple[int, int], ...] = field(default=(), compare=False)
     shortfalls: tuple[PitchShortfall, ...] = field(default=(), compare=False)
-    wanted: tuple[RequestedPitch | None, ...] = field(default=(None, None, None), compare=False)
+    requested: tuple[RequestedPitch | None, ...] = field(default=(None, None, None), compare=False)
     remarks: tuple[str, ...] = field(default=(), compare=False)
 
 
@@ -369,7 +371,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
     """
     texts = [file for file in files if file.path.suffix.lower() != ".json"]
     if not texts:
-        raise InputError("no FANUC text file is given; expected PITCH.TXT (or a file punched from the control)")
+        raise InputError("no FANUC text file was given; expected PITCH.TXT (or a file punched from the control)")
     found, points = PunchedRecords(settings.sample.style.path or 1), PointRecords()
     base, known = settings.number_base, (*AXIS_PARAMETERS, UNIT_PARAMETER, TOTAL_PARAMETER)
     for record in (record for file in texts for record in read_records(file)):
@@ -378,7 +380,7 @@ def parse_pitch(settings: PitchSettings, files: Sequence[SourceFile]) -> PitchTa
         if 0 <= record.number - base <= MOST_NUMBER and kind != 1:
             points.setdefault(record.number - base, []).append(record)
         elif record.number not in known:
-            found.passed_over += 1
+            found.skipped += 1
         if record.number in known and not (base < 10000 and kind == 0):
             found.take(record, is_point=False)
     found.check_metric()
@@ -397,7 +399,8 @@ def _remarks(settings: PitchSettings, found: PunchedRecords, others: Sequence[tu
     said = [found.unit_remark(settings.detection_unit_um)]
     for axis, first, last in others:
         said.append(
-            f"axis A{axis} (not X, Y or Z of the machine file) has the compensation points {first} to {last}: kept apart"
+            f"axis A{axis} (not X, Y or Z of the machine file) has the compensation points {first} to {last}: not part "
+            "of these tables"
         )
     bits = sorted(
         {
@@ -408,11 +411,11 @@ def _remarks(settings: PitchSettings, found: PunchedRecords, others: Sequence[tu
     )
     if bits:
         said.append(
-            f"3605 of X, Y, Z is {', '.join(bits)} (bit 7 first); which bit makes the compensation interpolated is not settled, "
-            f"read as {settings.interpolation}"
+            f"3605 of X, Y, Z is {', '.join(bits)} (bit 7 first); public documents do not settle which bit makes the "
+            f"compensation interpolated; read as {settings.interpolation}"
         )
-    if found.passed_over:
-        said.append(found.passed_over_remark("pitch"))
+    if found.skipped:
+        said.append(found.skipped_remark("pitch"))
     return tuple(said)
 
 
@@ -536,8 +539,8 @@ def pitch_violations(machine: Machine, settings: PitchSettings, tables: PitchTab
     for axis_number, total in tables.turns:
         if total:
             messages.append(
-                f"the values of the rotary axis A{axis_number} sum to {total} counts over a revolution; they must sum to 0, "
-                f"else every revolution adds to the error"
+                f"the values of the rotary axis A{axis_number} sum to {total} counts over a revolution; they must sum "
+                "to 0, otherwise every revolution adds to the error"
             )
     present = [(AXES[k], block) for k, block in enumerate(tables.blocks) if block is not None]
     spans = [(name, block.first, block.last) for name, block in present]
@@ -558,10 +561,10 @@ def shortfall_text(settings: PitchSettings, shortfall: PitchShortfall) -> str:
     """Say that the limit on the change per section keeps a table from reaching the request, and what helps."""
     numbers = ", ".join(map(str, shortfall.sections[:5])) + (", ..." if len(shortfall.sections) > 5 else "")
     return (
-        f"{AXES[shortfall.axis]}: the requested curve is too steep, the limit is {settings.increment_limit} counts per "
-        f"section: {len(shortfall.sections)} sections are full (points {numbers}), and even the best table misses by up "
-        f"to {shortfall.missed_counts * settings.count_mm(shortfall.axis) / MM_PER_UM:.1f} um; a shorter interval or a larger "
-        f"magnification is needed"
+        f"{AXES[shortfall.axis]}: the requested curve is too steep; the limit is {settings.increment_limit} counts per "
+        f"section. {len(shortfall.sections)} sections reach it (points {numbers}), and even the best table misses the "
+        f"curve by up to {shortfall.missed_counts * settings.count_mm(shortfall.axis) / MM_PER_UM:.1f} um; set a "
+        "shorter interval or a larger magnification"
     )
 
 
@@ -572,12 +575,12 @@ def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> 
         if steps.size and steps.max() > settings.increment_limit and (block.negative or not way):
             worst = int(np.argmax(steps))
             messages.append(
-                f"{name}: the change over section {block.curve_numbers[worst + 1]}{way} is {steps[worst]} counts, the limit "
-                f"is {settings.increment_limit}; a shorter interval or a larger magnification is needed"
+                f"{name}: the change over section {block.curve_numbers[worst + 1]}{way} is {steps[worst]} counts; the "
+                f"limit is {settings.increment_limit}: set a shorter interval or a larger magnification"
             )
     if block.total and max(map(abs, block.values)) > MOST_TOTAL:
         most = max(map(abs, block.values))
-        messages.append(f"{name}: a total value of {most} counts does not fit 16 bits ({MOST_TOTAL})")
+        messages.append(f"{name}: a total value of {most} counts does not fit into 16 bits ({MOST_TOTAL})")
     if block.total and block.values[block.reference - block.first] != 0:
         messages.append(f"{name}: the total value at the reference point {block.reference} must be 0")
     if block.last > settings.last_number:
@@ -596,7 +599,7 @@ def _block_violations(settings: PitchSettings, name: str, block: PitchBlock) -> 
     if float(block.interval_mm) < settings.least_interval_mm - 1e-9:
         messages.append(
             f"{name}: the interval {block.interval_mm:f} mm is shorter than the {settings.least_interval_mm:g} mm that "
-            f"{settings.max_feed_mm_min:g} mm/min need"
+            f"a feed of {settings.max_feed_mm_min:g} mm/min needs"
         )
     return messages
 

@@ -68,7 +68,7 @@ class Record:
         """Return ``text`` as a whole number within limits (a trailing decimal point is harmless)."""
         value = Decimal(text)
         if value != value.to_integral_value() or not low <= value <= high:
-            raise self.fail(f"{text} is given; expected a whole number from {low} to {high}")
+            raise self.fail(f"got {text}; expected a whole number from {low} to {high}")
         return int(value)
 
 
@@ -91,7 +91,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
                     raise file.fail(f"{one_line(block[:20])!r} is outside the pair of '%'", number)
                 if len(block) > MOST_IN_BLOCK:
                     raise file.fail(
-                        f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are possible", number
+                        f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are allowed", number
                     )
                 found = _RECORD.match(block)
                 if found is None:
@@ -99,7 +99,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
                     raise file.fail(message, number)
                 if found.end() != len(block):
                     what = one_line(block[found.end() : found.end() + 20])
-                    message = f"{what!r} has no place in a block; words are a letter and a decimal number with '.'"
+                    message = f"{what!r} is not allowed in a block; a word is a letter and a decimal number with '.'"
                     raise file.fail(message, number)
                 yield Record(int(found[1]), found[2], file, number, len(found[1]), found[1].startswith("0"))
     if marks == 0:
@@ -127,7 +127,7 @@ def axis_values(record: Record, words: Sequence[tuple[str, str]]) -> list[tuple[
         if axis_letter != "A":
             raise record.fail(f"expected an axis word A, e.g. A1P40, found {axis_letter}{axis}")
         if value_letter == "I":
-            raise record.fail("the value word I is inch data; punch the file with the control set to mm")
+            raise record.fail("the value word I marks inch data; punch the file with the control set to mm")
         if value_letter not in ("P", "M"):
             raise record.fail(f"expected a value word P, e.g. A1P40, found {value_letter}{value}")
         pairs.append((record.whole(axis, 1, 99), value))
@@ -342,8 +342,9 @@ class Sample:
         for axis, (low, high) in self.others(number):
             if first <= high and last >= low:
                 raise axis.record.fail(
-                    f"axis A{axis.number} uses the compensation points {low} to {high}; the points {first} to {last} of "
-                    f"{name} (A{number}) would overwrite them. Set first_numbers or reserved_numbers so that they do not meet"
+                    f"axis A{axis.number} uses the compensation points {low} to {high}; the points {first} to {last} "
+                    f"of {name} (A{number}) would overwrite them. Set first_numbers or reserved_numbers so that they "
+                    "do not overlap"
                 )
 
     def bits(self, parameter: int, number: int) -> str | None:
@@ -352,7 +353,7 @@ class Sample:
         if found is None:
             return None
         if not re.fullmatch("[01]{8}", found[0]):
-            raise found[1].fail(f"{found[0]} is given for A{number}; expected eight binary digits, bit 7 first")
+            raise found[1].fail(f"A{number} has {found[0]}; expected eight binary digits, bit 7 first")
         return found[0]
 
 
@@ -364,14 +365,14 @@ class FanucSettings:
     """What the numbers of a FANUC control mean, and which of its axes are X, Y and Z."""
 
     detection_unit_um: float = setting(
-        toml_files.positive, 1.0, meaning="detection unit: what the control counts in, um"
+        toml_files.positive, 1.0, meaning="detection unit: the step in which the control counts, um"
     )
     stores: str = setting(
         choice("correction", "error"),
         "correction",
-        meaning='what the numbers are: "correction" (the control adds them) or "error"',
+        meaning='what the numbers are: "correction" (the control adds them) or "error" (it subtracts them)',
     )
-    axis_numbers: tuple[int, int, int] = axis_setting(whole(1, 99), (1, 2, 3), meaning="controlled axis numbers")
+    axis_numbers: tuple[int, int, int] = axis_setting(whole(1, 99), (1, 2, 3), meaning="numbers of the controlled axes")
 
     @property
     def sign(self) -> int:
@@ -395,9 +396,9 @@ class PunchedSettings(FanucSettings):
 
     style_from: tuple[Path, ...] = file_setting(
         several=True,
-        meaning="a file punched from the user's own control, or a list of them (parameters, pitch data): its style, points "
-        "(3620 to 3624) and magnification are kept, points and entries of other axes never overwritten; the keys of the "
-        "style take precedence",
+        meaning="a file punched out by your control, or a list of them (parameters, pitch data): style, points (3620 "
+        "to 3624) and magnification are kept, points and entries of other axes are never overwritten; the "
+        "style keys take precedence",
     )
     eol: str | None = setting(word_for({"lf": "\n", "crlf": "\r\n"}), None, meaning="line ends of the file")
     digits: int | None = setting(whole(1, 8), None, meaning="digits of the N words, 1 to 8")
@@ -429,7 +430,7 @@ def take_punched(kind: type[P], section: toml_files.Section, **given: Any) -> P:
         raise section.fail(
             "interval_unit_mm",
             "is missing; with real_point = false parameter 3624 is a whole number whose unit depends on the control "
-            "(1.0 or 0.001 mm are common): read 3624 of a known axis and give the unit in mm",
+            "(1.0 or 0.001 mm are common): look up 3624 of an axis with a known interval and set the unit in mm",
         )
     style = replace(
         sample.style,
@@ -502,7 +503,7 @@ class PunchedRecords:
         self.axes: Parameters = {}
         self.common: dict[int, tuple[str, Record]] = {}
         self.points: list[tuple[str, Record]] = []
-        self.passed_over = 0
+        self.skipped = 0
 
     def take(self, record: Record, is_point: bool) -> None:
         """Sort in a record; one unrelated to compensation is counted."""
@@ -520,7 +521,7 @@ class PunchedRecords:
             if value is not None:
                 self._once(self.common, record.number, value, record, "the parameter")
         else:
-            self.passed_over += 1
+            self.skipped += 1
 
     def _once(self, into: dict[Any, tuple[str, Record]], key: Any, text: str, record: Record, what: str) -> None:
         if key in into:
@@ -531,24 +532,24 @@ class PunchedRecords:
     def unit_remark(self, detection_unit_um: float) -> str:
         """Say which unit the machine is assumed to have."""
         known = UNIT_PARAMETER in self.common
-        unit = "metric by 1001#0 (INM)" if known else "taken to be metric, 1001#0 (INM) is not in the file"
+        unit = "metric by 1001#0 (INM)" if known else "assumed to be metric (1001#0, INM, is not in the file)"
         return (
-            f"unit: the machine is {unit}; parameter 3624 counts in mm, one detection unit is {detection_unit_um:g} um by the "
-            "machine file"
+            f"unit: the machine is {unit}; parameter 3624 is in mm; the detection unit of the machine file is "
+            f"{detection_unit_um:g} um"
         )
 
-    def passed_over_remark(self, kind: str) -> str:
+    def skipped_remark(self, kind: str) -> str:
         """Count the records that were skipped."""
-        records = "1 record" if self.passed_over == 1 else f"{self.passed_over} records"
-        return f"passed over: {records} that cannot change a {kind} table"
+        records = "1 record" if self.skipped == 1 else f"{self.skipped} records"
+        return f"skipped: {records} that cannot change a {kind} table"
 
     def check_metric(self) -> None:
         """Reject a machine whose least command increment is in inch (1001#0, INM)."""
         found = self.common.get(UNIT_PARAMETER)
         if found is not None and found[0][-1:] == "1":
             raise found[1].fail(
-                "bit 0 (INM) is 1: an inch machine, whose parameter 3624 and detection unit are in inch. Only metric "
-                "machines are read and written"
+                "bit 0 (INM) is 1: an inch machine, whose parameter 3624 and detection unit are in inches. Only metric "
+                "machines are supported"
             )
 
 
@@ -557,7 +558,7 @@ def check_increments(common: Mapping[int, tuple[str, Record]]) -> None:
     text, record = common.get(TOTAL_PARAMETER, ("0", None))
     if record is not None and text.endswith("1"):
         raise record.fail(
-            'bit 0 (APE) is 1: the pitch data of this control are total values; state value_type = "total" in '
+            'bit 0 (APE) is 1: the pitch data of this control are total values; set value_type = "total" in '
             "[controllers.fanuc-pitch], or set the bit to 0 and punch the files again"
         )
 
@@ -573,8 +574,8 @@ def _axes_of(parameters: Parameters, unit_mm: float) -> dict[int, AxisPoints]:
             for entry in entries:
                 if entry is not None and Decimal(entry[0]):
                     raise entry[1].fail(
-                        f"axis A{axis} has a value here, but none for {' and '.join(missing)}: which points it uses is not "
-                        "known, and they could be overwritten. Punch all parameters of the control"
+                        f"axis A{axis} has a value here, but none for {' and '.join(missing)}: its points are not "
+                        "known and could be overwritten. Punch all parameters of the control"
                     )
             continue
         (reference, first, last), record = numbers, entries[1][1]  # type: ignore[index]
@@ -598,7 +599,7 @@ def length_of(record: Record, text: str, unit_mm: float) -> Decimal:
     """Return an interval in mm: a number with a decimal point is in mm, one without is in units of ``unit_mm``."""
     value = Decimal(text) if "." in text else Decimal(text) * Decimal(repr(unit_mm))
     if not 0 < value < 100000:
-        raise record.fail(f"the interval {value} mm is not possible; it is the positive length of a section")
+        raise record.fail(f"the interval {value} mm is not possible; expected the positive length of a section")
     return value
 
 
@@ -673,7 +674,9 @@ def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Recor
     pieces = text.split(eol)
     for number, piece in enumerate(pieces, start=1):
         if "\r" in piece or "\n" in piece:
-            raise file.fail(f"this line does not end with {LINE_ENDS[eol]} as others do; punch the file again", number)
+            raise file.fail(
+                f"this line does not end with {LINE_ENDS[eol]} like the others; punch the file again", number
+            )
     marks = [k for k, piece in enumerate(pieces) if piece.strip().rstrip(";") == "%"]
     lines = sorted({record.line for record in records})
     own = [pieces[line - 1] for line in lines]
@@ -699,7 +702,7 @@ def spacing_of(style: FanucStyle, records: Sequence[Record]) -> FanucStyle:
     first = records[0]
     words = first.words()
     if not words:
-        raise first.fail("has no value; a punched record has one")
+        raise first.fail("has no value; every punched record has one")
     space = first.rest[: len(first.rest) - len(first.rest.lstrip())]
     has_q, last = any(letter == "Q" for letter, _ in words), words[-1][0] == "Q" and len(words) > 1
     for record in records:
@@ -772,14 +775,14 @@ def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]
     if points:
         found.append(f"compensation point 0 is record N{style.number_base}; e.g. {style.point(1, -2)}")
     else:
-        found.append(f"no compensation point in it: number base {style.number_base} is NOT confirmed")
+        found.append(f"the sample contains no compensation point: number base {style.number_base} is NOT confirmed")
     if any(record.number == LENGTH_PARAMETER for record in others):
         example = style.length(Decimal(50))
         found.append(
             f"lengths {'with' if style.real_point else 'without'} decimal point, e.g. {style.real_letter}{example}"
         )
     else:
-        found.append("no parameter 3624 in it: the form of lengths is NOT confirmed")
+        found.append("the sample contains no parameter 3624: the form of lengths is NOT confirmed")
     order = "points before parameters" if style.points_first else "parameters before points"
     found.append(f"{order}, {style.containers} pair{'s' if style.containers > 1 else ''} of %")
     axes = "all axes of a parameter in one record" if style.axes_together else "one record per axis"

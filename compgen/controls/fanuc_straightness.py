@@ -59,7 +59,9 @@ def _pairs(value: Any) -> tuple[tuple[int, int], ...]:
         raise ValueError(f"expected a list of {', '.join(map(repr, ACROSS))}")
     found = tuple(ACROSS[item] for item in value)
     if len({moving for _, moving in found}) < len(found):
-        raise ValueError("each moving axis can be given once only: the control keeps four points for each moving axis")
+        raise ValueError(
+            "each moving axis may be given only once: the control has one table of four points for each moving axis"
+        )
     return found
 
 
@@ -88,16 +90,19 @@ class StraightnessSettings(PunchedSettings):
     assumed. ``pairs`` are (compensated axis, moving axis), 0..2; None: the best are chosen.
     """
 
-    path: int = setting(whole(1, 99), 1, meaning="path of the control whose parameters count, where they have a word L")
+    path: int = setting(whole(1, 99), 1, meaning="path of the control whose parameters are used, if they have a word L")
     grids: tuple[PointGrid | None, ...] = setting(
         _points,
         (None, None, None),
         key="points",
-        meaning="compensation points of an axis as pitch error compensation has them, { X = { reference = 40, first = 33, "
-        "last = 49, interval_mm = 50.0 } }; those of the sample, else of [controllers.fanuc-pitch], else assumed, if not stated",
+        meaning="compensation points of an axis in pitch error compensation, { X = { reference = 40, first = 33, last "
+        "= 49, interval_mm = 50.0 } }; default: those of the sample, else of [controllers.fanuc-pitch], else "
+        "assumed",
     )
     pairs: tuple[tuple[int, int], ...] | None = setting(
-        _pairs, None, meaning='up to three tables, e.g. ["Y(x)", "X(y)"], each moving axis once; chosen if not stated'
+        _pairs,
+        None,
+        meaning='up to three tables, e.g. ["Y(x)", "X(y)"], each moving axis once; default: chosen automatically',
     )
     amount_limit: int = setting(whole(1, 32767), 32767, meaning="largest magnitude of an amount, counts")
     stated: tuple[bool, ...] = (False, False, False)
@@ -126,15 +131,15 @@ def read_straightness_settings(machine: Machine) -> StraightnessSettings:
         if settings.axis_numbers != pitch.axis_numbers:
             own, stated = (", ".join(map(str, numbers)) for numbers in (settings.axis_numbers, pitch.axis_numbers))
             part = section.section("axis_numbers")
-            raise part.fail("X", f"{own} are the axis numbers here, and {stated} in [controllers.fanuc-pitch]")
+            raise part.fail("X", f"the axis numbers are {own} here, but {stated} in [controllers.fanuc-pitch]")
     settings.finish(section)
     settings = _with_points(machine, settings, points)
     for _, moving in settings.pairs or ():
         if settings.grids[moving] is None:
             raise section.fail(
                 "pairs",
-                f"{AXES[moving]} (A{settings.axis_numbers[moving]}) has no compensation points in the sample (3620 to 3622 "
-                f"and 3624), and other axes must keep theirs; leave its table out, or state points.{AXES[moving]}",
+                f"{AXES[moving]} (A{settings.axis_numbers[moving]}) has no compensation points in the sample (3620 to "
+                f"3622 and 3624), and other axes must keep theirs; omit its table, or set points.{AXES[moving]}",
             )
     return settings
 
@@ -209,7 +214,7 @@ def default_grid(machine: Machine, settings: StraightnessSettings, axis: int, fr
 ENTRIES = range(3)
 MOVING, COMPENSATED, POINTS, AMOUNTS = 5711, 5721, 5731, 5761
 #: Additional moving axes on controls with more entries.
-FURTHER_MOVING = range(5714, 5721)
+UNKNOWN_MOVING = range(5714, 5721)
 #: Reference, first, last number and interval of the compensation points.
 GRID_PARAMETERS = (3620, 3621, 3622, 3624)
 #: Positions closer than this are the same, mm.
@@ -278,33 +283,33 @@ class Polyline:
 
 
 def best_polyline(
-    candidates_mm: FloatArray, position_mm: FloatArray, wanted: FloatArray, weight: FloatArray
+    candidates_mm: FloatArray, position_mm: FloatArray, requested: FloatArray, weight: FloatArray
 ) -> Polyline:
     """Return the polyline with knots at the first, the last and two other candidates that best fits the samples.
 
     Parameters
     ----------
     candidates_mm : allowed knots (m,), ascending, at least four.
-    position_mm, wanted, weight : samples (n,) within the candidates, ascending, including the candidates.
+    position_mm, requested, weight : samples (n,) within the candidates, ascending, including the candidates.
     """
     if len(candidates_mm) < 4:
         raise ValueError("at least four candidates are needed")
-    gain = _gain_of_inner_knots(candidates_mm, position_mm, wanted, weight)
+    gain = _gain_of_inner_knots(candidates_mm, position_mm, requested, weight)
     b, c = (int(k) for k in np.unravel_index(int(np.argmax(gain)), gain.shape))
     knots = (0, b, c, len(candidates_mm) - 1)
     matrix = hat_matrix(candidates_mm[list(knots)], position_mm)
     root = np.sqrt(weight)
-    values = np.linalg.lstsq(matrix * root[:, None], wanted * root, rcond=None)[0]
-    return Polyline(knots, np.asarray(values), float(np.sum(weight * (matrix @ values - wanted) ** 2)))
+    values = np.linalg.lstsq(matrix * root[:, None], requested * root, rcond=None)[0]
+    return Polyline(knots, np.asarray(values), float(np.sum(weight * (matrix @ values - requested) ** 2)))
 
 
 def _gain_of_inner_knots(
-    candidates: FloatArray, position: FloatArray, wanted: FloatArray, weight: FloatArray
+    candidates: FloatArray, position: FloatArray, requested: FloatArray, weight: FloatArray
 ) -> FloatArray:
     """Decrease of the squared deviation with inner knots b (row) and c (column), shape (m, m); -inf where b >= c."""
     # sums of h0^2, h0 h1, h1^2, h0 y, h1 y over the samples of each segment from candidate p to q, (m, m), only p < q
     middle = 0.5 * (candidates[0] + candidates[-1])
-    x, y = position - middle, wanted
+    x, y = position - middle, requested
     at = candidates - middle
     moments = np.array([weight, weight * x, weight * x**2, weight * y, weight * x * y])
     running = np.hstack([np.zeros((5, 1)), np.cumsum(moments, axis=1)])
@@ -417,18 +422,18 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         """
         texts = [file for file in files if file.path.suffix.lower() != ".json"]
         if not texts:
-            raise InputError("no FANUC text file is given; expected STRAIGHT.TXT (or a punched parameter file)")
+            raise InputError("no FANUC text file was given; expected STRAIGHT.TXT (or a punched parameter file)")
         found = PunchedRecords(self.settings.path)
         for file in texts:
             for record in read_records(file):
                 if type_word(record, record.words())[0] != 0:
                     found.take(record, is_point=False)
         found.check_metric()
-        for number in FURTHER_MOVING:
-            text, further = found.common.get(number, ("0", None))
-            if further is not None and Decimal(text):
-                raise further.fail(
-                    f"{text} is given: a fourth moving axis, whose points and amounts are not known; set it to 0"
+        for number in UNKNOWN_MOVING:
+            text, unknown = found.common.get(number, ("0", None))
+            if unknown is not None and Decimal(text):
+                raise unknown.fail(
+                    f"{text} is a fourth moving axis, whose points and amounts are not known; set it to 0"
                 )
         apart: list[InputError] = []
         entries = tuple(entry for k in ENTRIES if (entry := self._entry(texts[0], k, found, apart)) is not None)
@@ -441,18 +446,20 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         moving = [entry.moving for entry in entries]
         for k, entry in enumerate(entries):
             if entry.moving in moving[:k]:
-                raise texts[0].fail(f"{AXES[entry.moving]} is the moving axis of two entries; each may have one")
+                raise texts[0].fail(
+                    f"{AXES[entry.moving]} is the moving axis of two entries; every axis may have only one"
+                )
         remarks = [found.unit_remark(self.settings.detection_unit_um), *map(str, apart)]
         for entry in entries:
             number, grid = self.settings.axis_numbers[entry.moving], entry.grid
             if not any((parameter, number) in found.axes for parameter in GRID_PARAMETERS):
                 remarks.append(
                     f"3620 to 3624 of {AXES[entry.moving]} (A{number}) are not in the file; the points {grid.first} to "
-                    f"{grid.last}, reference point {grid.reference}, every {grid.interval_mm:f} mm are taken from the machine "
-                    "file"
+                    f"{grid.last}, reference point {grid.reference}, interval {grid.interval_mm:f} mm are taken from "
+                    "the machine file"
                 )
-        if found.passed_over:
-            remarks.append(found.passed_over_remark("straightness"))
+        if found.skipped:
+            remarks.append(found.skipped_remark("straightness"))
         return StraightTables(entries, tuple(remarks))
 
     def emulate(self, tables: StraightTables, points: Points) -> FloatArray:
@@ -470,7 +477,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         for entry in tables.entries:
             most = max(map(abs, entry.amounts))
             if most > settings.amount_limit:
-                messages.append(f"{entry.name}: an amount of {most} counts, the limit is {settings.amount_limit}")
+                messages.append(f"{entry.name}: an amount is {most} counts; the limit is {settings.amount_limit}")
             knots = self.machine.reference_point_mm[entry.moving] + entry.along_mm
             short = coverage_violations(self.machine, entry.moving, knots[0], knots[-1], f"the polyline {entry.name}")
             messages += [
@@ -480,7 +487,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             if known is not None and settings.stated[entry.moving] and entry.grid != known:
                 messages.append(
                     f"{entry.name}: the file has the points {entry.grid.first} to {entry.grid.last} every "
-                    f"{entry.grid.interval_mm:f} mm, which are not those of the machine file or of the sample"
+                    f"{entry.grid.interval_mm:f} mm, which differ from those of the machine file or of the sample"
                 )
         return messages
 
@@ -545,7 +552,10 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
                 pair for pair in zip(numbers, controlled, strict=False) if pair[1] not in settings.axis_numbers
             )
             known = ", ".join(map(str, settings.axis_numbers))
-            text = f"axis {axis} is none of X, Y, Z (axis numbers {known}): its straightness table is kept apart"
+            text = (
+                f"axis {axis} is not X, Y or Z (axis numbers {known}): its straightness table is not part of these "
+                "tables"
+            )
             apart.append(found.common[number][1].fail(text))
             return None
         missing = [str(number) for number in numbers if number not in found.common]
@@ -578,8 +588,8 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             return known
         if missing:
             raise file.fail(
-                f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number}); give the file that has it as "
-                f"well, or state points.{AXES[axis]} in the machine file"
+                f"parameter {', '.join(missing)} is missing for {AXES[axis]} (axis A{number}); also give the file that "
+                f"contains it, or set points.{AXES[axis]} in the machine file"
             )
         reference, first, last = (
             found.axes[parameter, number][1].whole(found.axes[parameter, number][0], 0, 9999)
@@ -617,10 +627,10 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             found = [f"Of other axes: nothing{'; ' + ', '.join(kept) + ' stays' if kept else ''}."]
         else:
             given = "the sample has no parameters 5711 to 5713" if sample.notes else "no file of this control was given"
-            found = [f"Of other axes: NOT KNOWN, {given} (`--style-from`): look at 5711 to 5723."]
+            found = [f"Of other axes: NOT KNOWN, {given} (`--style-from`): check 5711 to 5723."]
         for number, values in grids.items():
             texts = [f"{names[axis]} (A{axis}) = {text}" for axis, text in values]
-            found.append(f"{number}, which pitch error compensation uses as well: {', '.join(texts)}")
+            found.append(f"{number}, also used by pitch error compensation: {', '.join(texts)}")
         if not_written:
             letters = ", ".join(names[axis] for axis, _ in not_written[GRID_PARAMETERS[0]])
             found.append(
@@ -662,18 +672,20 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
 
     def _sign_statement(self, tables: StraightTables) -> str:
         settings = self.settings
-        stored = "the correction, which the control adds" if settings.stores == "correction" else "the error"
+        stored = "correction, which the control adds to"
+        if settings.stores == "error":
+            stored = "error, which the control subtracts from"
         text = (
-            f"The amounts are {stored} to the command of the compensated axis; one count is {settings.detection_unit_um:g} um. "
-            f"Linear between the four points, zero outside."
+            f"The amounts are the {stored} the command of the compensated axis; one count is "
+            f"{settings.detection_unit_um:g} um. Between the four points the amount is linear, outside it is zero."
         )
         for entry in tables.entries[:1]:
             k = int(np.argmax(np.abs(entry.amounts)))
             moved = settings.sign * entry.amounts[k] * settings.detection_unit_um
             at = self.machine.reference_point_mm[entry.moving] + entry.along_mm[k]
             text += (
-                f" At point {entry.numbers[k]}, {AXES[entry.moving]} = {at:g} mm, the amount {entry.amounts[k]:+d} moves "
-                f"{AXES[entry.compensated]} by {moved:+g} um."
+                f" Example: at point {entry.numbers[k]}, {AXES[entry.moving]} = {at:g} mm, the amount "
+                f"{entry.amounts[k]:+d} moves {AXES[entry.compensated]} by {moved:+g} um."
             )
         return text
 
@@ -718,9 +730,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
 
     def _warnings(self, tables: StraightTables) -> list[str]:
         settings = self.settings
-        found = [
-            "Sign, range and parameter numbers are not settled by public documents: check one entry first (part 3)."
-        ]
+        found = ["Public documents do not settle sign, range and parameter numbers: check one entry first (part 3)."]
         if settings.sample.notes:
             found.append("The style was taken from the sample: " + "; ".join(settings.sample.notes) + ".")
             if not settings.sample.common:
@@ -730,16 +740,16 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             if not settings.stated[entry.moving]:
                 source = "those of [controllers.fanuc-pitch]" if settings.of_pitch[entry.moving] else "assumed"
                 found.append(
-                    f"The compensation points of {AXES[entry.moving]} are {source}: {grid.first} to {grid.last}, reference "
-                    f"point {grid.reference}, every {grid.interval_mm:f} mm. The table is right on a control that has exactly "
-                    f"these; if it has others, give its file with --style-from, or state "
+                    f"The compensation points of {AXES[entry.moving]} are {source}: {grid.first} to {grid.last}, "
+                    f"reference point {grid.reference}, every {grid.interval_mm:f} mm. The table is right only on a "
+                    "control with exactly these points; if yours has others, give its file with --style-from, or set "
                     f"points.{AXES[entry.moving]}, and export again."
                 )
             ends = [settings.sign * entry.amounts[k] * settings.count_mm / MM_PER_UM for k in (0, 3)]
             if any(ends):
                 found.append(
-                    f"{entry.name}: beyond its outer points the control is taken to drop to zero, a step of {fixed(ends[0], 1)} "
-                    f"and {fixed(ends[1], 1)} um."
+                    f"{entry.name}: beyond the outer points the correction is assumed to drop to zero, a step of "
+                    f"{fixed(ends[0], 1)} and {fixed(ends[1], 1)} um."
                 )
         return found
 
@@ -804,8 +814,8 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
         settings = self.settings
         free, taken = self._free_entries()
         possible = [axis for axis in range(3) if settings.grids[axis] is not None and axis not in taken]
-        asked = settings.pairs or ()
-        if any(axis in taken for _, axis in asked) or len(asked) > len(free) or not possible or not free:
+        requested = settings.pairs or ()
+        if any(axis in taken for _, axis in requested) or len(requested) > len(free) or not possible or not free:
             sample = ", ".join(
                 f"{k} = {text}" for k, (text, _) in sorted(settings.sample.common.items()) if MOVING <= k < POINTS
             )

@@ -16,7 +16,7 @@ from compgen.controls.heidenhain_text import (
     NUMBER_COLUMN,
     ComLayout,
     TextTable,
-    own_layout,
+    default_layout,
     read_table,
     template_layout,
 )
@@ -79,7 +79,7 @@ def check_names(section: toml_files.Section, names: tuple[str, str, str]) -> Non
     """Raise InputError unless the names of the axes differ from each other and from the other columns."""
     if len({*names, "NR", POSITION, BACKLASH, ACTIVE}) < 7:
         raise section.fail(
-            "axis_names", f"{', '.join(names)}: expected three different names, none of them that of another column"
+            "axis_names", f"{', '.join(names)}: expected three different names, none of them the name of another column"
         )
 
 
@@ -87,7 +87,7 @@ def check_names(section: toml_files.Section, names: tuple[str, str, str]) -> Non
 def _position(value: Any) -> Decimal:
     exact = Decimal(repr(toml_files.number(value)))
     if exact % SPACING_UNIT_MM or abs(exact) >= 10**7:
-        raise ValueError(f"expected a position in whole multiples of {SPACING_UNIT_MM} mm")
+        raise ValueError(f"expected a position that is a multiple of {SPACING_UNIT_MM} mm")
     return exact
 
 
@@ -118,32 +118,32 @@ class HeidenhainSettings:
         word_for({"free": False, "power-of-two": True}),
         key="generation",
         stated="free",
-        meaning="free: positions as they are wanted (newer controls); power-of-two: datum + k 2^n x 0.0001 mm (older ones)",
+        meaning='node positions: "free" (newer controls), or "power-of-two", at datum + k 2^n x 0.0001 mm (older ones)',
     )
     subtracts: bool = setting(
         word_for({"error": True, "correction": False}),
         key="sign",
         stated="error",
-        meaning="what the entries are: error (the control subtracts them) or correction (it adds them)",
+        meaning='what the entries are: "error" (the control subtracts them) or "correction" (it adds them)',
     )
     axis_names: tuple[str, str, str] = axis_setting(
-        name_on_control, AXES, meaning="names of X, Y, Z in CfgAxes/axisList, which are the columns"
+        name_on_control, AXES, meaning="names of X, Y, Z in CfgAxes/axisList, also the names of the columns"
     )
     decimals: int = setting(whole(3, 6), 4, meaning="decimals of the entries in mm")
-    loss_mm: float = loss_setting("loss by interpolation, um at the tool, that is worth no further node")
-    max_points: int = setting(whole(4, 100_000), MOST_ENTRIES, meaning="entries that one .COM file may have")
+    loss_mm: float = loss_setting()
+    max_points: int = setting(whole(4, 100_000), MOST_ENTRIES, meaning="largest number of entries in one .COM file")
     max_tables: int | None = setting(
-        whole(1, 1000), None, meaning="number of .COM files that the control takes; stated, it is a limit"
+        whole(1, 1000), None, meaning="largest number of .COM files on the control; checked if set"
     )
     max_total_points: int | None = setting(
-        whole(12, 1_000_000), None, meaning="entries that the control takes in all; stated, it is a limit"
+        whole(12, 1_000_000), None, meaning="largest number of entries in all .COM files together; checked if set"
     )
     backlash: str = setting(
         choice("empty", "absolute", "difference"),
         "empty",
         key="backlash_column",
-        meaning="what the column BACKLASH means: empty (zeros are written), absolute entries for negative travel, or "
-        "their difference",
+        meaning='column BACKLASH: "empty" (zeros are written), "absolute" (entries for negative travel) or '
+        '"difference" (negative minus positive travel)',
     )
     datum_mm: tuple[Decimal | None, Decimal | None, Decimal | None] = axis_setting(
         _position, meaning="older controls: first node of each axis"
@@ -157,7 +157,7 @@ class HeidenhainSettings:
         word_for({"keep": True, "file": False}),
         key="begin_name",
         stated="keep",
-        meaning="name in the first line of a saved table: keep it, or that of the written file (file)",
+        meaning='name in the first line of the saved table: "keep" it, or write that of the "file"',
     )
 
     @property
@@ -176,13 +176,15 @@ class HeidenhainSettings:
         if self.com is not None:
             return self._named(self.com, name)
         columns = [("NR", 5), (POSITION, 13), (BACKLASH, 11), *((item, 11) for item in self.axis_names)]
-        return own_layout(name, "COM", _wide(columns))
+        return default_layout(name, "COM", _wide(columns))
 
     def cma_layout(self) -> ComLayout:
         """Layout of the .CMA file."""
         if self.cma is not None:
             return self._named(self.cma, "CONFIG")
-        return own_layout("CONFIG", "CMA", _wide([("NR", 5), (ACTIVE, 9), *((item, 13) for item in self.axis_names)]))
+        return default_layout(
+            "CONFIG", "CMA", _wide([("NR", 5), (ACTIVE, 9), *((item, 13) for item in self.axis_names)])
+        )
 
     def _named(self, layout: ComLayout, name: str) -> ComLayout:
         if self.keep_name:
@@ -197,8 +199,8 @@ def _wide(columns: list[tuple[str, int]]) -> list[tuple[str, int]]:
 
 def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) -> None:
     """Check that the saved tables have the required columns; errors point at their header line."""
-    for layout, due in ((settings.com, settings.axis_names), (settings.cma, (ACTIVE, *settings.axis_names))):
-        missing = [] if layout is None else [name for name in due if name not in layout.names]
+    for layout, expected in ((settings.com, settings.axis_names), (settings.cma, (ACTIVE, *settings.axis_names))):
+        missing = [] if layout is None else [name for name in expected if name not in layout.names]
         if layout is not None and missing:
             raise layout.fail(
                 f"the table has no column {', '.join(missing)} (it has {', '.join(layout.names)}); columns are named "
@@ -207,17 +209,19 @@ def _check_templates(section: toml_files.Section, settings: HeidenhainSettings) 
     if settings.com is None:
         return
     if settings.backlash != "empty" and BACKLASH not in settings.com.names:
-        raise settings.com.fail('the table has no column BACKLASH, which backlash_column needs ("empty": not)')
+        raise settings.com.fail(
+            'the table has no column BACKLASH; set backlash_column = "empty", or save a table with this column'
+        )
     if POSITION not in settings.com.names:
         if not settings.older:
             raise settings.com.fail(
-                'the table has no column AXISPOS; with generation = "power-of-two" a table of an older control is filled'
+                'the table has no column AXISPOS; if it is from an older control, set generation = "power-of-two"'
             )
         if None in settings.datum_mm or None in settings.exponent:
             raise section.fail(
                 "datum_mm",
-                "and spacing_exponent are needed for X, Y and Z: the saved table has no column AXISPOS, so that its "
-                "positions follow from the datum and the spacing 2^n x 0.0001 mm in its head alone",
+                "and spacing_exponent are required for X, Y and Z: the saved table has no column AXISPOS, so only the "
+                "datum and the spacing 2^n x 0.0001 mm in its head define the positions",
             )
 
 
@@ -340,7 +344,7 @@ def _kind(file: SourceFile, table: TextTable) -> str:
     """COM or CMA, from the first line of the file, else from the file extension."""
     found = EXTENSIONS.get(table.kind) or EXTENSIONS.get(file.path.suffix[1:].upper())
     if found is None:
-        raise file.fail("is neither a .COM nor a .CMA table by its first line or its name", 1)
+        raise file.fail("is neither a .COM nor a .CMA table, judging by its first line and its name", 1)
     return found
 
 
@@ -395,12 +399,14 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         check_names(section, settings.axis_names)
         if settings.older and settings.backlash != "empty":
             raise section.fail(
-                "backlash_column", "the column BACKLASH is known of the newer controls only (generation)"
+                "backlash_column", 'only newer controls are known to have a column BACKLASH (generation = "free")'
             )
         for key, values in (("datum_mm", settings.datum_mm), ("spacing_exponent", settings.exponent)):
             if not settings.older and any(value is not None for value in values):
                 raise section.fail(
-                    key, 'belongs to generation = "power-of-two"; tables with free positions have neither'
+                    key,
+                    'applies only to generation = "power-of-two"; tables with free positions have no datum and no '
+                    "spacing",
                 )
         _check_templates(section, settings)
         return settings
@@ -467,7 +473,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         assignments = [(file, table) for file, table in read if _kind(file, table) == "CMA"]
         if not assignments:
             first = files[0].path if files else None
-            raise InputError("no .CMA file is given; it says which .COM file belongs to which axis", file=first)
+            raise InputError("no .CMA file was given; it says which .COM file belongs to which axis", file=first)
         if len(assignments) > 1:
             raise assignments[1][0].fail(f"is a second .CMA file; the first is {assignments[0][0].path.name}", 1)
         coms: dict[str, tuple[SourceFile, TextTable]] = {}
@@ -481,7 +487,9 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         unused = sorted(set(coms) - set(active.values()))
         if unused:
             warnings.warn(
-                f"{', '.join(unused)}: not in the active line of the .CMA, not used", CompgenWarning, stacklevel=3
+                f"{', '.join(unused)}: not in the active line of the .CMA file, therefore not used",
+                CompgenWarning,
+                stacklevel=3,
             )
         return ComTables({axis: self._com_table(axis, coms[name][1]) for axis, name in sorted(active.items())})
 
@@ -507,7 +515,8 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             what = f"the table over {AXES[axis]}"
             if len(table.positions) > settings.max_points:
                 found.append(
-                    f"{what} has {len(table.positions)} entries, the limit is {settings.max_points} (9095 error 3)"
+                    f"{what} has {len(table.positions)} entries; the limit is {settings.max_points} (module 9095, "
+                    "error 3)"
                 )
             steps = {b - a for a, b in pairwise(table.positions)}
             if settings.older and (len(steps) > 1 or _exponent(*steps) is None):
@@ -520,10 +529,13 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             )
         if settings.max_total_points is not None and tables.total_points > settings.max_total_points:
             found.append(
-                f"all tables have {tables.total_points} entries, the limit is {settings.max_total_points} (9095 error 4)"
+                f"all tables have {tables.total_points} entries; the limit is {settings.max_total_points} (module "
+                "9095, error 4)"
             )
         if settings.max_tables is not None and len(tables.tables) > settings.max_tables:
-            found.append(f"{len(tables.tables)} tables are needed, the limit is {settings.max_tables} (9095 error 5)")
+            found.append(
+                f"{len(tables.tables)} tables are needed; the limit is {settings.max_tables} (module 9095, error 5)"
+            )
         return found
 
     def table_nodes_mm(self, tables: ComTables) -> tuple[FloatArray, ...]:
@@ -569,9 +581,9 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             {
                 "name": f"{name} of {settings.axis_names[axis]}",
                 "value": f"{abs(reversal.mean_mm(axis)):.4f} mm in size",
-                "meaning": f"position reached in positive minus in negative direction is {reversal.mean_mm(axis):+.4f} mm; "
-                "which sign takes it out is not documented: try it with a dial gauge. If a value was active while the machine "
-                "was measured, this one comes on top",
+                "meaning": "position reached in positive travel minus that in negative travel: "
+                f"{reversal.mean_mm(axis):+.4f} mm; which sign corrects it is not documented: test it with "
+                "a dial gauge. If a value was active while the machine was measured, add this one to it",
             }
             for axis in range(3)
             if abs(reversal.mean_mm(axis)) >= WORTH_MM
@@ -597,11 +609,11 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         """Return the nodes of the corrections over an axis, ascending, mm; nodes beyond the ends are added later."""
         candidates = self._candidates_mm(errors, axis)
         terms = one_dimensional_terms(self.machine, errors, [candidates] * 3, [(output, axis) for output in range(3)])
-        wanted = np.array([term.start for term in terms])
+        requested = np.array([term.start for term in terms])
         tolerances = np.array([worth_mm(errors, axis, self.settings.loss_mm, output) for output in range(3)])
         if self.settings.older:
             # nodes with the widest power-of-two spacing that stays within the permitted loss
-            scaled, stated = wanted / tolerances[:, None], self.settings.exponent[axis]
+            scaled, stated = requested / tolerances[:, None], self.settings.exponent[axis]
             tried: list[tuple[float, EquidistantGrid]] = []
             for exponent in range(LARGEST_EXPONENT, SMALLEST_EXPONENT - 1, -1) if stated is None else (stated,):
                 grid = self._grid(axis, spacing_mm(exponent))
@@ -616,7 +628,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         reference = np.flatnonzero(np.abs(candidates - self.machine.reference_point_mm[axis]) < 1e-6).tolist()
         chosen = candidates
         while True:
-            chosen = candidates[fewest_nodes(candidates, wanted, tolerances, reference)]
+            chosen = candidates[fewest_nodes(candidates, requested, tolerances, reference)]
             if len(chosen) <= self.settings.max_points - 2:
                 return chosen
             tolerances = 1.3 * tolerances
@@ -697,7 +709,8 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             raise table.file.fail("no column of an axis is filled", table.header_line)
         if backlash is not None and any(backlash) and self.settings.backlash == "empty":
             message = (
-                "the column BACKLASH is filled; say with backlash_column what its values mean (absolute or difference)"
+                'the column BACKLASH is filled; set backlash_column to the meaning of its values ("absolute" or '
+                '"difference")'
             )
             raise table.file.fail(message, table.header_line)
         return ComTable(positions, filled, backlash)
@@ -714,7 +727,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         datum, exponent = self.settings.datum_mm[axis], self.settings.exponent[axis]
         if datum is None or exponent is None:
             raise table.file.fail(
-                f"has no column {POSITION}; datum_mm and spacing_exponent of {AXES[axis]} in the machine file are needed",
+                f"has no column {POSITION}; set datum_mm and spacing_exponent of {AXES[axis]} in the machine file",
                 table.header_line,
             )
         return tuple(datum + k * spacing_mm(exponent) for k in range(len(table.rows)))
@@ -765,10 +778,11 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         else:
             kind = "An entry is the correction in mm; the control ADDS it to the command"
         return (
-            f"{kind} (sign). [Axis of the column] = F([axis of the file's column in the .CMA]); several tables into one axis "
-            f"add up. Here: AXIS_{AXES[axis]}.COM, column {settings.axis_names[output]}, at {AXES[axis]} = "
-            f"{float(table.positions[node]):.4f} mm: {value:+.4f} mm, so it moves {AXES[output]} by "
-            f"{settings.sign * value:+.4f} mm."
+            f"{kind} (setting sign). A column corrects the axis that it is named after, as a function of the axis to "
+            "which the .CMA file assigns the table; several tables into one axis add up. Example: "
+            f"AXIS_{AXES[axis]}.COM, column {settings.axis_names[output]}, at {AXES[axis]} = "
+            f"{float(table.positions[node]):.4f} mm: the entry is {value:+.4f} mm, so the control moves {AXES[output]} "
+            f"by {settings.sign * value:+.4f} mm."
         )
 
     def _parameters(self, tables: ComTables) -> list[dict[str, str]]:
@@ -777,12 +791,12 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 {
                     "name": "CfgAxes/axisList",
                     "value": ", ".join(self.settings.axis_names),
-                    "meaning": "keys of X, Y, Z; the columns of .COM and .CMA carry these names",
+                    "meaning": "keys of X, Y, Z; the columns of .COM and .CMA have these names",
                 },
                 {
                     "name": "MP_refPosition",
-                    "value": "as it is",
-                    "meaning": "AXISPOS counts from the machine datum; the positions of the machine file must do so too",
+                    "value": "unchanged",
+                    "meaning": "AXISPOS counts from the machine datum, as must the positions in the machine file",
                 },
                 {
                     "name": "column ACTIVE of CONFIG.CMA",
@@ -792,7 +806,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 {
                     "name": "linear axis error compensation",
                     "value": "off",
-                    "meaning": "for X, Y, Z: linear and non-linear compensation of one axis exclude each other",
+                    "meaning": "for X, Y, Z: an axis has either linear or non-linear compensation",
                 },
             ]
         rows = [
@@ -809,8 +823,8 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 {
                     "name": f"datum, spacing of AXIS_{AXES[axis]}.COM",
                     "value": f"{table.positions[0]:f} mm, {step:f} mm",
-                    "meaning": f"spacing 2^{_exponent(step)} x 0.0001 mm; both count from the machine datum. Look at the head "
-                    "of the table on the control: they must stand there",
+                    "meaning": f"spacing 2^{_exponent(step)} x 0.0001 mm; both count from the machine datum. Check "
+                    "that the head of the table on the control shows them",
                 }
             )
         return rows
@@ -818,28 +832,29 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
     def _warnings(self, tables: ComTables) -> list[str]:
         settings = self.settings
         found = [
-            "The sign of the entries is probable, not proven by public documents: check it with one table (part 3)."
+            "The sign of the entries is probable, but public documents do not prove it: check it with one table first "
+            "(part 3)."
         ]
         steepest = max(table.steepest for table in tables.tables.values())
         if steepest > GRADIENT_SHARE:
             found.append(
-                f"An entry changes by {100 * steepest:.2f} % of the travel between neighbours; the oldest tables allow "
-                f"1/64 = {100 * GRADIENT_SHARE:.2f} %, a limit of .COM files is not known."
+                f"Neighbouring entries differ by up to {100 * steepest:.2f} % of their distance; the oldest tables "
+                f"allow 1/64 = {100 * GRADIENT_SHARE:.2f} %, the limit of .COM files is not known."
             )
         if settings.older and settings.max_total_points is None and tables.total_points > USUAL_TOTAL:
             found.append(
-                f"All tables have {tables.total_points} entries. How many the control takes in all is not documented "
-                f"(error 4 of module 9095; {USUAL_TOTAL} is remembered): state max_total_points."
+                f"All tables together have {tables.total_points} entries. The limit of the control is not documented "
+                f"(error 4 of module 9095; from memory {USUAL_TOTAL}): set max_total_points."
             )
         if settings.com is not None and settings.keep_name:
             found.append(
-                f"The first line of the .COM files is that of the saved table ({settings.com.before[0].strip()}); if the "
-                'control wants the file name there, set begin_name = "file".'
+                f"The first line of the .COM files is that of the saved table ({settings.com.before[0].strip()}); if "
+                'the control expects the file name there, set begin_name = "file".'
             )
         if settings.older and settings.has_positions:
             found.append(
-                "How a file of an older control holds datum and spacing is not documented; these files have a column AXISPOS. "
-                "Save an empty table on the control and export with --template-from."
+                "It is not documented how a file of an older control states datum and spacing; these files have a "
+                "column AXISPOS. Save an empty table on the control and export with --template-from."
             )
         return found
 

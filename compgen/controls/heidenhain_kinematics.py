@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from compgen.controls.heidenhain_com import MOST_ENTRIES, POSITION, check_names, file_stem, name_on_control
-from compgen.controls.heidenhain_text import NUMBER_COLUMN, Row, TextTable, own_layout, read_table
+from compgen.controls.heidenhain_text import NUMBER_COLUMN, Row, TextTable, default_layout, read_table
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
 from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
 from compgen.controls.shared.terms import error_terms
@@ -44,7 +44,7 @@ class DraftSettings:
         word_for({"deg": True, "rad": False}),
         key="angle_unit",
         stated="deg",
-        meaning="unit of C4 to C6 and of the constants: deg or rad",
+        meaning='unit of C4 to C6 and of the constants: "deg" or "rad"',
     )
     axis_names: tuple[str, str, str] = axis_setting(name_on_control, AXES, meaning="names of X, Y, Z on the control")
     prefixes: tuple[str, str, str] = axis_setting(
@@ -56,8 +56,8 @@ class DraftSettings:
     )
     decimals: int = setting(whole(3, 6), 4, meaning="decimals of C1 to C3 in mm")
     angle_decimals: int = setting(whole(5, 9), 7, meaning="decimals of C4 to C6 (default 7 for deg, 9 for rad)")
-    loss_mm: float = loss_setting("loss by interpolation, um at the tool, that is worth no further node")
-    max_points: int = setting(whole(4, 100_000), MOST_ENTRIES, meaning="entries that one .COM file may have")
+    loss_mm: float = loss_setting()
+    max_points: int = setting(whole(4, 100_000), MOST_ENTRIES, meaning="largest number of entries in one .COM file")
 
     @property
     def rad_per_unit(self) -> float:
@@ -198,7 +198,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         for axis, letter in enumerate(AXES):
             table = tables.tables.get(axis, DraftTable((Decimal(0), Decimal(1)), {}))
             widths = [(NUMBER_COLUMN, 5), (POSITION, 13), *((f"C{k}", 13) for k in range(1, 7))]
-            com[letter] = {"layout": own_layout(f"AXIS_{letter}", "COM", widths), "rows": self._com_rows(table)}
+            com[letter] = {"layout": default_layout(f"AXIS_{letter}", "COM", widths), "rows": self._com_rows(table)}
         header = [(NUMBER_COLUMN, 5), ("DOC", 9), ("KEY", 10), ("AXIS", 14), ("COORD", 9), ("COMPTAB", 16)]
         rows = self._chain_rows(tables)
         return {
@@ -207,18 +207,18 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
                 {
                     "name": "COMPTAB",
                     "value": str(comptab_rows(tables)),
-                    "meaning": "entries; 97 are left with three axes",
+                    "meaning": "number of entries; at most 97 with three axes",
                 },
-                {"name": "MP4070", "value": "as it is", "meaning": "how often the control works the compensation out"},
+                {"name": "MP4070", "value": "unchanged", "meaning": "how often the control computes the compensation"},
             ],
             "warnings": [
-                "DRAFT: the maker of the machine must integrate these rows into the kinematics description and check them.",
-                f"Whether angles are degrees or rad is not documented; {'degrees' if settings.degrees else 'rad'} are written.",
+                "DRAFT: the machine builder must integrate these rows into the kinematics description and check them.",
+                f"The unit of angles is not documented; they are written in {'degrees' if settings.degrees else 'rad'}.",
                 "The text before '..C1' in COMPTAB is not documented; set comptab_prefix.",
             ],
             "com": com,
             "chain_rows": {
-                "layout": own_layout("KINCOMP", "TAB", header),
+                "layout": default_layout("KINCOMP", "TAB", header),
                 "rows": [[str(k), *row] for k, row in enumerate(rows)],
             },
             "angle_unit": "deg" if settings.degrees else "rad",
@@ -231,7 +231,9 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
         chains = [table for table in read if table.kind == "TAB"]
         if len(chains) != 1:
             first = files[0].path if files else None
-            raise InputError(f"{len(chains)} files with rows for the kinematics table are given; give one", file=first)
+            raise InputError(
+                f"{len(chains)} files with rows for the kinematics table were given; expected one", file=first
+            )
         coms = {file_stem(table.file.path.name): table for table in read if table.kind == "COM"}
         tables: dict[int, DraftTable] = {}
         constants: dict[str, Decimal] = {}
@@ -242,8 +244,8 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
             if name.startswith("-"):
                 constant = constants.get(name[1:])
                 if constant is None or chains[0].number(row, "COMPTAB") != -constant:
-                    due = "there is no such constant before it" if constant is None else f"expected {-constant}"
-                    raise chains[0].file.fail(f"takes {name[1:][:10]} back behind its axis: {due}", row.line)
+                    fault = "there is no such constant before its axis" if constant is None else f"expected {-constant}"
+                    raise chains[0].file.fail(f"cancels {name[1:][:10]} after its axis: {fault}", row.line)
                 continue
             if name in SQUARENESS_NAMES:
                 constants[name] = _once(chains[0], row, name, constants)
@@ -278,10 +280,10 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
                 self.machine, axis, float(table.positions[0]), float(table.positions[-1]), what
             )
             if len(table.positions) > settings.max_points:
-                found.append(f"{what} has {len(table.positions)} entries, the limit is {settings.max_points}")
+                found.append(f"{what} has {len(table.positions)} entries; the limit is {settings.max_points}")
         rows = comptab_rows(tables)
         if rows > MOST_COMPTAB - 3:
-            found.append(f"{rows} entries in COMPTAB, with three MachAxis rows {MOST_COMPTAB - 3} are left")
+            found.append(f"{rows} entries in COMPTAB; with three MachAxis rows at most {MOST_COMPTAB - 3} are possible")
         return found
 
     def table_nodes_mm(self, tables: DraftTables) -> tuple[FloatArray, ...]:
@@ -337,15 +339,16 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
                 node = int(np.argmax(np.abs([float(value) for value in table.columns[1]])))
                 value = float(table.columns[1][node])
                 example = (
-                    f" Here: C1 of AXIS_{AXES[axis]}.COM at {float(table.positions[node]):.4f} mm is {value:+.4f} mm, so "
-                    f"{AXES[axis]} is moved by {-value:+.4f} mm."
+                    f" Example: C1 of AXIS_{AXES[axis]}.COM at {float(table.positions[node]):.4f} mm is {value:+.4f} "
+                    f"mm, so the control moves {AXES[axis]} by {-value:+.4f} mm."
                 )
                 break
         else:
             example = ""
         return (
-            "An entry is an error in the sense of ISO 230-1 (tool against workpiece, actual minus nominal) in mm or "
-            f"{'degrees' if settings.degrees else 'rad'}; the control is taken to move to target minus error.{example}"
+            "An entry is an error in the sense of ISO 230-1 (tool relative to workpiece, actual minus nominal) in mm "
+            f"or {'degrees' if settings.degrees else 'rad'}; the control is assumed to move to target minus "
+            f"error.{example}"
         )
 
     def _reference(self, table: TextTable, row: Row, name: str) -> tuple[int, int]:
@@ -355,7 +358,7 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
             raise table.file.fail("expected a row such as 'EYX Trans Y X..C2' with an error's name in DOC", row.line)
         axis = error_named(name).axis
         column = 1 + COLUMNS[axis].index(name)
-        due = (self.settings.prefixes[axis], str(column), self._direction(name))
-        if (found.group(1), found.group(2), row.cells.get("AXIS")) != due:
-            raise table.file.fail(f"expected {name} along {due[2]} with {due[0]}..C{column}", row.line)
+        expected = (self.settings.prefixes[axis], str(column), self._direction(name))
+        if (found.group(1), found.group(2), row.cells.get("AXIS")) != expected:
+            raise table.file.fail(f"expected {name} along {expected[2]} with {expected[0]}..C{column}", row.line)
         return axis, column

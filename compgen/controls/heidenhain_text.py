@@ -78,7 +78,9 @@ class TextTable:
         """Return a cell as a number; InputError if it is blank or not a plain decimal number."""
         text = row.cells.get(column)
         if text is None:
-            raise self.file.fail(f"column {column} is blank here; a filled column has a number in every row", row.line)
+            raise self.file.fail(
+                f"column {column} is blank here; a column with values must have one in every row", row.line
+            )
         return fixed_point(self.file, row.line, text, f"column {column}", _NUMBER)
 
 
@@ -87,7 +89,9 @@ def read_table(file: SourceFile) -> TextTable:
     lines = plain_lines(SourceFile(file.path, file.text.removeprefix("\ufeff")), MOST_CHARACTERS, MOST_IN_LINE)
     words = tuple(lines[0].split())
     if len(words) < 3 or words[0] != BEGIN:
-        raise file.fail(f"{one_line(lines[0])[:40]!r} is not a first line such as 'BEGIN AXIS_Y .COM MM'", 1)
+        raise file.fail(
+            f"{one_line(lines[0])[:40]!r} is not a valid first line; expected e.g. 'BEGIN AXIS_Y .COM MM'", 1
+        )
     unit = next((word.upper() for word in words[2:] if word.upper() in UNITS), "")
     if unit in ("INCH", "IN"):
         raise file.fail("the table is in inches; only tables in mm are read", 1)
@@ -106,7 +110,7 @@ def read_table(file: SourceFile) -> TextTable:
         if text == END:
             for behind, rest in enumerate(lines[number:], start=number + 1):
                 if rest.strip():
-                    raise file.fail(f"{one_line(rest)[:20]!r} is behind {END}, where the table ends", behind)
+                    raise file.fail(f"{one_line(rest)[:20]!r} follows {END}, the end of the table", behind)
             before, after = tuple(lines[: header + 1]), tuple(lines[number - 1 :])
             return TextTable(file, words, before, columns, tuple(rows), after)
         if text and not text.startswith(";"):
@@ -128,7 +132,7 @@ def _columns(file: SourceFile, header: str, line: int) -> tuple[TableColumn, ...
     return tuple(TableColumn(name, start, end - start) for name, start, end in zip(names, starts, ends, strict=True))
 
 
-def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: int, due: int) -> Row:
+def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: int, expected: int) -> Row:
     """Cells of one row: one word per column in order, or by field position if some cells are blank."""
     found = list(_WORD.finditer(line))
     if len(found) > len(columns):
@@ -141,13 +145,14 @@ def _row(file: SourceFile, columns: Sequence[TableColumn], line: str, number: in
             column = next((item for item in reversed(columns) if item.start <= match.start()), columns[0])
             if column.name in cells or (column.width and match.end() > column.start + column.width):
                 what = one_line(match.group())[:40]
-                message = f"{what!r} is not within the field of one column (columns start as in the header)"
+                message = f"{what!r} extends beyond the field of its column (fields start where the header words start)"
                 raise file.fail(message, number)
             cells[column.name] = match.group()
     counted = cells.get(NUMBER_COLUMN, "")
-    if not re.fullmatch(r"\d{1,6}", counted, re.ASCII) or int(counted) != due:
+    if not re.fullmatch(r"\d{1,6}", counted, re.ASCII) or int(counted) != expected:
         message = (
-            f"{NUMBER_COLUMN} is {one_line(counted)[:20] or 'blank'}, expected {due}; rows are numbered 0, 1, 2 ..."
+            f"{NUMBER_COLUMN} is {one_line(counted)[:20] or 'blank'}; expected {expected}, because rows are numbered 0, 1, "
+            "2 ..."
         )
         raise file.fail(message, number)
     return Row(cells, number)
@@ -185,7 +190,7 @@ class ComLayout:
                 )
 
 
-def own_layout(name: str, kind: str, columns: Sequence[tuple[str, int]]) -> ComLayout:
+def default_layout(name: str, kind: str, columns: Sequence[tuple[str, int]]) -> ComLayout:
     """Return a default layout from name, extension, and (column, field width) in order."""
     header = "".join(f"{column:<{width}}" for column, width in columns).rstrip()
     starts = [sum(width for _, width in columns[:k]) for k in range(len(columns))]
@@ -221,7 +226,7 @@ def template_layout(path: Path, kind: str) -> ComLayout:
             raise file.fail(message, row.line)
     ends = [line.endswith("\r") for line in file.text.split("\n")[:-1]]
     if len(set(ends)) > 1:
-        message = "ends otherwise than the first line (CR LF and LF are mixed)"
+        message = "does not end like the first line (CR LF and LF are mixed)"
         raise file.fail(message, ends.index(not ends[0]) + 1)
     fields = tuple(
         TableColumn(column.name, column.start, 0 if k == len(table.columns) - 1 else column.width)

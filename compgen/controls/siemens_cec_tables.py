@@ -574,10 +574,10 @@ class _Gains:
 
     def taken(self, terms: Sequence[Term]) -> float:
         """Mean square that a set of terms removes, mm^2."""
-        held = [term for term in (*terms, *self.given) if term.name in self.columns]
-        if not held:
+        present = [term for term in (*terms, *self.given) if term.name in self.columns]
+        if not present:
             return 0.0
-        where = np.concatenate([self.columns[term.name] for term in held])
+        where = np.concatenate([self.columns[term.name] for term in present])
         solution = np.linalg.lstsq(self.normal[np.ix_(where, where)], self.right[where], rcond=_UNDETERMINED)[0]
         return float(self.right[where] @ solution)
 

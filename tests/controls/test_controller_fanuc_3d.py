@@ -163,7 +163,7 @@ def test_limits_are_named_with_what_helps(make_errors):
     machine = machine_of(value_high=20, value_low=-20, interval_mm={**COARSE_MM, "X": 20.0})
     made = export(machine, make_errors(machine), "fanuc-3d", allow_unverified=True)
     text = " | ".join(made.violations)
-    assert "set magnification." in text and "vertices along X, at most 25" in text
+    assert "set magnification." in text and "vertices along X; at most 25" in text
     cover = parse(machine_of(), box(CORNERS, ends=((-350.0, 400.0), (-200.0, 300.0), (-400.0, 50.0))))
     assert "covers -350 ... 400 mm of X" in CONTROL(machine, CONTROL.read_settings(machine_of())).violations(cover)[0]
 
@@ -228,7 +228,7 @@ def test_records_follow_the_sample_and_hold_what_the_csv_holds(name, order, smal
     if name == "with parameters":
         assert CONTROL(machine, chosen).parse(files[2:]) == both
     else:
-        with pytest.raises(InputError, match=r"give VOLUME\.csv as well"):
+        with pytest.raises(InputError, match=r"also give VOLUME\.csv"):
             CONTROL(machine, chosen).parse(files[2:])
     wrong = data[0][:-1] + ("7" if data[0][-1] != "7" else "6")
     with pytest.raises(InputError, match=r"vertex \(0, 0, 0\) has"):

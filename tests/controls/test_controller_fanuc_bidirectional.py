@@ -140,7 +140,7 @@ def test_points_of_unknown_approach_get_the_mean_and_a_warning(small_machine):
         ({"value_type": "total"}, "3627 counts with total values"),
         ({"magnification": 2}, "3627 is multiplied"),
         ({"reference_return": {"X": "up"}}, "'positive', 'negative'"),
-        ({"negative_first_number": 50, "negative_last_number": 40}, "lies below 50"),
+        ({"negative_first_number": 50, "negative_last_number": 40}, "is below 50"),
     ],
 )
 def test_what_no_document_settles_is_refused(small_machine, settings, words):

@@ -181,14 +181,14 @@ def test_the_points_of_the_user_are_taken_and_a_file_with_others_is_refused():
     assert "N03620A1P40\nN03621A1P32\nN03622A1P49\nN03624A1P50.0\n" in text
     assert made.violations == []
     other = parse(machine, text.replace("P50.0", "P60.0"))
-    assert any("not those of the machine file" in m for m in CONTROL(machine).violations(other))
+    assert any("which differ from those of the machine file" in m for m in CONTROL(machine).violations(other))
 
 
 def test_travel_beyond_the_outer_points_and_large_amounts_are_violations():
     machine = machine_of(amount_limit=9)
     chosen = CONTROL.read_settings(machine)
     messages = CONTROL(machine, chosen).violations(parse(machine, SAMPLE.replace("N05731P32", "N05731P33")))
-    assert any("an amount of 10 counts, the limit is 9" in m for m in messages)
+    assert any("an amount is 10 counts; the limit is 9" in m for m in messages)
     assert any("covers -350 ... 450 mm of X" in m for m in messages)
 
 
@@ -280,7 +280,9 @@ def test_assumed_points_are_in_a_file_of_their_own(small_machine, small_errors):
     told = made.preflight
     assert "- NOT written: 3620, 3621, 3622 and 3624 of X, Y, Z, which belong to pitch error compensation" in told
     assert "Only on a control whose pitch error compensation has no points" in told and "POINTS-ASSUMED.TXT" in told
-    with pytest.raises(InputError, match="3620, 3621, 3622, 3624 is missing for .*; give the file that has it as well"):
+    with pytest.raises(
+        InputError, match="3620, 3621, 3622, 3624 is missing for .*; also give the file that contains it"
+    ):
         parse(small_machine, made.files["STRAIGHT.TXT"])
 
 
@@ -309,7 +311,7 @@ def test_the_trial_and_the_way_back_leave_entries_of_other_axes_alone(tmp_path, 
     machine = small_machine.with_setting("fanuc-straightness", "style_from", path)
     told = export(machine, small_errors, "fanuc-straightness", allow_unverified=True).preflight
     assert "Set the amounts 5771 to 5774 to 0, then only parameter 5772" in told
-    assert "To switch these tables off at once: set\n5712, 5713 to 0" in told
+    assert "To switch only these tables off, set\n5712, 5713 to 0" in told
 
 
 def test_points_that_differ_from_the_sample_are_refused(tmp_path, small_machine):
@@ -337,14 +339,14 @@ def test_a_sample_that_leaves_no_room_is_refused(tmp_path, small_machine, small_
         export(machine, small_errors, "fanuc-straightness", allow_unverified=True)
 
 
-def test_reading_says_what_was_assumed_kept_apart_and_passed_over():
+def test_reading_says_what_was_assumed_kept_apart_and_skipped():
     machine = machine_of()
     tables = parse(machine, SAMPLE.replace("%\nN03620", "%\nN00010P00000001\nN05712P7\nN05722P1\nN03620"))
     with pytest.raises(InputError, match="parameter 5741"):  # an entry that is cut
         parse(machine, SAMPLE.replace("N05711", "N05712P1\nN05722P1\nN05711"))
     said = CONTROL(machine).remarks(tables, [])
-    assert "taken to be metric" in said[0] and "axis 7 is none of X, Y, Z" in said[1]
-    assert said[2] == "passed over: 1 record that cannot change a straightness table"
+    assert "assumed to be metric" in said[0] and "axis 7 is not X, Y or Z" in said[1]
+    assert said[2] == "skipped: 1 record that cannot change a straightness table"
     with pytest.raises(InputError, match="a fourth moving axis") as caught:
         parse(machine, SAMPLE.replace("N05711", "N05714P1\nN05711"))
     assert caught.value.line == 6
@@ -359,13 +361,13 @@ MALFORMED = [
     (lambda t: t.replace("N05763P4", "N05763P4\nN05763P5"), r"second time \(first in", 15),
     (lambda t: t.replace("N05763P4", "N05763P4.5"), "whole number", 14),
     (lambda t: t.replace("N05763P4", "N05763P4E1"), "single value word", 14),
-    (lambda t: t.replace("N05763P4", "N05763P4,5"), "no place", 14),
+    (lambda t: t.replace("N05763P4", "N05763P4,5"), "is not allowed in a block", 14),
     (lambda t: t.replace("N05763P4", "N05763PNAN"), "not a word", 14),
     (lambda t: t.replace("N05763P4", "N05763A1P4"), "single value word", 14),
     (lambda t: t.replace("N05732P36", "N05732P32"), "a < b < c < d", 9),
     (lambda t: t.replace("N05734P49", "N05734P50"), "not within those of X", 8),
     (lambda t: t.replace("N05721P2", "N05721P1"), "both moving and compensated", 7),
-    (lambda t: t.replace("N05721P2", "N05721P7"), "axis 7 is none of X, Y, Z", 7),
+    (lambda t: t.replace("N05721P2", "N05721P7"), "axis 7 is not X, Y or Z", 7),
     (lambda t: t.replace("N03624A1P50.0\n", ""), "parameter 3624 is missing for X", None),
     (lambda t: t.replace("P50.0", "P-50.0"), "not possible", 5),
     (lambda t: t.replace("A1P40", "A1P40A1P41"), "second time", 2),
@@ -408,7 +410,7 @@ def test_any_text_is_parsed_or_refused_but_never_crashes(lines):
     ("options", "words"),
     [
         ({"pairs": ["X(x)"]}, "a list of 'Y(x)', 'Z(x)', 'X(y)', 'Z(y)', 'X(z)', 'Y(z)'"),
-        ({"pairs": ["Y(x)", "Z(x)"]}, "each moving axis can be given once only"),
+        ({"pairs": ["Y(x)", "Z(x)"]}, "each moving axis may be given only once"),
         ({"points": {"X": {"reference": 4, "first": 1, "last": 3, "interval_mm": 5.0}}}, "at least four"),
         ({"points": {"X": {"reference": 4, "first": 1, "last": 9}}}, "interval_mm"),
         ({"stores": "minus"}, "'correction', 'error'"),

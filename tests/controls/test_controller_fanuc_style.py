@@ -208,7 +208,7 @@ def test_both_files_are_read_back_as_they_act(controls_files, make_errors, tmp_p
     assert backup.tables.others == ((4, 301, 312),)
     assert any("axis A4 (not X, Y or Z of the machine file)" in text for text in backup.remarks)
     assert backup.remarks[0].startswith("unit: the machine is metric by 1001#0")
-    assert backup.remarks[-1] == "passed over: 1 record that cannot change a pitch table"
+    assert backup.remarks[-1] == "skipped: 1 record that cannot change a pitch table"
 
 
 def test_new_points_avoid_those_of_every_axis_of_the_sample(controls_files, make_errors):
@@ -349,7 +349,7 @@ def test_total_values_are_read_only_where_they_are_stated(controls_files):
     machine.controllers["fanuc-pitch"].data.pop("style_from")
     assert read_tables(machine, controls_files, "fanuc-pitch").tables.blocks[0].total
     machine.controllers["fanuc-pitch"].data["value_type"] = "incremental"
-    with pytest.raises(InputError, match="total values; state value_type"):
+    with pytest.raises(InputError, match="total values; set value_type"):
         read_tables(machine, controls_files, "fanuc-pitch")
 
 
@@ -365,7 +365,7 @@ MALFORMED = [
     (lambda t: "", "contains no '%'", None),
     (lambda t: "%\n%\n", "contains no record", 1),
     (lambda t: t.replace("N10036P-2", "O1234"), "is not a block", 10),
-    (lambda t: t.replace("N10036P-2", "N10036P-2,5"), "no place", 10),
+    (lambda t: t.replace("N10036P-2", "N10036P-2,5"), "is not allowed in a block", 10),
     (lambda t: t.replace("N10036P-2", "N10036P-2E1"), "single value word", 10),
     (lambda t: t.replace("N10036P-2", "N10036P-2.5"), "whole number", 10),
     (lambda t: t.replace("N10036P-2", "N10036Q0P-2"), "some records have a type word", 10),

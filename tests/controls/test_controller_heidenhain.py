@@ -439,7 +439,7 @@ def test_columns_carry_the_names_of_the_control(tmp_path, make_errors):
         ("10.0000 ", "-60.0000", 5, "ascend"),
         ("\n2    10", "\n3    10", 5, "expected 2"),
         ("\n2    10", "\n1    10", 5, "expected 2"),
-        ("[END]\n", "[END]\nmore\n", 8, "behind"),
+        ("[END]\n", "[END]\nmore\n", 8, "the end of the table"),
         ("0.0050", "0.005\u20ac", 5, "printable ASCII"),
         ("0.0050", "0.0050" + " " * 2000, 5, "characters"),
     ],
@@ -613,7 +613,7 @@ def test_columns_rows_and_units_of_the_draft_are_those_of_the_manual(tmp_path):
         ("X..C2", "X..C3", "expected EYX along Y with X..C2"),
         ("X..C2", "Y..C2", "expected EYX along Y with X..C2"),
         ("X..C2", "X.C2", "expected a row such as"),
-        ("-EA0Z ", "-EC0Y ", "takes EC0Y back"),
+        ("-EA0Z ", "-EC0Y ", "cancels EC0Y after its axis: there is no such constant"),
         ("EYX ", "EQX ", "expected a row such as"),
     ],
 )
