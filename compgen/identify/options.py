@@ -172,7 +172,8 @@ class IdentifyOptions:
 
     ``part_scale`` "free" removes one scale from each set-up of a part (of unknown temperature), and ``travel``
     "from-data" limits the curves to the range of the readings; both apply to positions in frames of unknown pose
-    (:mod:`compgen.identify.positions`). ``small_deviations`` accepts deviations that are all zero, or too small for a
+    (:mod:`compgen.identify.positions`). ``nodes`` "from-data" takes as many nodes as the readings of tracers determine.
+    ``small_deviations`` accepts deviations that are all zero, or too small for a
     machine.
 
     Examples
@@ -227,6 +228,11 @@ class IdentifyOptions:
         "machine: curves over the whole travel, with nodes beyond the readings tied by smoothness; from-data: over the "
         "range that the readings cover. For parts, and deviations at one height or without a component.",
         name="--range",
+    )
+    nodes: Literal["machine", "from-data"] = option(
+        "machine",
+        "Nodes of the curves identified from tracer lengths: those of the machine file, or from-data: as many of them, "
+        "at most, as the readings determine.",
     )
     small_deviations: bool = option(
         False,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeAlias
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import MM_PER_UM
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.propagation import Adjustment
@@ -89,8 +90,12 @@ class Task:
         return unknown_names(self.problem.parameters, self.lengths.stations, self.station, self.group)
 
 
+#: Positions within this share of the travel of every axis determine nothing; they were probably written in metres.
+SHARE_OF_METRES = 0.002
+
+
 def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
-    """Raise InputError for fewer than ``least`` stations, and for positions outside the travel."""
+    """Raise InputError for fewer than ``least`` stations, positions outside the travel, and positions in metres."""
     if len(lengths.stations) < least:
         raise InputError(
             f"contains readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
@@ -99,6 +104,15 @@ def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
             file=lengths.origin[0][0] if lengths.origin else None,
         )
     check_travel(machine, lengths.position_mm, lengths.origin)
+    span_mm = np.ptp(lengths.position_mm, axis=0)
+    travel_mm = np.array([np.ptp(axis.range_mm) for axis in machine.axes])
+    if np.all(span_mm < SHARE_OF_METRES * travel_mm):
+        k = int(np.argmax(span_mm))
+        raise InputError(
+            f"the positions look like metres: they span {span_mm[k]:g} of {travel_mm[k]:g} mm of {AXES[k]}; convert them to mm",
+            file=lengths.origin[0][0] if lengths.origin else None,
+            field="columns x_mm, y_mm, z_mm",
+        )
 
 
 def task_of(machine: Machine, lengths: Lengths) -> Task:
@@ -304,6 +318,73 @@ def _stations(
 # ``docs/conventions.md`` by elimination.
 
 
+# What to do where the readings do not determine the errors of the machine file.
+
+
+#: Stations of two names closer than this are one place, mm: the distance of two tracers set up side by side is larger.
+ONE_PLACE_MM = 20.0
+#: Levels closer than this are the same position of an axis, mm.
+SAME_LEVEL_MM = 0.5
+
+
+def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> list[str]:
+    """Return what makes the readings determine the errors, the most likely cause first; empty if nothing simple does."""
+    span_mm = np.ptp(lengths.position_mm, axis=0)
+    found = [
+        f"{AXES[k]} did not move (all readings at {lengths.position_mm[0, k]:g} mm): measure at several positions of it"
+        for k in np.flatnonzero(span_mm < SAME_LEVEL_MM).tolist()
+    ]
+    task = task_of(machine, lengths)
+    place_mm = start_values(task)[0].stations_mm
+    for first, second in itertools.combinations(range(len(place_mm)), 2):
+        distance = float(np.linalg.norm(place_mm[first] - place_mm[second]))
+        if distance < ONE_PLACE_MM:
+            names = f"{lengths.stations[first]} and {lengths.stations[second]}"
+            found.append(
+                f"the stations {names} are in one place ({distance:.1f} mm apart), which counts once: measure from another place"
+            )
+    if options.nodes == "machine" and not found:
+        fewer = next(
+            (item for item in with_fewer_nodes(machine, lengths) if _quietly(item, lengths, options) is not None), None
+        )
+        if fewer is not None:
+            counts = ", ".join(
+                f"{letter} = {len(axis.nodes_mm)}" for letter, axis in zip(AXES, fewer.axes, strict=True)
+            )
+            has = ", ".join(str(len(axis.nodes_mm)) for axis in machine.axes)
+            found.append(
+                f"{counts} nodes fit these readings (the machine file has {has}): set nodes there, or use --nodes from-data"
+            )
+    return found
+
+
+def with_fewer_nodes(machine: Machine, lengths: Lengths) -> Iterator[Machine]:
+    """Yield the machine with the nodes that the positions of the readings can support, then with ever fewer.
+
+    An axis has at most as many nodes as positions were measured; the nodes are equally spaced, or at measured positions.
+    """
+    levels = []
+    for position in lengths.position_mm.T:
+        sorted_mm = np.sort(position)
+        levels.append(sorted_mm[np.flatnonzero(np.diff(sorted_mm, prepend=-np.inf) > SAME_LEVEL_MM)])
+    counts = [max(2, min(len(axis.nodes_mm), len(own))) for axis, own in zip(machine.axes, levels, strict=True)]
+    while True:
+        for at_levels in (False, True):
+            axes = []
+            for axis, own, count in zip(machine.axes, levels, counts, strict=True):
+                nodes = np.linspace(*axis.range_mm, count)
+                if len(axis.nodes_mm) == count:
+                    nodes = axis.nodes_mm
+                elif at_levels and len(own) >= count:
+                    nodes = own[np.rint(np.linspace(0, len(own) - 1, count)).astype(int)]
+                    nodes[[0, -1]] = axis.range_mm
+                axes.append(replace(axis, nodes_mm=nodes))
+            yield replace(machine, axes=(axes[0], axes[1], axes[2]))
+        if max(counts) == 2:
+            return
+        counts = [max(2, int(0.85 * count)) for count in counts]
+
+
 MIN_STATIONS = 3
 
 
@@ -337,10 +418,16 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     """
     chosen = options or IdentifyOptions()
     with one_thread():
+        if chosen.nodes == "from-data":
+            fitting = (item for item in with_fewer_nodes(machine, lengths) if _quietly(item, lengths, chosen))
+            machine = next(fitting, machine)
         try:
             found = _at_reference(machine, lengths, chosen)
         except ConvergenceError as error:
             raise ConvergenceError(f"{error}{_explained(machine, lengths, chosen)}") from error
+        except UndeterminedError as error:
+            advice = "".join(f"{text}; " for text in remedies(machine, lengths, chosen))
+            raise UndeterminedError(f"{advice}{error}", error.combinations) from error
         return with_systematic(machine, lengths, _with_causes(machine, lengths, chosen, found), chosen.systematic)
 
 

@@ -77,6 +77,11 @@ def identification_table(result: Identification) -> Group:
         f"residual {result.rms_um:.3f} um rms, reduced chi-square {result.reduced_chi_square:.3f} "
         f"({result.degrees_of_freedom} degrees of freedom, {result.u_source} uncertainty {stated})",
     ]
+    if result.stations:
+        places = {item.station: ", ".join(f"{value:.0f}" for value in item.position_mm) for item in result.stations}
+        found = "; ".join(f"{name} ({place})" for name, place in places.items())
+        lines.append(f"stations found at X, Y, Z in mm: {found}")
+        lines.append("are they really there? Lengths alone cannot show that an axis is mirrored")
     lines += [segment.text for segment in result.segments[:MOST_VERDICT_REASONS]]
     lines += [
         f"rejected: {item.station} point {item.point} (line {item.line}): {item.reason}"

@@ -11,7 +11,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import CHAINS, Axis, Chain, Machine
 from compgen.data.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.identify import IdentifyOptions, identify
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.problem import length_problem
@@ -349,6 +349,65 @@ def test_nodes_without_data_are_named():
     with pytest.raises(UndeterminedError, match="no data at all") as caught:
         identify(machine, lengths)
     assert "EXX at -282.5 mm" in str(caught.value)
+
+
+def test_nodes_that_the_readings_determine_are_proposed_and_taken():
+    """A machine file with more nodes than measured positions: the fewer ones give the errors that were measured."""
+    machine, coarse = machine_of(counts=(9, 4, 11)), machine_of(counts=(3, 4, 6))
+    truth = truth_of(coarse)
+    lengths = measured(coarse, truth, positions=grid_of(coarse))
+    with pytest.raises(UndeterminedError, match="no data at all") as caught:
+        identify(machine, lengths)
+    assert str(caught.value).startswith(
+        "X = 3, Y = 4, Z = 6 nodes fit these readings (the machine file has 9, 4, 11): set nodes"
+    )
+    found = identify(machine, lengths, IdentifyOptions(nodes="from-data"))
+    for name in truth.curves:
+        np.testing.assert_allclose(found.errors.curves[name].value, truth.curves[name].value, atol=NANOMETRE)
+    # where the nodes of the machine file fit, they stay
+    again = identify(coarse, lengths, IdentifyOptions(nodes="from-data"))
+    np.testing.assert_array_equal(
+        again.errors.curves["EXX"].value, identify(coarse, lengths).errors.curves["EXX"].value
+    )
+
+
+def test_fewer_nodes_are_at_measured_positions_where_equal_steps_do_not_fit():
+    coarse = machine_of(counts=(5, 4, 6))
+    positions = grid_of(coarse)
+    uneven = {-282.5: -400.0, -145.0: -380.0, -7.5: -350.0}  # X was measured near its lower end, and at both ends
+    positions[:, 0] = [uneven.get(round(x, 6), x) for x in positions[:, 0]]
+    lengths = measured(coarse, truth_of(machine_of(counts=(2, 4, 6))), positions=positions)
+    found = identify(machine_of(counts=(9, 4, 6)), lengths, IdentifyOptions(nodes="from-data"))
+    np.testing.assert_allclose(found.errors.curves["EXX"].position_mm, [-420.0, -400.0, -380.0, -350.0, 130.0])
+    assert found.rms_um < 1e-3
+
+
+def test_an_axis_that_did_not_move_is_named_first():
+    machine = machine_of()
+    positions = grid_of(machine)
+    with pytest.raises(
+        UndeterminedError, match=r"^Z did not move \(all readings at -300 mm\): measure at several positions"
+    ):
+        identify(machine, measured(machine, truth_of(machine), positions=positions[positions[:, 2] == -300.0]))
+
+
+def test_two_stations_in_one_place_are_named_first():
+    machine = machine_of()
+    stations = STATIONS.copy()
+    stations[1] = stations[0]
+    lengths = measured(machine, truth_of(machine), stations=stations[:3])
+    first, second, _ = lengths.stations
+    with pytest.raises((UndeterminedError, ConvergenceError)) as caught:
+        identify(machine, lengths)
+    assert f"the stations {first} and {second} are in one place (0.0 mm apart), which counts once" in str(caught.value)
+
+
+def test_positions_in_metres_are_recognised():
+    machine = machine_of()
+    machine = replace(machine, axes=tuple(replace(axis, range_mm=(-420.0, 650.0)) for axis in machine.axes))
+    lengths = measured(machine, truth_of(machine))
+    with pytest.raises(InputError, match=r"look like metres: they span 0\.6 of 1070 mm of Y; convert them to mm"):
+        identify(machine, replace(lengths, position_mm=lengths.position_mm / 1000.0))
 
 
 def test_three_lines_through_a_corner_do_not_determine_the_errors():
