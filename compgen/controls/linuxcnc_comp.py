@@ -58,7 +58,7 @@ def units_setting(meaning: str) -> Any:
 def check_size(source: SourceFile, most: int) -> None:
     """Raise InputError for a text that is longer than any file of its kind."""
     if len(source.text) > most:
-        raise source.fail(f"has {len(source.text)} characters; such a file has at most {most}: it is not a table", 1)
+        raise source.fail(f"has {len(source.text)} characters; a table has at most {most}", 1)
 
 
 def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
@@ -84,7 +84,7 @@ def number_in(source: SourceFile, line: int, word: str, what: str) -> float:
     """Return a finite number; InputError with the line for a decimal comma, nan, inf or anything else."""
     if _NUMBER.fullmatch(word) and math.isfinite(value := float(word)):
         return value
-    hint = "; LinuxCNC reads '.' as decimal point" if "," in word else ""
+    hint = "; the decimal mark of LinuxCNC is '.'" if "," in word else ""
     raise source.fail(f"{word[:SHOWN]!r} is not a number; expected {what}{hint}", line)
 
 
@@ -197,7 +197,7 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
             blank = blank or line
             continue
         if blank:
-            raise source.fail("is blank, and LinuxCNC stops reading there without a word; take the line out", blank)
+            raise source.fail("is blank: LinuxCNC stops reading there without a message. Remove the line", blank)
         rows.append(_row(source, line, text, rows))
         if not ended:
             raise source.fail("the last line has no line end; is the file truncated?", line)
@@ -208,11 +208,11 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
     span = float(np.ptp(nominal))
     slope = float(np.ptp(forward)) / span if span > 0.0 and len(nominal) > 2 else 0.5
     if slope > _LIKE_POSITIONS if file_type == 1 else slope < 1.0 - _LIKE_POSITIONS:
-        message = "these are trims (file type 1), and comp_file_type is 0"
+        message = "these are trims (file type 1), but comp_file_type is 0"
         if file_type == 1:
-            message = "these are nominal and actual positions (file type 0), and comp_file_type is 1"
+            message = "these are nominal and actual positions (file type 0), but comp_file_type is 1"
         largest = float(np.max(np.abs(forward if file_type == 1 else nominal - forward)))
-        message += f": the trims would be up to {largest:g} machine units; set comp_file_type in the machine file"
+        message += f": the trims would be up to {largest:g} machine units. Set comp_file_type in the machine file"
         raise source.fail(message, 1)
     if file_type == 0:
         return CompTable(nominal, nominal - forward, nominal - reverse, mm_per_unit)
@@ -221,19 +221,19 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
 
 def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]]) -> tuple[float, ...]:
     if len(text) > LONGEST_LINE:
-        raise source.fail(f"has {len(text)} characters; LinuxCNC reads {LONGEST_LINE} of a line", line)
+        raise source.fail(f"has {len(text)} characters; LinuxCNC reads only {LONGEST_LINE} per line", line)
     words = text.split()
     if words[0][0] in "#;(%":
-        raise source.fail("is a comment; LinuxCNC stops reading there without a word, take the line out", line)
+        raise source.fail("is a comment: LinuxCNC stops reading there without a message. Remove the line", line)
     if len(words) < 3:
         message = f"has {len(words)} columns; expected nominal, forward and reverse, got {text.strip()[:SHOWN]!r}"
         raise source.fail(message, line)
     row = tuple(number_in(source, line, word, what) for word, what in zip(words, _COLUMNS, strict=False))
     if above and row[0] <= above[-1][0]:
-        message = f"{row[0]:g} is not above {above[-1][0]:g} of the row before; LinuxCNC drops such a row"
+        message = f"the position {row[0]:g} is not above {above[-1][0]:g} in the row before; LinuxCNC drops such a row"
         raise source.fail(message, line)
     if len(above) == MOST_ROWS:
-        raise source.fail(f"is row {MOST_ROWS + 1}; LinuxCNC takes {MOST_ROWS} rows and drops the rest", line)
+        raise source.fail(f"is row {MOST_ROWS + 1}; LinuxCNC accepts {MOST_ROWS} rows and drops the rest", line)
     return row
 
 
@@ -266,7 +266,7 @@ def parameters(
         {
             "name": "[TRAJ] LINEAR_UNITS",
             "value": unit,
-            "meaning": "unit of all numbers in the files; LinuxCNC takes them in its own unit, whatever they were meant in",
+            "meaning": "unit of all numbers in the files; LinuxCNC reads them in its own unit, without a check",
         }
     ]
     for axis, table in sorted(tables.items()):
@@ -278,7 +278,7 @@ def parameters(
             {
                 "name": f"{section} BACKLASH",
                 "value": "0",
-                "meaning": "not used together with a COMP_FILE; put a former value into the file",
+                "meaning": "ignored for a joint with a COMP_FILE; a previous value must go into the file",
             }
         )
         steps = table.step_mm[table.step_mm > _NO_STEP_MM]
@@ -291,8 +291,8 @@ def parameters(
                 {
                     "name": f"{section} MAX_ACCELERATION",
                     "value": f"not {low:.0f} ... {high:.0f} {unit}/s2",
-                    "meaning": f"with SERVO_PERIOD {servo_period_us:g} us; within, the reversal step of {AXES[axis]} may "
-                    "not be applied from standstill",
+                    "meaning": f"for SERVO_PERIOD {servo_period_us:g} us: in this range, the reversal step of {AXES[axis]} "
+                    "may not be applied from standstill",
                 }
             )
     return rows
@@ -312,10 +312,10 @@ def dead_zone_warnings(
         if lost:
             unit_um = acceleration * period_s**2 / MM_PER_UM
             found.append(
-                f"the reversal step of {AXES[axis]} ({max(lost) / MM_PER_UM:.3f} um) lies between {AT_ONCE * unit_um:.3f} "
+                f"the reversal step of {AXES[axis]} ({max(lost) / MM_PER_UM:.3f} um) is between {AT_ONCE * unit_um:.3f} "
                 f"and {RAMPED * unit_um:.3f} um: LinuxCNC does not apply such a step from standstill at MAX_ACCELERATION "
-                f"{acceleration:g} mm/s2 and SERVO_PERIOD {servo_period_us:g} us. Up to {RAMPED * unit_um:.3f} um may stay; "
-                "change the acceleration or the period"
+                f"{acceleration:g} mm/s2 and SERVO_PERIOD {servo_period_us:g} us. Up to {RAMPED * unit_um:.3f} um may "
+                "remain uncorrected; change the acceleration or the period"
             )
     return found
 
@@ -350,7 +350,7 @@ class CompSettings:
     """Settings ``[controllers.linuxcnc-comp]``."""
 
     comp_file_type: int = setting(
-        whole(0, 1), 1, meaning="INI key of that name; 1: the file holds trims, 0: nominal and actual positions"
+        whole(0, 1), 1, meaning="INI key of that name; 1: the file contains trims, 0: nominal and actual positions"
     )
     loss_mm: float = loss_setting()
     servo_period_us: float = setting(
@@ -362,10 +362,10 @@ class CompSettings:
         _positive3, None, meaning="[JOINT_n] MAX_ACCELERATION of X, Y, Z, for the same warning"
     )
     machine_units: str = units_setting(
-        "[TRAJ] LINEAR_UNITS, mm or inch: LinuxCNC takes the numbers of a COMP_FILE in machine units"
+        "[TRAJ] LINEAR_UNITS, mm or inch: LinuxCNC reads the numbers of a COMP_FILE in machine units"
     )
     comp_files: tuple[str | None, str | None, str | None] = axis_setting(
-        toml_files.text, meaning="names of the COMP_FILEs of X, Y, Z on the control, for reading them under any name"
+        toml_files.text, meaning="file names of the COMP_FILEs of X, Y, Z on the control, to read them under any name"
     )
 
     @property
@@ -478,14 +478,14 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
                     axis = _axis_of(source)  # by our naming rule
                 except InputError:
                     message = (
-                        "the name does not say which joint it belongs to; state it in the machine file: "
+                        "the file name does not say which joint it belongs to; state it in the machine file: "
                         f'[controllers.linuxcnc-comp] comp_files = {{ X = "{source.path.name}" }}'
                     )
                     raise source.fail(message) from None
             if axis in found:
                 raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
             found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
-            remarks.append(f"{source.path.name} was taken for {AXES[axis]}, type {settings.comp_file_type}")
+            remarks.append(f"{source.path.name} was read as the file of {AXES[axis]}, type {settings.comp_file_type}")
         return CompTables(found), remarks
 
     def emulate(self, tables: CompTables, points: Points) -> FloatArray:
@@ -510,7 +510,9 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             other = "inch" if self.settings.machine_units == "mm" else "mm"
             share = MM_PER_UNIT[other] / self.settings.mm_per_unit
             if left_out and not coverage_violations(self.machine, axis, first * share, last * share, ""):
-                left_out = [f"{text}; in {other} it would cover it: is machine_units right?" for text in left_out]
+                left_out = [
+                    f"{text}; in {other} it would cover the travel: is machine_units right?" for text in left_out
+                ]
             found += left_out
         return found
 
@@ -558,6 +560,6 @@ def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
 def _axis_of(source: SourceFile) -> int:
     matches = list(_AXIS_OF_NAME.finditer(source.path.name))
     if not matches:
-        raise source.fail(f"the name does not say which joint it belongs to; expected a name such as {FILES[0]!r}")
+        raise source.fail(f"the file name does not say which joint it belongs to; expected a name such as {FILES[0]!r}")
     joint, letter = matches[-1].groups()
     return int(joint) if joint else AXES.index(letter.upper())

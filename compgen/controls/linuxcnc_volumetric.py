@@ -172,21 +172,21 @@ class VolTable:
         """Tip position minus the tool offset with the axes at positions (n, 3): shape (n, 3), mm."""
         return position_mm + self.error(position_mm, tool_mm)
 
-    def inverse(self, wanted_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
-        """Axis positions at which the tip (minus the tool offset) is at ``wanted_mm`` (n, 3): shape (n, 3), mm.
+    def inverse(self, commanded_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
+        """Axis positions at which the tip (minus the tool offset) is at ``commanded_mm`` (n, 3): shape (n, 3), mm.
 
         InputError if the iteration does not converge: no machine has such errors, and the control refuses to move.
         """
-        axes = np.array(wanted_mm, dtype=np.float64)
+        axes = np.array(commanded_mm, dtype=np.float64)
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(MOST_ROUNDS):
-                following = wanted_mm - self.error(axes, tool_mm)
+                following = commanded_mm - self.error(axes, tool_mm)
                 ended = np.abs(following - axes) <= LAST_STEP_MM + LAST_PART * np.abs(following)
                 axes = following
                 if np.all(ended):
                     return axes
         raise InputError(
-            "the errors of the table change too fast with position: no position puts the tool at the commanded point"
+            "the errors of the table change too fast with position: no axis position puts the tool at the commanded point"
         )
 
     def slope(self, lower_mm: FloatArray, upper_mm: FloatArray, tool_mm: FloatArray) -> float:
@@ -258,7 +258,7 @@ class _WordReader:
     def _split(self, line: int, text: str, _: bool) -> list[str]:
         self.line = line
         if len(text) > _LONGEST_LINE:
-            raise self.source.fail(f"has {len(text)} characters; {_LONGEST_LINE} are allowed", line)
+            raise self.source.fail(f"has {len(text)} characters; at most {_LONGEST_LINE} are allowed", line)
         return text.split()
 
     def number(self, what: str) -> float:
@@ -293,8 +293,8 @@ def parse_volcomp(source: SourceFile) -> VolTable:
     """Read a table; InputError with the line for anything that the kinematics module rejects."""
     check_size(source, _MOST_CHARACTERS)
     words = _WordReader(source)
-    for due in _MAGIC:
-        if (word := words.take("'volcomp 1'")) != due:
+    for expected in _MAGIC:
+        if (word := words.take("'volcomp 1'")) != expected:
             raise source.fail(f"expected 'volcomp 1' at the start, found {word[:SHOWN]!r}", words.line)
     curves: dict[str, VolCurve] = {}
     terms: list[VolTerm] = []
@@ -309,13 +309,13 @@ def parse_volcomp(source: SourceFile) -> VolTable:
             curves[curve.name] = curve
         elif word == "term":
             if len(terms) == MOST_TERMS:
-                raise source.fail(f"is term {len(terms) + 1}; {MOST_TERMS} are allowed", words.line)
+                raise source.fail(f"is term {len(terms) + 1}; at most {MOST_TERMS} are allowed", words.line)
             output, name = words.whole("an axis (0 X, 1 Y, 2 Z)", 0, 2), words.take("the name of a curve")
             if name not in curves:
-                raise source.fail(f"there is no curve above with the name {name[:SHOWN]!r}", words.line)
+                raise source.fail(f"no curve with the name {name[:SHOWN]!r} is defined above", words.line)
             coefficient, lever = words.number("a coefficient"), words.take("a lever")
             if lever not in LEVERS:
-                raise source.fail(f"{lever[:SHOWN]!r} is not a lever; {', '.join(LEVERS)} are", words.line)
+                raise source.fail(f"{lever[:SHOWN]!r} is not a lever; use {', '.join(LEVERS)}", words.line)
             terms.append(VolTerm(output, name, coefficient, lever))
         elif word == "grid" and grid is None:
             grid = _read_grid(words)
@@ -323,7 +323,7 @@ def parse_volcomp(source: SourceFile) -> VolTable:
             raise source.fail(f"expected 'curve', 'term', one 'grid' or 'end', found {word[:SHOWN]!r}", words.line)
         word = words.take("'end'")
     if bool(terms) == (grid is not None):
-        raise source.fail("expected either terms or a grid, and not both", words.line)
+        raise source.fail("expected either terms or a grid, but not both", words.line)
     _check_trailer(source, words)
     return VolTable(tuple(curves.values()), tuple(terms), grid, unit).scaled(MM_PER_UNIT[unit])
 
@@ -366,8 +366,8 @@ def _check_trailer(source: SourceFile, words: _WordReader) -> None:
             shown = " ".join(plain)[:SHOWN]
             raise source.fail(f"only comments and one 'crc32 XXXXXXXX' may follow 'end', found {shown!r}", line)
         if plain[1].upper() != counted:
-            message = f"the checksum of the words up to 'end' is {counted}, the file says {plain[1][:SHOWN]!r}"
-            raise source.fail(f"{message}: it was changed or damaged; export it again", line)
+            message = f"the checksum of the words up to 'end' is {counted}, but the file says {plain[1][:SHOWN]!r}"
+            raise source.fail(f"{message}: the table was changed or damaged. Export it again", line)
         found = True
     if not found:
         raise source.fail("there is no 'crc32 XXXXXXXX' after 'end': the file is truncated", words.line)
@@ -537,14 +537,14 @@ def _parameters(gauge_mm: Vector3, coordinates: str, unit: str) -> list[dict[str
         {
             "name": "volkins.loaded",
             "value": "true",
-            "meaning": "belongs into the e-stop chain (volkins.hal): false means that nothing is compensated",
+            "meaning": "belongs in the e-stop chain (volkins.hal): false means that nothing is compensated",
         },
     ]
     rows += [
         {
             "name": f"volkins.gauge-{letter.lower()}",
             "value": f"{value / MM_PER_UNIT[unit]:.9g} {unit}",
-            "meaning": "tool offset of the error model where the control's tool offset is zero",
+            "meaning": "tool offset of the error model when the control's tool offset is zero",
         }
         for letter, value in zip(AXES, gauge_mm, strict=True)
     ]
@@ -572,7 +572,9 @@ def _coordinates(value: Any) -> str:
     """One letter of an axis for each joint, including X, Y and Z."""
     letters = str(value).upper() if isinstance(value, str) else ""
     if set(letters) - set(_AXIS_LETTERS) or not set(AXES) <= set(letters) or len(letters) > _MOST_JOINTS:
-        raise ValueError(f"expected the axis of each joint, e.g. 'XYZA', X, Y and Z among at most {_MOST_JOINTS}")
+        raise ValueError(
+            f"expected one axis letter for each of at most {_MOST_JOINTS} joints, including X, Y and Z, e.g. 'XYZA'"
+        )
     return letters
 
 
@@ -589,19 +591,19 @@ class VolumetricSettings:
         meaning='"curves": E = C P with the tool in use; "grid": for the tool offset of the machine file only',
     )
     loss_mm: float = loss_setting()
-    most_nodes: int = setting(whole(2, 1000), 400, meaning="most nodes per axis (a grid has at most 46)")
+    most_nodes: int = setting(whole(2, 1000), 400, meaning="largest number of nodes per axis (a grid has at most 46)")
     gauge_mm: tuple[float, float, float] = setting(
         toml_files.vector3,
         (0.0, 0.0, 0.0),
-        meaning="tool offset of the error model where the control's tool offset is zero",
+        meaning="tool offset of the error model when the control's tool offset is zero",
     )
     machine_units: str = units_setting(
-        "[TRAJ] LINEAR_UNITS, mm or inch: all numbers are written in it, and the module refuses a table in another unit"
+        "[TRAJ] LINEAR_UNITS, mm or inch: the unit of all exported numbers; the module refuses a table in another unit"
     )
     coordinates: str = setting(
         _coordinates,
         "XYZ",
-        meaning="axis of each joint from joint 0 on, as in trivkins coordinates=XYYZA; axes other than X, Y, Z pass through",
+        meaning="axis of each joint from joint 0 on, as in trivkins coordinates=XYYZA; axes other than X, Y, Z pass unchanged",
     )
 
 
@@ -669,7 +671,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         if not tables:
             raise InputError("no table was given; expected volcomp.tab")
         if len(tables) > 1:
-            raise tables[1].fail(f"is a second table; the first is {tables[0].path.name}, and volkins reads one")
+            raise tables[1].fail(f"is a second table; the first is {tables[0].path.name}, and volkins reads only one")
         return parse_volcomp(tables[0])
 
     def emulate(self, tables: VolTable, points: Points) -> FloatArray:
@@ -683,7 +685,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         found = []
         if tables.unit != settings.machine_units:
             found.append(
-                f"the table is in {tables.unit}, and machine_units is {settings.machine_units!r}: the control does not use "
+                f"the table is in {tables.unit}, but machine_units is {settings.machine_units!r}: the control does not use "
                 "such a table, and the machine cannot be switched on"
             )
         for axis, first, last, what in _spans(tables):
@@ -758,9 +760,9 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         place, axis = divmod(int(np.argmax(np.abs(error))), 3)
         x, y, z = points[place]
         return (
-            "The table holds ERRORS (actual minus commanded, ISO 230-1); volkins sends the axes to q = P - E(q). With the axes "
-            f"at X {x:g} Y {y:g} Z {z:g} the error of {AXES[axis]} is {error[place, axis]:+.6f} mm: there the joint stands "
-            f"{-error[place, axis]:+.6f} mm beside what the display says."
+            "The table contains ERRORS (actual minus commanded, ISO 230-1); volkins sends the axes to q = P - E(q). With the "
+            f"axes at X {x:g} Y {y:g} Z {z:g} the error of {AXES[axis]} is {error[place, axis]:+.6f} mm, and the joint position "
+            f"differs from the displayed position by {-error[place, axis]:+.6f} mm."
         )
 
     def _warnings(self, table: VolTable) -> list[str]:
@@ -770,7 +772,7 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         if np.max(np.abs(at_home)) > 1e-6:
             shown = ", ".join(f"{letter} {value:+.6f}" for letter, value in zip(AXES, at_home, strict=True))
             found.append(
-                f"with the axes at 0 the tool stands at {shown} mm: after homing there the display shows these numbers, not 0"
+                f"with the axes at 0 the tool is at {shown} mm: after homing there the display shows these numbers, not 0"
             )
         if table.grid is not None:
             found.append("a grid is made for one tool offset: with another tool, use form = 'curves'")

@@ -100,7 +100,7 @@ _FIELD_KEYS = ("nodes_mm", "correction_um")
 def parse_neutral(files: Sequence[SourceFile]) -> NeutralTables:
     """Return the contents of the files; the same data given twice must agree."""
     if not files:
-        raise InputError("no file was given; neutral.field.csv is one")
+        raise InputError("no file was given; give a file such as neutral.field.csv")
     fields: list[tuple[SourceFile, FieldGrid]] = []
     curves: list[tuple[SourceFile, ErrorTable]] = []
     for source in files:
@@ -139,15 +139,15 @@ def _read(source: SourceFile) -> FieldGrid | ErrorTable:
             or data.get("schema") not in (FIELD_SCHEMA, CURVE_SCHEMA)
             or data.get("version") != 1
         ):
-            raise source.fail(f'"schema" must be "{FIELD_SCHEMA}" or "{CURVE_SCHEMA}", and "version" 1', 1)
+            raise source.fail(f'"schema" must be "{FIELD_SCHEMA}" or "{CURVE_SCHEMA}", and "version" must be 1', 1)
         if data["schema"] == CURVE_SCHEMA:
             return _curves_json(source, data)
         lines = _object(source, data, "nodes_mm", "nodes_mm")
         x, y, z = (_ascending(source, lines.get(letter), f"nodes_mm.{letter}") for letter in ("x", "y", "z"))
         values = _array(source, data.get("correction_um"), "correction_um", columns=3)
         if len(values) != len(x) * len(y) * len(z):
-            due = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
-            raise _fail(source, "correction_um", f"has {len(values)} entries; {due}")
+            expected = f"expected {len(x)} x {len(y)} x {len(z)} vertices"
+            raise _fail(source, "correction_um", f"has {len(values)} entries; {expected}")
         return FieldGrid((x, y, z), values.reshape(len(x), len(y), len(z), 3))
     header = next((line for line in text.split("\n") if line.strip() and not line.lstrip().startswith("#")), "")
     if "error" in [name.strip() for name in header[:1000].split(",")]:
@@ -185,8 +185,8 @@ def _array(source: SourceFile, value: Any, key: str, *, columns: int | None = No
     for number, row in enumerate(rows):
         cells = row if columns and isinstance(row, list) else [row]
         if len(cells) != (columns or 1) or not all(_is_number(cell) for cell in cells):
-            due = f"{columns} finite numbers" if columns else "a finite number"
-            raise _fail(source, key, f"entry {number} is {one_line(json.dumps(row))[:40]}; expected {due}")
+            expected = f"{columns} finite numbers" if columns else "a finite number"
+            raise _fail(source, key, f"entry {number} is {one_line(json.dumps(row))[:40]}; expected {expected}")
     return np.array(rows, dtype=np.float64)
 
 
@@ -199,14 +199,14 @@ def _is_number(value: Any) -> bool:
 def _ascending(source: SourceFile, value: Any, key: str) -> FloatArray:
     nodes = _array(source, value, key)
     if np.any(np.diff(nodes) <= 0):
-        raise _fail(source, key, "positions must ascend")
+        raise _fail(source, key, "positions must be in ascending order")
     return nodes
 
 
 def _object(source: SourceFile, data: Mapping[str, Any], key: str, path: str) -> dict[str, Any]:
     value = data.get(key)
     if not isinstance(value, dict):
-        raise _fail(source, path, "is missing or no object")
+        raise _fail(source, path, "is missing or not an object")
     return value
 
 
@@ -230,7 +230,7 @@ def _curves_json(source: SourceFile, data: Mapping[str, Any]) -> ErrorTable:
         nodes = _ascending(source, entry["position_mm"], label)
         values = _array(source, entry[key], label)
         if len(nodes) != len(values):
-            raise _fail(source, label, f"{len(nodes)} positions, {len(values)} values")
+            raise _fail(source, label, f"has {len(nodes)} positions but {len(values)} values")
         curves[name] = Curve(nodes, values * error.si_per_unit, np.full(len(nodes), np.nan))
     if not curves and not squareness:
         raise _fail(source, "errors", "contains no error")
@@ -252,7 +252,7 @@ _TOOL_DIFFERENCE_MM = 1e-6
 class NeutralSettings:
     """Settings ``[controllers.neutral]``."""
 
-    max_nodes: int = setting(whole(2, 200), 61, meaning="nodes of the grid per axis")
+    max_nodes: int = setting(whole(2, 200), 61, meaning="largest number of grid nodes per axis")
     loss_mm: float = loss_setting()
 
 
@@ -301,7 +301,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
             "sign_statement": (
                 "The field (cx_um, cy_um, cz_um) is what must be ADDED to the command at the commanded machine position: "
                 "cx_um = -5 at X = 100 mm means that X = 99.995 mm must be commanded. The curves are ERRORS as ISO 230-1 "
-                "defines them (actual minus commanded tool position relative to the workpiece): EXX = +5 um."
+                "defines them (actual minus commanded tool position relative to the workpiece): the same error is EXX = +5 um."
             ),
             "parameters": [],
             "warnings": [],
@@ -340,14 +340,14 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         if tables.field is not None and tables.curves is not None:
             lines = tables.field.nodes_mm
             vertices = full_grid(lines).reshape(-1, 3)
-            due = self._curve_correction(tables.curves, vertices, None)
-            miss = np.abs(due - tables.field.correction_um.reshape(-1, 3) * MM_PER_UM)
+            of_curves = self._curve_correction(tables.curves, vertices, None)
+            miss = np.abs(of_curves - tables.field.correction_um.reshape(-1, 3) * MM_PER_UM)
             if np.max(miss) > AGREEMENT_MM:
                 worst = vertices[int(np.argmax(np.max(miss, axis=1)))]
                 place = ", ".join(f"{letter} {value:g}" for letter, value in zip(AXES, worst, strict=True))
                 found.append(
-                    f"field and curves differ by {np.max(miss) / MM_PER_UM:.3f} um at {place} mm: they are of different "
-                    "exports, or the machine file has another chain or tool"
+                    f"field and curves differ by {np.max(miss) / MM_PER_UM:.3f} um at {place} mm: they come from "
+                    "different exports, or the machine file has another chain or tool offset"
                 )
         return found
 

@@ -269,7 +269,7 @@ class _Body:
         """Return the number of an entry, or raise the error that says why it is not a number."""
         number = float(fixed_point(self.source, entry.line, entry.value, label))
         if abs(number) > 2.0**53:
-            raise self.source.fail(f"{label}: {number:g} is beyond the whole numbers of the control", entry.line)
+            raise self.source.fail(f"{label}: {number:g} is beyond the largest whole number of the control", entry.line)
         return number
 
     def whole(self, structure: str, name: str, low: int, high: int, default: int | None = None) -> int:
@@ -289,7 +289,7 @@ class _Body:
         number = self.whole(structure, name, 0, 65535)
         if number not in self.logical_axes:
             known = ", ".join(map(str, self.logical_axes))
-            raise self.fail(structure, name, f"no axis has the logical number {number}; logical_axes has {known}")
+            raise self.fail(structure, name, f"no axis has the logical number {number}; logical_axes is {known}")
         return self.logical_axes.index(number)
 
     def column(self, structure: str, name: str, shape: tuple[int, ...]) -> FloatArray:
@@ -299,7 +299,9 @@ class _Body:
         for index, entry in entries.items():
             if any(k >= n for k, n in zip(index, shape, strict=True)):
                 places = "".join(f"[0 ... {n - 1}]" for n in shape)
-                raise self.source.fail(f"{_label(structure, name, index)}: the table goes over {places}", entry.line)
+                raise self.source.fail(
+                    f"{_label(structure, name, index)}: the indices of the table are {places}", entry.line
+                )
             result[index] = self.value(_label(structure, name, index), entry)
         if len(entries) != result.size:
             missing = next(index for index in np.ndindex(*shape) if index not in entries)
@@ -332,7 +334,7 @@ def parse_axis_list(
         code, start, rest = text.partition("/*")
         _, end, behind = rest.partition("*/")
         if start and (not end or behind.strip()):
-            raise source.fail("a comment /* ... */ ends on its line, with nothing after it", line)
+            raise source.fail("a comment /* ... */ must end on its own line, with nothing after it", line)
         if code.strip():
             _take(body, line, code.strip())
             count += 1
@@ -418,8 +420,8 @@ def _values(body: _Body, structure: str, axis: int, values: FloatArray) -> Float
         raise body.fail(
             structure,
             "unit",
-            f"0 means that the values are encoder increments, whose length the list does not hold: state it in the machine "
-            f"file, e.g. increment_um = {{ {AXES[axis]} = 0.1 }}, or write unit 1 and values in 0.1 um",
+            f"0 means that the values are encoder increments, but the list does not contain their length. Set it in the "
+            f"machine file, e.g. increment_um = {{ {AXES[axis]} = 0.1 }}, or use unit 1 and values in 0.1 um",
         )
     return values * (length_mm / MM_PER_UNIT)
 
@@ -437,7 +439,7 @@ def _ascending(body: _Body, structure: str, setpoints: FloatArray) -> FloatArray
 def _screw(body: _Body, axis: int) -> LeadscrewTable:
     name = "kw.ssfk"
     if body.whole(name, "modulo", 0, 1, 0):
-        raise body.fail(name, "modulo", "1 belongs to rotary axes; the model has three linear ones")
+        raise body.fail(name, "modulo", "1 belongs to rotary axes; the model has three linear axes")
     count = body.whole(name, "kw_nr_max", 1, _MOST_POINTS)
     interval = body.number(name, "interval")
     if interval < 0:
@@ -475,10 +477,10 @@ def _plane(body: _Body, axis: int) -> PlaneTable:
         raise body.fail(name, "last_index_master2", f"gives {first} x {second} points; at most {_MOST_POINTS} are read")
     interval = body.number(name, "interval")
     if interval <= 0:
-        raise body.fail(name, "interval", f"{interval:g} is not above zero (the control's error 70430)")
+        raise body.fail(name, "interval", f"{interval:g} is not above zero (error 70430 on the control)")
     masters = (body.axis(name, "master1_ax_nr"), body.axis(name, "master2_ax_nr"))
     if masters[0] == masters[1]:
-        raise body.fail(name, "master2_ax_nr", "is the first master too; a plane needs two axes")
+        raise body.fail(name, "master2_ax_nr", "is also the first master; a plane needs two different axes")
     starts = (body.number(name, "start_position_master1"), body.number(name, "start_position_master2"))
     values = _values(body, name, axis, body.column(name, "correction", (second, first)))
     return PlaneTable(masters, starts, interval, values)
@@ -489,7 +491,7 @@ def _plane(body: _Body, axis: int) -> PlaneTable:
 
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_-]{0,31}")
 _PLANES = {"XY": (0, 1), "YX": (1, 0), "XZ": (0, 2), "ZX": (2, 0), "YZ": (1, 2), "ZY": (2, 1), "none": None}
-_DIFFER = "gives {} for X, Y, Z; three different ones are needed"
+_DIFFER = "gives {} for X, Y, Z; expected three different values"
 
 
 @accepts({"type": "string", "pattern": f"^{_NAME.pattern}$"})
@@ -503,7 +505,7 @@ def _axis_name(value: Any) -> str:
 def plane_masters(value: Any) -> tuple[int, int] | None:
     """First and second master of a plane from their letters, e.g. "XZ"; None for "none"."""
     if not isinstance(value, str) or value not in _PLANES:
-        raise ValueError(f"expected two different letters, first and second master: {', '.join(_PLANES)}")
+        raise ValueError(f"expected the letters of first and second master, or none: {', '.join(_PLANES)}")
     return _PLANES[value]
 
 
@@ -521,24 +523,28 @@ class TwincatSettings:
         _axis_name, ("X", "Y", "Z"), differ=_DIFFER, meaning="names of the axes on the control"
     )
     planes: tuple[tuple[int, int] | str | None, ...] = axis_setting(
-        plane_masters, ("auto",) * 3, meaning="masters of the plane table of each slave; chosen unless stated"
+        plane_masters,
+        ("auto",) * 3,
+        meaning="masters of the plane table of each slave; chosen automatically if not stated",
     )
-    most: PointLimits = table_setting(PointLimits, key="max_points", meaning="points per table that the control takes")
+    most: PointLimits = table_setting(
+        PointLimits, key="max_points", meaning="largest number of points per table that the control accepts"
+    )
     cross_sign: str = setting(
         choice("correction", "error"),
         "correction",
-        meaning='"correction": crosscomp and crosscomp2 are added to the command of the slave; or "error"',
+        meaning='"correction": the control adds crosscomp and crosscomp2 to the command of the slave; "error": it subtracts them',
     )
     ssfk_sign: str = setting(
         choice("error", "correction"),
         "error",
-        meaning='"error": actual minus nominal, which the control takes off; or "correction"',
+        meaning='"error": ssfk is actual minus nominal, which the control subtracts; "correction": it adds ssfk',
     )
     real64: bool = setting(
         word_for({"SGN32": False, "REAL64": True}),
         key="number_type",
         stated="SGN32",
-        meaning="numbers as the build of the control reads them",
+        meaning="number format of the control: SGN32 whole numbers, REAL64 with decimals",
     )
     crosscomp2: bool = setting(flag, True, meaning="write plane tables")
     own_setpoints: bool = setting(flag, False, meaning="every ssfk point has its own position (interval 0)")
@@ -548,7 +554,7 @@ class TwincatSettings:
         positive,
         key="increment_um",
         unit=MM_PER_UM,
-        meaning="encoder increments of the axes, e.g. { X = 0.1 }: for reading lists of the control with unit 0",
+        meaning="encoder increments of the axes, e.g. { X = 0.1 }, needed to read lists of the control with unit 0",
     )
 
     @property
@@ -625,8 +631,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             if screw is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
                 nodes = screw.setpoints
                 if len(curve.position_mm) > 1:
-                    held = np.interp(curve.position_mm, nodes * MM_PER_UNIT, curve.at(nodes * MM_PER_UNIT))
-                    if np.max(np.abs(held - curve.value)) > WORTH_MM:
+                    between = np.interp(curve.position_mm, nodes * MM_PER_UNIT, curve.at(nodes * MM_PER_UNIT))
+                    if np.max(np.abs(between - curve.value)) > WORTH_MM:
                         inside = np.clip(np.rint(curve.position_mm / MM_PER_UNIT), nodes[0], nodes[-1])
                         nodes = np.unique(np.concatenate([nodes, inside]))
                 # reversal B: after positive travel -B/2 is added to the command, after negative travel +B/2
@@ -648,8 +654,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             "warnings": self._warnings(tables),
             "overwrites": [
                 "Of other axes: nothing.",
-                "The compensation lists of X, Y and Z as a whole: what the old list of one of them holds beside these tables, "
-                "e.g. a table over a rotary axis, is lost.",
+                "The complete compensation lists of X, Y and Z: anything else in the old lists, e.g. a table over a rotary axis, "
+                "is lost.",
             ],
             "digits": self.settings.digits,
             "n_cycles": self.settings.n_cycles,
@@ -659,7 +665,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
     def parse(self, files: Sequence[SourceFile]) -> TwincatTables:
         """Read the lists of one or more axes, in any order."""
         if not files:
-            raise InputError("no axis list was given; achskw1.lis is one")
+            raise InputError("no axis list was given; give a list such as achskw1.lis")
         return self._parsed(files, None)
 
     def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[TwincatTables, list[str]]:
@@ -667,7 +673,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         foreign = Findings()
         tables = self._parsed(files, foreign)
         if not any(item != AxisList() for item in tables.lists.values()):
-            raise files[0].fail("; ".join(["contains no table of an axis of the machine file", *foreign.statements()]))
+            raise files[0].fail("; ".join(["contains no table for an axis of the machine file", *foreign.statements()]))
         return tables, foreign.statements()
 
     def _parsed(self, files: Sequence[SourceFile], foreign: Findings | None) -> TwincatTables:
@@ -680,7 +686,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             if axis is None:
                 continue
             if axis in seen:
-                raise source.fail(f"is a second list of axis {AXES[axis]}; the first is {seen[axis].path.name}")
+                raise source.fail(f"is a second list for axis {AXES[axis]}; the first is {seen[axis].path.name}")
             lists[axis], seen[axis] = item, source
         return TwincatTables(lists)
 
@@ -696,8 +702,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         for axis, item in tables.lists.items():
             if item.screw is not None and item.screw.neg is not None and np.any(approach[:, axis] == 0):
                 message = (
-                    f"kw.ssfk of {AXES[axis]} knows two directions of travel, and some points do not say from where they "
-                    "were approached: the mean of both is taken; give approach_x, approach_y, approach_z"
+                    f"kw.ssfk of {AXES[axis]} has values for both directions of travel, but some points do not state the "
+                    "direction of approach: the mean of both is used there. Give approach_x, approach_y, approach_z"
                 )
                 warnings.warn(message, CompgenWarning, stacklevel=2)
             screw, cross = stored_sums(item, axis, points.position_mm, approach)
@@ -708,13 +714,13 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         """Return tables with too many points, numbers that do not fit, travel not covered, missing lists."""
         settings = self.settings
         found = [
-            f"no list of axis {AXES[axis]} ({settings.logical_axes[axis]}) was given"
+            f"no list for axis {AXES[axis]} ({settings.logical_axes[axis]}) was given"
             for axis in range(3)
             if axis not in tables.lists
         ]
         for axis, item in sorted(tables.lists.items()):
             found += [
-                f"{use.name}: {use.used:g}, the control takes {use.allowed:g}"
+                f"{use.name}: {use.used:g}; the control accepts {use.allowed:g}"
                 for use in list_usage(AXES[axis], item, settings.most)
                 if use.used > use.allowed
             ]
@@ -725,7 +731,9 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             ]
             numbers = item.numbers
             if not settings.real64 and np.any(numbers != np.round(numbers)):
-                found.append(f"the list of {AXES[axis]} has numbers with decimals; number_type SGN32 takes whole ones")
+                found.append(
+                    f"the list of {AXES[axis]} has numbers with decimals; number_type SGN32 allows whole numbers only"
+                )
             if np.any(np.abs(numbers) > _LARGEST_SGN32):
                 found.append(f"the list of {AXES[axis]} has numbers beyond {_LARGEST_SGN32:g}")
         return found
@@ -863,14 +871,14 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
     def _screw_statement(self) -> str:
         if self.settings.ssfk_sign == "error":
             return (
-                "kw.ssfk holds actual minus nominal in 0.1 um, and the control takes it off: 21 at 100 mm says that the axis "
-                "stands 0.0021 mm too far in the positive direction; the control then commands 99.9979 mm."
+                "kw.ssfk is actual minus nominal in 0.1 um, which the control subtracts: 21 at 100 mm means that the axis is "
+                "0.0021 mm too far in the positive direction; the control then commands 99.9979 mm."
             )
-        return "kw.ssfk holds what the control adds, in 0.1 um: 21 at 100 mm makes it command 100.0021 mm."
+        return "kw.ssfk is what the control adds, in 0.1 um: with 21 at 100 mm it commands 100.0021 mm."
 
     def _cross_statement(self) -> str:
         settings = self.settings
-        added, sign = ("added to", "+") if settings.cross_sign == "correction" else ("taken off", "-")
+        added, sign = ("added to", "+") if settings.cross_sign == "correction" else ("subtracted from", "-")
         return (
             f"Values of kw.crosscomp and kw.crosscomp2 are {added} the command of the slave (cross_sign = "
             f'"{settings.cross_sign}"): 50 moves it by {sign}0.0050 mm.'
@@ -885,13 +893,13 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
                 active = 1 if table is not None else 0
                 rows.append((f"lr_param.{name} ({AXES[axis]})", active, where))
             if item.screw is not None and item.screw.neg is not None:
-                meaning = "bilateral table: it holds the backlash, so backlash compensation of this axis must be off"
+                meaning = "bilateral table: it contains the backlash, so backlash compensation of this axis must be off"
                 rows.append((f"backlash compensation ({AXES[axis]})", "off", meaning))
-                meaning = "cycles over which a change of direction is spread"
-                rows.append((f"lr_param.n_backlash_cyc ({AXES[axis]})", "as suits", meaning))
+                meaning = "cycles over which the change at a reversal is spread"
+                rows.append((f"lr_param.n_backlash_cyc ({AXES[axis]})", "as required", meaning))
             for kind, used in point_counts(item).items():
                 if used > (usual := getattr(PointLimits(), kind)):
-                    meaning = f"the usual {usual} do not hold this table"
+                    meaning = f"this table has {used} points, more than the usual {usual}"
                     rows.append((f"kw.{kind}.max_points ({AXES[axis]})", f">= {used + 1}", meaning))
         return [{"name": name, "value": value, "meaning": meaning} for name, value, meaning in rows]
 
@@ -901,8 +909,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         if any(item.cross or item.plane for item in tables.lists.values()):
             found.append(
                 f'cross_sign = "{settings.cross_sign}": no public document says whether kw.crosscomp and kw.crosscomp2 are '
-                "added or taken off. Do section 3 of the preflight list before you use them, and write what it shows "
-                "into the machine file."
+                "added or subtracted. Do section 3 of the preflight list before you use them, and enter the result "
+                "in the machine file."
             )
         own = [
             AXES[axis]
@@ -911,7 +919,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         ]
         if own:
             found.append(
-                f"the plane of {', '.join(own)} has its own slave as a master: documented for the older CNC builds"
+                f"the plane of {', '.join(own)} has its own slave as a master; this is documented for the older CNC builds"
             )
         idle = [
             AXES[axis]

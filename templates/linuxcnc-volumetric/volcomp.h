@@ -5,17 +5,17 @@
 //
 // This program is free software; you can redistribute it and/or modify it under the terms of the GNU General Public
 // License as published by the Free Software Foundation; either version 2 of the License, or (at your option) any later
-// version. It comes WITHOUT ANY WARRANTY; see the file COPYING beside the sources, or
+// version. It comes WITHOUT ANY WARRANTY; see the file COPYING in this folder, or
 // <https://www.gnu.org/licenses/old-licenses/gpl-2.0.html>.
 //
 // E(q, t) is the error of the tool tip, actual minus commanded, with the axes at q and the tool offset t. All lengths are in
-// the unit of the machine, mm or inch; the table says which it was written for, and volcomp_check_unit compares:
+// the unit of the machine, mm or inch; the table states for which it was written, and volcomp_check_unit compares:
 //
-//     P = q + E(q, t)         where the tip stands, less the tool offset   (forward)
-//     q = P - E(q, t)         where the axes must stand                    (inverse, by iteration until nothing changes)
+//     P = q + E(q, t)         position of the tip minus the tool offset    (forward)
+//     q = P - E(q, t)         position of the axes                         (inverse, by iteration until nothing changes)
 //
-// A table that cannot be read to its last word is not used at all: volcomp_load returns 0 and says why. Nor is one whose unit
-// is not that of the machine.
+// A table that cannot be read to its last word is not used at all: volcomp_load returns 0 and says why. The same
+// applies to a table in another unit than that of the machine.
 
 #ifndef VOLCOMP_H
 #define VOLCOMP_H
@@ -36,7 +36,7 @@
 #define VOLCOMP_BYTES (64L << 20)
 #define VOLCOMP_NAME 32
 // The iteration ends when no axis moves by more than this, mm or inch, and this part of its coordinate (far from machine zero
-// neighbouring numbers differ by more than the first); a table that needs more rounds is refused.
+// neighbouring numbers differ by more than the first); after this many rounds it has failed.
 #define VOLCOMP_STEP 0.0000000000001
 #define VOLCOMP_PART 0.000000000000001
 #define VOLCOMP_ROUNDS 50
@@ -144,7 +144,7 @@ static double *volcomp_numbers(volcomp_table *table, volcomp_text *text, size_t 
     double *value = malloc(count * sizeof *value);
     for (k = 0; value && k < count; k++)
         if (!volcomp_number(text, &value[k])) {
-            volcomp_fail(table, text, "a number is due");
+            volcomp_fail(table, text, "expected a number");
             free(value);
             return NULL;
         }
@@ -168,16 +168,16 @@ static int volcomp_read_curve(volcomp_table *table, volcomp_text *text)
     if (table->curves == VOLCOMP_CURVES)
         return volcomp_fail(table, text, "too many curves");
     if (!volcomp_take(text) || strlen(text->word) >= VOLCOMP_NAME || volcomp_find(table, text->word) >= 0)
-        return volcomp_fail(table, text, "a new name of a curve is due");
+        return volcomp_fail(table, text, "expected a new name of a curve");
     strcpy(curve->name, text->word);
     if (!volcomp_whole(text, 0, 2, &curve->axis))
-        return volcomp_fail(table, text, "an axis 0, 1 or 2 is due");
+        return volcomp_fail(table, text, "expected an axis 0, 1 or 2");
     if (!volcomp_whole(text, 1, VOLCOMP_NODES, &curve->count))
-        return volcomp_fail(table, text, "a number of nodes is due");
+        return volcomp_fail(table, text, "expected a number of nodes");
     if (!volcomp_number(text, &curve->first))
-        return volcomp_fail(table, text, "the position of the first node is due");
+        return volcomp_fail(table, text, "expected the position of the first node");
     if (!volcomp_number(text, &curve->step) || curve->step <= 0)
-        return volcomp_fail(table, text, "a step above zero is due");
+        return volcomp_fail(table, text, "expected a step above zero");
     curve->value = volcomp_numbers(table, text, curve->count);
     table->curves += curve->value != NULL;
     return curve->value != NULL;
@@ -190,19 +190,19 @@ static int volcomp_read_term(volcomp_table *table, volcomp_text *text)
     if (table->terms == VOLCOMP_TERMS)
         return volcomp_fail(table, text, "too many terms");
     if (!volcomp_whole(text, 0, 2, &term->out))
-        return volcomp_fail(table, text, "an axis 0, 1 or 2 is due");
+        return volcomp_fail(table, text, "expected an axis 0, 1 or 2");
     if (!volcomp_take(text) || (term->curve = volcomp_find(table, text->word)) < 0)
-        return volcomp_fail(table, text, "the name of a curve above is due");
+        return volcomp_fail(table, text, "expected the name of a curve above");
     if (!volcomp_number(text, &term->coefficient))
-        return volcomp_fail(table, text, "a coefficient is due");
+        return volcomp_fail(table, text, "expected a coefficient");
     if (!volcomp_take(text))
-        return volcomp_fail(table, text, "a lever is due");
+        return volcomp_fail(table, text, "expected a lever");
     for (term->lever = 0; term->lever < 7; term->lever++)
         if (!strcmp(text->word, levers[term->lever])) {
             table->terms++;
             return 1;
         }
-    return volcomp_fail(table, text, "a lever 1 x y z tx ty tz is due");
+    return volcomp_fail(table, text, "expected a lever: 1 x y z tx ty tz");
 }
 
 static int volcomp_read_grid(volcomp_table *table, volcomp_text *text)
@@ -210,16 +210,16 @@ static int volcomp_read_grid(volcomp_table *table, volcomp_text *text)
     int k;
     double total = 1;
     if (table->vertices)
-        return volcomp_fail(table, text, "a second grid");
+        return volcomp_fail(table, text, "there is a second grid");
     for (k = 0; k < 3; k++)
         if (!volcomp_whole(text, 1, VOLCOMP_NODES, &table->count[k]))
-            return volcomp_fail(table, text, "a number of vertices is due");
+            return volcomp_fail(table, text, "expected a number of vertices");
     for (k = 0; k < 3; k++)
         if (!volcomp_number(text, &table->first[k]))
-            return volcomp_fail(table, text, "the position of the first vertex is due");
+            return volcomp_fail(table, text, "expected the position of the first vertex");
     for (k = 0; k < 3; k++) {
         if (!volcomp_number(text, &table->step[k]) || table->step[k] <= 0)
-            return volcomp_fail(table, text, "a step above zero is due");
+            return volcomp_fail(table, text, "expected a step above zero");
         total *= table->count[k];
     }
     if (total > VOLCOMP_VERTICES)
@@ -248,13 +248,13 @@ static int volcomp_read_trailer(volcomp_table *table, volcomp_text *text)
             return volcomp_fail(table, text, "the checksum is wrong");
         found = 1;
     }
-    return found || volcomp_fail(table, text, "there is no checksum: the file was cut");
+    return found || volcomp_fail(table, text, "there is no checksum: the file is truncated");
 }
 
 static int volcomp_read_unit(volcomp_table *table, volcomp_text *text)
 {
     if (!volcomp_take(text) || (strcmp(text->word, "mm") && strcmp(text->word, "inch")))
-        return volcomp_fail(table, text, "a unit mm or inch is expected");
+        return volcomp_fail(table, text, "expected the unit mm or inch");
     table->unit = strcmp(text->word, "mm") ? VOLCOMP_INCH : VOLCOMP_MM;
     return 1;
 }
@@ -263,13 +263,13 @@ static int volcomp_read(volcomp_table *table, volcomp_text *text)
 {
     int good = 1, first;
     if (!volcomp_take(text) || strcmp(text->word, "volcomp"))
-        return volcomp_fail(table, text, "'volcomp 1' is due");
+        return volcomp_fail(table, text, "expected 'volcomp 1'");
     if (!volcomp_take(text) || strcmp(text->word, "1"))
-        return volcomp_fail(table, text, "'volcomp 1' is due");
+        return volcomp_fail(table, text, "expected 'volcomp 1'");
     table->unit = VOLCOMP_MM;   // of tables without the word "unit"
     for (first = 1; good; first = 0) {
         if (!volcomp_take(text))
-            return volcomp_fail(table, text, "there is no 'end': the file was cut");
+            return volcomp_fail(table, text, "there is no 'end': the file is truncated");
         if (!strcmp(text->word, "end"))
             break;
         if (first && !strcmp(text->word, "unit"))
@@ -281,10 +281,10 @@ static int volcomp_read(volcomp_table *table, volcomp_text *text)
         else if (!strcmp(text->word, "grid"))
             good = volcomp_read_grid(table, text);
         else
-            good = volcomp_fail(table, text, "'curve', 'term', 'grid' or 'end' is due");
+            good = volcomp_fail(table, text, "expected 'curve', 'term', 'grid' or 'end'");
     }
     if (good && !table->vertices == !table->terms)
-        return volcomp_fail(table, text, "either terms or a grid are due");
+        return volcomp_fail(table, text, "expected either terms or a grid");
     return good && volcomp_read_trailer(table, text);
 }
 
@@ -305,7 +305,7 @@ static char *volcomp_slurp(volcomp_table *table, const char *path, size_t *lengt
     }
     fclose(file);
     if (!bytes)
-        snprintf(table->message, sizeof table->message, "cannot be read, %ld bytes", size);
+        snprintf(table->message, sizeof table->message, "cannot be read (%ld bytes)", size);
     *length = bytes ? size : 0;
     return bytes;
 }
@@ -376,8 +376,8 @@ static inline int volcomp_unit(const char *word)
     return fabs(per_mm - 1) < 0.001 ? VOLCOMP_MM : fabs(per_mm * 25.4 - 1) < 0.001 ? VOLCOMP_INCH : 0;
 }
 
-// Take the table out of use unless its unit is that of the machine: what "units=" states, what the INI file says. Both have
-// to agree, and one of them has to be there; a table in the wrong unit would act 25.4 times too much at the wrong place.
+// Take the table out of use unless its unit is that of the machine: what "units=" states, and what the INI file says. Both
+// must agree, and one of them must be given; a table in the wrong unit would act 25.4 times too much at the wrong place.
 static inline void volcomp_check_unit(volcomp_table *table, const char *stated)
 {
     static const char *names[] = {"?", "mm", "inch"};
@@ -390,15 +390,15 @@ static inline void volcomp_check_unit(volcomp_table *table, const char *stated)
     said = volcomp_unit(stated);
     machine = known ? volcomp_unit(ini) : said;
     if (*stated && !said)
-        snprintf(table->message, size, "units=%.32s is not known: mm or inch is expected", stated);
+        snprintf(table->message, size, "units=%.32s is not known; expected mm or inch", stated);
     else if (known && !machine)
-        snprintf(table->message, size, "[TRAJ] LINEAR_UNITS = %.32s is not known: mm or inch is expected", ini);
+        snprintf(table->message, size, "[TRAJ] LINEAR_UNITS = %.32s is not known; expected mm or inch", ini);
     else if (!machine)
-        snprintf(table->message, size, "the unit of the machine is not known: add units=mm or units=inch behind file=");
+        snprintf(table->message, size, "the unit of the machine is not known: add units=mm or units=inch after file=");
     else if (said && said != machine)
         snprintf(table->message, size, "units=%.32s, but [TRAJ] LINEAR_UNITS = %.32s", stated, ini);
     else if (machine != table->unit)
-        snprintf(table->message, size, "the table is in %s, the machine in %s: export it with machine_units = \"%s\"",
+        snprintf(table->message, size, "the table is in %s, but the machine is in %s: export it with machine_units = \"%s\"",
                  names[table->unit], names[machine], names[machine]);
     else
         table->good = 1;
@@ -406,7 +406,7 @@ static inline void volcomp_check_unit(volcomp_table *table, const char *stated)
 
 // ---- evaluation ----------------------------------------------------------------------------------------------------
 
-// Linear between the nodes, the end values hold outside.
+// Linear between the nodes, end values outside.
 static double volcomp_curve_at(const volcomp_curve *curve, double q)
 {
     double ratio = (q - curve->first) / curve->step;
@@ -419,7 +419,7 @@ static double volcomp_curve_at(const volcomp_curve *curve, double q)
     return curve->value[left] + (ratio - left) * (curve->value[left + 1] - curve->value[left]);
 }
 
-// Trilinear between the vertices, the values of the surface hold outside.
+// Trilinear between the vertices, the values of the surface outside.
 static void volcomp_grid_at(const volcomp_table *table, const double q[3], double e[3])
 {
     double share[3];
@@ -474,7 +474,7 @@ static int volcomp_finite(const double v[3])
     return isfinite(v[0]) && isfinite(v[1]) && isfinite(v[2]);
 }
 
-// Axis positions q at which the tip stands at P; returns 0, or -1 if the iteration does not end, or P or t is not a number
+// Axis positions q that put the tip at P; returns 0, or -1 if the iteration does not end, or P or t is not a number
 // (one NaN on a tool pin would reach every drive).
 static int volcomp_inverse(const volcomp_table *table, const double p[3], const double t[3], double q[3])
 {

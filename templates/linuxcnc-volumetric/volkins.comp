@@ -1,31 +1,31 @@
 // SPDX-License-Identifier: GPL-2.0-or-later
 //
-// volkins.comp - LinuxCNC kinematics of linear axes X, Y, Z with volumetric compensation; all other axes pass through.
+// volkins.comp - LinuxCNC kinematics of linear axes X, Y, Z with volumetric compensation; all other axes pass unchanged.
 // Copyright (C) 2026 the compgen authors
 //
 // This program is free software; you can redistribute it and/or modify it under the terms of the GNU General Public
 // License as published by the Free Software Foundation; either version 2 of the License, or (at your option) any later
-// version. It comes WITHOUT ANY WARRANTY; see the file COPYING beside the sources, or
+// version. It comes WITHOUT ANY WARRANTY; see the file COPYING in this folder, or
 // <https://www.gnu.org/licenses/old-licenses/gpl-2.0.html>.
 
 component volkins "Kinematics like trivkins, with volumetric compensation of X, Y and Z from a table";
 
 description """
-Build and install: halcompile --install volkins.comp (volcomp.h beside it). INI: [KINS] KINEMATICS = volkins file=volcomp.tab
-coordinates=XYZ, JOINTS = 3. As in trivkins, coordinates= names the axis of each joint from joint 0 on: XYZA has a rotary axis
-at joint 3, XYYZ a gantry with two joints for Y. Without it, [TRAJ] COORDINATES of the INI file is taken. A, B, C, U, V, W pass
-through as they are. Other settings behind file=: units=mm or units=inch states the unit of the machine where the INI file
-cannot be read.
+Build and install: halcompile --install volkins.comp (with volcomp.h in the same folder). INI: [KINS] KINEMATICS = volkins
+file=volcomp.tab coordinates=XYZ, JOINTS = 3. As in trivkins, coordinates= names the axis of each joint from joint 0 on: XYZA has
+a rotary axis at joint 3, XYYZ a gantry with two joints for Y. Without it, [TRAJ] COORDINATES of the INI file is used. A, B, C,
+U, V, W pass unchanged. Another setting after file=: units=mm or units=inch states the unit of the machine if the INI file cannot
+be read.
 
 All lengths are in machine units. A table in another unit than [TRAJ] LINEAR_UNITS is not used. Put volkins.loaded into the
 e-stop chain: without a table the axes are not compensated, and coordinated motion is refused.
 
-The pins volkins.* exist from loadrt on. Tool offset of the error model: volkins.gauge-* minus volkins.tool-* (to be netted to
-motion.tooloffset.*). When it changes, the module goes to the new one at volkins.tool-rate, so that no joint is told to
-jump; net volkins.settling to motion.feed-inhibit, and the path waits. A pin that is not a number raises volkins.fault,
+The pins volkins.* exist from loadrt on. Tool offset of the error model: volkins.gauge-* minus volkins.tool-* (net these to
+motion.tooloffset.*). When it changes, the module goes to the new one at volkins.tool-rate, so that no joint is commanded
+to jump; net volkins.settling to motion.feed-inhibit to hold the feed meanwhile. A pin that is not a number raises volkins.fault,
 and coordinated motion stops with an error.
 
-The table is read once, at loadrt: a new table acts after LinuxCNC has been started again.
+The table is read once, at loadrt: a new table takes effect after LinuxCNC has been restarted.
 """;
 
 pin out bit installed "always true once the module runs";
@@ -116,14 +116,14 @@ static int check_joints(void)
             letter = strchr(letters, *c >= 'a' && *c <= 'z' ? *c - 'a' + 'A' : *c);
             if (letter && joint_of[letter - letters] < 0) {
                 snprintf(table.message, sizeof table.message, "no joint for %c of [TRAJ] COORDINATES = %.32s: add it to "
-                         "coordinates= behind file=", *letter, ini);
+                         "coordinates= after file=", *letter, ini);
                 return 0;
             }
         }
-    // coordinates= may leave further joints out on purpose, as in trivkins; [TRAJ] COORDINATES may not
+    // as in trivkins, coordinates= may leave out joints on purpose; [TRAJ] COORDINATES may not
     if (volcomp_ini("KINS", "JOINTS", ini, sizeof ini) && (*coordinates ? atoi(ini) < joints : atoi(ini) != joints)) {
         snprintf(table.message, sizeof table.message, "[KINS] JOINTS = %.16s, and the coordinates are for %d joints: name "
-                 "the axis of each joint by coordinates= behind file=", ini, joints);
+                 "the axis of each joint by coordinates= after file=", ini, joints);
         return 0;
     }
     return 1;

@@ -175,7 +175,7 @@ def test_files_for_an_inch_machine_hold_inches(file_type):
     metric = machine_with(comp={"comp_file_type": file_type})
     found = control(metric).violations(parsed(COMP, metric, texts))
     assert len(found) == 3
-    assert all("in inch it would cover it: is machine_units right?" in text for text in found)
+    assert all("in inch it would cover the travel: is machine_units right?" in text for text in found)
 
 
 def test_an_inch_machine_is_corrected_as_one_in_mm_reversal_too_and_the_preflight_says_the_unit():
@@ -270,7 +270,7 @@ ROW = "0 0.1 0.1\n"
         (ROW + "5 0.1\n", 2, "2 columns"),
         (ROW + "5 0.1 0.1", 2, "no line end"),
         (ROW + "5 0.1 0.", 2, "no line end"),
-        ("0,0 0,0 0,0\n", 1, "decimal point"),
+        ("0,0 0,0 0,0\n", 1, "the decimal mark of LinuxCNC is '.'"),
         (ROW + "5 abc 0\n", 2, "not a number"),
         (ROW + "5 nan 0\n", 2, "not a number"),
         (ROW + "5 1e999 0\n", 2, "not a number"),
@@ -472,7 +472,7 @@ def test_the_setting_of_joints_names_axes():
     assert "[JOINT_4]" not in texts["volkins.ini"]
     assert "loadrt volcomp" not in texts["volcomp.hal"]  # a gantry needs volkins
     for wrong in ("XYA", "XYZQ", 3, "XYZ" * 6):
-        with pytest.raises(InputError, match="the axis of each joint"):
+        with pytest.raises(InputError, match="expected one axis letter for each of at most 16 joints"):
             built(VOLUMETRIC, machine.with_setting(VOLUMETRIC, "coordinates", wrong), random_errors(machine))
 
 
@@ -532,7 +532,7 @@ MALFORMED = [
     ("volcomp 1\nunit mm\nunit mm\ncurve A 0 1 0 1 0.1\nterm 0 A 1 x\nend\n", 3, "expected"),
     ("volcomp 1\ncurve A 0 1 0 1 0.1\nunit inch\nterm 0 A 1 x\nend\n", 3, "expected"),
     ("volcomp 1\nend\n", 2, "terms or a grid"),
-    ("volcomp 1\ncurve A 0 2 0 1\n0.1\n0,2\nend\n", 4, "decimal point"),
+    ("volcomp 1\ncurve A 0 2 0 1\n0.1\n0,2\nend\n", 4, "the decimal mark of LinuxCNC is '.'"),
     ("volcomp 1\ncurve A 3 2 0 1 0.1 0.2\nend\n", 2, "axis"),
     ("volcomp 1\ncurve A 0 3 0 1 0.1 0.2\nterm 0 A 1 x\nend\n", 3, "not a number"),
     ("volcomp 1\ncurve A 0 2 0 1 0.1 0.2 0.3\nend\n", 2, "expected"),

@@ -64,7 +64,7 @@ def test_the_vendors_third_point_is_taken_off_in_each_direction():
 
 
 def test_an_unknown_direction_takes_the_mean_and_says_so():
-    with pytest.warns(CompgenWarning, match="two directions"):
+    with pytest.warns(CompgenWarning, match="values for both directions of travel"):
         assert added(parsed(golden("ssfk_y.lis")), [0, -19.8667, 0])[0, 1] == pytest.approx(0.0011, abs=1e-12)
 
 
@@ -209,7 +209,7 @@ def test_a_table_over_a_travel_in_whole_units_ends_where_the_travel_ends():
 
 def test_the_preflight_says_that_an_inch_machine_takes_the_lists_as_they_are(make_errors):
     text = compgen.export(PLAIN, make_errors(PLAIN), NAME).preflight
-    assert "Metric only" in text and "convert no number" in text
+    assert "Metric only" in text and "do not convert any number" in text
 
 
 def test_limits_of_points_and_missing_lists_are_named(make_errors):
@@ -219,7 +219,7 @@ def test_limits_of_points_and_missing_lists_are_named(make_errors):
     found = CONTROL(few).violations(replace(tables, lists={0: tables.lists[0]}))
     for words in ("points of kw.ssfk of X", "points of kw.crosscomp of X", "points of kw.crosscomp2 of X"):
         assert any(text.startswith(words) for text in found)
-    assert "no list of axis Z (3) was given" in found
+    assert "no list for axis Z (3) was given" in found
     for axis in range(3):
         plane = tables.lists[axis].plane
         assert plane is None or plane.values.size <= 10201
@@ -229,7 +229,7 @@ def test_limits_of_points_and_missing_lists_are_named(make_errors):
     ("own", "words"),
     [
         ({"cross_sign": "plus"}, "'correction', 'error'"),
-        ({"planes": {"X": "XX"}}, "two different letters"),
+        ({"planes": {"X": "XX"}}, "expected the letters of first and second master"),
         ({"logical_axes": {"X": 2}}, "three different"),
         ({"axis_names": {"Y": "X"}}, "three different"),
         ({"number_type": "REAL32"}, "SGN32"),
@@ -254,7 +254,7 @@ CROSS, PLANE = golden("crosscomp_z.lis"), golden("crosscomp2_x.lis")
         ("# nothing\n", None, "contains no data"),
         (LIST.replace("kw.ssfk.table[2].pos   34\n", ""), None, r"kw.ssfk.table\[2\].pos is missing"),
         (LIST.replace("table[2]", "table[1]"), 10, "second time; the first is in line 9"),
-        (LIST.replace("table[2]", "table[3]"), 10, "the table goes over"),
+        (LIST.replace("table[2]", "table[3]"), 10, "the indices of the table are"),
         (LIST.replace("pos   34", "pos   3,4"), 10, "decimal mark"),
         (LIST.replace("pos   34", "pos   3.4e1"), 10, "exponent"),
         (LIST.replace("pos   34", "pos   nan"), 10, "not a number"),
@@ -267,13 +267,13 @@ CROSS, PLANE = golden("crosscomp_z.lis"), golden("crosscomp2_x.lis")
         (LIST.replace("bilateral      0", "bilateral      1"), None, "neg is missing"),
         (LIST.replace("achs_nr           1", "achs_nr           9"), 1, "no axis has the logical number 9"),
         (LIST.replace("kw.ssfk.interval       500000\n", ""), None, "interval is missing"),
-        (LIST.replace("X\n", "X /* open\n", 1), 2, "ends on its line"),
+        (LIST.replace("X\n", "X /* open\n", 1), 2, "must end on its own line"),
         (LIST + "garbage\n", 11, "is not an entry"),
         (LIST + "\N{MICRO SIGN}\n", 11, "ASCII"),
         ("# entries: 11\n" + LIST, None, "declares 11 entries but contains 10"),
         (CROSS.replace("11523", "10735"), 13, "not above the position before it"),
         (PLANE.replace("interval                           100000", "interval 0"), 3, "70430"),
-        (re.sub(r"master2_ax_nr +3", "master2_ax_nr 2", PLANE), 11, "two axes"),
+        (re.sub(r"master2_ax_nr +3", "master2_ax_nr 2", PLANE), 11, "two different axes"),
     ],
 )
 def test_a_malformed_list_is_refused_with_its_line(text, line, words):
@@ -283,7 +283,7 @@ def test_a_malformed_list_is_refused_with_its_line(text, line, words):
 
 
 def test_two_lists_of_one_axis_are_refused():
-    with pytest.raises(InputError, match="second list of axis X; the first is a.lis"):
+    with pytest.raises(InputError, match="second list for axis X; the first is a.lis"):
         parsed({"a.lis": LIST, "b.lis": LIST})
 
 

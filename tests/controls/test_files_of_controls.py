@@ -458,7 +458,7 @@ def test_axis_lists_of_other_axes_are_kept_apart_and_unknown_entries_refused(tmp
     other.write_text(AXIS_LIST.replace("achs_nr            1", "achs_nr            5"), encoding="utf-8")
     tables = read_tables(machine, [first, other], "twincat-lists", foreign=True)
     assert any("the list of axis 5 (a5.lis)" in remark for remark in tables.remarks)
-    with pytest.raises(InputError, match="contains no table of an axis of the machine file"):
+    with pytest.raises(InputError, match="contains no table for an axis of the machine file"):
         read_tables(machine, other, "twincat-lists", foreign=True)
     first.write_text(AXIS_LIST.replace("kw.ssfk.res1 ", "kw.ssfk.gain "), encoding="utf-8")
     with pytest.raises(InputError, match="not a parameter of these lists") as caught:
@@ -688,7 +688,7 @@ def test_words_that_could_change_a_table_are_refused(tmp_path, line):
                 "I51",
             ],
         ),
-        ("twincat-lists", ["- Of other axes: nothing.", "The compensation lists of X, Y and Z as a whole"]),
+        ("twincat-lists", ["- Of other axes: nothing.", "The complete compensation lists of X, Y and Z"]),
         ("siemens-eec", ["of other axes: none", "The encoder table of AX1, measuring system 1"]),
         ("siemens-cec-eec", ["- Of other axes: NOT KNOWN", "- Tables 0 ... "]),
     ],

@@ -498,7 +498,7 @@ def damaged(text, how):
     ("how", "said"),
     [
         ("missing", "cannot open"),
-        ("cut", "is due"),
+        ("cut", "expected a number"),
         ("cut after end", "no checksum"),
         ("one digit", "checksum is wrong"),
     ],
@@ -558,10 +558,10 @@ def test_the_hal_component_looks_up_as_the_emulator_does(workshop, small_machine
 @pytest.mark.parametrize(
     ("table_unit", "machine_unit", "stated", "said"),
     [
-        ("mm", "inch", "", r'the table is in mm, the machine in inch: export it with machine_units = "inch"'),
-        ("mm", "imperial", "", "the table is in mm, the machine in inch"),
-        ("inch", "mm", "", "the table is in inch, the machine in mm"),
-        ("inch", "metric", "", "the table is in inch, the machine in mm"),
+        ("mm", "inch", "", r'the table is in mm, but the machine is in inch: export it with machine_units = "inch"'),
+        ("mm", "imperial", "", "the table is in mm, but the machine is in inch"),
+        ("inch", "mm", "", "the table is in inch, but the machine is in mm"),
+        ("inch", "metric", "", "the table is in inch, but the machine is in mm"),
         ("mm", "inch", " units=mm", r"units=mm, but \[TRAJ\] LINEAR_UNITS = inch"),
         ("mm", "mm", " units=cm", "units=cm is not known"),
     ],
@@ -811,4 +811,4 @@ def test_the_hal_component_refuses_a_table_in_another_unit(workshop, small_machi
     )  # fmt: skip
     assert done.started is False
     assert done.pins == {"volcomp.loaded": False}
-    assert re.search("NO COMPENSATION.*volcomp.tab.*the table is in mm, the machine in inch", done.output)
+    assert re.search("NO COMPENSATION.*volcomp.tab.*the table is in mm, but the machine is in inch", done.output)
