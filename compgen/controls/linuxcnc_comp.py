@@ -312,10 +312,10 @@ def dead_zone_warnings(
         if lost:
             unit_um = acceleration * period_s**2 / MM_PER_UM
             found.append(
-                f"the reversal step of {AXES[axis]} ({max(lost) / MM_PER_UM:.3f} um) is between {AT_ONCE * unit_um:.3f} "
+                f"The reversal step of {AXES[axis]} ({max(lost) / MM_PER_UM:.3f} um) is between {AT_ONCE * unit_um:.3f} "
                 f"and {RAMPED * unit_um:.3f} um: LinuxCNC does not apply such a step from standstill at MAX_ACCELERATION "
                 f"{acceleration:g} mm/s2 and SERVO_PERIOD {servo_period_us:g} us. Up to {RAMPED * unit_um:.3f} um may "
-                "remain uncorrected; change the acceleration or the period"
+                "remain uncorrected; change the acceleration or the period."
             )
     return found
 

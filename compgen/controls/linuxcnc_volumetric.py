@@ -204,8 +204,8 @@ class VolTable:
         for term in self.terms:
             curve = curves[term.curve]
             steepest = np.max(np.abs(np.diff(curve.values)), initial=0.0) / curve.step_mm
-            own = np.max(np.abs(curve.values)) if term.lever in LEVERS[1:4] else 0.0
-            sums[term.output] += abs(term.coefficient) * (largest[term.lever] * steepest + own)
+            value = np.max(np.abs(curve.values)) if term.lever in LEVERS[1:4] else 0.0
+            sums[term.output] += abs(term.coefficient) * (largest[term.lever] * steepest + value)
         return float(np.max(sums))
 
 
@@ -772,10 +772,10 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
         if np.max(np.abs(at_home)) > 1e-6:
             shown = ", ".join(f"{letter} {value:+.6f}" for letter, value in zip(AXES, at_home, strict=True))
             found.append(
-                f"with the axes at 0 the tool is at {shown} mm: after homing there the display shows these numbers, not 0"
+                f"With the axes at 0 the tool is at {shown} mm: after homing there the display shows these numbers, not 0."
             )
         if table.grid is not None:
-            found.append("a grid is made for one tool offset: with another tool, use form = 'curves'")
+            found.append("A grid is made for one tool offset: with another tool, use form = 'curves'.")
         return found
 
 

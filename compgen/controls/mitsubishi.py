@@ -353,8 +353,8 @@ class MitsubishiSettings:
 
     def scale_of(self, pair: tuple[int, int]) -> int:
         """Scale of a table (output, base axis): from the machine file, else from the control's set, else 1."""
-        own = self.set_in_file(pair)
-        return self.scale or (own.scale if own is not None and own.scale else 1)
+        in_file = self.set_in_file(pair)
+        return self.scale or (in_file.scale if in_file is not None and in_file.scale else 1)
 
     def count_mm(self, pair: tuple[int, int]) -> float:
         """One count of a written table (output, base axis), mm."""
@@ -372,9 +372,9 @@ class MitsubishiSettings:
 
     def kept(self, pair: tuple[int, int]) -> ControlSet | None:
         """Return the control's set whose numbers and interval a table keeps, unless another interval is stated."""
-        own, stated = self.set_in_file(pair), self.interval_mm[pair[1]]
-        same = own is not None and (stated is None or Decimal(repr(stated)) == own.interval_mm)
-        return own if same else None
+        in_file, stated = self.set_in_file(pair), self.interval_mm[pair[1]]
+        same = in_file is not None and (stated is None or Decimal(repr(stated)) == in_file.interval_mm)
+        return in_file if same else None
 
     def kept_at_reference(self, pair: tuple[int, int]) -> int:
         """Return the value of a kept set at its reference number: a constant, which is preserved; else 0."""
@@ -789,11 +789,11 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             limit = int(2 * np.max(np.abs(requested))) + 2 if settings.absolute else HIGHEST_VALUE
             best = best_integers(requested, travel_weights(self.machine, base, term.nodes_mm), at, limit)
             numbers = values_of(best.counts, at, settings.kept_at_reference(pair), absolute=settings.absolute)
-            kept, own = settings.kept(pair), settings.set_in_file(pair)
+            kept, in_file = settings.kept(pair), settings.set_in_file(pair)
             first = lowest_free(taken, settings.first_number, len(numbers)) if kept is None else kept.first
             self._check_free(pair, first, first + len(numbers) - 1)
             taken.append((first, first + len(numbers) - 1))
-            index = free.pop(0) if own is None else own.index
+            index = free.pop(0) if in_file is None else in_file.index
             interval = Decimal(repr(float(term.nodes_mm[1] - term.nodes_mm[0]))).quantize(INTERVAL_QUANTUM_MM)
             scale = settings.scale_of(pair)
             sets.append(SetTable(base, output, first + at, first, numbers, scale, interval, settings.absolute, index))
@@ -857,8 +857,8 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     def keeping_others(self, tables: MitsubishiTables, files: Sequence[Path]) -> dict[str, dict[str, Any]]:
         """Return ``style_from`` with the parameter file of the control, if it is among the files."""
-        own = [] if self.settings.sample.file is not None else list(filter(begins_with_mark, files))
-        return {self.name: {"style_from": str(own[0].resolve())}} if len(own) == 1 else {}
+        found = [] if self.settings.sample.file is not None else list(filter(begins_with_mark, files))
+        return {self.name: {"style_from": str(found[0].resolve())}} if len(found) == 1 else {}
 
     def resolution_mm(self) -> float:
         """Half a count of each table that acts on an axis, where the range of the values is not active."""
@@ -876,8 +876,8 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
             value = new.pop(str(number), None)
             if value is not None and number != SYSTEM:
                 line = lines[entry.line - 1]
-                behind = "\r" if line.endswith("\r") else ""
-                lines[entry.line - 1] = f"N{number}P{value}{behind}"
+                line_end = "\r" if line.endswith("\r") else ""
+                lines[entry.line - 1] = f"N{number}P{value}{line_end}"
         if new:
             raise settings.sample.file.fail(
                 f"has no #{next(iter(new))}, which the tables need; set last_number or first_set in the machine file"
@@ -927,8 +927,8 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
                     f"{constant:g} um in all values of {table.name}, which shifts the zero "
                     "of the axis as before"
                 )
-            own = self.settings.set_in_file((table.output, table.base))
-            old = None if own is None else sample.entries.get(own.reference)
+            in_file = self.settings.set_in_file((table.output, table.base))
+            old = None if in_file is None else sample.entries.get(in_file.reference)
             if table.absolute and not table.at_reference and old is not None and not _same(old.value or "0", "0"):
                 found.append(
                     f"The value at the reference number #{old.number} was {old.value} and is now 0: "
@@ -1043,10 +1043,10 @@ class Mitsubishi(Controller[MitsubishiSettings, MitsubishiTables]):
 
     def _check_free(self, pair: tuple[int, int], first: int, last: int) -> None:
         """Reject numbers used by a set of another table in the control's file."""
-        own = self.settings.set_in_file(pair)
+        in_file = self.settings.set_in_file(pair)
         for item in self.settings.sample.sets:
             low, high = item.span
-            if item is not own and first <= high and last >= low:
+            if item is not in_file and first <= high and last >= low:
                 raise item.entry.fail(
                     f"set {item.index + 1} ({item.output} over {item.base}) uses the numbers {low} to {high}; {first} to {last} "
                     f"of {one_dimensional_name(*pair)} would overwrite them. Set interval_mm to get new numbers"

@@ -44,7 +44,7 @@ class FieldGrid:
     correction_um: FloatArray
 
     def at(self, position_mm: FloatArray) -> FloatArray:
-        """Trilinear correction at positions (n, 3), boundary values held outside: shape (n, 3), mm."""
+        """Trilinear correction at positions (n, 3), boundary values outside: shape (n, 3), mm."""
         parts = [ParameterGrid((0, 1, 2), self.nodes_mm, self.correction_um[..., k]).at(position_mm) for k in range(3)]
         return np.column_stack(parts) * MM_PER_UM
 
@@ -376,9 +376,9 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
 
     def _nodes_mm(self, curves: ErrorTable, axis: int) -> FloatArray:
         """Nodes of the curves of an axis, subdivided where an angle acts with its own travel as lever (parabola)."""
-        own = [curve for name, curve in curves.curves.items() if error_named(name).axis == axis]
+        along = [curve for name, curve in curves.curves.items() if error_named(name).axis == axis]
         nodes = np.unique(
-            np.concatenate([np.array(self.machine.axes[axis].range_mm), *(curve.position_mm for curve in own)])
+            np.concatenate([np.array(self.machine.axes[axis].range_mm), *(curve.position_mm for curve in along)])
         )
         if axis not in self.machine.chain.lever_axes(axis):
             return nodes

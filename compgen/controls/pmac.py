@@ -710,9 +710,9 @@ class Pmac(Controller[PmacSettings, PmacTables]):
 
     def _backlash(self, tables: PmacTables, motor: int, counts: Mapping[int, FloatArray], points: Points) -> FloatArray:
         size = np.full(len(points), float(tables.constants.get(motor, 0)))
-        own = [table for table in tables.backlash if table.motor == motor and tables.enabled is not False]
-        for table in own:
-            size += table.at(counts)
+        for table in tables.backlash if tables.enabled is not False else ():
+            if table.motor == motor:
+                size += table.at(counts)
         if not np.any(size):
             return size
         axis = self.settings.motors.index(motor)
@@ -908,7 +908,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
 
     def _overwrites(self, tables: PmacTables) -> list[str]:
         """Say which tables and variables the file overwrites, starting with motors without an axis."""
-        own = sorted(table.motor for table in tables.tables if table.motor in self.settings.motors)
+        of_axes = sorted(table.motor for table in tables.tables if table.motor in self.settings.motors)
         others = sorted(table.motor for table in tables.tables if table.motor not in self.settings.motors)
         names = {motor: letter for letter, motor in zip(AXES, self.settings.motors, strict=True)}
         first = "Of motors that are not X, Y or Z: nothing."
@@ -917,7 +917,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
                 f"Of motors that are not X, Y or Z: NOT KNOWN. These get a table: {', '.join(map(str, others))}. List "
                 "their tables first: an existing one is lost."
             )
-        found = [first, f"The tables of motors {', '.join(f'{motor} ({names[motor]})' for motor in own)}."]
+        found = [first, f"The tables of motors {', '.join(f'{motor} ({names[motor]})' for motor in of_axes)}."]
         variables = [
             "I51 (switches the tables of all motors)",
             *(f"I{motor}86" for motor in sorted(tables.constants)),
@@ -929,16 +929,16 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         owners = [table.motor for table in tables.tables if table.motor not in self.settings.motors]
         if owners:
             found.append(
-                f"the file stores tables for X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which are not axes "
-                "of the machine file: a table that one of these motors already has on the control is lost"
+                f"The file stores tables for X, Y and Z at the motors {', '.join(map(str, sorted(owners)))}, which are not axes "
+                "of the machine file: a table that one of these motors already has on the control is lost."
             )
         if any(isinstance(table, CompTable2D) for table in tables.tables):
             found.append(
-                "two-dimensional tables: the order of the arguments (row motor, column motor, target, row span, column span) "
-                "was inferred from remarks in the manuals; check it with section 3 of the preflight list"
+                "Two-dimensional tables: the order of the arguments (row motor, column motor, target, row span, column span) "
+                "was inferred from remarks in the manuals; check it with section 3 of the preflight list."
             )
         if any(value < 0 for value in tables.constants.values()):
-            found.append("a backlash Ixx86 is negative: the position reached in positive travel is the larger one")
+            found.append("A backlash Ixx86 is negative: the position reached in positive travel is the larger one.")
         return found
 
     def _with_backlash(
@@ -975,8 +975,8 @@ class Pmac(Controller[PmacSettings, PmacTables]):
         half = np.rint(-0.5 * PER_COUNT * scale * varying).astype(np.int64)
         entries: IntArray = np.append(pitch[1:] + half[1:], 0)
         length = ring.step * ring.size
-        own = BacklashTable(settings.motors[axis], length, np.append(size[1:], 0))
-        return replace(table, entries=entries, length=length), own if np.any(size) else None, constant
+        backlash = BacklashTable(settings.motors[axis], length, np.append(size[1:], 0)) if np.any(size) else None
+        return replace(table, entries=entries, length=length), backlash, constant
 
 
 def _motors(table: CompTable1D | CompTable2D | BacklashTable) -> set[int]:

@@ -59,7 +59,7 @@ class LeadscrewTable:
     interval: float = 0.0
 
     def at(self, along: FloatArray, direction: FloatArray) -> FloatArray:
-        """Value at positions (n,) reached in directions (n,) (+1, -1; 0: unknown, mean), end values held outside."""
+        """Value at positions (n,) reached in directions (n,) (+1, -1; 0: unknown, mean), end values outside."""
         pos = np.interp(along, self.setpoints, self.pos)
         if self.neg is None:
             return pos
@@ -76,7 +76,7 @@ class CrossTable:
     values: FloatArray
 
     def at(self, along: FloatArray) -> FloatArray:
-        """Value at positions (n,), end values held outside."""
+        """Value at positions (n,), end values outside."""
         return np.interp(along, self.setpoints, self.values)
 
 
@@ -99,7 +99,7 @@ class PlaneTable:
         )
 
     def at(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Value at positions (n,) of both masters: bilinear between four corners, boundary values held outside."""
+        """Value at positions (n,) of both masters: bilinear between four corners, boundary values outside."""
         (i, u), (j, v) = (
             _cell(along, start, self.interval, count)
             for along, start, count in zip((first, second), self.starts, self.values.shape[::-1], strict=True)
@@ -332,8 +332,8 @@ def parse_axis_list(
     count = 0
     for line, text in content_lines(source, "#"):
         code, start, rest = text.partition("/*")
-        _, end, behind = rest.partition("*/")
-        if start and (not end or behind.strip()):
+        _, end, after = rest.partition("*/")
+        if start and (not end or after.strip()):
             raise source.fail("a comment /* ... */ must end on its own line, with nothing after it", line)
         if code.strip():
             _take(body, line, code.strip())
@@ -912,14 +912,14 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
                 "added or subtracted. Do section 3 of the preflight list before you use them, and enter the result "
                 "in the machine file."
             )
-        own = [
+        slaves = [
             AXES[axis]
             for axis, item in sorted(tables.lists.items())
             if item.plane is not None and axis in item.plane.masters
         ]
-        if own:
+        if slaves:
             found.append(
-                f"the plane of {', '.join(own)} has its own slave as a master; this is documented for the older CNC builds"
+                f"The plane of {', '.join(slaves)} has its own slave as a master; this is documented for the older CNC builds."
             )
         idle = [
             AXES[axis]
@@ -927,7 +927,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             if not (item.cross or item.plane or (item.screw and (np.any(item.screw.pos) or np.any(item.screw.neg))))
         ]
         if idle:
-            found.append(f"the tables of {', '.join(idle)} are zero everywhere")
+            found.append(f"The tables of {', '.join(idle)} are zero everywhere.")
         return found
 
     def _list_context(self, axis: int, item: AxisList) -> dict[str, Any]:

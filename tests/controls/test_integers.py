@@ -220,7 +220,7 @@ def test_a_curve_steeper_than_the_limit_is_met_as_far_as_it_goes_and_said_so():
     tables = CONTROL(machine, chosen).build(basis, {term.name: term.start for term in basis})
     assert max(map(abs, tables.blocks[0].values)) == 3
     (message,) = CONTROL(machine, chosen).violations(tables)
-    assert message.startswith("X: the requested curve is too steep, the limit is 3 counts per section")
+    assert message.startswith("X: the requested curve is too steep; the limit is 3 counts per section")
     exported = export(machine, errors, CONTROL.name)
     assert any("too steep" in text for text in exported.violations)
 

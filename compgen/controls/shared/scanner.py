@@ -45,13 +45,13 @@ class Findings:
         return found + list(dict.fromkeys(self.notes))
 
 
-def number_pattern(before: int = 40, behind: int = 40, exponent: int = 0) -> re.Pattern[str]:
+def number_pattern(before: int = 40, after: int = 40, exponent: int = 0) -> re.Pattern[str]:
     """Return the pattern of a decimal number with at most so many digits before and after the point.
 
     ``exponent`` is the number of digits an exponent may have; 0: no exponent.
     """
     power = rf"(?:[eE][+-]?[0-9]{{1,{exponent}}})?" if exponent else ""
-    return re.compile(rf"[+-]?(?:[0-9]{{1,{before}}}(?:\.[0-9]{{0,{behind}}})?|\.[0-9]{{1,{behind}}}){power}")
+    return re.compile(rf"[+-]?(?:[0-9]{{1,{before}}}(?:\.[0-9]{{0,{after}}})?|\.[0-9]{{1,{after}}}){power}")
 
 
 FLOATING, FIXED_POINT = number_pattern(exponent=3), number_pattern(15, 15)
