@@ -22,6 +22,7 @@ def pytest_configure(config):
     """Put temporary folders into memory: a store or a published table waits for the disk with every file it writes."""
     if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ENOUGH_BYTES:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+    os.environ["COMPGEN_CONFIG"] = ""  # the tests do not depend on the user's own defaults
 
 
 #: Ranges, node counts and reference point differ between the axes; the reference lies inside the travel.

@@ -12,10 +12,11 @@ import sys
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import click
 
-from compgen.cli.common import load_for, plugin_option, run_command
+from compgen.cli.common import load_for, output_options, plugin_option, run_command
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
 _COMMANDS = {
@@ -82,7 +83,7 @@ class Unloaded(click.Command):
         module = import_module(f"compgen.cli.{self.module}")
         command = getattr(module, f"{str(self.name).replace('-', '_')}_command")
         assert isinstance(command, click.Command)
-        return plugin_option(command)  # type: ignore[no-any-return]
+        return output_options(plugin_option(command))  # type: ignore[no-any-return]
 
 
 class CommandTable(click.Group):
@@ -128,6 +129,30 @@ def _may_have_plugins() -> bool:
     return False
 
 
+def _configured() -> dict[str, Any]:
+    """Return the defaults of options that the configuration file states; paths are relative to it.
+
+    It is ``config.toml`` in the user's folder for settings, or the file that ``COMPGEN_CONFIG`` names (empty: none). It may only
+    state where files are: nothing in it changes a number.
+    """
+    named = os.environ.get("COMPGEN_CONFIG")
+    path = Path(click.get_app_dir("compgen")) / "config.toml" if named is None else Path(named)
+    if named == "" or (named is None and not path.is_file()):
+        return {}
+    from compgen.data import toml_files
+
+    root = toml_files.read_toml(path)
+    machines = root.take("machines", toml_files.texts_of_paths, ())
+    certificate = root.take("certificate", toml_files.text_of_path, "")
+    root.finish()
+    found: dict[str, Any] = {}
+    if machines:
+        found["machines"] = [str(path.parent / Path(folder).expanduser()) for folder in machines]
+    if certificate:
+        found["certificate"] = str(path.parent / Path(certificate).expanduser())
+    return found
+
+
 @click.group(
     cls=CommandTable,
     commands=[Unloaded(name, module, line) for module, lines in _COMMANDS.items() for name, line in lines.items()],
@@ -142,6 +167,7 @@ def _may_have_plugins() -> bool:
     help="Show the version and exit.",
 )
 @plugin_option
+@output_options
 @click.pass_context
 def cli(context: click.Context) -> None:
     """From a machine-tool measurement to checked compensation tables.
@@ -155,6 +181,10 @@ def cli(context: click.Context) -> None:
     """
     if _may_have_plugins():
         load_for(context, installed=True)
+    configured = _configured()
+    if configured:
+        # `report` takes a certificate by --dcc, for another purpose
+        context.default_map = {name: configured for lines in _COMMANDS.values() for name in lines if name != "report"}
 
 
 def main() -> None:

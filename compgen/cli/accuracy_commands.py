@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 from rich.console import Console, RenderableType
 
 from compgen.accuracy.circularity import accuracy_of_circles
@@ -165,7 +166,7 @@ def accuracy_command(
     rows = rows_with_tolerance(found, dict(tolerances))
     if side.readings is not None or side.circles is not None:
         files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory)
-    elif laboratory is not None:
+    elif click.get_current_context().get_parameter_source("certificate") is ParameterSource.COMMANDLINE:
         raise InputError("is for the sheet of axis runs or circles; this file has none", field="--certificate")
     if tolerances:
         data["tolerances"] = {

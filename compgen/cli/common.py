@@ -99,11 +99,11 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         except MemoryError:
             return _fail("not enough memory for this input", 3, words)
         except Exception as error:  # last resort: exit code 3 of the contract
-            if os.environ.get("COMPGEN_TRACEBACK"):
+            if os.environ.get("COMPGEN_TRACEBACK") or {"-v", "--verbose"} & set(words):
                 traceback.print_exc()
             place = traceback.extract_tb(error.__traceback__)[-1]
             text = f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
-            return _fail(f"{text}; COMPGEN_TRACEBACK=1 shows more", 3, words)
+            return _fail(f"{text}; -v shows more", 3, words)
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:
@@ -142,6 +142,32 @@ plugin_option: Callable[[Any], Any] = click.option(
     help="Plug-in to load: a .py file or a package folder with controls, effects, instruments "
     "(may be given several times).",
 )
+
+
+#: Key in the context of a command that is to say what it does.
+VERBOSE = "compgen.verbose"
+
+
+def _quiet(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    if value and not context.resilient_parsing:
+        from compgen.cli.terminal import stdout
+
+        stdout.quiet = True
+        context.find_root().call_on_close(functools.partial(setattr, stdout, "quiet", False))
+
+
+def _verbose(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    if value:
+        context.meta[VERBOSE] = True
+
+
+def output_options(command: Any) -> Any:
+    """Add -q and -v, before the command or among its options; they are in force before anything else is read."""
+    how: dict[str, Any] = {"is_flag": True, "expose_value": False, "is_eager": True}
+    text = "Print no result, only warnings and errors; files and the exit code are the same."
+    command = click.option("-q", "--quiet", callback=_quiet, help=text, **how)(command)
+    text = "Print each step with the time since the start to stderr, and where an internal error occurred."
+    return click.option("-v", "--verbose", callback=_verbose, help=text, **how)(command)
 
 
 def fleet_options(command: Command) -> Command:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import click
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from compgen.cli.common import print_json
+from compgen.cli.common import VERBOSE, print_json
 from compgen.data.messages import visible
 
 #: Tables in a pipe or a file get the width they need, not the width of an unknown terminal.
@@ -69,7 +71,13 @@ def table_of(headings: Sequence[str], rows: Iterable[Sequence[str]], **options: 
 
 @contextmanager
 def progress(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Show the current step on a terminal; nothing in a pipe."""
+    """Show the current step on a terminal, with -v every step as a line with the time; otherwise nothing in a pipe."""
+    context = click.get_current_context(silent=True)
+    if context is not None and context.meta.get(VERBOSE):
+        start = time.monotonic()
+        yield lambda text: complain(f"{time.monotonic() - start:7.2f} s  {text}", None)
+        complain(f"{time.monotonic() - start:7.2f} s  done", None)
+        return
     if quiet or not stderr.is_terminal:
         yield lambda _: None
         return
