@@ -201,6 +201,20 @@ def test_a_varying_reversal_becomes_ixx86_and_a_backlash_table():
         assert up - down == pytest.approx(-curve.at(np.array([x]))[0], abs=2 / 16000)
 
 
+@pytest.mark.parametrize("parts", [1, 5, 64])
+def test_the_spacing_of_the_pitch_is_divided_as_finely_as_the_reversal_bends(parts):
+    """Pitch bends every 100 mm, 128 000 counts, and the reversal ``parts`` times as often; 64 is the finest division."""
+    machine = machine_with(tool=(0.0, 0.0, 0.0), counts_per_mm={**COUNTS, "X": 1280.0})
+    bent = np.array([0, 1, 0, 0, 1, 0, -1, 1, 0.0])
+    pitch = compgen.Curve(np.linspace(*TRAVELS[0], 9), 0.05 * bent, np.full(9, np.nan))
+    count = 8 * parts + 1
+    zigzag = -0.006 + 0.002 * (np.arange(count) % 2)
+    reversal = ReversalCurves({(0, 0): compgen.Curve(np.linspace(*TRAVELS[0], count), zigzag, np.full(count, np.nan))})
+    _, tables = made(machine, compgen.ErrorTable({"EXX": pitch}), reversal)
+    (table,) = tables.backlash
+    assert table.length / len(table.entries) == 128_000 / parts
+
+
 def test_backlash_tables_are_defined_from_the_highest_motor_down():
     """Software Reference, DEFINE BLCOMP: in another order the control gives ERR003."""
     ends = [np.array(travel) for travel in TRAVELS]
