@@ -374,6 +374,16 @@ def test_broken_rules_are_violations(text, words):
     assert any(words in message for message in found), found
 
 
+def test_the_entries_of_a_table_are_the_numbers_in_the_file():
+    """Software Reference, DEFINE COMP: (rows + 1) (columns + 1) - 1 numbers, without the one at the zero of both motors."""
+    tables = parsed("#4\nDEFINE COMP 2.3,#1D,#2D,#3,3000,4000\n16 32 0\n160 176 192 160\n0 16 32 0\nI51=1\n")
+    for most, named in ((11, False), (10, True)):
+        control = CONTROL(machine_with(max_entries=most))
+        assert [usage.used for usage in control.usage(tables) if usage.unit == "entries"] == [11]
+        said = f"the table of motor 4 has 11 entries; max_entries is {most}"
+        assert (said in control.violations(tables)) == named
+
+
 def test_the_preflight_gives_the_scale_of_an_inch_machine(make_errors):
     machine = machine_with(counts_per_mm={"X": 1000.0, "Y": 2000.0, "Z": -500.0})
     text = compgen.export(machine, make_errors(machine), NAME).preflight

@@ -394,8 +394,27 @@ def test_a_pmac_backup_is_read_and_other_motors_are_kept_apart(tmp_path):
     np.testing.assert_allclose(moved, [-125.0, -62.5, -62.5], atol=1e-9)
     said = " ".join(tables.remarks)
     assert "motor 4 (uses #20)" in said and "(8 lines)" in said and "no file sets I51" in said
+    assert "motor 1 (uses" not in said
     off = read(tmp_path, PMAC_FILE + "I51=0\n", "pmac", PMAC, "comp.pmc")
     assert not np.any(added(machine_with(tmp_path, PMAC), off, [[125, 0, 0]]))
+
+
+def test_the_backlash_of_a_pmac_backup_is_that_of_the_axes(tmp_path):
+    """Entries of the motor's own table: 160 / 16 = 10 counts at 125 mm, which are 1.25 um after negative travel."""
+    blcomp = "#4 DEFINE BLCOMP 8,8000000\n1600 0 0 0 0 0 0 0\n#1 DEFINE BLCOMP 8,8000000\n160 0 0 0 0 0 0 0\n"
+    tables = read(tmp_path, PMAC_FILE + blcomp + "I51=1\n", "pmac", PMAC, "comp.pmc")
+    at = np.array([[125.0, 0.0, 0.0]])
+    up, down = (
+        tables.correction(machine_with(tmp_path, PMAC), Points(at, approach=np.full((1, 3), sign)))[0, 0]
+        for sign in (1.0, -1.0)
+    )
+    assert up - down == pytest.approx(1.25e-3, abs=1e-12)
+    assert "motor 4 (uses #4)" in " ".join(tables.remarks)
+
+
+def test_a_pmac_backup_without_tables_of_the_axes_is_refused_with_those_that_it_has(tmp_path):
+    with pytest.raises(InputError, match=r"no table for the motors #1, #2, #3; .*: motor 4 \(uses #20\)$"):
+        read(tmp_path, PMAC_FILE.partition("#1 DEFINE")[0] + "I51=1\n", "pmac", PMAC, "comp.pmc")
 
 
 @pytest.mark.parametrize(
