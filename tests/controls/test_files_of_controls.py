@@ -414,7 +414,7 @@ def test_the_backlash_of_a_pmac_backup_is_that_of_the_axes(tmp_path):
 
 def test_a_pmac_backup_without_tables_of_the_axes_is_refused_with_those_that_it_has(tmp_path):
     with pytest.raises(InputError, match=r"no table for the motors #1, #2, #3; .*: motor 4 \(uses #20\)$"):
-        read(tmp_path, PMAC_FILE.partition("#1 DEFINE")[0] + "I51=1\n", "pmac", PMAC, "comp.pmc")
+        read(tmp_path, PMAC_FILE.partition("#1 DEFINE")[0], "pmac", PMAC, "comp.pmc")
 
 
 @pytest.mark.parametrize(
