@@ -292,13 +292,6 @@ class AxisTable:
     index: NodeIndex
     values: FloatArray
 
-    def at(self, position_mm: FloatArray) -> FloatArray:
-        """Values at positions (m,): shape (m, groups, 3)."""
-        cell, share = self.index.locate(position_mm)
-        left = self.values[:-1].take(cell, axis=0, mode="clip")
-        step = np.diff(self.values, axis=0).take(cell, axis=0, mode="clip")
-        return left + share[:, None, None] * step
-
     @cached_property
     def groups(self) -> tuple[int, ...]:
         """Groups that are not zero everywhere."""
