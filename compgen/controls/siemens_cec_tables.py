@@ -561,9 +561,10 @@ class _Gains:
             axis, part = int(term.axis or 0), term.carrier[0]
             values = part.sign * hat_matrix(term.nodes_mm, levels_mm[axis])
             parts.append(_times_lever(levels_mm, axis, values, part.lever, part.origin_mm))
+        # the errors instead of their corrections: only squares count
         for axis, table in enumerate(grid_tables(machine, errors, tool_of(machine, None), levels_mm)):
             for group, lever in enumerate((None, 0, 1, 2)):
-                parts.append(_times_lever(levels_mm, axis, -table[:, group, output, None], lever))
+                parts.append(_times_lever(levels_mm, axis, table[:, group, output, None], lever))
         gram = np.ones(())
         for axis, (_, weight) in enumerate(sides):
             along = np.hstack([part[axis] for part in parts])

@@ -429,9 +429,37 @@ def test_what_is_left_of_jagged_curves_is_their_standard_deviation_over_the_trav
 
     leaning = ErrorTable({"EXX": x, "EXY": y, "EXZ": z, "EBX": angle})
     terms = controller_named("siemens-cec")(machine).basis(leaning)
-    choice = chosen_terms(machine, leaning, terms, "S2", 3)
     left_mm = np.sqrt((square_rad - mean_rad**2) * axes[2].length_mm ** 2 / 12)
-    assert choice.dropped == (("X(x)*z", pytest.approx(left_mm, rel=1e-9)),)
+    encoder = [term for term in terms if term.name == "X(x)"]
+    for own, given, allowed in ((terms, [], 3), ([term for term in terms if term not in encoder], encoder, 2)):
+        choice = chosen_terms(machine, leaning, own, "S2", allowed, given)
+        assert choice.dropped == (("X(x)*z", pytest.approx(left_mm, rel=1e-9)),)
+        assert choice.left_mm == pytest.approx(left_mm, rel=1e-9)
+
+
+def test_what_tables_with_other_nodes_than_the_errors_would_remove_is_what_they_can_follow():
+    """Errors with 31 nodes, tables with 41: least squares along the axis, at eight points between all of them."""
+    ranges_mm = ((-350.0, 450.0), (-200.0, 300.0), (-400.0, 50.0))
+    axes = tuple(Axis(range_mm, np.linspace(*range_mm, 41)) for range_mm in ranges_mm)
+    steps_mm = {letter: axis.length_mm / 40 for letter, axis in zip("XYZ", axes, strict=True)}
+    settings = {"sign": "error", "mult_mode": "S2", "step_mm": steps_mm}
+    machine = replace(machine_with("WFYXZT", {"siemens-cec": settings}), axes=axes, tool_offset_mm=(0.0, 0.0, 0.0))
+    rng = np.random.default_rng(5)
+    x, y = (
+        Curve(np.linspace(*ranges_mm[axis], 31), size * rng.normal(size=31), np.full(31, np.nan))
+        for axis, size in ((0, 0.02), (1, 0.004))
+    )
+    errors = ErrorTable({"EXX": x, "EXY": y})
+    choice = chosen_terms(machine, errors, controller_named("siemens-cec")(machine).basis(errors), "S2", 1)
+    ends = np.unique(np.concatenate([y.position_mm, axes[1].nodes_mm]))
+    points, weight = np.polynomial.legendre.leggauss(8)
+    along = (0.5 * (ends[1:] + ends[:-1])[:, None] + 0.5 * np.diff(ends)[:, None] * points).ravel()
+    weight = (np.diff(ends)[:, None] * weight).ravel() / np.sum(np.diff(ends)) / 2
+    hats = np.stack([np.interp(along, axes[1].nodes_mm, row) for row in np.eye(41)], axis=1)
+    wanted, root = np.interp(along, y.position_mm, y.value), np.sqrt(weight)
+    follows = hats @ np.linalg.lstsq(root[:, None] * hats, root * wanted, rcond=None)[0]
+    left_mm = np.sqrt(weight @ follows**2 - (weight @ wanted) ** 2)
+    assert choice.dropped == (("X(y)", pytest.approx(left_mm, rel=1e-9)),)
     assert choice.left_mm == pytest.approx(left_mm, rel=1e-9)
 
 
