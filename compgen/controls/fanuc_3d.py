@@ -283,7 +283,13 @@ def _row(file: SourceFile, text: str, line: int) -> Row:
 # Template content for three-dimensional compensation: vertices, plan, what to set, worked example.
 
 
-MEANINGS = ("axis", "vertices along", "number of the reference vertex of", "magnification of", "interval of, mm,")
+MEANINGS = (
+    "axis {}",
+    "vertices along {}",
+    "number of the reference vertex of {}",
+    "magnification of {}",
+    "interval along {}, mm",
+)
 
 
 def _place(table: VolumeTable, index: tuple[int, int, int]) -> str:
@@ -372,7 +378,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
                 {
                     "name": str(number),
                     "value": text,
-                    "meaning": f"{MEANINGS[k // 3]} {AXES[k % 3]} (number unverified)",
+                    "meaning": f"{MEANINGS[k // 3].format(AXES[k % 3])} (number unverified)",
                 }
                 for k, (number, text) in enumerate(parameters.items())
             ],

@@ -488,11 +488,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             for low, high in axis.spans
         ]
         if sample.shows_points:
-            told = (
-                f"The sample has {'; '.join(others)}; they stay."
-                if others
-                else "No other axis of the sample has points."
-            )
+            told = f"Kept: {'; '.join(others)}." if others else "No other axis of the sample has points."
             found = [f"Of other axes: nothing. {told}"]
         else:
             given = (

@@ -88,7 +88,7 @@ def read_records(file: SourceFile) -> Iterator[Record]:
                 if blocks > MOST_BLOCKS:
                     raise file.fail(f"has more than {MOST_BLOCKS} blocks; a parameter file has fewer", number)
                 if not inside:
-                    raise file.fail(f"{one_line(block[:20])!r} is outside the pair of '%'", number)
+                    raise file.fail(f"{one_line(block[:20])!r} is not between two '%'", number)
                 if len(block) > MOST_IN_BLOCK:
                     raise file.fail(
                         f"this block has {len(block)} characters; at most {MOST_IN_BLOCK} are allowed", number
@@ -532,7 +532,7 @@ class PunchedRecords:
     def unit_remark(self, detection_unit_um: float) -> str:
         """Say which unit the machine is assumed to have."""
         known = UNIT_PARAMETER in self.common
-        unit = "metric by 1001#0 (INM)" if known else "assumed to be metric (1001#0, INM, is not in the file)"
+        unit = "metric (1001#0, INM)" if known else "assumed to be metric (1001#0, INM, is not in the file)"
         return (
             f"unit: the machine is {unit}; parameter 3624 is in mm; the detection unit of the machine file is "
             f"{detection_unit_um:g} um"
@@ -765,7 +765,7 @@ def _parameter_style(style: FanucStyle, records: Sequence[Record]) -> FanucStyle
 
 def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]) -> tuple[str, ...]:
     """State what the sample showed, and what it did not show."""
-    type_words = ("Q1 and Q0" + (" behind the other words" if style.q_last else "")) if style.q_word else "none"
+    type_words = ("Q1 and Q0" + (" after the other words" if style.q_last else "")) if style.q_word else "none"
     found = [
         f"line end {LINE_ENDS[style.eol]}" + (f", {style.block_end} before it" if style.block_end else ""),
         f"type words: {type_words}",

@@ -624,7 +624,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             if k not in self._free_entries()[0] and COMPENSATED + k in sample.common
         ]
         if any(MOVING + k in sample.common for k in ENTRIES):
-            found = [f"Of other axes: nothing{'; ' + ', '.join(kept) + ' stays' if kept else ''}."]
+            found = [f"Of other axes: nothing.{' Kept: ' + ', '.join(kept) + '.' if kept else ''}"]
         else:
             given = "the sample has no parameters 5711 to 5713" if sample.notes else "no file of this control was given"
             found = [f"Of other axes: NOT KNOWN, {given} (`--style-from`): check 5711 to 5723."]

@@ -157,7 +157,7 @@ class HeidenhainSettings:
         word_for({"keep": True, "file": False}),
         key="begin_name",
         stated="keep",
-        meaning='name in the first line of the saved table: "keep" it, or write that of the "file"',
+        meaning='name in the first line: "keep" that of the saved table, or write that of the "file"',
     )
 
     @property

@@ -381,8 +381,8 @@ def foreign_cec_tables(
             findings.apart.append(f"table {index} ({axes[0]} into {axes[1]}, up to {part.largest})")
     if missing := sorted(apart - set(settings.kept_tables)):
         findings.notes.append(
-            "new tables must not overwrite them: export with --active, or set kept_tables = "
-            f"{missing} in the machine file"
+            f"new tables must not overwrite those of other axes: export with --active, or set kept_tables = {missing} "
+            "in the machine file"
         )
     # products that cannot be evaluated: an axis is missing, or no mode is stated
     for index, part in parts.items():

@@ -633,6 +633,6 @@ def cec_reservations(tables: CecMap, settings: CecSettings) -> list[str]:
         found.append(
             f"{needed} tables with up to {nodes} nodes are needed, but the machine file does not say how many the control "
             f"has: an 840D sl has two for each of its axes ({sure} with {FEWEST_AXES} axes), an 828D has {small.cec_tables} "
-            f"of {small.cec_nodes} nodes. Tables that do not fit have no effect. Set nc_axes or tables_available"
+            f"with {small.cec_nodes} nodes. Tables that do not fit have no effect. Set nc_axes or tables_available"
         )
     return found

@@ -256,7 +256,7 @@ def test_parameters_of_a_path_have_the_word_L_of_the_sample_and_entries_of_other
     assert not re.search(r"(?m)^N0(5712|5722|574\d|577\d)", text)
     assert not re.search(r"L[23]", text)
     assert len(parse(machine, text).entries) == 2
-    assert "Of other axes: nothing; entry 2 (A4 moves, 5722 = 2) stays" in made.preflight
+    assert "Of other axes: nothing. Kept: entry 2 (A4 moves, 5722 = 2)." in made.preflight
     other = parse(machine.with_setting("fanuc-straightness", "path", 2), text.replace("L1P", "L1P9L2P"))
     assert other == parse(machine, text)
 

@@ -189,7 +189,7 @@ def test_points_and_magnification_of_the_sample_are_kept(controls_files, make_er
     ]
     written = [int(row[3:6]) for row in made.files["PITCH.TXT"].split("\n")[1:-2]]
     assert written == [*range(32, 50), *range(131, 146), *range(231, 246)]
-    assert "Of other axes: nothing. The sample has A4: points 300 to 312; they stay." in made.preflight
+    assert "Of other axes: nothing. Kept: A4: points 300 to 312." in made.preflight
     assert "3605" in made.preflight and "X 00000010, Y 00000010, Z 00000010" in made.preflight
 
 
@@ -207,7 +207,7 @@ def test_both_files_are_read_back_as_they_act(controls_files, make_errors, tmp_p
     backup = read_tables(machine, controls_files, "fanuc-pitch")
     assert backup.tables.others == ((4, 301, 312),)
     assert any("axis A4 (not X, Y or Z of the machine file)" in text for text in backup.remarks)
-    assert backup.remarks[0].startswith("unit: the machine is metric by 1001#0")
+    assert backup.remarks[0].startswith("unit: the machine is metric (1001#0, INM)")
     assert backup.remarks[-1] == "skipped: 1 record that cannot change a pitch table"
 
 
@@ -270,10 +270,7 @@ def test_an_axis_whose_points_are_not_known_is_refused(controls_files, make_erro
 def test_points_of_an_axis_without_an_interval_are_kept(controls_files, make_errors):
     Path(controls_files[0]).write_text(re.sub(r"(N03624.*)A4P[\d.]+", r"\1", PARAMETERS))
     machine = controls_machine(controls_files)
-    assert (
-        "The sample has A4: points 300 to 312; they stay."
-        in export(machine, make_errors(machine), "fanuc-pitch").preflight
-    )
+    assert "Kept: A4: points 300 to 312." in export(machine, make_errors(machine), "fanuc-pitch").preflight
 
 
 def test_comments_of_the_sample_may_be_in_any_language(controls_files, make_errors):

@@ -632,7 +632,7 @@ def test_an_active_backup_of_a_fanuc_keeps_the_points_of_other_axes(tmp_path):
     code, out = export_with_active(tmp_path, [tmp_path / "PRM.TXT", tmp_path / "PITCH.TXT"], "fanuc-pitch")
     assert code == 0
     told = (out / "preflight.md").read_text()
-    assert "Of other axes: nothing. The sample has A4: points 1 to 30; they stay." in told
+    assert "Of other axes: nothing. Kept: A4: points 1 to 30." in told
     written = {int(n) - 10000 for n in re.findall(r"(?m)^N(1\d{4})Q0", (out / "PITCH.TXT").read_text())}
     assert not written & set(range(1, 31)) and written >= set(range(41, 60))
 
