@@ -467,10 +467,10 @@ def test_positions_count_from_the_reference_point_of_the_machine(tmp_path):
 
 MALFORMED = [
     (lambda t: "", r"contains no '%'", None),
-    (lambda t: t.replace("%", ""), r"N03620A1P40.*outside", 2),
+    (lambda t: t.replace("%", ""), r"N03620A1P40.*is not between two '%'", 2),
     (lambda t: t[: t.rindex("%")], r"last '%' is missing", 24),
     (lambda t: t[: t.index("N10040")], r"last '%' is missing", None),
-    (lambda t: t + "N10050P1\n", r"outside", 25),
+    (lambda t: t + "N10050P1\n", r"N10050P1.*is not between two '%'", 25),
     (lambda t: t.replace("N10041P2\n", ""), r"gives points 33 to 49, but 41 \(1 in all\) are missing", 4),
     (lambda t: t.replace("N03623A1P1\n", ""), r"parameter 3623 is missing for X \(axis A1\)", None),
     (lambda t: t.replace("N10041P2", "N10041P2\nN10041P2"), r"N10041: is given a second time.*:15\)", 16),
