@@ -446,7 +446,9 @@ def _screw(body: _Body, axis: int) -> LeadscrewTable:
         raise body.fail(name, "interval", f"{interval:g} is negative")
     if interval:
         setpoints = np.asarray(body.number(name, "kw_startpos") + interval * np.arange(count), dtype=np.float64)
-        _refuse(body, name, "setpoint", "an equidistant table (interval above 0) has no setpoints")
+        for index, entry in body.tables.get((name, "setpoint"), {}).items():
+            message = "an equidistant table (interval above 0) has no setpoints"
+            raise body.source.fail(f"{_label(name, 'setpoint', index)}: {message}", entry.line)
     else:
         setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
     pos = body.column(name, "pos", (count,))
@@ -455,11 +457,6 @@ def _screw(body: _Body, axis: int) -> LeadscrewTable:
         neg = body.column(name, "neg", (count,))
     other = _values(body, name, axis, neg) if two_sided else None
     return LeadscrewTable(setpoints, _values(body, name, axis, pos), other, interval)
-
-
-def _refuse(body: _Body, structure: str, name: str, message: str) -> None:
-    for index, entry in body.tables.get((structure, name), {}).items():
-        raise body.source.fail(f"{_label(structure, name, index)}: {message}", entry.line)
 
 
 def _cross(body: _Body, axis: int) -> CrossTable:
