@@ -327,7 +327,7 @@ def reversal_beside(path: Path) -> KnownReversal:
         )
     where = " and ".join([*([named.name] if named else []), *(["identify.json"] if curves else [])])
     curves |= {} if named is None else read_reversal(named).curves
-    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a missing direction counts as zero")
+    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a missing direction is taken as zero")
 
 
 def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:

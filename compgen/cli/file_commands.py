@@ -129,7 +129,7 @@ def schema_command(kind: str) -> int:
 
 @click.command("check")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--kind", type=click.Choice(list(KINDS)), help="What the files are; by default their keys say it.")
+@click.option("--kind", type=click.Choice(list(KINDS)), help="Kind of the files; default: recognised by their keys.")
 @json_option
 def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> int:
     """List every problem of machine, job, scenario and instrument files at once.
@@ -154,7 +154,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
             listing.append({"file": str(path), "kind": None, "problems": [], "warnings": [], "unsure": False})
             continue
         if known is None and present:
-            none = InputError(f"is none of {', '.join(KINDS)}: no key tells its kind; say it by --kind", file=path)
+            none = InputError(f"is none of {', '.join(KINDS)}: its keys do not show its kind; give --kind", file=path)
             found = toml_files.FileProblems((none,))
         else:  # if the kind is unknown, the file is not TOML, which any reader reports
             found = toml_files.problems_of(path, KINDS[known or "machine"].read, _APART)
@@ -190,7 +190,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         say(f"{item['file']}: {of_kind}, {what}", style="red" if wrong else None)
         say(*(f"  {problem['text']}" for problem in item["problems"]))
         if item["unsure"]:
-            say("  what depends on these keys is looked over once they are right")
+            say("  settings that depend on these keys are checked once these are correct")
         say(*(f"  {'question' if '?' in text else 'warning'}: {text}" for text in item["warnings"]), style="yellow")
     return 2 if count else 0
 
@@ -295,7 +295,7 @@ def init_command(
     summary = {"file": str(target), "name": name, "chain": understood.name, "meaning": meaning, "questions": questions}
     for question in questions:
         complain(f"question: {question}")
-    answer(as_json, summary, f"{target}: {understood.name}: {meaning}", f"volcomp check {target} looks it over")
+    answer(as_json, summary, f"{target}: {understood.name}: {meaning}", f"volcomp check {target} checks it")
     return 0
 
 
@@ -313,7 +313,7 @@ def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
     fits = chains_of(words)
     if not fits:
         raise InputError(
-            f"{words!r}: no machine is built like this; say for each axis what moves in it", field="--chain"
+            f"{words!r}: no machine can be built like this; state for each axis what moves in it", field="--chain"
         )
     listed = [f"{item.name}: {in_words(item)}" for item in fits]
     if len(fits) > 1 and asks:
@@ -327,7 +327,7 @@ def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
             f"{words!r} can mean {len(fits)} machines; give one of the codes: {'. '.join(listed)}", field="--chain"
         )
     others = ", or ".join(listed[1:])
-    return fits[0], [f"{words!r} is taken as {listed[0]}. Is it {others}? Then give that code"] if others else []
+    return fits[0], [f"{words!r} is taken as {listed[0]}. Is it {others}? If so, give that code"] if others else []
 
 
 def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:

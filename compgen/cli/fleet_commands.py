@@ -101,7 +101,7 @@ notify_option = click.option(
     "command",
     default=None,
     metavar="COMMAND",
-    help="Command that gets one JSON object on stdin for every decision and failure; default: that of the job file.",
+    help="Command that receives one JSON object on stdin for every decision and failure; default: that of the job file.",
 )
 
 
@@ -171,7 +171,7 @@ def _words(command: str | None) -> tuple[str, ...]:
     default=WATCH_POLL_S,
     show_default=True,
     type=click.FloatRange(0.05, 3600),
-    help="How often to look at the job file, s.",
+    help="Interval between checks of the job file, s.",
 )
 @click.option(
     "--metrics-port", type=click.IntRange(0, 65535), help="Show Prometheus metrics on 127.0.0.1 at this port."
@@ -367,7 +367,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
     what += measured.measured_at.isoformat(timespec="minutes")
     if not (may_ask and sys.stdin.isatty() and sys.stderr.isatty()):
         raise InputError(
-            f"{what}, waits; without a terminal, give the version: volcomp recal approve {name} {table.version}",
+            f"{what}, waits for a decision; without a terminal, give the version: volcomp recal approve {name} {table.version}",
             field="VERSION",
         )
     active = decisions.active_table(store, machine)
@@ -485,8 +485,8 @@ def show_drift(store: Store, job: Job, machine: str | None, report: Path | None,
             level = 1.0 - found.settings.confidence
             named = ", ".join(item.error for item in errors if item.adjusted < level) or "no single error"
             say(
-                f"since the {title}: {change.rms_um:.2f} um rms over the volume ({change.expected_rms_um:.2f} um by "
-                f"uncertainty alone), p = {change.p_value:.2g}; changed: {named}"
+                f"since the {title}: {change.rms_um:.2f} um rms over the volume ({change.expected_rms_um:.2f} um "
+                f"expected from the uncertainty alone), p = {change.p_value:.2g}; changed: {named}"
             )
     for text in found.sentences():
         say(f"  {text}")
@@ -565,7 +565,7 @@ def exclude_command(
 
     who = actor_of(actor)
     exclude(job, machine, version, who, reason, undo=undo)
-    what = "counts again" if undo else "is left out of the drift"
+    what = "is included in the drift again" if undo else "is left out of the drift"
     answer(
         as_json,
         {"accepted": True, "machine": machine, "version": version, "excluded": not undo, "actor": who},

@@ -72,7 +72,7 @@ Progress = Callable[[str], None]
 @click.option("--points", type=PATH, help="*.points.csv (mm); a point listed twice is measured twice.")
 @click.option("--grid", is_flag=True, help="Use all nodes of the machine as points, instead of --points.")
 @options_of(IdentifyOptions, "readings", only=("u_length_um", "u_length_um_per_m"))
-@click.option("--suggest", "search", is_flag=True, help="Search for better places of the stations.")
+@click.option("--suggest", "search", is_flag=True, help="Search for better station positions.")
 @click.option(
     "--box", multiple=True, metavar="LABEL:XMIN,XMAX,YMIN,YMAX,ZMIN,ZMAX", help="Where a station may be placed, mm."
 )

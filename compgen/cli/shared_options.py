@@ -289,7 +289,7 @@ def _active(machine: Machine, paths: tuple[Path, ...], name: str | None, target:
 
 _SAMPLES = {
     "style_from": "A file saved on your control (may be given several times, e.g. parameters and pitch data): the export follows "
-    "its style, and keeps the points and parameters in it, above all those of other axes.",
+    "its style, and keeps the points and parameters in it, in particular those of other axes.",
     "template_from": "An empty table saved on your control; the export fills in its values.",
 }
 

@@ -63,7 +63,7 @@ TOOL_HELP = (
     "Tool offset X,Y,Z in mm in addition to that of the machine file; may be given several times. Default: 0, "
     "-100 and -200 mm along Z."
 )
-ZONE_HELP = "The part of the travel that counts, mm, e.g. X=-400:0,Y=100:300; default: all."
+ZONE_HELP = "Part of the travel to evaluate, mm, e.g. X=-400:0,Y=100:300; default: all."
 OPTIONS_REVERSAL_HELP = "*.reversal.csv (um): the reversal value of each axis along its travel."
 
 

@@ -303,7 +303,9 @@ def _uncertainties(table: CsvTable, column: str) -> FloatArray:
         return np.full(len(table), np.nan)
     values = table.numbers(column, empty=np.nan)
     for row in np.flatnonzero(values < 0)[:1]:
-        raise table.fail(int(row), column, f"{values[row]:g} is negative; a standard uncertainty is not")
+        raise table.fail(
+            int(row), column, f"{values[row]:g} is negative; expected a standard uncertainty of zero or more"
+        )
     return values
 
 

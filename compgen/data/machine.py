@@ -52,7 +52,9 @@ class Emphasis:
     """
 
     zone_mm: tuple[Interval | None, Interval | None, Interval | None] = toml_files.axis_setting(
-        toml_files.interval, key="work_zone_mm", meaning="the part of the travel where tables have to be best, mm"
+        toml_files.interval,
+        key="work_zone_mm",
+        meaning="the part of the travel where the tables must be most accurate, mm",
     )
     zone_weight: float = toml_files.setting(_weight, ZONE_WEIGHT)
     tools_mm: tuple[Vector3, ...] = toml_files.setting(toml_files.vectors3, ())
@@ -281,7 +283,7 @@ class Axis(Displayed):
         toml_files.number, None, meaning="thermal expansion of screw or scale, um/m/K"
     )
     screw_pitch_mm: float | None = toml_files.setting(
-        toml_files.positive, None, meaning="pitch of the screw, mm: where periodic errors are looked for"
+        toml_files.positive, None, meaning="pitch of the screw, mm: used to search for periodic errors"
     )
 
     @property
@@ -348,7 +350,7 @@ class Machine(Displayed):
     source: Path | None = None
     emphasis: Emphasis = Emphasis()
     effects: Mapping[str, toml_files.Section] = toml_files.part_setting(
-        factory=dict, meaning="known effects beside the geometric errors"
+        factory=dict, meaning="known effects in addition to the geometric errors"
     )
     tool_range_mm: ToolRange | None = toml_files.part_setting(
         lambda: toml_files.table_schema(dict.fromkeys(AXES, toml_files.accepted(toml_files.interval))),
@@ -399,7 +401,7 @@ class Machine(Displayed):
             (letter, axis.length_mm) for letter, axis in zip(AXES, self.axes, strict=True) if axis.length_mm < FEW_MM
         ]
         return [
-            f"[axes.{letter}] range_mm: is the travel really {length:g} mm? It is in mm, not in m"
+            f"[axes.{letter}] range_mm: is the travel really {length:g} mm? The unit is mm, not m"
             for letter, length in short
         ]
 

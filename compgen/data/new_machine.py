@@ -167,8 +167,8 @@ def machine_text(
         return f"{text:<41} # {about[key].get('description', '')}"
 
     lines = [
-        f"# {name}: a machine file of volcomp. Lengths are in mm; a unit is part of its key. `volcomp check` looks it over.",
-        "# A line that begins with # and a key shows a default, or what is left to state: take the # away and change it.",
+        f"# {name}: a machine file of volcomp. Lengths are in mm; a unit is part of its key. `volcomp check` checks it.",
+        "# A line that begins with # and a key shows a default, or a value that you must give: remove the # and change it.",
         "",
         line("name", f'"{name}"'),
         line("chain", f'"{chain.name}"'),

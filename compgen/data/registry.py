@@ -78,7 +78,10 @@ class Kind:
             text = "its name must be lower-case letters and digits with single '-' between them, e.g. 'my-csv'"
             problems = [text, *problems]
         elif name in self.registry:
-            problems = [f"the name is taken by {self.origins.get(name, 'a built-in one')}; choose another", *problems]
+            problems = [
+                f"the name is already used by {self.origins.get(name, 'a built-in one')}; choose another",
+                *problems,
+            ]
         if problems:
             code = thing if inspect.isclass(thing) or inspect.isroutine(thing) else type(thing)
             try:  # where the code of the item begins, if known

@@ -231,7 +231,7 @@ def analyse(
     sigma_mm : standard uncertainty of each reading, (n,), if given.
     show : called with a description of each step.
     """
-    show("building the catalogue")
+    show("building the candidate effects")
     repeats = has_repeats(fit.observed.layout)
     wider = wider_of(fit)
     groups, missing, fixed = _groups_of(fit, only)
@@ -257,7 +257,7 @@ def analyse(
         design = design_of(fit, groups, whitener(fit.observed.layout, noise))
         rules = rules_of(design, most_named)
         chosen = search(design, rules)
-    show("weighing the evidence")
+    show("weighing the candidates")
     ratio = run_ratio(fit, [*fixed, *more], noise, RUN_RATIO)
     evidence = evidence_of(design, chosen, noise, ratio, fit.observed.layout)
     return Analysis(fit, noise, design, rules, chosen, evidence, tuple(missing))

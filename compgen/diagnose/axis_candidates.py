@@ -161,11 +161,11 @@ def _generic(session: AxisSession) -> list[Candidate]:
         if columns.shape[1] and columns.shape[1] <= len(session) // 2 and _varies(session, columns, least):
             found.append(Candidate(text, "generic", columns, scans, text, covariates))
 
-    add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
-    add("the readings wander smoothly with time", ("time",), np.column_stack([t, t**2]))
+    add("the readings drift smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
+    add("the readings drift smoothly with time", ("time",), np.column_stack([t, t**2]))
     for waves in WAVES.tolist():
         angle = np.pi * (t + 1) * waves
-        text = f"the readings swing with time, about {waves:.3g} waves in the session"
+        text = f"the readings oscillate with time, about {waves:.3g} periods in the session"
         # a wave about as long as a run looks like a reversal; one of exactly that length is part of the axis curve
         as_run = waves > RUN_LIKE * (int(session.cycle.max()) + 1)
         columns = np.column_stack([np.sin(angle), np.cos(angle)])
@@ -184,10 +184,10 @@ def _generic(session: AxisSession) -> list[Candidate]:
         curve = np.polynomial.legendre.legvander(s, min(CURVE, len(session.targets_mm) - 1))[:, 1:]
         add("every run has a separate curve", ("run", "x"), _products(cycles, np.asarray(curve, dtype=np.float64)))
         if cycles.shape[1] * len(session.targets_mm) <= MOST_OF_RUNS:
-            text = "both ways of a run agree, and differ from the other runs"
+            text = "both directions of a run agree, and differ from the other runs"
             add(text, ("run", "x"), _products(cycles, _indicators(session.target)))
     if legs.shape[1] > cycles.shape[1] and session.in_runs:
-        add("every way of every run has a separate level", ("run", "approach"), legs[:, 1:])
+        add("every direction of every run has a separate level", ("run", "approach"), legs[:, 1:])
     inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
     for k in inside:
         way_text = f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"

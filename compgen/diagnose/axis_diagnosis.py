@@ -207,7 +207,7 @@ def findings_of(
                 f"{session.letter}: {len(session)} readings leave {freedom} degrees of freedom beside the mean of every "
                 f"target; a diagnosis needs at least {LEAST_FREEDOM}: measure more runs"
             )
-        show(f"comparing what may change along {session.letter}")
+        show(f"comparing candidate effects of {session.letter}")
         with one_thread():
             found.append(_findings(session, most, only, add, u_um, against))
     return found
@@ -238,7 +238,7 @@ def _findings(
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
         least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
-        static = [_doubted(i, "small beside what has no name") if i.gain < least else i for i in static]
+        static = [_doubted(i, "small compared with the unexplained part") if i.gain < least else i for i in static]
     effects, unknown = [*effects, *static], [*unknown, *irregular]
     if unknown:
         effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
@@ -275,7 +275,7 @@ def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list
     one_of_each = len(of_runs) == 2 and any(set(OF_RUNS) <= names for names in may_be)
     if len({item.name for item in of_runs}) < len(of_runs) and not one_of_each:
         effects = [_doubted(item, "the runs do not repeat") for item in effects]
-        text = "the runs do not repeat: more than one of them is off, or steps between more than two of them"
+        text = "the runs do not repeat: more than one run deviates, or more than two are separated by steps"
         covariates = ("run", *_one_way(changes.session, effects))
         unknown.append(AxisUnknown(text, covariates, np.nan, of_runs[0].name))
     return sorted(effects, key=lambda item: -item.gain), unknown
@@ -305,13 +305,13 @@ def _common_part(
     u = changes.sigma_mm * float(np.sqrt(min(memory / len(session.targets_mm), 1.0)))
     if not _levels_off(session.run_means_mm(session.deviation_mm, used), drift, u):
         return item
-    stays = "part of the drift is not the same at all positions or in both directions and stays"
+    stays = "part of the drift is not the same at all positions or in both directions and is not removed"
     if NOT_THE_SAME not in item.reasons and item.homogeneity_p >= UNEVEN_P:
-        stays = "what has no name beside it stays"
+        stays = "the unexplained part is not removed"
     moves = "rise" if item.shift_mm[0] < 0 else "fall"
     ways = "both directions" if len(drift) > 1 else "the one direction that was measured"
     text = (
-        f"the means of the runs {moves} and level off in {ways}: what is common to all positions is taken off; {stays}"
+        f"the means of the runs {moves} and level off in {ways}: the part common to all positions is removed; {stays}"
     )
     return replace(item, remains=text)
 
@@ -440,7 +440,7 @@ def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
         if gains[best] > (SCATTER_GROWS if what == "time" else SCATTER_CHANGES):
             factor = float(np.exp(abs(best)))
             if what == "time" and abs(float(np.corrcoef(t, session.s)[0, 1])) > ALIKE:
-                what, covariates = "time or the position, which go together here", ("time", "x")
+                what, covariates = "time or the position, which cannot be separated here", ("time", "x")
             text = f"the scatter of the readings changes with {what}, by a factor of about {factor:.1f}"
             return [AxisUnknown(text, covariates, rms)]
     return []
@@ -478,7 +478,7 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
     unnamed = sum(float(search.criteria([k for k in changes.members if k != g])[0][g]) for g in generic)
     share = LEAST_SHARE_OF_DRIFT if item.name in DRIFTS and "time" in of_generic else LEAST_SHARE
     if unnamed and gains[member] < share * unnamed:
-        reasons.append("small beside what has no name")
+        reasons.append("small compared with the unexplained part")
     own = np.array([float(values.mean())]) if item.free else values
     u = np.sqrt(np.diag(covariance))
     first = float(np.mean(u)) if item.free else float(u[0])
@@ -561,7 +561,7 @@ def _text(
                 f"session (by this fit {cycles:.2g} runs there and back), or a drift"
             )
         return (
-            f"{moved} and level off: {size:+.3g} um in the end, time constant {unit} ({cycles:.2g} runs there and back); "
+            f"{moved} and level off: {size:+.3g} um at the end, time constant {unit} ({cycles:.2g} runs there and back); "
             "machine or sensor"
         )
     if item.name == "linear_drift":
@@ -663,11 +663,11 @@ class _Reversal:
         effects, unknown = [], []
         varies = (varies and (not only or lost in only)) or lost in add
         if varies:
-            why = reasons if law or not irregular else (*reasons, "it follows no smooth law along the axis")
+            why = reasons if law or not irregular else (*reasons, "it does not vary smoothly along the axis")
             effects.append(self._lost_motion(lost, smooth, covariance, left_0, why, exact=not irregular))
         if irregular and (not varies or not law):
             rest = self.half - self._shapes(2) @ smooth
-            text = "the reversal differs from target to target without a smooth law"
+            text = "the reversal varies irregularly from target to target"
             size = float(np.sqrt(np.mean(rest**2)))
             unknown.append(AxisUnknown(text, ("x", "approach"), size, lost if varies else ""))
         if (
@@ -707,7 +707,7 @@ class _Reversal:
         self, name: str, mean: FloatArray, covariance: FloatArray, gain: float, reasons: tuple[str, ...]
     ) -> AxisEffect:
         c, u = float(mean[0]) / MM_PER_UM, float(np.sqrt(covariance[0, 0])) / MM_PER_UM
-        text = f"reversal of {2 * c:+.3g} um (mean of up less down)"
+        text = f"reversal of {2 * c:+.3g} um (mean of up minus down)"
         return self._effect(name, text, {"c_um": (c, u)}, gain, reasons, self.session.direction * mean[0], mean)
 
     def _lost_motion(
@@ -793,9 +793,7 @@ def _taken_off(
         if not kept_effects or (after and not grows):
             break
         item = kept_effects.pop()
-        notes.append(
-            f"{item.name} is named but not taken off: {' and '.join(grows) or 'the figures'} would not improve"
-        )
+        notes.append(f"{item.name} is named but not removed: {' and '.join(grows) or 'the figures'} would not improve")
     figures = {key: {"before": before[key], "after": after.get(key, before[key])} for key in before}
     return removed, left_out, tuple(item.name for item in kept_effects), figures, notes
 
@@ -950,7 +948,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             if any(item.covariates for item in part.unknown):
                 depends = ", ".join(part.unknown[0].covariates)
                 found.append(
-                    f"two more runs with the temperatures logged: show whether what depends on {depends} comes again"
+                    f"two more runs with the temperatures logged: show whether the dependence on {depends} repeats"
                 )
             shown: dict[str, list[str]] = {}
             for name in part.invisible:
@@ -962,22 +960,24 @@ class AxisDiagnosis(DisplayedDiagnosis):
         found = []
         for part in self.axes:
             letter = part.session.letter
-            found.append(f"{letter}: order of time by {ORDER_TEXTS[part.session.order]}")
+            found.append(f"{letter}: time order: {ORDER_TEXTS[part.session.order]}")
             found += [f"{letter}: {text}" for text in part.notes]
             if part.phi > MEMORY and part.noise_source == "repeats":
                 found.append(
-                    f"{letter}: the scatter has a memory (neighbouring readings correlate by {part.phi:.2f}, "
-                    f"{part.sigma_mm / MM_PER_UM:.3g} um): repeats do not agree, and no name explains it; look at clamping, "
-                    "sensor and air before the tables"
+                    f"{letter}: the scatter is autocorrelated (neighbouring readings by {part.phi:.2f}, "
+                    f"{part.sigma_mm / MM_PER_UM:.3g} um): repeats do not agree, and no known effect explains it; check "
+                    "clamping, sensor and air before making tables"
                 )
             if any(item.name in ("warmup_drift", "linear_drift") for item in part.effects):
                 found.append(f"{letter}: {WARM_UP_NOTE}")
             found += [f"{letter}: {item.name} is tentative; {item.remains}" for item in part.effects if item.remains]
             grown = [key for key, pair in part.figures.items() if pair["after"] > pair["before"] * 1.001]
             if grown and part.taken_off:
-                found.append(f"{letter}: {', '.join(grown)} had been hidden a little by what was taken off")
+                found.append(
+                    f"{letter}: {', '.join(grown)} are a little larger without the removed effects, which had hidden part of them"
+                )
             if part.taken_off:
-                found.append(f"{letter}: removed.csv lists what was taken off each reading")
+                found.append(f"{letter}: removed.csv lists what was removed from each reading")
         return found
 
     def extended(self) -> str:

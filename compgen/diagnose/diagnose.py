@@ -65,21 +65,21 @@ class DiagnoseOptions:
     order : time order of axis runs: as logged, otherwise run by run, up then down; or as requested by the user.
     """
 
-    max_effects: int = option(4, "Most named effects at once.", within=(0, 6))
+    max_effects: int = option(4, "Largest number of effects to name.", within=(0, 6))
     effects: tuple[str, ...] = option(
-        (), "Look for these effects only; default: the whole catalogue.", metavar="NAME,..."
+        (), "Look only for these effects; default: the whole catalogue.", metavar="NAME,..."
     )
     add: tuple[str, ...] = option((), "Add this effect whether it was found or not.", metavar="NAME")
     u_um: float | None = option(None, "Standard uncertainty of a reading, um; used if no line was repeated.")
     against: ErrorTable | None = option(
         None,
-        "Errors (*.errors.csv) that the measurement is compared with: which have changed?",
+        "Errors (*.errors.csv) to compare the measurement with, to show which have changed.",
         metavar="ERRORS",
     )
     order: Order = option(
         "auto",
-        "Order of axis runs in time: time_s or the column order, else run by run, up then down (auto); or as named. The "
-        "order of rows counts with 'rows' only.",
+        "Time order of axis runs: by time_s or the column order, else run by run, up then down (auto); or as named. The "
+        "order of the rows is used only with 'rows'.",
     )
     leave_out_disturbed: bool = option(False, "Leave out short bursts of disturbed readings once they are found.")
 
@@ -128,7 +128,7 @@ def diagnose(
         before = fit
         _refuse_too_few(fit)  # before the search, which is slow
         if isinstance(observed, ObservedLengths) and looks_gross(observed, fit.rms_mm):
-            show("residuals are gross: trying other axes, signs and labels")
+            show("residuals are very large: trying other axes, signs and labels")
             corrected = correction_of(machine, observed.lengths, fit.rms_mm)
             if corrected is not None:
                 classed.append(Classed("axis_mapping", {}, 1.0, corrected.text))
@@ -253,14 +253,12 @@ def _completed(
 # identify it; only changes with direction, time or order are visible. Names are tentative: a machine may bend that way.
 
 
-NOTE = (
-    "an optical error that depends only on the distance equals a geometric error: no statistics can distinguish the two"
-)
+NOTE = "an optical error that depends only on the distance equals a geometric error: no statistical test can distinguish the two"
 #: How to separate instrument and machine.
 ADVICE = (
     "turn the target by 180 degrees and measure again: separates crosstalk fixed to the target from straightness",
     "measure with a second target offset: separates crosstalk and detector gains from straightness",
-    "run forth and back three times: separates the drift of the beam from straightness",
+    "measure forth and back three times: separates the drift of the beam from straightness",
 )
 
 
@@ -315,5 +313,5 @@ def diagnose_sixdof(machine: Machine, readings: SixDof, instrument: SixDofInstru
 def sixdof_text(found: SixDofDiagnosis) -> str:
     """Return the report as Markdown text."""
     lines = [f"# Diagnosis of the six-DOF readings of {found.machine.name}", ""]
-    lines += [f"* **{item.name}** ({item.axis}): {item.text}" for item in found.suspicions] or ["* nothing stands out"]
+    lines += [f"* **{item.name}** ({item.axis}): {item.text}" for item in found.suspicions] or ["* nothing significant"]
     return "\n".join([*lines, "", f"Note: {NOTE}.", "", *[f"* {text}" for text in ADVICE]]) + "\n"

@@ -229,7 +229,7 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
     kinds = {path: _kind(path) for path in paths}
     if len(set(kinds.values())) > 1:
         odd = next(path for path, kind in kinds.items() if kind != kinds[paths[0]])
-        message = f"holds {kinds[odd]}, and another file {kinds[paths[0]]}; diagnose them one after the other"
+        message = f"contains {kinds[odd]}, but another file contains {kinds[paths[0]]}; diagnose them separately"
         raise InputError(message, file=odd)
     kind, files = kinds[paths[0]], list(paths)
     if kind == "axis runs":
@@ -246,6 +246,8 @@ def _kind(path: str | Path) -> str:
         raise InputError(message, file=path)
     others = {"part": "features of a part", "artefact": "an artefact", "circle": "circles", "errors": "errors"}
     if kind in others:
-        message = f"contains {others[kind]}, which identify reads; diagnose reads lengths, deviations, axis runs"
+        message = (
+            f"contains {others[kind]}, which only identify can read; diagnose reads lengths, deviations and axis runs"
+        )
         raise InputError(message, file=path)
     return {"axis": "axis runs", "deviations": "deviations"}.get(str(kind), "lengths")

@@ -55,7 +55,7 @@ def axis_pictures(part: AxisFindings) -> list[Picture]:
         plot.dots(session.time[rows], left[rows], role)
     plot.dots(session.time[~kept], scatter[0][0][~kept], "before", size=6.0)
     plot.dots(session.time[~kept], scatter[0][0][~kept], "page", size=3.5)
-    title = "Deviation less the mean of its target and direction, over time"
+    title = "Deviation minus the mean of its target and direction, over time"
     pictures = [Picture(f"time-{letter}", "Scatter", svg(f"time-{letter}", title, [plot]), note="over time")]
     for name, values, role, rows in (("As measured", measured, "before", every), ("Without", without, "after", kept)):
         limits = limits_of(measured, without[kept])
@@ -147,11 +147,13 @@ def suspects_picture(ranked: Sequence[tuple[str, float, float]], chosen: Contain
     names = [(float(count - k), name) for k, (name, _, _) in enumerate(ranked)]
     plot = Plot(
         ends, (0.5, count + 0.5), (150.0, 8.0, 600.0, 8.0 + height),
-        x_label="chi-square that it explains by itself", x_ticks=marks, y_ticks=names,
+        x_label="chi-square explained by this effect alone", x_ticks=marks, y_ticks=names,
     )  # fmt: skip
     for (at, name), length in zip(names, size.tolist(), strict=True):
         plot.bars(ends[0], length, at - 0.4, at + 0.4, "after" if name in chosen else "muted")
-    drawn = svg("suspects", "Suspects by what each explains by itself", [plot], (620.0, height + 36.0))
+    drawn = svg(
+        "suspects", "Candidate effects by the chi-square that each explains alone", [plot], (620.0, height + 36.0)
+    )
     return Picture("suspects", "Suspects", drawn)
 
 
@@ -190,7 +192,7 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
         picture_grid(volume_pictures(found)),
         "<h2>Suspects</h2>",
         picture_grid([suspects_picture(ranked, {item.name for item in found.verdict.named})], "wide") if ranked else "",
-        f"<table><tr><th>suspect</th><th>chi-square by itself</th><th>visible</th></tr>{rows}</table>",
+        f"<table><tr><th>candidate effect</th><th>chi-square alone</th><th>visible</th></tr>{rows}</table>",
     ]
     return _page(title, parts, data)
 
@@ -201,10 +203,10 @@ def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
     parts = [_effects(data), _figures(data), _gap(data)]
     for part in found.axes:
         parts += [
-            f"<h2>Axis {escape(part.session.letter)}</h2><p>Scatter: deviation less the mean of its target and direction, in "
-            'the order of time; <span class="key before"></span> as measured, <span class="key after"></span> without what was '
-            "taken off, open points: left out. Then all runs over the targets, upwards (round points) and downwards (square), "
-            "as measured and without.</p>",
+            f"<h2>Axis {escape(part.session.letter)}</h2><p>Scatter: deviation minus the mean of its target and direction, in "
+            'chronological order; <span class="key before"></span> as measured, <span class="key after"></span> with the named '
+            "effects removed; open points: left out. Then all runs over the targets, up (circles) and down (squares), "
+            "as measured and with the effects removed.</p>",
             picture_grid(axis_pictures(part)),
         ]
     return _page(title, parts, data)
@@ -215,7 +217,7 @@ def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
     parts = [
         f"<h1>{escape(title)}</h1>",
         *parts,
-        _list("What would decide or show more", data["advice"]),
+        _list("What to measure next", data["advice"]),
         _list("What this measurement cannot show", data["invisible"]),
         _list("Notes", [*data["reasons"], *data["notes"]]),
     ]
@@ -260,7 +262,7 @@ def _figures(data: dict[str, Any]) -> str:
     """Figures of ISO 230-2 as measured and after subtraction of the changes."""
     parts = []
     for axis, figures in data["iso_230_2"].items():
-        taken = ", ".join(data["taken_off"][axis]) or "nothing was taken off"
+        taken = ", ".join(data["taken_off"][axis]) or "nothing was removed"
         rows = "".join(
             f"<tr><td>{key}</td><td>{pair['before']:.2f}</td><td>{pair['after']:.2f}</td></tr>"
             for key, pair in figures.items()
@@ -281,7 +283,7 @@ def _gap(data: dict[str, Any]) -> str:
     )
     floor = f"{data['gap']['noise_floor_um']:.3f} um ({data['gap']['noise_floor_source']})"
     return (
-        "<h2>Does the gap shrink?</h2><table><tr><th>residual rms in um</th><th>before</th><th>after</th></tr>"
+        "<h2>Does the misfit shrink?</h2><table><tr><th>residual rms in um</th><th>before</th><th>after</th></tr>"
         f"{rows}</table><p>Noise floor {escape(floor)}.</p>"
     )
 
@@ -315,7 +317,7 @@ def next_steps(files: Container[str], machine: str, measurement: str, out: str) 
     if "extended.toml" not in files:
         return ""
     return (
-        f"{out}/extended.toml is the machine file with these effects; it takes them off the next measurement, for example\n"
+        f"{out}/extended.toml is the machine file with these effects; it removes them from the next measurement, for example\n"
         f"  volcomp run {out}/extended.toml {measurement} --controller NAME --out tables/\n"
         f"instead of\n  volcomp run {machine} {measurement} --controller NAME --out tables/"
     )
@@ -334,7 +336,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
         name = "**unknown**" if markdown else "unknown"
         lines.append(f"* {name}: {item['text']} (depends on {depends}; acts in {item['direction'] or '?'}{size})")
         if item.get("resembles"):
-            lines.append(f"  * resembles {item['resembles']}, without being certain")
+            lines.append(f"  * resembles {item['resembles']}, but this is not certain")
     lines += [f"* possible secondary effect: {item['name']}" for item in data["secondary"]]
     gap = [
         (key.replace("_", " "), pair["before_rms_um"], pair["after_rms_um"])
@@ -357,7 +359,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
     # figures of ISO 230-2 before and after, one row per axis and figure
     for axis, figures in data.get("iso_230_2", {}).items():
         taken = ", ".join(data.get("taken_off", {}).get(axis, ()))
-        lines += ["", f"ISO 230-2, axis {axis}, as measured and without {taken or 'anything (nothing was taken off)'}:"]
+        lines += ["", f"ISO 230-2, axis {axis}, as measured and without {taken or 'anything (nothing was removed)'}:"]
         if markdown:
             lines += ["", "| | as measured, um | without |", "|---|---|---|"]
             lines += [f"| {key} | {pair['before']:.2f} | {pair['after']:.2f} |" for key, pair in figures.items()]
@@ -366,7 +368,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
     lines += ["", f"Noise floor {data['gap']['noise_floor_um']:.3f} um ({data['gap']['noise_floor_source']})."]
     lines += [f"Note: {text}." for text in (*data["reasons"], *data["notes"])]
     if data["advice"]:
-        lines += ["", "What would decide or show more:", *[f"* {text}" for text in data["advice"]]]
+        lines += ["", "What to measure next:", *[f"* {text}" for text in data["advice"]]]
     if data["invisible"]:
         lines += ["", f"This measurement cannot show: {', '.join(data['invisible'])}."]
     text = "\n".join(lines) + "\n"

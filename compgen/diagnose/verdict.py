@@ -225,9 +225,11 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
     share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
     if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
-        reasons.append("small compared with what has no name")
+        reasons.append("small compared with the unexplained part")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
-        reasons.append(f"the plan shows {100 * visible:.1f} % of it only: any misfit could be reshaped into it")
+        reasons.append(
+            f"the measurement shows only {100 * visible:.1f} % of it: almost any misfit could be explained by it"
+        )
     if (effect := design.groups[group].effect) is not None:
         values, covariance, _ = contribution(design, analysis.chosen, group)
         for parameter, value, u in zip(effect.card.parameters, values, np.sqrt(np.diag(covariance)), strict=False):
@@ -338,7 +340,7 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
         found.append("measure every line at least twice, in random order: only repeats separate noise from effects")
     if verdict.unknown and verdict.unknown[0].covariates:
         depends = ", ".join(verdict.unknown[0].covariates)
-        found.append(f"vary {depends} by themselves, each line twice: shows the law of what has no name")
+        found.append(f"vary {depends} separately, each line twice: shows how the unexplained part depends on them")
     shown: dict[str, list[str]] = {}
     for name in verdict.invisible:
         if name in cards and cards[name].breaker:

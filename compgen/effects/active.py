@@ -208,7 +208,7 @@ def section_text(effect: Effect, readings: Readings, values: FloatArray) -> str:
 # What a control can compensate of the effects of a machine file: reversal in tables, the rest as advice.
 
 
-#: Positions of a reversal that varies along the stroke.
+#: Positions of a reversal that varies along the travel.
 POSITIONS = 21
 
 ADVICE = {
@@ -216,9 +216,9 @@ ADVICE = {
     "this axis to this coefficient, fixed point and reference temperature; the tables do not follow the temperature",
     "periodic": "the error repeats with the pitch: use the control's periodic (encoder, torque-ripple) compensation, or "
     "table positions at a fraction of the pitch; tables with wide positions do not change it",
-    "spindle_growth": "the tool grows with the temperature of the spindle: warm the spindle up, or use the control's "
+    "spindle_growth": "the tool grows with the temperature of the spindle: warm up the spindle, or use the control's "
     "spindle growth compensation",
-    "servo_lag": "the axis lags by a time: adapt loop gain or feed-forward; tables cannot correct it",
+    "servo_lag": "the axis lags behind its command: adjust loop gain or feed-forward; tables cannot correct it",
 }
 
 

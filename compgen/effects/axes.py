@@ -36,7 +36,7 @@ class ThermalScale(SingleAxisEffect):
         equation="d_{A} = c ({a} - fixed) (T_{A} - reference)",
         source="ISO 230-3; Mayr et al., CIRP Annals 61/2 (2012) 771",
         covariates=("temp_{a}_c",),
-        parameters=(Parameter("c_um_per_m_k", 1e-6, "expansion that is left of the scale", 30.0),),
+        parameters=(Parameter("c_um_per_m_k", 1e-6, "remaining expansion of the scale", 30.0),),
         aliases=("refractive_index", "spindle_growth_{A}", "E{A}{A} (its constant part)"),
         breaker="measure again at another temperature of the axis, with the temperatures logged",
         settings=(
@@ -77,7 +77,7 @@ class SpindleGrowth(SingleAxisEffect):
         equation="d_{A} = c (T_spindle - reference)",
         source="ISO 230-3 (thermal distortion by the rotating spindle)",
         covariates=("temp_spindle_c",),
-        parameters=(Parameter("c_um_per_k", MM_PER_UM, "growth for each K of the spindle", 30.0),),
+        parameters=(Parameter("c_um_per_k", MM_PER_UM, "growth per kelvin of the spindle", 30.0),),
         aliases=("dead_path", "station_drift", "thermal_scale_{A}"),
         breaker="switch the spindle on and off in cycles while measuring, instead of one warm-up",
         settings=(reference_of("temp_spindle_c"),),
@@ -122,16 +122,16 @@ class LostMotion(SingleAxisEffect):
 
     template = Card(
         name="lost_motion_{A}",
-        title="Lost motion of {A} that varies along the stroke",
+        title="Lost motion of {A} that varies along the travel",
         equation="d_{A} = dir_{A} (c1 P1(s_{A}) + c2 P2(s_{A}))",
         source="ISO 230-2: reversal value at each target position, as a polynomial of the position",
         covariates=("approach_{a}",),
         parameters=(
-            Parameter("c1_um", MM_PER_UM, "half the reversal value that grows along the stroke, at its end", 100.0),
-            Parameter("c2_um", MM_PER_UM, "half the reversal value that bends along the stroke, at its ends", 100.0),
+            Parameter("c1_um", MM_PER_UM, "half the reversal value: linear part, at the end of the travel", 100.0),
+            Parameter("c2_um", MM_PER_UM, "half the reversal value: quadratic part, at the ends of the travel", 100.0),
         ),
         aliases=("backlash_{A}",),
-        breaker="measure the whole stroke in both directions",
+        breaker="measure the full travel in both directions",
     )
 
     def displacement(self, readings: Readings) -> FloatArray | None:
@@ -164,7 +164,7 @@ class Periodic(SingleAxisEffect):
                 ("s1", "sine"),
                 ("c1", "cosine"),
                 ("s2", "sine of twice the angle"),
-                ("c2", "cosine of it"),
+                ("c2", "cosine of twice the angle"),
             )
         ),
         breaker="steps that are not a multiple of the pitch, with a few targets spread over one pitch",
@@ -255,8 +255,8 @@ LONGEST, SHORTEST, SHORTEST_READINGS = 4.0, 0.015, 4.0
 #: Time constants of settling that are tried, s.
 SETTLING_S = (0.3, 0.6, 1.2, 2.5, 5.0, 10.0)
 _WINDOW = (
-    Setting("first", "time (or number in the order of time) of the first reading that is off", needed=True),
-    Setting("last", "time (or number) of the last reading that is off", needed=True),
+    Setting("first", "time (or number in chronological order) of the first disturbed reading", needed=True),
+    Setting("last", "time (or number) of the last disturbed reading", needed=True),
 )
 
 
@@ -285,12 +285,12 @@ class WarmupDrift(Effect):
             equation="d = c (1 - exp(-(t - start) / tau))",
             source="ISO 230-2 (warm-up before the test), ISO 230-3",
             covariates=("time_s or order",),
-            parameters=(Parameter("c_um", MM_PER_UM, "drift in the end", 500.0),),
+            parameters=(Parameter("c_um", MM_PER_UM, "final value of the drift", 500.0),),
             aliases=("warm-up of the sensor", "linear_drift"),
-            breaker="a stationary test: the same target again and again with the axis at rest, and then with the sensor warm",
+            breaker="a stationary test: measure one target repeatedly with the axis at rest, then again with the sensor warm",
             kinds=("axis",),
             settings=(
-                Setting("tau", "time constant in s; in readings where no time was logged", needed=True),
+                Setting("tau", "time constant, s; number of readings if no time was logged", needed=True),
                 Setting("start", "time (or number of the reading) at which the drift begins; default: the first"),
             ),
             scan="tau",
@@ -358,7 +358,7 @@ class StepBetweenRuns(Effect):
         self.card = Card(
             name="step_between_runs",
             title="Step between two runs",
-            equation="d = c H(k - at), k the number of the reading in the order of time",
+            equation="d = c H(k - at), k the number of the reading in chronological order",
             source="change of the zero during a test of ISO 230-2",
             covariates=("run or order",),
             parameters=(Parameter("c_um", MM_PER_UM, "step", 1000.0),),
@@ -395,7 +395,7 @@ class BadRun(_Window):
         self.card = Card(
             name="bad_run",
             title="One run that differs from all others",
-            equation="d = c in one run (or one way of it), 0 in all others",
+            equation="d = c in one run (or one direction of it), 0 in all others",
             source="repeats of ISO 230-2",
             covariates=("run",),
             parameters=(Parameter("c_um", MM_PER_UM, "offset of the run", 1000.0),),
@@ -413,7 +413,7 @@ class DisturbedReadings(_Window):
         self.card = Card(
             name="disturbed_readings",
             title="Readings disturbed for a short time",
-            equation="readings from .. to .. are off against their repeats",
+            equation="readings from .. to .. differ from their repeats",
             source="scatter of repeats over time",
             covariates=("time_s or order",),
             parameters=(Parameter("c_um", MM_PER_UM, "mean offset of these readings", 1000.0),),
@@ -436,7 +436,7 @@ class Settling(DisplacementEffect):
             equation=f"d_{letter} = c dir_{letter} exp(-dwell / tau)",
             source="ISO 230-2 (dwell at each target)",
             covariates=("dwell_s", f"approach_{letter.lower()}"),
-            parameters=(Parameter("c_um", MM_PER_UM, "what is missing at the moment of the stop", 200.0),),
+            parameters=(Parameter("c_um", MM_PER_UM, "distance left when the command stops", 200.0),),
             aliases=(f"backlash_{letter}", f"servo_lag_{letter}"),
             breaker="one more run with twice the dwell, dwell_s logged",
             kinds=("axis",),

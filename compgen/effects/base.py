@@ -52,7 +52,7 @@ class Setting:
 def reference_of(covariate: str) -> Setting:
     """Return the setting for the temperature at which an effect is zero."""
     return Setting(
-        "reference_c", "temperature that counts as zero; default: the mean of the readings", mean_of=covariate
+        "reference_c", "temperature at which the effect is zero; default: mean of the readings", mean_of=covariate
     )
 
 

@@ -137,10 +137,10 @@ def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
             problems.append(f"{type(effect).__name__} has no card")
         else:
             lacking = [key for key in ("name", "title", "equation", "source", "parameters") if not getattr(card, key)]
-            problems += [f"the name {card.name!r} is taken"] if card.name in taken else []
+            problems += [f"the name {card.name!r} is already used"] if card.name in taken else []
             problems += [f"the card of {card.name!r} lacks {', '.join(lacking)}"] if lacking else []
             if card.scan and card.scan not in {setting.name for setting in card.settings}:
-                problems.append(f"the card of {card.name!r} scans {card.scan!r}, which is none of its settings")
+                problems.append(f"the card of {card.name!r} scans {card.scan!r}, which is not one of its settings")
     return family, problems
 
 
@@ -151,19 +151,19 @@ def check_family(name: str, thing: Any) -> tuple[Any, list[str]]:
 WHAT_TO_DO = {
     "thermal_scale": "set the control's temperature compensation of this axis to this coefficient, fixed point and "
     "reference temperature, or let the axis reach its working temperature before the test; the tables do not follow it",
-    "spindle_growth": "warm the spindle up at working speed before measuring, or use the control's compensation of spindle "
+    "spindle_growth": "warm up the spindle at working speed before measuring, or use the control's compensation of spindle "
     "growth with this coefficient",
     "column_bending": "shield the column from draught and sun, or run it warm before measuring; compensate by the "
     "difference of two temperatures of the column if the control can",
     "backlash": "enter the reversal value (twice c) as the control's backlash compensation of this axis, or export tables "
-    "with reversal; look at nut, preload, coupling and thrust bearing if it has grown",
+    "with reversal; check nut, preload, coupling and thrust bearing if it has grown",
     "lost_motion": "a single backlash value cannot correct it: export tables for each direction; look for a worn stretch of the "
     "screw, wind-up of a long screw and sticking guides, and measure again after lubrication",
-    "periodic": "use table positions at a fraction of the pitch, or the control's periodic compensation; look at screw run-out, "
+    "periodic": "use table positions at a fraction of the pitch, or the control's periodic compensation; check screw run-out, "
     "coupling and scale mounting, and measure one pitch in steps of a tenth",
-    "servo_lag": "adapt loop gain (KV) or velocity feed-forward, or dwell before each reading; tables cannot correct it",
-    "lever": "let the model of the machine file contain this angular error, measure with a second tool offset, and export it",
-    "squareness": "let the model of the machine file contain this squareness and export it; check the alignment of the guides "
+    "servo_lag": "adjust loop gain (KV) or velocity feed-forward, or dwell before each reading; tables cannot correct it",
+    "lever": "add this angular error to the model in the machine file, measure with a second tool offset, and export it",
+    "squareness": "add this squareness error to the model in the machine file, and export it; check the alignment of the guides "
     "if it is new",
     "beam_sag": "measure more sections along the beam, and let the tables follow two axes; check the balance of the carriage",
     "ram_droop": "export tables over both axes, and measure with the heaviest tool; check the counterbalance",
@@ -174,7 +174,7 @@ WHAT_TO_DO = {
     "station_drift": "let the tracer warm up, clamp it on the table and not on a tripod, and return to one reference point "
     "every few minutes",
     "length_step": "find the broken beam in the log, and measure these lines again with a reference point before and after",
-    "machine_jump": "look for a bump, a clamp or a table that slipped at this time, and measure what came after it again",
+    "machine_jump": "look for a bump, a clamp or a table that slipped at this time, and repeat the measurements after it",
     "tracer_runout": "have the centring of the tracer's sphere checked, or turn its head by 180 degrees and take the mean",
     "target_angle": "point the reflector at the station, or use one with a wider angle, and measure the far lines again",
     "tool_offset_error": "measure the length and the offset of the target again and enter them; a third offset shows which is "
@@ -182,27 +182,27 @@ WHAT_TO_DO = {
     "sign": "check sign and lever arm of this error in the machine file and in the source of the tables before any export",
     "cosine_error": "align the beam with the axis again",
     "warmup_drift": "repeat the test after a warm-up of three time constants with the axis moving and the sensor switched on; "
-    "whether machine or sensor warms up shows a stationary test (axis at rest, then sensor warm)",
+    "a stationary test (axis at rest, then sensor warm) shows which of the two warms up",
     "linear_drift": "log the temperatures of scale, workpiece and air, and repeat the test in a longer session: a warm-up "
-    "levels off, a drift of sensor or room goes on",
+    "levels off, a drift of sensor or room continues",
     "step_between_runs": "look for what happened between these runs (zero set again, bumped sensor or optics, a slipped "
     "clamp, an axis that was homed), fix the sensor, and repeat the runs on one side of the step",
-    "bad_run": "leave this run out and measure it again; look at what was different (first run after a stop, door open, "
+    "bad_run": "leave this run out and measure it again; check what was different (first run after a stop, door open, "
     "another feed, a beam that was cut)",
     "disturbed_readings": "leave these readings out or measure them again; look for draught, vibration or people at that time",
-    "settling": "raise the dwell at each target to five time constants before reading; if it stays, look at integral gain "
-    "and friction of the axis",
+    "settling": "raise the dwell at each target to five time constants before reading; if the effect remains, check "
+    "integral gain and friction of the axis",
     "outliers": "measure these readings again; they are left out of everything else",
-    "variance_trend": "find what grew louder (draught, vibration, a warming laser), and repeat a few lines at the beginning "
-    "and at the end",
+    "variance_trend": "find the source of the growing noise (draught, vibration, a laser that warms up), and repeat a few lines "
+    "at the beginning and at the end",
     "autocorrelated_noise": "take repeats far apart in time and in random order; shield the beam from draught",
     "quantisation": "log more decimals",
     "axis_mapping": "correct columns or signs in the file, and confirm by a small move of one axis before any export",
-    "stick_slip": "lubricate the guide, look at its preload and at the friction compensation of the control, and approach each "
+    "stick_slip": "lubricate the guide, check its preload and the friction compensation of the control, and approach each "
     "target slowly and fast",
     "crosstalk_yaw": "turn the target by 180 degrees and measure again; have the instrument's crosstalk calibrated",
     "crosstalk_pitch": "turn the target by 180 degrees and measure again; have the instrument's crosstalk calibrated",
-    "beam_drift": "let the laser warm up, shield its beam, and run forth and back three times",
+    "beam_drift": "let the laser warm up, shield its beam, and measure forth and back three times",
     "detector_gain": "have the gain of this detector calibrated and entered into the instrument's file",
     "nonparallel_beams": "have the instrument's beams adjusted, or enter their angle into its file",
     "distance_offset": "enter the distance of the target's points into the instrument's file",

@@ -41,18 +41,24 @@ def noise_cards() -> list[Card]:
         ),
         _card(
             "autocorrelated_noise",
-            "Noise that is alike in neighbouring readings",
-            "noise with a memory (random walk, drift of the air)",
+            "Noise that is correlated between neighbouring readings",
+            "autocorrelated noise (random walk, drift of the air)",
             ("time_s", "repeat"),
             "measure every line at least twice, in random order",
         ),
-        _card("quantisation", "Readings in coarse steps", "readings are multiples of a step", (), "log more decimals"),
+        _card(
+            "quantisation",
+            "Coarse resolution of the readings",
+            "readings are multiples of a step",
+            (),
+            "log more decimals",
+        ),
         _card(
             "axis_mapping",
             "Swapped axes, signs or stations",
             "columns of the file exchanged or of the other sign",
             (),
-            "check the file: residuals of mm, not of um",
+            "check the file: residuals are millimetres, not micrometres",
         ),
     ]
     stick_slip = [

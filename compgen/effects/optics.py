@@ -25,9 +25,9 @@ class RefractiveIndex(Effect):
         name="refractive_index",
         title="Refractive index of the air, not compensated",
         equation="dl = c l (T_ambient - reference)",
-        source="Birch & Downs, Metrologia 30 (1993) 155: about -0.93 ppm of the index for each K",
+        source="Birch & Downs, Metrologia 30 (1993) 155: about -0.93 ppm of the index per kelvin",
         covariates=("temp_ambient_c",),
-        parameters=(Parameter("c_ppm_per_k", 1e-6, "change of a length for each K of the air", 5.0),),
+        parameters=(Parameter("c_ppm_per_k", 1e-6, "change of a length per kelvin of the air", 5.0),),
         aliases=("dead_path", "thermal_scale_X", "thermal_scale_Y", "thermal_scale_Z"),
         breaker="vary the range at constant air temperature, and the temperature at constant range",
         kinds=("lengths",),
@@ -56,7 +56,7 @@ class DeadPath(Effect):
             source="Steinmetz, Precision Engineering 12 (1990) 12; Birch & Downs, Metrologia 30 (1993) 155",
             covariates=("temp_ambient_c", "station"),
             parameters=tuple(
-                Parameter(f"c_{name}_um_per_k", MM_PER_UM, f"change of the lengths of {name} for each K", 5.0)
+                Parameter(f"c_{name}_um_per_k", MM_PER_UM, f"change of the lengths of {name} per kelvin", 5.0)
                 for name in stations
             ),
             aliases=("refractive_index", "station_drift", "spindle_growth_X", "spindle_growth_Y", "spindle_growth_Z"),
@@ -124,7 +124,7 @@ class StationDrift(StationEffect):
         breaker="return to one reference point from time to time",
         kinds=("lengths",),
         settings=(
-            Setting("reference_s", "time that counts as zero; default: the mean of the readings", mean_of="time_s"),
+            Setting("reference_s", "time at which the effect is zero; default: mean of the readings", mean_of="time_s"),
         ),
         slow=True,
     )
@@ -209,7 +209,7 @@ class TargetAngle(Effect):
 
     card = Card(
         name="target_angle",
-        title="Target that depends on the angle of the beam",
+        title="Target error that depends on the angle of the beam",
         equation="dl = c1 u_z^2 + c2 u_z^3,  u from the station to the target",
         source="cat's eye and corner cube off their axis: series of the angle, second and third order",
         covariates=(),
@@ -217,7 +217,7 @@ class TargetAngle(Effect):
             Parameter("c1_um", MM_PER_UM, "second order", 20.0),
             Parameter("c2_um", MM_PER_UM, "third order", 20.0),
         ),
-        aliases=("smooth errors of the machine", "places of the stations"),
+        aliases=("smooth errors of the machine", "positions of the stations"),
         breaker="turn the target and measure again",
         kinds=("lengths",),
     )
@@ -249,7 +249,7 @@ def sixdof_cards() -> list[Card]:
     ]
     return [
         _card("beam_drift", "Angle drift of the beam", "straightness signals = L times an angle that drifts with time",
-              "run forth and back three times"),
+              "measure forth and back three times"),
         _card("crosstalk_yaw", "Crosstalk of yaw into straightness", "signal of straightness + k times yaw"),
         _card("crosstalk_pitch", "Crosstalk of pitch into straightness", "signal of straightness + k times pitch"),
         *detectors,

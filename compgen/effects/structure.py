@@ -47,7 +47,7 @@ class CurveEffect(DisplacementEffect):
         self.card = replace(card, aliases=aliases, parameters=self._parameters(USUAL_DEGREE))
 
     def _parameters(self, degree: int) -> tuple[Parameter, ...]:
-        meaning = f"part of {self.error.name} that goes as P{{}} along {AXES[self.error.axis]}"
+        meaning = f"part of {self.error.name} proportional to P{{}} along {AXES[self.error.axis]}"
         return tuple(
             Parameter(f"p{k}_urad", RAD_PER_URAD, meaning.format(k), 200.0) for k in range(self.lowest, degree + 1)
         )
@@ -86,7 +86,7 @@ class Lever(CurveEffect):
     lowest = 0
     template = Card(
         name="lever_{name}",
-        title="{name}, which only a tool offset shows",
+        title="{name}, visible only with a tool offset",
         equation="d = theta({a}) e x lever,  theta = sum of p_k P_k(s_{A}) up to the degree",
         source="ISO 230-1; column of C of Zha & Zhang 2024, eq. 9, with a tool offset",
         covariates=("tool_x_mm", "tool_y_mm", "tool_z_mm"),
@@ -121,13 +121,13 @@ class Squareness(DisplacementEffect):
         self.error = f"E{short}"
         self.card = Card(
             name=f"squareness_{short}",
-            title=f"Squareness {self.error}, which the model leaves out",
+            title=f"Squareness {self.error}, missing from the model",
             equation={"C0Y": "d_X = -c y", "B0Z": "d_X = c z", "A0Z": "d_Y = -c z"}[short],
             source="ISO 230-1; docs/conventions.md",
             covariates=(),
             parameters=(Parameter("c_urad", RAD_PER_URAD, "squareness error", 1000.0),),
             aliases=("straightness slopes", "rotation of the workpiece frame"),
-            breaker="let the machine file's errors contain it",
+            breaker="add it to the errors of the machine file",
             kinds=("lengths", "deviations"),
         )
 
@@ -202,7 +202,7 @@ class BeamSag(DisplacementEffect):
         source="deflection of a beam under a travelling load, second order; Schwenke et al., CIRP Annals 57/2 (2008) 660",
         covariates=(),
         parameters=tuple(
-            Parameter(f"c{i}{j}_um", MM_PER_UM, f"sag that goes as P{i} along X and P{j} along Y", 100.0)
+            Parameter(f"c{i}{j}_um", MM_PER_UM, f"sag proportional to P{i} along X and P{j} along Y", 100.0)
             for i in (1, 2)
             for j in (1, 2)
         ),
@@ -233,12 +233,12 @@ class ColumnBending(DisplacementEffect):
         equation="d_Y = c (T_front - T_rear - reference) (z - z0)^2",
         source="bending of a free beam under a linear temperature gradient; Mayr et al., CIRP Annals 61/2 (2012) 771",
         covariates=CHANNELS,
-        parameters=(Parameter("c_um_per_k_m2", 1e-9, "deflection for each K at 1 m from the foot", 200.0),),
+        parameters=(Parameter("c_um_per_k_m2", 1e-9, "deflection per kelvin at 1 m from the foot", 200.0),),
         aliases=("spindle_growth_Y", "EYZ (its constant part)"),
-        breaker="let the gradient cycle while measuring over the whole stroke of Z",
+        breaker="let the gradient cycle while measuring over the full travel of Z",
         settings=(
             Setting("z0_mm", "position of Z at which the column is clamped"),
-            Setting("reference_k", "gradient that counts as zero; default: the mean of the readings"),
+            Setting("reference_k", "gradient at which the effect is zero; default: mean of the readings"),
         ),
         scan="z0_mm",
         slow=True,
@@ -282,10 +282,10 @@ class RamDroop(DisplacementEffect):
         source="deflection of a cantilever of variable length; Schwenke et al., CIRP Annals 57/2 (2008) 660",
         covariates=(),
         parameters=(
-            Parameter("c1_um", MM_PER_UM, "droop that grows along Y", 100.0),
-            Parameter("c2_um", MM_PER_UM, "droop that bends along Y", 100.0),
+            Parameter("c1_um", MM_PER_UM, "droop, linear along Y", 100.0),
+            Parameter("c2_um", MM_PER_UM, "droop, quadratic along Y", 100.0),
         ),
-        aliases=("EYZ (the part that Y leaves alone)", "EAY (the part linear in z)"),
+        aliases=("EYZ (the part that does not depend on Y)", "EAY (the part linear in z)"),
         breaker="measure more heights of Z at several places of Y",
         kinds=("lengths", "deviations"),
     )
@@ -309,12 +309,12 @@ class LoadDeflection(DisplacementEffect):
         source="elastic compliance of table and bed, second order in the position",
         covariates=("load_kg",),
         parameters=(
-            Parameter("c0_um_per_kg", MM_PER_UM, "deflection everywhere alike", 2.0),
-            Parameter("c1_um_per_kg", MM_PER_UM, "deflection that bends along X", 2.0),
-            Parameter("c2_um_per_kg", MM_PER_UM, "deflection that bends along Y", 2.0),
+            Parameter("c0_um_per_kg", MM_PER_UM, "deflection, the same everywhere", 2.0),
+            Parameter("c1_um_per_kg", MM_PER_UM, "deflection, quadratic along X", 2.0),
+            Parameter("c2_um_per_kg", MM_PER_UM, "deflection, quadratic along Y", 2.0),
         ),
         aliases=("tool_offset_error", "station_drift"),
-        breaker="two loads, changed to and fro between the lines, not once at the end",
+        breaker="two loads, alternated between the lines, not changed once at the end",
         kinds=("lengths", "deviations"),
     )
 
@@ -335,9 +335,9 @@ class MachineJump(DisplacementEffect):
 
     card = Card(
         name="machine_jump",
-        title="Jump of the machine that all stations see",
+        title="Jump of the machine seen by all stations",
         equation="d = c H(t - tau)",
-        source="change point common to all stations: what repeated single jumps of stations cannot be by chance",
+        source="change point common to all stations, which separate jumps of single stations do not explain",
         covariates=("time_s",),
         parameters=vector_parameters("jump along {}", 1000.0),
         aliases=("tool_offset_error", "length_step"),

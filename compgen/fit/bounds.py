@@ -343,19 +343,17 @@ class FitOptions:
         "straightness.",
         metavar="NAME=WAY",
     )
-    robust: bool = option(False, "Huber's loss instead of squares: single nodes far off do not bend the curve.")
+    robust: bool = option(False, "Huber loss instead of least squares: single outlying nodes do not bend the curve.")
 
     def __post_init__(self) -> None:
         if self.smoothness is not None and not (math.isfinite(self.smoothness) and self.smoothness >= 0):
-            message = (
-                f"{self.smoothness!r} is not allowed; give a number >= 0, or leave it out to take it from the data"
-            )
+            message = f"{self.smoothness!r} is not allowed; give a number >= 0, or omit it to choose it from the data"
             raise InputError(message, field="smoothness")
         for bound in ("max_abs", "max_slope", "max_curvature"):
             for key, limit in getattr(self, bound).items():
                 _check_key(bound, key)
                 if not limit > 0:
-                    message = f"{limit!r} for {key} leaves no curve; a bound must be a positive number, or omit it"
+                    message = f"{limit!r} for {key} is not a possible bound; give a positive number, or omit it"
                     raise InputError(message, field=bound)
         for key, direction in self.monotone.items():
             if key not in CURVE_NAMES:

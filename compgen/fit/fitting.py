@@ -391,7 +391,7 @@ def robust(curves: Mapping[str, FixedCurve], options: FitOptions) -> tuple[list[
         if count >= _SEARCHES and change <= _SETTLED:
             return prepared, weighted
         trusts = fresh
-    raise ConvergenceError(f"the robust fit did not settle in {_ROUNDS} rounds; fit without it or give a smoothness")
+    raise ConvergenceError(f"the robust fit did not converge in {_ROUNDS} rounds; fit without it or give a smoothness")
 
 
 def running_median(y: FloatArray) -> FloatArray:
@@ -466,7 +466,7 @@ def solve_constrained(
     for name, rule in own.items():
         broken = float(np.max(rule.violation(), initial=0.0))
         if not broken <= TOLERANCE:
-            raise ConvergenceError(f"{name} is broken by {broken:.3g} in the solver's result; scale or loosen it")
+            raise ConvergenceError(f"{name} is violated by {broken:.3g} in the solver's result; scale or loosen it")
     found = []
     for item in prepared:
         curve = item.smoother.expand(np.asarray(inner[item.name].value)[:, None])[:, 0]
@@ -523,7 +523,7 @@ def _solve(cp: Any, problem: Any) -> None:
         if problem.status != "user_limit":
             return
     if problem.status is None:
-        raise ConvergenceError("no solver could work with your constraints; scale or loosen them")
+        raise ConvergenceError("no solver could handle your constraints; scale or loosen them")
 
 
 def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
@@ -540,11 +540,11 @@ def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
             elastic.append(rule)
     beginning = "no curves satisfy zeros, bounds and your constraints together; "
     if not slack:
-        return beginning + "none of them can be relaxed by an amount; leave one out"
+        return beginning + "none of them can be relaxed by an amount; remove one"
     problem = cp.Problem(cp.Minimize(sum(cp.sum(amount) for amount in slack.values())), [*rules, *elastic])
     _solve(cp, problem)
     if problem.status not in _STATES:
-        return beginning + f"those that can be relaxed by an amount ({', '.join(slack)}) do not help; leave one out"
+        return beginning + f"those that can be relaxed by an amount ({', '.join(slack)}) do not help; remove one"
     amounts = {name: np.atleast_1d(np.asarray(amount.value)) for name, amount in slack.items()}
     named = []
     for name, amount in amounts.items():

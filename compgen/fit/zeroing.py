@@ -228,7 +228,7 @@ def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[Frame
         for field, removed in zip(removed_fields(machine, name, fixed), fixed.removed, strict=True):
             parts = inverse @ field.ravel()
             if np.abs(basis @ parts - field.ravel()).max() > 1e-9 * np.abs(field).max():
-                raise InputError("leaves a field that neither squareness nor a rigid motion can take up", field=name)
+                raise InputError("leaves a field that neither squareness nor a rigid motion can absorb", field=name)
             parts[np.abs(parts) < 1e-13 * np.abs(parts).max()] = 0.0
             total += parts * removed
             shares.append(parts * (abs(removed) > NOTHING))

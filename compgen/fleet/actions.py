@@ -113,7 +113,7 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
         without a name or a reason, or if the folder cannot be written.
     """
     if not actor.strip() or not reason.strip():
-        raise InputError("give a name and a reason for handing the folder to this store", field="--reason")
+        raise InputError("assigning the folder to this store requires a name and a reason", field="--reason")
     machine_job = job.machine(name)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.add_machine(name)
@@ -121,8 +121,8 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
             moved = set_aside(machine_job.out)
         except OSError as error:
             raise InputError(f"cannot be set aside: {error.strerror or error}", file=machine_job.out) from error
-        said = "nothing was there" if moved is None else f"what was there is in {moved.name}"
-        store.add_event(ADOPTED, "folder", f"given to this store by {actor}, {said}: {reason}", machine)
+        said = "the folder was empty" if moved is None else f"the earlier contents are in {moved.name}"
+        store.add_event(ADOPTED, "folder", f"assigned to this store by {actor}, {said}: {reason}", machine)
         publish(store, machine, machine_job.out)
         return moved
 
@@ -136,7 +136,7 @@ def carried_out(
         machine = store.machine(name)
         check_folder(store, machine, machine_job.out)
         decision = decide(store, machine)
-        _follow(store, machine_job, machine, "The decision is made")
+        _follow(store, machine_job, machine, "The decision is recorded")
         return decision
 
 
@@ -186,7 +186,8 @@ def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | 
     machine_job = job.machine(name)
     if request.active_table is not None and not re.fullmatch(r"(?i)none|v?[0-9]{1,9}", request.active_table):
         raise InputError(
-            f"{request.active_table!r} is not a name of tables; give a version (v3) or none", field="--active-table"
+            f"{request.active_table!r} is not a version of the tables; give one, e.g. v3, or none",
+            field="--active-table",
         )
     if not request.reason.strip() or not request.actor.strip():
         raise InputError("processing a measurement again needs a reason and a name", field="--reason")
@@ -217,7 +218,7 @@ def _chosen(store: Store, machine: MachineRecord, requested: str | None) -> Meas
         found += [item for item in known if item.sha256.startswith(text)]
     if len(found) != 1:
         listed = ", ".join(f"{item.id} ({item.name}, {item.sha256[:12]})" for item in known[-5:])
-        what = "several begin with it" if found else f"the newest are {listed}"
+        what = "several begin with this text" if found else f"the newest are {listed}"
         raise InputError(
             f"{requested!r} does not name one measurement of {machine.name}; {what}", field="--measurement"
         )

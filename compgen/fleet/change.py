@@ -90,11 +90,11 @@ class Likeness:
     def words(self) -> str:
         """State the figures.
 
-        E.g. ``correlation +0.990, size 1.02; an arbitrary change comes as close with probability 1e-07``.
+        E.g. ``correlation +0.990, size 1.02; a random change is as similar with probability 1e-07``.
         """
         by_chance = f"{self.p_value:.1g}" if self.p_value >= LEAST_P else f"below {LEAST_P:g}"
         return (
-            f"correlation {self.correlation:+.3f}, size {abs(self.size):.2f}; an arbitrary change comes as close with "
+            f"correlation {self.correlation:+.3f}, size {abs(self.size):.2f}; a random change is as similar with "
             f"probability {by_chance}"
         )
 
@@ -337,14 +337,14 @@ def with_all_errors(
     richest = max(names, key=len)
     kept = [k for k, found in enumerate(names) if len(found & richest) >= LEAST_SHARE * len(richest)]
     left = len(history) - len(kept)
-    notes = [f"{left} of {len(history)} calibrations are left out: they show a few errors only"] if left else []
+    notes = [f"{left} of {len(history)} calibrations are left out: they contain only a few errors"] if left else []
     return [history[k] for k in kept], [ids[k] for k in kept], notes
 
 
 def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     """Bring calibrations, oldest first, into one gauge on the nodes of the newest."""
     if any(late.at < early.at for early, late in zip(history, history[1:], strict=False)):
-        raise InputError("calibrations must be in order of time; sort them")
+        raise InputError("calibrations must be in chronological order; sort them by time")
     common = set.intersection(*({*item.covariance.error} for item in history))
     newest = history[-1].covariance
     kept = [k for k, name in enumerate(newest.error) if name in common]

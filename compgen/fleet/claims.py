@@ -159,9 +159,9 @@ def work_on(
             try:
                 give_back(store, claim)
             except (CompgenError, sa.exc.SQLAlchemyError) as error:  # must not hide the original error
-                logs.error("claim not given back", problem=str(error))
+                logs.error("claim not released", problem=str(error))
             raise
-    raise ClaimLostError("other tables became active again and again")
+    raise ClaimLostError("the active tables kept changing")
 
 
 def renew(store: Store, claim: Claim, lease_s: float | None = None) -> Claim:
@@ -340,7 +340,9 @@ def keep_result(
         decisions = locked_decisions(connection, machine)
         release(store, connection, claim)
         if active_id(decisions) != judged_against:
-            raise ChangedMeanwhileError(f"{machine.name}: other tables became active; the measurement is judged again")
+            raise ChangedMeanwhileError(
+                f"{machine.name}: the active tables have changed; the measurement is judged again"
+            )
         table_id = _insert(store, connection, machine, claim, new)
         reason, actor = "; ".join(filter(None, [new.reason, *new.hold])), new.actor or AUTOMATIC
         if not new.accepted:
@@ -351,7 +353,7 @@ def keep_result(
             return table_id
         for old in dict.fromkeys(item.table_id for item in decisions):
             if old is not None and state_of(old, decisions) in OPEN:
-                add_decision(store, connection, machine, "supersede", old, AUTOMATIC, "a newer proposal came")
+                add_decision(store, connection, machine, "supersede", old, AUTOMATIC, "superseded by a newer proposal")
         shown = "; ".join(filter(None, [reason, *new.reservations]))
         add_decision(store, connection, machine, "propose", table_id, actor, shown)
         if new.approve:

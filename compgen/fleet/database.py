@@ -298,8 +298,8 @@ def engine_of(url: str) -> sa.Engine:
             time.sleep(pause)
     else:
         raise StoreError(
-            f"the store {shown(url)} is damaged: the file is empty (0 bytes); restore a backup, or remove the file if there "
-            "never was anything in it"
+            f"the store {shown(url)} is damaged: the file is empty (0 bytes); restore a backup, or remove the file if it "
+            "never contained data"
         )
     return _sqlite(parsed.set(database=str(path)), os.getpid())
 

@@ -47,7 +47,7 @@ def only_pending(store: Store, machine: MachineRecord) -> TableRecord:
     if len(waiting) != 1:
         listed = ", ".join(f"{table.version} ({table.state})" for table in waiting)
         raise DecisionError(
-            f"{machine.name}: {f'versions {listed} wait; name one' if waiting else 'nothing waits for a decision'}"
+            f"{machine.name}: {f'versions {listed} wait for a decision; name one' if waiting else 'nothing waits for a decision'}"
         )
     return waiting[0]
 
@@ -91,14 +91,16 @@ def approve(
         _check_seen(connection, machine, decisions, seen)
         state = state_of(table_id, decisions)
         if not accepted:
-            raise DecisionError(_place(machine, version) + " was not accepted by the round trip; it cannot be approved")
+            raise DecisionError(
+                _place(machine, version) + " was not accepted by the verification; it cannot be approved"
+            )
         if state == "held" and not override:
             raise DecisionError(
                 _place(machine, version) + " is held back by the policy; override it with a reason, or reject it"
             )
         if state == "held" and not reason.strip():
             raise DecisionError(
-                _place(machine, version) + " is held back by the policy; give the reason why it is right nevertheless"
+                _place(machine, version) + " is held back by the policy; give the reason for overriding it"
             )
         files_of(connection, table_id)  # StoreError if the files can no longer be written
         return add_decision(store, connection, machine, "approve", table_id, actor, reason)
@@ -167,13 +169,13 @@ def rollback(
 def check_person(actor: str) -> None:
     """Raise DecisionError unless this can be a person's name: one line, all characters visible, not "automatic"."""
     if not actor.strip():
-        raise DecisionError("a decision needs the name of who makes it")
+        raise DecisionError("a decision requires the name of the person who makes it")
     plain = unicodedata.normalize("NFKC", actor)  # wide letters, ligatures and hard spaces become plain ones
     if not plain.isprintable():
         shown = actor.encode("unicode_escape").decode("ascii")
-        raise DecisionError(f"the name of who decides contains control characters or invisible ones: {shown}")
+        raise DecisionError(f"the name of the person contains control or invisible characters: {shown}")
     if plain.strip().casefold() == AUTOMATIC:
-        raise DecisionError(f"{AUTOMATIC!r} is the signature of automatic decisions; give your own name")
+        raise DecisionError(f"{AUTOMATIC!r} is reserved for automatic decisions; give your own name")
 
 
 def _check_seen(
@@ -186,7 +188,7 @@ def _check_seen(
     query = sa.select(database.tables.c.version).where(database.tables.c.id == active)
     if seen != (0 if active is None else connection.execute(query).scalar()):
         raise DecisionError(
-            f"{machine.name}: other tables became active since you looked; look again before you decide"
+            f"{machine.name}: the active tables have changed since you looked; look again before you decide"
         )
 
 

@@ -312,14 +312,14 @@ class Forecast:
         """State it in one sentence, e.g. ``EC0Y leaves tolerance in about 7 weeks, 95 % 5-11``."""
         percent = f"{100.0 * self.confidence:g} %"
         if self.outside_now > 0.5:
-            return f"{name} is outside its tolerance already (probability {self.outside_now:.2f})"
+            return f"{name} is already outside its tolerance (probability {self.outside_now:.2f})"
         if not np.isfinite(self.low_days):
             return f"{name} stays within tolerance for the next {_span(self.horizon_days)} ({percent})"
         divisor, unit = _unit(self.median_days if np.isfinite(self.median_days) else self.low_days)
         high = f"-{self.high_days / divisor:.0f}" if np.isfinite(self.high_days) else " or later"
         if not np.isfinite(self.median_days):
             at_first = f"{self.low_days / divisor:.0f} {unit}"
-            rather = f"rather later than {_span(self.horizon_days)}"
+            rather = f"more likely later than {_span(self.horizon_days)}"
             return f"{name} may leave tolerance after {at_first} at the earliest ({percent}), {rather}"
         about = f"{self.median_days / divisor:.0f}"
         word = unit.removesuffix("s") if about == "1" else unit
@@ -510,7 +510,7 @@ def sentences(drift: Drift) -> list[str]:
             told.append(f"{item.figure.name} drifts by {_with_interval(drift, item.figure, value, u)} per month")
         if item.figure.name in warm and item.trend is not None and item.trend.per_kelvin is not None:
             size = _with_interval(drift, item.figure, *item.trend.per_kelvin)
-            told.append(f"{item.figure.name} follows the temperature by {size} per K")
+            told.append(f"{item.figure.name} changes with temperature by {size} per K")
         if item.forecast is not None:
             told.append(item.forecast.words(item.figure.name) + (at if item.figure.name in warm else ""))
     if drift.volume_forecast is not None:

@@ -52,7 +52,7 @@ def draw_history(drift: Drift) -> list[Picture]:
         plot.across(value, "table")
     plot.line(days, rms, "line")
     plot.dots(days, rms, "line", size=5.0)
-    note = "change against what the active tables take out; dotted: by uncertainty alone"
+    note = "change against the errors that the active tables correct; dotted: expected from the uncertainty alone"
     pictures = [Picture("volume", "Volume", svg("volume", f"Volume: {note}", [plot]), note=note)]
     if drift.temperature_c is not None:
         temperature = np.array(drift.temperature_c)

@@ -85,7 +85,7 @@ def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str,
         if a file cannot be read, is changing, is a link or not a file, or together they are larger than the job allows.
     """
     if len(group) > MOST_FILES:
-        raise InputError(f"holds {len(group)} files; one measurement has at most {MOST_FILES}", file=group[0].parent)
+        raise InputError(f"contains {len(group)} files; one measurement has at most {MOST_FILES}", file=group[0].parent)
     contents: dict[str, bytes] = {}
     times = []
     left = round(job.max_size_mb * 1e6)
@@ -129,14 +129,14 @@ def _read_regular(path: Path, most: int, *, folder_is_real: bool) -> tuple[bytes
                 raise InputError("cannot be read: it was replaced while it was opened", file=path)
             if before.st_size > most:
                 size, allowed = before.st_size / 1e6, most / 1e6
-                message = f"is too large: {size:.3g} MB where {allowed:.3g} MB are left for this measurement"
+                message = f"is too large: {size:.3g} MB, but only {allowed:.3g} MB are left for this measurement"
                 raise InputError(f"{message}; max_size_mb of the job file is the limit", file=path)
             content = stream.read(most + 1)
             after = os.fstat(handle)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
     if (before.st_size, before.st_mtime_ns) != (after.st_size, after.st_mtime_ns) or len(content) != after.st_size:
-        raise InputError("is being written; the next run reads it", file=path)
+        raise InputError("is still being written; the next run reads it", file=path)
     return content, after
 
 

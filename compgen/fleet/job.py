@@ -471,8 +471,8 @@ def job_of(root: Section, path: Path) -> Job:
         if around is not None:
             raise every.fail(
                 name,
-                f"has its folder out ({out}) inside that of {known[around]} ({around}); give each machine its own, beside "
-                "each other",
+                f"has its folder out ({out}) inside that of {known[around]} ({around}); give each machine a folder of its own, "
+                "not inside another one",
             )
     shared: dict[str, list[OtherInbox]] = {}
     for name, machine in machines.items():
@@ -547,7 +547,7 @@ def add_machine(path: Path, name: str, keys: Mapping[str, Any]) -> MachineJob:
     """
     before = read_text(path) if path.exists() else ""
     if before and name in job_of_text(before, path).machines:
-        raise InputError(f"has a machine {name!r} already; edit it there", file=path)
+        raise InputError(f"already has a machine {name!r}; edit it there", file=path)
     # texts, numbers and lists of texts: JSON's escapes are also valid in TOML
     lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None]
     head = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)

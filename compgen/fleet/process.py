@@ -180,7 +180,7 @@ def judge_order(judgement: Judgement, case: Case) -> None:
             made = case.store.identification(table.identification_id).measured_at
             if case.measurement.measured_at < made:
                 judgement.hold.append(
-                    f"version {table.version}, which waits, comes from a newer measurement ({_day(made)})"
+                    f"version {table.version} waits for approval and comes from a newer measurement ({_day(made)})"
                 )
 
 
@@ -225,8 +225,8 @@ def judge_assumption(judgement: Judgement, case: Case) -> None:
             doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
     if doubts:
         judgement.hold.append(
-            "it is not certain which tables were on while the machine was measured, and "
-            f"{'no table' if taken is None else f'version {taken}'} was taken out: "
+            "it is not certain which tables were on while the machine was measured (assumed: "
+            f"{'none' if taken is None else f'version {taken}'}): "
             f"{'; '.join(dict.fromkeys(doubts))}; {how_to_state(job.name, measurement, 'VERSION|none')}"
         )
 
@@ -283,12 +283,12 @@ def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
     if found is None:
         return
     judgement.figures["likeness"] = found.summary()
-    was = "nothing was" if taken is None else f"version {taken} was"
+    assumed = "no tables were" if taken is None else f"version {taken} was"
     seems, what = ("was on", "what") if found.sign > 0 else ("was off", "the opposite of what")
     version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
     judgement.hold.append(
         f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
-        f"while the machine was measured, but {was} taken out; "
+        f"while the machine was measured, but the evaluation assumed that {assumed} on; "
         f"{how_to_state(case.job.name, case.measurement, version)}; if the machine has really changed, approve with --override"
     )
 
@@ -374,7 +374,7 @@ def shows_all(judgement: Judgement, store: Store, result: RunResult, active: Act
     if missing:
         judgement.figures["errors_not_shown"] = missing
         judgement.hold.append(
-            f"the measurement does not show {', '.join(missing)}, which version {active.version} takes out and the new "
+            f"the measurement does not show {', '.join(missing)}, which version {active.version} corrects and the new "
             "tables would not; measure them all"
         )
     return not missing

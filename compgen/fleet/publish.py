@@ -249,12 +249,12 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     )
     if seen.pointer is not None and seen.pointer not in known:
         raise InputError(
-            f"leads to {seen.pointer}, which was never active by this store, so it is not the store of this folder; {then}",
+            f"points to {seen.pointer}, which this store never made active, so this is not the store of this folder; {then}",
             file=folder / POINTER,
         )
     unknown = [name for name in seen.versions if name not in known]
     if unknown:
-        raise InputError(f"holds {', '.join(unknown)}, which this store never made active; {then}", file=folder)
+        raise InputError(f"contains {', '.join(unknown)}, which this store never made active; {then}", file=folder)
     ledger = seen.ledger
     if ledger is None:  # then compare the contents
         for name in seen.versions:
@@ -272,12 +272,12 @@ def _compare(store: Store, machine: MachineRecord, tables: Sequence[TableRecord]
     history, count = lineage(store, machine), ledger["decisions"]
     if count > len(history):
         raise InputError(
-            f"follows {count} decisions about {machine.name}, but this store has {len(history)}: it is another one, was "
+            f"records {count} decisions about {machine.name}, but this store has {len(history)}: it is another store, was "
             f"emptied, or is an older backup; {then}",
             file=folder,
         )
     if count and history[count - 1] != ledger["sha256"]:
-        raise InputError(f"follows other decisions and tables than those of this store; {then}", file=folder)
+        raise InputError(f"records other decisions or tables than this store; {then}", file=folder)
 
 
 def _is_of_others(folder: Path, about: Mapping[str, Any]) -> bool:

@@ -150,7 +150,7 @@ def _shape(layout: ErrorParameters, name: str) -> FloatArray:
     """Change of the unknowns (errors,) with the requested shape and size 1, up to the gauge of the layout."""
     known = next((item for item in error_values(layout) if item[0] == name), None)
     if known is None:
-        raise InputError(f"{name!r} is not in the model of machine {layout.machine.name!r}; ask for one that is")
+        raise InputError(f"{name!r} is not in the model of machine {layout.machine.name!r}; choose one that is")
     _, position_mm, columns, matrix = known
     shape = np.zeros(layout.size)
     if name in SQUARENESS_NAMES:

@@ -162,7 +162,7 @@ def _passed(
 ) -> MachineOutcome:
     started = time.monotonic()
     if stop():
-        return MachineOutcome(job.name, "stopped", ("not looked at: stopped",))
+        return MachineOutcome(job.name, "stopped", ("not checked: stopped",))
     try:
         with opened() as store:
             outcome = _Pass(store, job, store.add_machine(job.name), stop, elsewhere).run()
@@ -285,7 +285,7 @@ class _Pass:
                 with one_thread():  # the same bytes whatever the number of processors
                     claims.work_on(self.store, measurement, partial(self._keep, measurement, settings))
             except ClaimLostError as error:
-                self.messages.append(f"{measurement.name}: {error}; it is left to the next run")
+                self.messages.append(f"{measurement.name}: {error}; the next run tries again")
                 self.again = True
                 break
             waiting = waiting[1:] or self._waiting(settings, seen)
@@ -301,7 +301,7 @@ class _Pass:
             if isinstance(error, CompgenError | OSError | MemoryError):
                 if passes(error):
                     claims.give_back(self.store, claim)
-                    self._problem("passing", measurement.name, f"{measurement.name}: {error}; it is tried again")
+                    self._problem("passing", measurement.name, f"{measurement.name}: {error}; it will be tried again")
                     return
                 message = without_folder(str(error))
             else:
@@ -389,7 +389,7 @@ class Elsewhere:
             return found
 
         if stop():
-            raise StoppedError("not begun: stopped")
+            raise StoppedError("not started: stopped")
         return _passed(lambda: nullcontext(self._store), item.value(), stop, elsewhere)
 
     def close(self) -> None:
@@ -539,7 +539,7 @@ def run_with(fleet: Workers, job: Job, names: Sequence[str] = (), *, stop: Stop 
 def _lost(job: MachineJob, error: CompgenError) -> MachineOutcome:
     """Return the outcome of a machine whose pass did not finish."""
     if isinstance(error, StoppedError):
-        return MachineOutcome(job.name, "stopped", (f"not looked at: {error}",))
+        return MachineOutcome(job.name, "stopped", (f"not checked: {error}",))
     outcome = MachineOutcome(job.name, "failed", (str(error),), again=True)
     logs.error("machine lost", machine=job.name, problem=str(error))
     return outcome

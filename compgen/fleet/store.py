@@ -360,7 +360,7 @@ class Store:
         """Return the identified errors of the bare machine (or the fitted ones), mm and rad."""
         digest = identification.fitted_sha256 if fitted else identification.errors_sha256
         if digest is None:
-            raise InputError("this identification keeps no fitted errors")
+            raise InputError("this identification contains no fitted errors")
         return parse_errors(decoded(self.blob(digest), "identified.errors.csv"), Path("identified.errors.csv"))
 
     def covariance_of(self, identification: IdentificationRecord) -> Covariance | None:
@@ -610,7 +610,7 @@ def backup(url: str, path: Path) -> dict[str, int]:
         if contents are damaged: otherwise the damage would only show when the copy is needed.
     """
     if path.exists():
-        raise InputError("exists already; a backup is never written over another one", file=path)
+        raise InputError("already exists; a backup never overwrites another one", file=path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -96,10 +96,10 @@ class Watch:
                         continue
                     self._content = content
                     self._load()
-                    logs.info("job file read anew", job=str(self.path))
+                    logs.info("job file read again", job=str(self.path))
                 except CompgenError as error:
                     if self._content != b"":
-                        logs.error("job file not taken", job=str(self.path), problem=str(error))
+                        logs.error("job file not used", job=str(self.path), problem=str(error))
                     if not self.path.is_file():
                         self._content = b""
         finally:
@@ -146,7 +146,7 @@ class Watch:
                 planned = self._scheduler.get_job(name)
                 if planned is not None and planned.next_run_time is not None and when < planned.next_run_time:
                     self._scheduler.modify_job(name, next_run_time=when)
-                    logs.info("looked at again soon", machine=name, at=when.isoformat(timespec="seconds"))
+                    logs.info("checked again soon", machine=name, at=when.isoformat(timespec="seconds"))
         else:
             self._troubles.pop(machine.name, None)
         self.on_outcome(outcome)

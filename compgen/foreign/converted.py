@@ -105,7 +105,7 @@ def _measured(path: Path, kind: str | None, axis: str | None) -> Plain | ErrorTa
         return _NATIVE_READERS[kind](path)
     data = _settled(path, axis).data
     if isinstance(data, Capture):
-        raise InputError("holds a capture over time, from which no errors are identified", file=path)
+        raise InputError("contains a capture over time, from which no errors are identified", file=path)
     return data
 
 

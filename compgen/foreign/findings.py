@@ -427,7 +427,9 @@ class TableFindings:
                 f"{name!r} is in {unit}; expected a unit of {'angle' if angular else 'length'}", field="--unit"
             )
         elif given is None and abs(decades_off(values, units[unit], usual_si)) > ABSURD_DECADES and judged.best != unit:
-            self.doubts.append(f"{name!r} says {unit}, but the numbers look like {judged.best}; give --unit {key}=...")
+            self.doubts.append(
+                f"{name!r} states {unit}, but the numbers look like {judged.best}; give --unit {key}=..."
+            )
         self.understood["unit"] = unit
         return values * units[unit]
 

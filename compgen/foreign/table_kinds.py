@@ -307,7 +307,7 @@ def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
         if away.max(initial=0.0) > allowed:
             k = int(np.argmax(away))
             findings.doubts.append(
-                f"{name!r} says {printed[k]:g} in line {findings.table.lines[k]}, the mean of "
+                f"{name!r} states {printed[k]:g} in line {findings.table.lines[k]}, the mean of "
                 f"{', '.join(repr(column.name) for column in own[:6])} is {runs[k].mean() / scale:.6g}: is a run missing, or one "
                 f"named wrongly? If the runs are right, --ignore {shown(name)}"
             )
@@ -329,7 +329,7 @@ def _deviations(findings: TableFindings, rows: _Rows, target: FloatArray, *, ang
     chosen = findings.options.sign
     if chosen is None and key == "correction":
         chosen = "correction"
-        findings.notes.append("the column is named a correction: its sign is reversed")
+        findings.notes.append("the name of the column says correction: its sign is reversed")
     if chosen is None:
         above = findings.table.metadata
         words = unaccented(" ".join([*findings.table.header, *above, *above.values()]))
@@ -360,14 +360,14 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
             f"the readings follow the targets with the slope {slope.slope:.5g}, which is not a ratio of units"
         )
     elif abs(scale * slope.unit_ratio - 1.0) > 0.01:
-        findings.doubts.append(f"{rows.name!r} says {declared}, but one mm of travel is {slope.unit_ratio:g} in it")
+        findings.doubts.append(f"{rows.name!r} states {declared}, but one mm of travel is {slope.unit_ratio:g} in it")
         scale = 1.0 / slope.unit_ratio
     if slope.sign < 0:
         findings.doubts.append("the readings decrease where the targets increase: the sign of one of them is reversed")
     sign = -1.0 if slope.sign < 0 and findings.options.sign == "correction" else 1.0
     offset = slope.offset * scale
     if abs(offset) > 1.0:
-        findings.notes.append(f"readings are {offset:.6g} mm off the targets at zero; nothing was subtracted")
+        findings.notes.append(f"readings differ from the targets by {offset:.6g} mm at zero; nothing was subtracted")
     findings.understood["slope_of_readings"] = slope.slope
     findings.understood["sign"] = "measured minus target"
     findings.understood["unit"] = next((u for u, mm in MM_PER_LENGTH.items() if abs(mm / scale - 1) < 1e-9), "mm")
@@ -556,7 +556,7 @@ def long_errors(findings: TableFindings) -> ErrorTable:
             u = np.array(table.numbers(u_column.name, empty=True))[rows]
             if np.any(u < 0):
                 line = table.lines[int(rows[np.flatnonzero(u < 0)[0]])]
-                raise table.grid.fail("a standard uncertainty is not negative", line, u_column.name)
+                raise table.grid.fail("expected a standard uncertainty of zero or more", line, u_column.name)
             largest = values[rows][np.argmax(np.abs(values[rows]))]
             common = si[np.argmax(np.abs(values[rows]))] / largest if largest else float("nan")
             units = RAD_PER_ANGLE if error_named(name).kind != "linear" else MM_PER_LENGTH

@@ -120,7 +120,7 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     letters = ", ".join(AXES[axis] for axis in runs.axes)
     warnings.warn(
         f"positioning runs of {letters} show {', '.join(errors.names)} along the line that was measured; angular errors, "
-        "straightness and squareness were not measured and count as zero",
+        "straightness and squareness were not measured and are taken as zero",
         CompgenWarning,
         stacklevel=2,
     )
@@ -208,7 +208,7 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     share = np.einsum("ij,ij->j", right[shown], right[shown])
     names = [column.key for k, column in enumerate(columns) if column.kind == "squareness" and share[k] > 1 - 1e-6]
     if not names:
-        raise UndeterminedError("the arcs are too short to tell squareness from the centre and the scales", [])
+        raise UndeterminedError("the arcs are too short to separate squareness from the centre and the scales", [])
     found = inverse @ circles.deviation_mm
     residual = design @ found - circles.deviation_mm
     freedom = len(circles) - int(np.count_nonzero(shown))
@@ -216,7 +216,7 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
         raise UndeterminedError(f"{len(circles)} readings for {np.count_nonzero(shown)} unknowns", [])
     for k, name in enumerate(PLANES):
         if len(np.unique(circles.direction[circles.plane == k])) == 1:
-            text = f"{name} was measured in one direction only: a servo mismatch counts as squareness; measure both directions"
+            text = f"{name} was measured in one direction only: a servo mismatch is taken for squareness; measure both directions"
             warnings.warn(text, CompgenWarning, stacklevel=2)
     spread = float(np.sqrt(residual @ residual / freedom * _correlated(circles, residual)))
     factor = spread * inverse
@@ -227,7 +227,7 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     errors = ErrorTable({}, squareness, metadata_of(machine, circles.metadata))
     for name in set(_of_planes(circles)) - set(names):
         warnings.warn(
-            f"the arcs do not tell {name} from the centre, the scales or the servo mismatch",
+            f"the arcs do not separate {name} from the centre, the scales or the servo mismatch",
             CompgenWarning,
             stacklevel=2,
         )
@@ -260,7 +260,7 @@ def _positions(machine: Machine, circles: Circles) -> FloatArray:
     if unknown.any():
         text = ", ".join(f"{AXES[k]} {middle[k]:g}" for k in range(3))
         warnings.warn(
-            f"the files do not say where the circles were; taken in the middle of the travel ({text} mm)",
+            f"the files do not state the centres of the circles; assumed in the middle of the travel ({text} mm)",
             CompgenWarning,
             stacklevel=3,
         )

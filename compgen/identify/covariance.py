@@ -129,7 +129,7 @@ def joint_covariance(result: Identification) -> Covariance:
     if result.values_factor is not None:
         return covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
     if result.adjustment is None:
-        raise ValueError("this identification keeps no joint covariance")
+        raise ValueError("this identification has no joint covariance")
     factor = result.adjustment.covariance_factor()
     if result.systematic is not None:
         factor = np.hstack([factor, result.systematic.response])

@@ -157,7 +157,7 @@ class Identification(Drawable):
         Systematic inputs are included if given.
         """
         if self.adjustment is None:
-            raise ValueError("this identification keeps no covariance")
+            raise ValueError("this identification has no covariance")
         factor = self.adjustment.covariance_factor()[: self.layout.size]
         if self.systematic is None:
             return factor @ factor.T

@@ -79,7 +79,9 @@ def read_stations(path: str | Path) -> KnownStations:
     elif all(name in table.columns for name in U_OF_IDENTIFY):
         u_mm = np.max([table.numbers(name) for name in U_OF_IDENTIFY], axis=0) * MM_PER_UM
     for row in np.flatnonzero(u_mm < 0)[:1]:
-        raise table.fail(int(row), "u_mm", f"{u_mm[row]:g} is negative; a standard uncertainty cannot be")
+        raise table.fail(
+            int(row), "u_mm", f"{u_mm[row]:g} is negative; expected a standard uncertainty of zero or more"
+        )
     return KnownStations(tuple(names[row] for row in kept), position_mm[kept], np.maximum(u_mm[kept], FIXED_MM))
 
 

@@ -243,7 +243,7 @@ def _uncalibrated(instrument: SixDofInstrument, evaluation: Evaluation) -> list[
     if letters:
         h = abs(instrument.optics.beam_separation_mm)
         found.append(
-            f"roll of {', '.join(letters)} may contain a line that no evaluation can show: calibrate eps_PEy and the angle "
+            f"roll of {', '.join(letters)} may contain a slope that no evaluation can detect: calibrate eps_PEy and the angle "
             f"difference of the cube corners: 1 arcsec of eps_PEy is {1000.0 / h:.2f} arcsec/m at h = {h:g} mm"
         )
     bare = [

@@ -60,7 +60,7 @@ class Source:
             found, _, _ = artefact_observations(machine, layout, self.measurement, options, start)
             return self._as_alone(found)
         if self.alone is None:
-            text = f"{self.name}: the readings do not determine the errors and what else is unknown of them"
+            text = f"{self.name}: the readings do not determine the errors and the other unknowns of this measurement"
             raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
         if self.alone.method == "sixdof":
             names, positions, values, factor, _ = projected(machine, layout, self.alone)
@@ -174,7 +174,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     }
     texts = [
         f"{name} disagrees with the other measurements beyond the uncertainty of both in {listed} (En, 1 is the limit); "
-        "look at calibration, set-up, signs and the time between the measurements"
+        "check calibration, set-up, signs and the time between the measurements"
         for name, listed in beyond.items()
         if listed
     ]
@@ -192,7 +192,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         misfit=misfit_of(reduced, freedom, u_scale, "stated") if freedom > 0 else None,
         unobservable=(
             *not_among(errors, "no reading shows it"),
-            *(f"{name}: a part of it is not told apart from other unknowns" for name in solution.partly),
+            *(f"{name}: part of it cannot be separated from other unknowns" for name in solution.partly),
         ),
         rank=solution.rank,
         unknowns=solution.rank,

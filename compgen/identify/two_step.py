@@ -465,7 +465,7 @@ def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[n
     by_pose = seen.sum(axis=1)
     advice = (
         "; self-calibration leaves three unknown coordinates for each point, so at least four stations must see common "
-        "points. Use the joint method (--method joint), which needs three stations and no common pointsss"
+        "points. Use the joint method (--method joint), which needs three stations and no common points"
     )
     file = lengths.origin[0][0] if lengths.origin else None
     if by_pose.max() < MIN_STATIONS:

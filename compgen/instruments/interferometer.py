@@ -176,7 +176,7 @@ def _metadata_number(readings: SixDof, key: str, default: float, allowed: tuple[
 def _check_complete(readings: SixDof, column: str, values: FloatArray, wanted: FloatArray) -> None:
     missing = np.flatnonzero(~np.isfinite(values) & wanted)
     if missing.size:
-        raise _at_row(readings, int(missing[0]), column, "is known for a part of the rows only; give it in every file")
+        raise _at_row(readings, int(missing[0]), column, "is given for only some of the rows; give it in every file")
 
 
 def _at_row(readings: SixDof, row: int, column: str, message: str) -> InputError:

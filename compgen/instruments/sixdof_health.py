@@ -87,7 +87,7 @@ def sixdof_health(machine: Machine, readings: SixDof, instrument: SixDofInstrume
         starts = np.array([monitor[run.rows[0]] for run in reduced])
         if len(reduced) > 1 and np.abs(starts).max() < ZERO_MM and np.ptp(monitor) > 0.1 * MM_PER_UM:
             text = (
-                f"{name} begins at zero in every run though it drifts: it was zeroed anew. For squareness it must keep "
+                f"{name} starts at zero in every run although it drifts: it was zeroed again. For squareness it must keep "
                 "one zero for all axes"
             )
             found.append(Suspicion("drift_zero", "", text, {"range_um": float(np.ptp(monitor)) / MM_PER_UM}))
@@ -228,7 +228,7 @@ def _crosstalk(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Re
         found |= {"arm_mm": arm, "expected_arm_sign": float(sign)}
         which = "distance_offset" if at_tool else f"crosstalk_{name}"
         text = f"straightness is {found['slope']:+.1f} mm times {name} ({100 * found['explained']:.0f} % of it): " + (
-            "the distance L may be off by so much" if at_tool else "a wrong t or mode, or a bend of the axis"
+            "the distance L may be wrong by this amount" if at_tool else "a wrong t or mode, or a bend of the axis"
         )
         yield Suspicion(which, AXES[axis], text, found)
 

@@ -56,9 +56,11 @@ class SixDof:
 
 def _signal(table: CsvTable, column: str) -> FloatArray:
     """Read a signal; a spot farther out than any detector is wide indicates a wrong unit."""
-    return (within(50.0, "mm", "beyond any detector; is the unit mm?") if column in SPOTS else CsvTable.numbers)(
-        table, column
-    )
+    return (
+        within(50.0, "mm", "exceeds the range of any detector; is the unit mm?")
+        if column in SPOTS
+        else CsvTable.numbers
+    )(table, column)
 
 
 _SIXDOF = Schema(
@@ -94,9 +96,13 @@ def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
         if len(kinds) != 1:
             message = "contains both of them" if kinds else "contains neither of them"
             field = "columns displacement_mm, phase_rad"
-            raise InputError(f"{message}; give the one that the interferometer read", file=table.path, field=field)
+            raise InputError(
+                f"{message}; give the one that was read from the interferometer", file=table.path, field=field
+            )
         if kinds[0] not in tables[0].columns:
-            raise InputError(f"has {kinds[0]}, but {tables[0].path} has not; give all files alike", file=table.path)
+            raise InputError(
+                f"has {kinds[0]}, but {tables[0].path} does not; use the same column in all files", file=table.path
+            )
     parts = [SixDof(**_SIXDOF.values(table)) for table in tables]
     # the displacement is nan if the phase was read; the second spot counts only if all files have it
     second = ("y_qd2_mm",) if all("y_qd2_mm" in part.signals_mm for part in parts) else ()

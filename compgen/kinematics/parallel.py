@@ -256,7 +256,7 @@ class Processes:
         try:
             for _ in range(2):
                 if stop() or self._stop.value:
-                    raise StoppedError("not begun: stopped")
+                    raise StoppedError("not started: stopped")
                 try:
                     future = lane.perform(function, item)
                     while True:
@@ -388,7 +388,7 @@ def objection(required: WorkerFacts, found: WorkerFacts, who: str) -> str:
     here, there = dict(required.versions), dict(found.versions)
     other = [f"{name} {there.get(name, 'none')} instead of {here[name]}" for name in here if here[name] != there[name]]
     if other:
-        return f"{who} has {', '.join(other)}; the same versions belong everywhere, so that results are the same"
+        return f"{who} has {', '.join(other)}; install the same versions everywhere, so that the results are the same"
     if required.host and required.host != found.host:
         return f"{who} runs on {found.host.split(' ')[0]}, this is {required.host.split(' ')[0]}"
     return ""
@@ -464,7 +464,7 @@ class Cluster:
     def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
         """Return ``function(item)``; see :class:`compgen.kinematics.parallel.Workers`."""
         if stop():
-            raise StoppedError("not begun: stopped")
+            raise StoppedError("not started: stopped")
         if self._empty_since is not None:
             self._look()
         for _ in range(2):  # another task may have killed the worker: try once more
@@ -495,7 +495,9 @@ class Cluster:
                     raise LostError(f"the scheduler {self.address} was lost") from error
                 except TimeoutError:
                     if stop():
-                        raise StoppedError("stopped; what runs on the cluster is kept when it ends") from None
+                        raise StoppedError(
+                            "stopped; results of what still runs on the cluster are kept when it ends"
+                        ) from None
                     self._look()
                 except Exception as error:  # the worker could not start it: the error is not from the item
                     raise ClusterError(f"the cluster {self.address} cannot run compgen: {error}") from error

@@ -226,7 +226,7 @@ def box_from_text(text: str) -> tuple[str, Box]:
     if not colon or not label or len(values) != 6 or not np.isfinite(values).all():
         raise InputError(f"{one_line(text)!r} is not LABEL:xmin,xmax,ymin,ymax,zmin,zmax (mm)", field="--box")
     if np.any(values[0::2] > values[1::2]):
-        raise InputError(f"{one_line(text)!r} has a lower end above the upper one", field="--box")
+        raise InputError(f"{one_line(text)!r} has a lower limit above the upper one", field="--box")
     return label, Box(values[0::2], values[1::2])
 
 
@@ -241,6 +241,6 @@ def read_boxes(path: str | Path) -> dict[str, Box]:
         lower, upper = values[row, 0::2], values[row, 1::2]
         if np.any(lower > upper):
             axis = int(np.argmax(lower > upper))
-            raise table.fail(row, _BOX_COLUMNS[2 * axis], f"{lower[axis]:g} is above the upper end {upper[axis]:g}")
+            raise table.fail(row, _BOX_COLUMNS[2 * axis], f"{lower[axis]:g} is above the upper limit {upper[axis]:g}")
         boxes[name] = Box(lower, upper)
     return boxes

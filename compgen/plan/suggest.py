@@ -142,7 +142,7 @@ def suggest(
 
         def cost(unit: FloatArray) -> float:
             value = search.at_units(np.clip(unit, 0.0, 1.0))
-            progress(f"searching places: {search.count} of {search.limit}, best {search.best_um:.3g} um")
+            progress(f"searching station positions: {search.count} of {search.limit}, best {search.best_um:.3g} um")
             return float(np.log(value)) if np.isfinite(value) else 50.0
 
         with suppress(StopIteration):
@@ -162,7 +162,7 @@ def _spread(search: _Search, seed: int, progress: Progress) -> None:
         if search.count >= search.limit:
             return
         search.at_units(unit)
-        progress(f"searching places: {k + 1} of {search.limit}, best {search.best_um:.3g} um")
+        progress(f"searching station positions: {k + 1} of {search.limit}, best {search.best_um:.3g} um")
 
 
 def _moved(start: Planned, stations_mm: FloatArray) -> Planned:

@@ -173,7 +173,7 @@ def _uncertainty(results: Sequence[Verification]) -> str:
     if known is None:
         return "the uncertainty of the measurement is unknown, and so is that of the figures after"
     return (
-        f"the uncertainty of the measurement (U, k = 2) comes on top of the figures by the files: +-{um_text(known.max_um)} / "
+        f"the uncertainty of the measurement (U, k = 2) adds to the figures from the files: +-{um_text(known.max_um)} / "
         f"{um_text(known.rms_um)} um on after, +-{um_text(known.max_rigid_removed_um)} / "
         f"{um_text(known.rms_rigid_removed_um)} um on after*"
     )
@@ -188,7 +188,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
     table.add_column("control", overflow="fold", min_width=12)
-    for heading in ("before", "after", "before*", "after*", "not held"):
+    for heading in ("before", "after", "before*", "after*", "at best"):
         table.add_column(heading, justify="right", overflow="fold", min_width=6)
     table.add_column("verdict", no_wrap=True, min_width=9)
     notes: list[Text] = []
@@ -223,7 +223,7 @@ def verification_table(results: Sequence[Verification]) -> Group:
     notes += [Text(_uncertainty(results))] if results else []
     legend = (
         "before, after: with the reference point fixed; before*, after*: with the best-fit rigid motion of the "
-        "workpiece removed; not held: the largest error that no table of this control can express"
+        "workpiece removed; at best: the largest error with the best possible table of this control"
     )
     judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
     return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
@@ -375,7 +375,7 @@ def crash_table(results: Sequence[CrashTest]) -> Group:
                 notes.append(Text(f"{name}: {what} changes {size_um:.3f} um at most", "yellow"))
     legend = (
         "same: the wrong table differs from the right one by no more than the verification resolves (resolution of "
-        "the format and 0.2 um), so it does not count"
+        "the format and 0.2 um), so it is not counted"
     )
     return Group(table, *notes, Text(legend))
 
@@ -464,7 +464,7 @@ def suggestion_table(suggestion: Suggestion) -> Group:
     stations = suggestion.plan.planned.stations
     for name, place in zip(stations.names, stations.position_mm, strict=True):
         table.add_row(name, *(f"{value:.1f}" for value in place))
-    title = "suggested places" if suggestion.improved else "no better places were found"
+    title = "suggested station positions" if suggestion.improved else "no better station positions were found"
     return Group(Text(volume_line(f"{title} ({suggestion.evaluations} arrangements)", suggestion.plan)), table)
 
 

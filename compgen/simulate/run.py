@@ -172,21 +172,23 @@ def instruments_schema() -> dict[str, Any]:
 class Scenario(Displayed):
     """A simulated measurement; ``name`` begins the names of its files, ``seed`` starts every random number."""
 
-    instrument: AnyInstrument = part_setting(lambda: instruments_schema(), required=True, meaning="what measures")
-    seed: int = setting(toml_files.whole(0), meaning="starts every random number")
-    name: str = setting(_file_name, "simulated", meaning="begins the names of the files")
+    instrument: AnyInstrument = part_setting(
+        lambda: instruments_schema(), required=True, meaning="the measuring instrument"
+    )
+    seed: int = setting(toml_files.whole(0), meaning="seed of all random numbers")
+    name: str = setting(_file_name, "simulated", meaning="prefix of the file names")
     errors: TruthPlan = part_setting(
         truth_schema, factory=lambda: TruthPlan(random=RandomErrors()), meaning="the true errors of the machine"
     )
     trajectory: Trajectory = part_setting(
-        lambda: toml_files.section_schema(Trajectory), factory=Trajectory, meaning="the points that are visited"
+        lambda: toml_files.section_schema(Trajectory), factory=Trajectory, meaning="the commanded points"
     )
     source: Path | None = None
     effects: tuple[SimulatedEffect, ...] = part_setting(
-        effects_schema, (), meaning="what acts besides the geometric errors"
+        effects_schema, (), meaning="effects in addition to the geometric errors"
     )
     session: Session | None = part_setting(
-        lambda: toml_files.section_schema(Session), None, meaning="how often the lines are run, and how"
+        lambda: toml_files.section_schema(Session), None, meaning="number and conditions of the runs"
     )
     temperatures: Mapping[str, Temperature] = part_setting(
         lambda: {"type": "object", "additionalProperties": toml_files.section_schema(Temperature)},

@@ -111,7 +111,7 @@ def truth_schema() -> dict[str, Any]:
         file={**toml_files.accepted(toml_files.text), "description": "*.errors.csv with the true errors"},
         random={
             **toml_files.accepted(toml_files.flag),
-            "description": "draw what is not given; by default without a file",
+            "description": "draw the errors that are not given; default: true if no file is given",
         },
         curve={
             **toml_files.array_schema({**toml_files.table_schema(curve, ["name", "position_mm"]), **either}),

@@ -101,7 +101,7 @@ def _set_aside_in(output: OutputFolder, base: PurePosixPath, new: Mapping[str, b
         if name in new or name in known or _twin(name) in new:
             target = output.set_aside(str(base / name))
             if not untouched or _twin(name) not in new:
-                changed = "not as an export wrote it" if not untouched else "of an earlier export"
+                changed = "changed after the export" if not untouched else "of an earlier export"
                 kept.append(f"{name} ({changed}) as {target.name}")
         else:
             strangers.append(name)
@@ -266,7 +266,7 @@ def export(
     with_errors = {**common, **own, "errors21": errors_context(machine, errors)}
     companions = companion_files(card, with_errors, files, templates)
     unread = [
-        f"{name} comes from a template of yours: it is not read back, and nothing in it is verified"
+        f"{name} comes from your own template: it is not read back, and nothing in it is verified"
         for name in companions
     ]
     own = {**own, "warnings": [*own["warnings"], *unread]}

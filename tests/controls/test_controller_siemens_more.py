@@ -914,7 +914,7 @@ def test_a_template_of_the_user_gets_the_21_errors_and_stands_beside_the_verifie
     assert sorted(path.name for path in paths) == ["AX_EEC.INI", "NC_CEC.INI"]
     assert (tmp_path / "out" / "VCS.DAT").read_text() == text
     assert [item["name"] for item in made.manifest["companions"]] == ["VCS.DAT"]
-    assert any("VCS.DAT comes from a template of yours: it is not read back" in note for note in made.warnings)
+    assert any("VCS.DAT comes from your own template: it is not read back" in note for note in made.warnings)
     assert verify(machine, read_tables(machine, paths, "siemens-cec-eec"), errors).reasons == ()
 
 

@@ -267,8 +267,8 @@ def test_of_a_warm_up_that_is_not_the_same_everywhere_the_common_part_is_taken_o
         assert pair["after"] < (0.6 if key == "R" else 0.7) * pair["before"]
     common = -20.0 * np.expm1(-np.arange(70) / 25.0)
     assert found.axes[0].removed_mm / UM == pytest.approx(common - common[-1], abs=1.2)
-    told = "the means of the runs rise and level off in both directions: what is common to all positions is taken off; "
-    told += "part of the drift is not the same at all positions or in both directions and stays"
+    told = "the means of the runs rise and level off in both directions: the part common to all positions is removed; "
+    told += "part of the drift is not the same at all positions or in both directions and is not removed"
     assert f"X: warmup_drift is tentative; {told}" in data["notes"]
     assert found.removed_csv().startswith(f"# warmup_drift_X = {told}\n")
 
@@ -286,7 +286,7 @@ def test_a_tentative_drift_that_the_means_of_the_runs_do_not_show_is_not_taken_o
     item = data["effects"][0]
     assert (item["name"] in ("warmup_drift", "linear_drift"), item["grade"]) == (True, "tentative")
     assert data["taken_off"] == {"X": []}
-    assert not [text for text in data["notes"] if "taken off" in text]
+    assert not [text for text in data["notes"] if "removed" in text]
     assert all(pair["after"] == pair["before"] for pair in data["iso_230_2"]["X"].values())
 
 

@@ -219,7 +219,7 @@ def test_the_list_shows_cards_and_what_comes_from_plug_ins(call, tmp_path, monke
         (
             "from compgen.effects import PerAxis\nfrom compgen.effects.axes import Backlash\n"
             "FAMILIES = {'a': PerAxis('a', Backlash)}",
-            "the name 'backlash_X' is taken",
+            "the name 'backlash_X' is already used",
         ),
     ],
 )

@@ -722,8 +722,8 @@ def test_cvxpy_is_imported_only_when_a_bound_is_active():
         ({"smoothness": math.nan}, "smoothness: nan is not allowed"),
         ({"max_abs": {"EXQ": 1.0}}, "max_abs: 'EXQ' is neither a curve.*did you mean"),
         ({"max_abs": {"EC0Y": 1.0}}, "max_abs: 'EC0Y' is neither a curve"),
-        ({"max_slope": {"EXX": 0.0}}, "max_slope: 0.0 for EXX leaves no curve"),
-        ({"max_abs": {"linear": -2.0}}, "max_abs: -2.0 for linear leaves no curve"),
+        ({"max_slope": {"EXX": 0.0}}, "max_slope: 0.0 for EXX is not a possible bound"),
+        ({"max_abs": {"linear": -2.0}}, "max_abs: -2.0 for linear is not a possible bound"),
     ],
 )
 def test_impossible_options_are_refused_with_the_error_and_the_bound(settings, message):

@@ -308,7 +308,7 @@ def test_a_monotone_straightness_is_refused_with_the_relaxation_that_it_needs():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"max_curvature": {"EXX": -1.0}}, "max_curvature: -1.0 for EXX leaves no curve"),
+        ({"max_curvature": {"EXX": -1.0}}, "max_curvature: -1.0 for EXX is not a possible bound"),
         ({"monotone": {"linear": "increasing"}}, "monotone: 'linear' is not one of the curves"),
         ({"monotone": {"EXX": "up"}}, "monotone: 'up' for EXX is not allowed; give one of increasing, decreasing"),
     ],
@@ -687,7 +687,7 @@ def test_the_command_takes_bounds_in_file_units(tmp_path, small_machine, small_m
     [
         ("--max-abs", "EXX", "--max-abs: 'EXX' is not of the form NAME=LIMIT"),
         ("--max-slope", "EXX=steep", "--max-slope: 'steep' for EXX is not a number"),
-        ("--max-abs", "EXX=-3", "max_abs: -0.003 for EXX leaves no curve"),
+        ("--max-abs", "EXX=-3", "max_abs: -0.003 for EXX is not a possible bound"),
         ("--monotone", "EXX=up", "'up' for EXX is not allowed"),
     ],
 )

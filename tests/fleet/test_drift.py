@@ -238,7 +238,7 @@ def test_few_calibrations_give_changes_but_no_trend(small_machine, small_errors)
     assert "a trend needs three calibrations" in drift.notes
     one = drift_report(small_machine, history[:1])
     assert (one.since_last, one.volume_since_last) == ((), None)
-    with pytest.raises(InputError, match="must be in order of time"):
+    with pytest.raises(InputError, match="must be in chronological order"):
         drift_report(small_machine, history[::-1])
     with pytest.raises(InputError, match="needs at least one calibration"):
         drift_report(small_machine, [])

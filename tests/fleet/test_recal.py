@@ -327,7 +327,7 @@ def test_an_older_measurement_that_comes_late_does_not_take_the_place_of_a_newer
     plant.measure("a", hours=-2)
     outcome = plant.run()
     assert plant.states() == ["pending", "held"]
-    assert "version 1, which waits, comes from a newer measurement" in outcome.outcomes[0].messages[0]
+    assert "version 1 waits for approval and comes from a newer measurement" in outcome.outcomes[0].messages[0]
 
 
 def test_tables_that_the_round_trip_refuses_can_never_be_approved(plant):
@@ -373,7 +373,7 @@ def test_what_cannot_be_read_is_reported_once_and_taken_when_it_can(plant):
     plant.write("max_size_mb = 1.5")
     first, second = plant.run(), plant.run()
     assert first.exit_code == second.exit_code == 1
-    assert "is too large: 2 MB where 1.5 MB are left" in first.outcomes[0].messages[0]
+    assert "is too large: 2 MB, but only 1.5 MB are left" in first.outcomes[0].messages[0]
     assert len(open_store(plant.job().store).events()) == 1
     plant.measure("a")
     assert plant.run().outcomes[0].processed == ("a.deviations.csv",)

@@ -401,7 +401,7 @@ class Counting:
 
     def call(self, function, item, stop):
         if stop():
-            raise StoppedError("not begun: stopped")
+            raise StoppedError("not started: stopped")
         return item.value()
 
     def close(self):

@@ -216,7 +216,7 @@ def test_the_season_of_c_is_separated_and_no_drift_is_left(year, checks):
     assert checks.named_drifts(drift) == set() and not drift.gaps
     told = drift.sentences()
     for name in ("EXX", "EYY", "EZZ"):
-        assert any(re.match(rf"{name} line follows the temperature by .* per K", text) for text in told)
+        assert any(re.match(rf"{name} line changes with temperature by .* per K", text) for text in told)
 
 
 def test_half_a_year_of_warming_up_is_no_drift_if_the_temperature_is_known(year, store, checks):
@@ -261,7 +261,7 @@ def test_the_example_tells_the_year_line_by_line_and_writes_its_pages(year, exam
     assert any("rollback" in line and " ada " in line and "out of tolerance" in line for line in told)
     pages = sorted((year.factory.folder / "reports").glob("*.html"))
     assert [page.stem for page in pages] == ["mill-a", "mill-b", "mill-c"]
-    assert all("follows the temperature" in page.read_text() for page in pages[2:])
+    assert all("changes with temperature" in page.read_text() for page in pages[2:])
 
 
 def test_running_again_changes_nothing(year, example, listing):
@@ -275,7 +275,7 @@ def test_running_again_changes_nothing(year, example, listing):
 def test_the_commands_work_on_the_factory(year, capsys, tmp_path):
     job = ["--job", str(year.factory.folder / "recal.toml")]
     assert run_command(cli, ["recal", "history", "mill-c", "--drift", "--report", str(tmp_path / "c.html"), *job]) == 0
-    assert "EXX line follows the temperature" in capsys.readouterr().out
+    assert "EXX line changes with temperature" in capsys.readouterr().out
     assert (tmp_path / "c.html").read_text().count('<svg class="plot"') > 10
     wrong = [["exclude", "mill-b", "99"], ["exclude", "mill-b", str(year.rows[-2].active)], ["exclude", "mill-x", "1"]]
     for words in wrong:
@@ -340,9 +340,9 @@ def prepared(example, tmp_path_factory):
         ("the file has no time and was copied", "held", "changes when it is copied", True),
         ("the server's clock ran ahead", "held", "the clock went back, so the time", True),
         ("the machine has another name in the job file", "held", "never made any of mill-x active", True),
-        ("the store was deleted", "failed", "never active by this store", False),
+        ("the store was deleted", "failed", "this store never made active", False),
         ("the store has 0 bytes", "stopped", r"0 bytes", False),
-        ("the store is an older one", "failed", "never active by this store", False),
+        ("the store is an older one", "failed", "this store never made active", False),
     ],
 )
 def test_wrong_times_and_lost_histories_never_undo_the_compensation(
@@ -404,4 +404,4 @@ def test_a_laser_along_one_axis_never_replaces_tables_of_all_errors(example, tmp
     told = drift_of_store(store, store.machine("mill-b"), DriftSettings())
     store.close()
     assert len(told.times) == 1
-    assert told.notes[-1] == "1 of 2 calibrations are left out: they show a few errors only"
+    assert told.notes[-1] == "1 of 2 calibrations are left out: they contain only a few errors"

@@ -469,7 +469,7 @@ def test_the_pointer_is_left_alone_by_a_store_that_does_not_know_it(site, tmp_pa
     site.job = faults.read_job(path)
     outcome = outcome_of(site)
     assert outcome.state == "failed"
-    assert "was never active by this store" in outcome.messages[-1]
+    assert "this store never made active" in outcome.messages[-1]
     assert os.readlink(site.out / "active") == "v0001"
     assert faults.read_active(site) == []
 

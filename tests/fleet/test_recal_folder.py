@@ -61,7 +61,7 @@ def test_a_lost_store_processes_nothing_and_overwrites_nothing(second, listing, 
     second.measure("third", drifted(small_errors, 70.0), seed=3, active_table="none")
     outcome = second.run()
     assert (outcome.state, outcome.processed) == ("failed", ())
-    assert "was never active by this store" in outcome.messages[0] and "volcomp recal adopt mill" in outcome.messages[0]
+    assert "this store never made active" in outcome.messages[0] and "volcomp recal adopt mill" in outcome.messages[0]
     assert listing(second.out) == before
     assert second.tables() == []
 
@@ -92,7 +92,7 @@ def test_an_older_backup_is_recognised_before_it_makes_another_version_2(second,
     second.measure("third", drifted(small_errors, 70.0), seed=3, active_table="none")
     outcome = second.run()
     assert (outcome.state, outcome.processed) == ("failed", ())
-    assert "leads to v0002, which was never active by this store" in outcome.messages[0]
+    assert "points to v0002, which this store never made active" in outcome.messages[0]
     with pytest.raises(InputError, match="never active"):
         actions.rollback(second.job, "mill", "ada", "why", to=0, clock=lambda: second.now)
     assert listing(second.out) == before
@@ -128,7 +128,7 @@ def test_an_older_backup_that_went_on_is_recognised_by_the_contents(second, list
     (second.folder / "recal.toml").write_text(text)
     second.job = read_job(second.folder / "recal.toml")
     (message,) = second.run().messages
-    assert "follows other decisions and tables than those of this store" in message
+    assert "records other decisions or tables than this store" in message
     assert listing(second.out) == before
 
 
@@ -166,7 +166,7 @@ def test_a_machine_with_a_new_name_is_told_whose_folder_it_is(second, small_erro
     second.write(name="lathe")
     second.measure("third", drifted(small_errors, 70.0), on=second.on(), seed=3)
     (message,) = second.run().messages
-    assert "was never active by this store" in message or "is the folder of machine mill" in message
+    assert "this store never made active" in message or "is the folder of machine mill" in message
     assert [table.version for table in second.tables()] == [1, 2]
 
 
@@ -375,7 +375,7 @@ def test_adopt_from_the_command_line(second, capsys):
         return code, capsys.readouterr()
 
     code, said = call("approve", "mill", "1")
-    assert code == 2 and "never active by this store" in said.err
+    assert code == 2 and "this store never made active" in said.err
     assert call("adopt", "mill")[0] == 2  # without a reason
     code, said = call("adopt", "mill", "--reason", "Sunday counts", "--actor", "ada", "--json")
     assert code == 0
@@ -385,7 +385,7 @@ def test_adopt_from_the_command_line(second, capsys):
         "set_aside": str(second.out / "SET-ASIDE-1"),
     }
     code, said = call("history", "mill", "--json")
-    assert "given to this store by ada, what was there is in SET-ASIDE-1: Sunday counts" in said.out
+    assert "assigned to this store by ada, the earlier contents are in SET-ASIDE-1: Sunday counts" in said.out
 
 
 def test_what_a_job_knows_of_other_machines_does_not_grow_with_the_fleet(tmp_path):

@@ -31,7 +31,7 @@ from compgen.fleet.watch import Watch
 
 HERE = Path(__file__).resolve().parents[1]
 #: What a page says while its figures are not there yet.
-UNDER_WAY = re.compile("being worked out")
+UNDER_WAY = re.compile("being calculated")
 
 
 def _loaded(path):

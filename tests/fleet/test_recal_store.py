@@ -317,7 +317,7 @@ def test_a_backup_restores_every_row_and_the_store_goes_on(store, tmp_path):
     counts = backup(store.url, tmp_path / "b" / "copy.sqlite")
     assert [path.name for path in (tmp_path / "b").iterdir()] == ["copy.sqlite"]
     assert counts["tables"] == 5
-    with pytest.raises(InputError, match="never written over"):
+    with pytest.raises(InputError, match="never overwrites another one"):
         backup(store.url, tmp_path / "b" / "copy.sqlite")
     url = f"sqlite:///{tmp_path}/new.sqlite"
     assert restore(tmp_path / "b" / "copy.sqlite", url) == counts

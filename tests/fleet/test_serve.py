@@ -97,7 +97,7 @@ def test_the_summary_of_the_database_is_that_of_the_decisions_one_by_one(site):
 def test_the_fleet_is_searched_by_name_and_by_status(site):
     assert "<caption>2 machines" in site.get("/?status=held").text
     assert "<caption>1 machines" in site.get("/?q=MILL-1").text
-    assert "No machine is found" in site.get("/?q=lathe").text
+    assert "No machines found" in site.get("/?q=lathe").text
     assert "<caption>5 machines" in site.get("/?status=unknown&page=99999999").text
 
 
@@ -399,7 +399,7 @@ def test_a_decision_on_a_page_that_is_out_of_date_is_refused(site):
     before = factory.everything(site.store)
     answer = site.post("/machines/1/tables/3/approve", {"seen": "2", "csrf": token})
     assert answer.status_code == 409
-    assert "other tables became active" in answer.text
+    assert "the active tables have changed" in answer.text
     assert factory.everything(site.store) == before
 
 

@@ -177,14 +177,14 @@ def test_what_was_seen_is_checked_in_the_same_transaction_as_the_decision(site):
     mill = site.store.machine("mill-1")
     factory.add(site.store, mill, 4, hold=["why"])
     decisions.approve(site.store, mill, 3, "meyer", seen=2)
-    with pytest.raises(decisions.DecisionError, match="other tables became active"):
+    with pytest.raises(decisions.DecisionError, match="the active tables have changed"):
         decisions.approve(site.store, mill, 4, "schmidt", "checked", override=True, seen=2)
-    with pytest.raises(decisions.DecisionError, match="other tables became active"):
+    with pytest.raises(decisions.DecisionError, match="the active tables have changed"):
         decisions.reject(site.store, mill, 4, "schmidt", "no", seen=2)
-    with pytest.raises(decisions.DecisionError, match="other tables became active"):
+    with pytest.raises(decisions.DecisionError, match="the active tables have changed"):
         decisions.rollback(site.store, mill, "schmidt", "back", to=1, seen=2)
     decisions.rollback(site.store, mill, "schmidt", "none", to=0, seen=3)
-    with pytest.raises(decisions.DecisionError, match="other tables became active"):
+    with pytest.raises(decisions.DecisionError, match="the active tables have changed"):
         decisions.rollback(site.store, mill, "schmidt", "back", to=1, seen=3)
     decisions.rollback(site.store, mill, "schmidt", "back", to=1, seen=0)
 

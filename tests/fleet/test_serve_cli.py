@@ -181,7 +181,7 @@ def test_a_decision_whose_files_cannot_follow_stands_and_says_so(site, tmp_path)
     (tmp_path / "tables").write_text("in the way")
     assert post("/machines/1/tables/3/reject", reason="no", seen="2").status_code == 303
     text = client.get("/machines/1", base_url=OWN).text
-    assert "The decision is made, but the files could not be updated yet" in text
+    assert "The decision is recorded, but the files could not be updated yet" in text
     assert [table.state for table in store.tables(store.machine("mill-1"))] == ["retired", "active", "rejected"]
 
 

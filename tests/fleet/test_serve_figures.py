@@ -124,9 +124,9 @@ def test_a_page_says_that_figures_are_being_worked_out_and_loads_itself_again(si
         lambda key, work, patience_s=None: Background.get(real, key, lambda: go_on.wait(30) and work(), 0.0),
     )
     text = site.get("/machines/1/drift").text
-    assert "being worked out" in text
+    assert "being calculated" in text
     assert '<meta http-equiv="refresh" content="3">' in text
-    assert "being worked out" in site.get("/machines/1").text
+    assert "being calculated" in site.get("/machines/1").text
     go_on.set()
     until = time.monotonic() + 60.0
     while "Changes</h2>" not in (text := site.get("/machines/1/drift").text):
@@ -378,7 +378,7 @@ def test_the_fleet_shows_trend_and_tolerance(tracked_site, monkeypatch):
     told = re.search(r"EC0Y leaves tolerance in about (\d+) months, 95 % (\d+)-(\d+)", row)
     assert int(told[2]) <= 9.7 <= int(told[3])
     mill = re.search(r'href="/machines/1">mill-1</a></th>(.*?)</tr>', text, re.S)[1]
-    assert "nothing beyond the uncertainty" in mill or "being worked out" in mill
+    assert "nothing beyond the uncertainty" in mill or "being calculated" in mill
 
 
 def test_the_fleet_is_worked_out_only_when_nobody_asks_for_anything(monkeypatch):

@@ -492,7 +492,7 @@ def test_plan_suggests_and_proposes(call, small_machine_file, stations_file, tmp
     assert len(read_points(out / "proposed.points.csv")) == report["trajectories"][-1]["points"]
     code, stdout, _ = call(*words, "--target-um", "0.0001", "--json")
     assert (code, json.loads(stdout)["proposed"]) == (1, None)
-    assert "suggested places" in call(*words, *search)[1]
+    assert "suggested station positions" in call(*words, *search)[1]
 
 
 @pytest.mark.parametrize(

@@ -356,7 +356,7 @@ def test_statements_say_what_it_is_not_and_which_sign_it_has(root):
         item.findtext("dcc:name/dcc:content", "", N): item.findtext("dcc:declaration/dcc:content", "", N)
         for item in root.iterfind(".//dcc:statement", N)
     }
-    assert "no calibration laboratory" in found["What this document is not"]
+    assert "not a calibration laboratory" in found["What this document is not"]
     assert "actual minus commanded" in found["Sign convention"]
     assert found["Traceability"].startswith("The instruments are calibrated")
     convention = root.findtext(".//dcc:statement/dcc:convention", "", N)

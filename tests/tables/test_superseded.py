@@ -37,7 +37,7 @@ def test_an_edited_table_is_kept_with_a_word(small_machine, small_lengths_file, 
     edited = exported.replace(b"0.0", b"0.1", 1)
     table.write_bytes(edited)
     with pytest.warns(
-        compgen.CompgenWarning, match=r"kept volcomp0\.csv \(not as an export wrote it\) as PREVIOUS-volcomp0\.csv"
+        compgen.CompgenWarning, match=r"kept volcomp0\.csv \(changed after the export\) as PREVIOUS-volcomp0\.csv"
     ):
         again(small_machine, small_lengths_file, folder)
     assert (folder / "PREVIOUS-volcomp0.csv").read_bytes() == edited

@@ -201,7 +201,7 @@ def machine(machine_id: int) -> str:
     try:
         sentences = service.drift_of(found, A_MOMENT_S).sentences()
     except NotReadyError:
-        g.complete, problem = False, "The drift is being worked out."
+        g.complete, problem = False, "The drift is being calculated."
     except InputError as error:
         problem = str(error)
     told = history(service.store, service.errors_of, found)
@@ -249,7 +249,7 @@ def recheck_points(machine_id: int) -> Response:
     try:
         plan = service.recheck_of(start, change)
     except NotReadyError:
-        abort(503, "The points are being worked out; ask again in a moment.")
+        abort(503, "The points are being calculated; try again in a moment.")
     return _download(format_recheck_points(plan).encode(), "recheck.points.csv")
 
 
@@ -298,7 +298,7 @@ def metrics() -> Response:
     if settings.private or settings.metrics_token:
         shown = request.headers.get("Authorization", "")
         if not settings.metrics_token or not same(shown, f"Bearer {settings.metrics_token}"):
-            abort(403, "The metrics need their token.")
+            abort(403, "The metrics require a token.")
     return Response(the_service().metrics.text(), content_type=CONTENT_TYPE)
 
 
@@ -337,7 +337,7 @@ def login() -> BaseResponse:
 def _form(problem: str, code: int, name: str = "") -> Response:
     service = the_service()
     if service.users is None:
-        abort(404, "This dashboard only reads; there is nothing to log in for.")
+        abort(404, "This dashboard is read-only; there is no login.")
     cookie, field = service.tokens.issue()
     back = request.values.get("back", "/")
     back = back if BACK.fullmatch(back) else "/"
@@ -352,11 +352,11 @@ def log_in() -> BaseResponse:
     """Check name and password; a new session always begins, whatever the browser sent."""
     service = the_service()
     if service.users is None:
-        abort(404, "This dashboard only reads; there is nothing to log in for.")
+        abort(404, "This dashboard is read-only; there is no login.")
     name, password = request.form.get("name", "")[:100].strip(), request.form.get("password", "")
     cookie = request.cookies.get(cookie_name(service.settings, "login"))
     if not service.tokens.right(cookie, request.form.get("csrf", "")):
-        return _form("The form was too old; try again.", 403, name)
+        return _form("The form has expired; try again.", 403, name)
     address = request.remote_addr or ""
     wait_s = service.limit.wait_s(address, name)
     if wait_s > 0.0:
@@ -380,9 +380,9 @@ def log_in() -> BaseResponse:
 
 def _refused(name: str, address: str, wait_s: float) -> Response:
     the_service().metrics.logins.labels("limited").inc()
-    logs.warning("too many logins", user=name, address=address)
+    logs.warning("too many login attempts", user=name, address=address)
     seconds = math.ceil(wait_s)
-    response = _form(f"Too many tries; wait {seconds} s.", 429, name)
+    response = _form(f"Too many attempts; wait {seconds} s.", 429, name)
     response.headers["Retry-After"] = str(seconds)
     return response
 
@@ -411,7 +411,7 @@ def decide(machine_id: int, version: int, kind: str) -> BaseResponse:
 def roll_back(machine_id: int) -> BaseResponse:
     """Make earlier tables active again, or none."""
     machine, decision = _allowed(machine_id), _decision_request()
-    to = _whole("to", "choose the version that becomes active again")
+    to = _whole("to", "choose the version to make active again")
     return _decided(machine, "rollback", lambda s, m: decisions.rollback(s, m, to=to, **decision))
 
 
@@ -421,7 +421,7 @@ def _decision_request() -> dict[str, Any]:
     reason = " ".join("".join(char if char.isprintable() else " " for char in text).split())
     if len(reason) > LONGEST_REASON:
         raise InputError(f"a reason has at most {LONGEST_REASON} characters; this one has {len(reason)}")
-    seen = _whole("seen", "open the page again: the form does not state what was active")
+    seen = _whole("seen", "reload the page: the form does not state which version was active")
     return {"actor": g.session.user, "reason": reason, "seen": seen}
 
 
@@ -436,9 +436,9 @@ def _whole(field: str, problem: str) -> int:
 def _allowed(machine_id: int) -> MachineRecord:
     """Return the machine if decisions are allowed here; session, origin and token have been checked."""
     if not the_service().settings.decide:
-        abort(403, "This dashboard only reads.")
+        abort(403, "This dashboard is read-only.")
     if not the_service().may_decide(g.session.user):
-        abort(403, "You may read, but not decide; `volcomp serve add-user` without --reader changes that.")
+        abort(403, "You may view, but not decide; `volcomp serve add-user` without --reader changes that.")
     return the_machine(machine_id)
 
 
@@ -454,11 +454,11 @@ def _decided(
             service.store.version()  # StoreError if the file was replaced, before a new one is opened
             actions.carried_out(read_job(service.settings.job), machine.name, decide)
     except NotPublishedError as error:
-        logs.error("files do not follow", machine=machine.name, problem=str(error))
+        logs.error("files not updated", machine=machine.name, problem=str(error))
         g.session.messages.append(str(error))
     service.metrics.decisions.labels(kind).inc()
     logs.info("decision", machine=machine.name, kind=kind, user=user, address=request.remote_addr)
-    g.session.messages.append(f"{machine.name}: {kind} is done and kept in the audit trail.")
+    g.session.messages.append(f"{machine.name}: {kind} is done and recorded in the audit trail.")
     return redirect(f"/machines/{machine.id}", code=303)
 
 
@@ -532,9 +532,9 @@ def _begin_request() -> BaseResponse | None:
     if request.method not in SAFE:
         check_origin(request, service.settings)
         if request.endpoint != "signing.log_in" and g.session is None:
-            raise Forbidden("Log in first; a session ends after half an hour without a request.")
+            raise Forbidden("Log in first; a session ends after 30 minutes without activity.")
         if request.endpoint != "signing.log_in" and not same(g.session.csrf, request.form.get("csrf", "")):
-            raise Forbidden("The form does not belong to this session; open the page again.")
+            raise Forbidden("The form does not belong to this session; reload the page.")
     if service.settings.private and g.session is None and request.endpoint not in OPEN_PAGES:
         return redirect("/login", code=303)
     return None
@@ -609,7 +609,7 @@ def _unexpected(error: Exception) -> tuple[str, int]:
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
     logs.error("internal error", problem=f"{type(error).__name__}: {error}", where=where, path=request.path[:200])
-    text = "This is an error of the program; see its log."
+    text = "This is a bug in the program; see its log."
     return render_template("error.html", code=500, title="Internal error", text=text), 500
 
 

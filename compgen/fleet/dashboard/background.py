@@ -98,7 +98,7 @@ class Background:
                 self._idle.setdefault(key, work)
             if not self._idling:
                 self._idling = True
-                threading.Thread(target=self._work_at_rest, name="figures at rest", daemon=True).start()
+                threading.Thread(target=self._work_at_rest, name="figures in idle time", daemon=True).start()
 
     def began(self) -> None:
         """Note that a request arrived."""
@@ -131,7 +131,7 @@ class Background:
                 return
             error = future.exception()
             if error is not None:  # it will be requested again; the page of that machine shows the problem
-                logs.warning("figures not worked out", problem=f"{type(error).__name__}: {error}")
+                logs.warning("figures not calculated", problem=f"{type(error).__name__}: {error}")
             since = time.monotonic()
 
     def _forget(self) -> None:

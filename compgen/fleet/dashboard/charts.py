@@ -195,7 +195,7 @@ class History:
 
     @property
     def open(self) -> list[TableRecord]:
-        """Tables that wait for a person."""
+        """Versions of tables that wait for a decision."""
         return [table for table in self.tables if table.state in OPEN]
 
     @property
@@ -322,11 +322,11 @@ class ErrorCache:
 #: Figures of the volume to compare, and their names.
 FIGURES = {
     "rms_um": "rms of the error vector",
-    "p95_um": "95 % of the points stay below",
+    "p95_um": "95th percentile of the error vector",
     "max_um": "largest error vector",
-    "v_x_um": "range in X",
-    "v_y_um": "range in Y",
-    "v_z_um": "range in Z",
+    "v_x_um": "range of the error in X",
+    "v_y_um": "range of the error in Y",
+    "v_z_um": "range of the error in Z",
 }
 #: Limits: curves drawn, lines of a difference, bytes of a compared file.
 DRAWN, DIFF_LINES, DIFF_BYTES = 6, 400, 400_000
@@ -507,7 +507,7 @@ def _curves(now: ErrorTable, before: ErrorTable | None) -> list[Chart]:
         series = [ChartSeries("this measurement", curve.position_mm.tolist(), (curve.value * scale).tolist(), u)]
         if name in old:
             place, value = old[name].position_mm.tolist(), (old[name].value * scale).tolist()
-            series.append(ChartSeries("behind the active tables", place, value))
+            series.append(ChartSeries("measurement of the active tables", place, value))
         charts.append(chart(f"{name}, {LABEL[error.unit]} over {'XYZ'[error.axis]}, mm", series))
     return [item for item in charts if item is not None]
 
@@ -526,7 +526,7 @@ def file_views(store: Store, table: TableRecord, active: TableRecord | None) -> 
         elif old == new:
             note = "the same bytes as the active file"
         elif max(len(old), len(new)) > DIFF_BYTES or b"\0" in old or b"\0" in new:
-            note = "differs; too large or no text, so the difference is not shown"
+            note = "differs; the difference is not shown because the file is too large or is not text"
         else:
             before, after = (content.decode("utf-8", "replace").splitlines() for content in (old, new))
             lines = list(difflib.unified_diff(before, after, "active", "this version", n=1, lineterm=""))

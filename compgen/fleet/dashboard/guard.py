@@ -46,7 +46,7 @@ class Misdirected(HTTPException):
     """The request uses a host name that is not one of the server's."""
 
     code = 421
-    description = "This server is not known by that name; --name adds one."
+    description = "This server does not have that name; add it with --name."
 
 
 def check_host(request: Request, settings: DashboardSettings) -> None:

@@ -62,8 +62,12 @@ class FleetCollector(Collector):
         measured = GaugeMetricFamily(
             "compgen_last_measurement_timestamp_seconds", "When the newest measurement was made.", labels=["machine"]
         )
-        active = GaugeMetricFamily("compgen_active_version", "Active tables, 0 if none are.", labels=["machine"])
-        waiting = GaugeMetricFamily("compgen_waiting_tables", "Tables that wait for a person.", labels=["machine"])
+        active = GaugeMetricFamily(
+            "compgen_active_version", "Version of the active tables, 0 if none.", labels=["machine"]
+        )
+        waiting = GaugeMetricFamily(
+            "compgen_waiting_tables", "Versions of tables that wait for a decision.", labels=["machine"]
+        )
         failed = GaugeMetricFamily(
             "compgen_last_attempt_failed", "Whether the last attempt failed.", labels=["machine"]
         )
@@ -99,12 +103,12 @@ class ServeMetrics(_Metrics):
         )
         self.logins = Counter("compgen_logins", "Logins by outcome.", ["outcome"], registry=self.registry)
         self.decisions = Counter(
-            "compgen_dashboard_decisions", "Decisions made here.", ["kind"], registry=self.registry
+            "compgen_dashboard_decisions", "Decisions made on this dashboard.", ["kind"], registry=self.registry
         )
         self.refused = Counter(
             "compgen_refused_requests", "Requests refused by reason.", ["reason"], registry=self.registry
         )
-        Gauge("compgen_sessions", "Users who are logged in.", registry=self.registry).set_function(sessions)
+        Gauge("compgen_sessions", "Users logged in.", registry=self.registry).set_function(sessions)
         self.registry.register(FleetCollector(store))
 
 
@@ -117,7 +121,7 @@ class WatchMetrics(_Metrics):
             "compgen_recal_passes", "Passes by outcome.", ["machine", "state"], registry=self.registry
         )
         self.measurements = Counter(
-            "compgen_recal_measurements", "Measurements that were processed.", ["machine"], registry=self.registry
+            "compgen_recal_measurements", "Measurements processed.", ["machine"], registry=self.registry
         )
         self.seconds = Histogram(
             "compgen_recal_pass_seconds",
@@ -126,7 +130,7 @@ class WatchMetrics(_Metrics):
             registry=self.registry,
         )
         self.last = Gauge(
-            "compgen_recal_last_pass_timestamp_seconds", "When a machine was last looked at.", ["machine"],
+            "compgen_recal_last_pass_timestamp_seconds", "When a machine was last checked.", ["machine"],
             registry=self.registry,
         )  # fmt: skip
         if store is not None:

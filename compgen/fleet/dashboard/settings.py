@@ -83,7 +83,7 @@ def check_settings(settings: DashboardSettings) -> DashboardSettings:
     """Return the settings; InputError if they are incomplete or would send unencrypted passwords over a network."""
     if settings.login and not is_local(settings.host) and not settings.tls:
         raise InputError(
-            f"passwords would go to {settings.host} in the clear; keep --host 127.0.0.1 and put a proxy with HTTPS in "
+            f"passwords would be sent to {settings.host} unencrypted; keep --host 127.0.0.1 and put a proxy with HTTPS in "
             "front, then add --behind-tls",
             field="--host",
         )

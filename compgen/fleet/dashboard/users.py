@@ -76,7 +76,7 @@ class Users:
         new = name not in users
         others = {known.lower() for known in users if known != name}
         if name.lower() in others:
-            raise InputError(f"{name!r} differs from another user by capital letters only; choose another name")
+            raise InputError(f"{name!r} differs from another user only in upper and lower case; choose another name")
         users[name] = self._hasher.hash(_normal(password))
         self._write(users, readers | {name} if reader else readers - {name})
         return new
@@ -94,7 +94,9 @@ class Users:
         try:
             with self.path.open(encoding="utf-8") as stream:
                 if os.name == "posix" and os.fstat(stream.fileno()).st_mode & 0o022:
-                    raise InputError("others may write this file of users; chmod 600 it", file=self.path)
+                    raise InputError(
+                        "other accounts may write to this file of users; run chmod 600 on it", file=self.path
+                    )
                 data = json.load(stream)
         except FileNotFoundError:
             return {}, frozenset()
@@ -102,11 +104,11 @@ class Users:
             raise InputError(f"cannot be read as a file of users: {error}", file=self.path) from error
         users = data.get("users") if isinstance(data, dict) else None
         if not isinstance(users, dict) or not all(isinstance(item, str) for item in users.values()):
-            raise InputError("is not a file of users; make one with `volcomp serve add-user`", file=self.path)
+            raise InputError("is not a file of users; create one with `volcomp serve add-user`", file=self.path)
         readers = data.get("readers", [])
         if not isinstance(readers, list) or not all(isinstance(item, str) for item in readers):
             raise InputError(
-                "has a malformed list of readers; make it again with `volcomp serve add-user`", file=self.path
+                "has a malformed list of readers; create it again with `volcomp serve add-user`", file=self.path
             )
         return users, frozenset(readers)
 
@@ -141,7 +143,7 @@ def check_name(name: str) -> None:
     if not NAME.fullmatch(name):
         raise InputError(f"{name!r} is not a name: letters, digits and . _ @ -, at most 64, are allowed")
     if name.lower() == AUTOMATIC:
-        raise InputError(f"{name!r} is the signature of automatic decisions; choose another name")
+        raise InputError(f"{name!r} is reserved for automatic decisions; choose another name")
 
 
 def check_password(name: str, password: str) -> None:

@@ -37,7 +37,7 @@ IS = (
     "issuer; the program checked their form, not their truth. The laboratory named here is responsible for the document."
 )
 IS_NOT = (
-    "The program and its authors are no calibration laboratory, neither accredited nor certified; the document claims no "
+    "The program and its authors are not a calibration laboratory, and neither accredited nor certified; the document claims no "
     "accreditation and no metrological traceability beyond what the issuer can show. It contains no electronic signature "
     "or seal: unless the issuer adds one, it does not prove its origin. It is not a statement of conformity of "
     "the machine, and its figures follow published formulas of the standards but are not certified against them."
@@ -174,7 +174,7 @@ def machine_text(data: Mapping[str, Any]) -> str:
     machine = data["machine"]
     parts = [f"Machine file {machine.get('name', data['title'])}"]
     if machine.get("chain"):
-        parts.append(f"kinematic chain {machine['chain']} (W workpiece, F frame, T tool)")
+        parts.append(f"kinematic chain {machine['chain']} (W workpiece, F foundation, T tool)")
     if machine.get("squareness_reference"):
         parts.append(f"squareness referred to {machine['squareness_reference']}")
     for axis, limits in dict(machine.get("travel_mm") or {}).items():

@@ -388,7 +388,7 @@ def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
             "accepted": "The tables may be loaded, following the preflight list",
             "partial": "The tables may be loaded, following the preflight list, but much of the error remains",
             "accepted_with_reservations": "The tables may be loaded, following the preflight list, with the reservations below",
-            "better_after_new_setup": "Better only after the workpiece is set up anew",
+            "better_after_new_setup": "Better only after the workpiece is set up again",
             "rejected": "Do not load these tables",
         }[state]
     count = {name: sum(item["state"] == name for item in controls) for name in VERDICTS}
@@ -409,10 +409,8 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
             f"{name} effect of the measured errors alone {change} {bounds}, as read back from the files. The error "
             "over the volume is unknown: the other errors were not measured."
         )
-    text = (
-        f"{name} error of the tool tip over the volume {change} {bounds}, with the reference point fixed, by the files "
-    )
-    text += "read back."
+    text = f"{name} error of the tool tip over the volume {change} {bounds}, with the reference point fixed, as read back from "
+    text += "the files."
     if best["state"] == "better_after_new_setup":
         rigid = f"{um(best['before_rigid'].get('rms_um'))} to {um(best['after_rigid'].get('rms_um'))} µm rms"
         text += f" With the best-fit rigid motion of the workpiece removed it goes from {rigid}."
