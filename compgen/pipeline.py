@@ -242,8 +242,8 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
         reversal=reversal,
     )
     verification = verified_export(machine, exported, identified, reversal, limits)
-    beside = tables.check_files(machine, exported, identified, templates, reversal)
-    return _write_results(OutputFolder(folder), {"": (exported, verification, beside)})[0][0]
+    extra_files = tables.check_files(machine, exported, identified, templates, reversal)
+    return _write_results(OutputFolder(folder), {"": (exported, verification, extra_files)})[0][0]
 
 
 def verified_export(
@@ -325,12 +325,12 @@ def _write_results(
         the result of each control, and the path to which the report of the earlier tables was moved.
     """
     results = []
-    for sub_folder, (exported, verification, beside) in checked.items():
+    for sub_folder, (exported, verification, extra_files) in checked.items():
         prefix = "" if verification.accepted else tables.REJECTED_PREFIX
         verification = replace(
             verification, files=tuple((prefix + name, digest) for name, digest in verification.files)
         )
-        files = {**beside, **tables.verification_files(verification)}
+        files = {**extra_files, **tables.verification_files(verification)}
         names = exported.add_to(output, sub_folder, accepted=verification.accepted, beside=files)
         paths = tuple(output.folder / name for name in names)
         results.append(ControllerResult(exported, verification, paths))
@@ -464,8 +464,8 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         verification = replace(verification, objections=found, reasons=tuple(reasons))
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
-        beside = tables.check_files(machine, exported, identification.errors, templates, reversal)
-        checked[sub_folder] = exported, verification, beside
+        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal)
+        checked[sub_folder] = exported, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
     add_identification(output, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})

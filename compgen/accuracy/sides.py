@@ -128,7 +128,7 @@ def read_side(
     header = names_in_header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
-        known = error_source(machine, errors, covariance_beside(source, errors))
+        known = error_source(machine, errors, covariance_named_by(source, errors))
         return Side(machine, source, "errors", source=known, reversal=reversal_beside(source))
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
@@ -151,17 +151,18 @@ def read_side(
     return Side(machine, source, "six-DOF readings", source=known, reversal=identified_reversal(found))
 
 
-def covariance_beside(path: Path, errors: ErrorTable) -> Covariance | None:
+def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
     """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match."""
     name = errors.metadata.get("covariance")
-    beside = path.parent / name if name else None
-    if beside is None or not beside.is_file():
+    covariance_file = path.parent / name if name else None
+    if covariance_file is None or not covariance_file.is_file():
         return None
-    found = read_covariance(beside)
+    found = read_covariance(covariance_file)
     if found.errors_sha256 == sha256_of(read_bytes(path)):
         return found
     message = (
-        f"{beside} belongs to another version of {path.name}; u_value is used instead, independent from node to node"
+        f"{covariance_file} belongs to another version of {path.name}; u_value is used instead, "
+        "independent from node to node"
     )
     warnings.warn(message, CompgenWarning, stacklevel=2)
     return None
@@ -342,12 +343,12 @@ def _predicted_at(predicted: Side, measured: ErrorField) -> ErrorField:
         return _exact(predicted).field(measured.position_mm)
     given = predicted.predicted
     index = {key: k for k, key in enumerate(map(tuple, np.round(given.position_mm, 3).tolist()))}
-    wanted = list(map(tuple, np.round(measured.position_mm, 3).tolist()))
-    missing = [key for key in wanted if key not in index]
+    points = list(map(tuple, np.round(measured.position_mm, 3).tolist()))
+    missing = [key for key in points if key not in index]
     if missing:
         raise InputError(
-            f"has no prediction for {len(missing)} of {len(wanted)} measured points, the first is {missing[0]} mm; "
+            f"has no prediction for {len(missing)} of {len(points)} measured points, the first is {missing[0]} mm; "
             "predict at the measured points",
             file=predicted.path,
         )
-    return given.at_rows(np.array([index[key] for key in wanted], dtype=np.int64))
+    return given.at_rows(np.array([index[key] for key in points], dtype=np.int64))

@@ -78,8 +78,8 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     from compgen.report.html.write import short_text
 
     OutputFolder(out or folder)
-    beside = folder / "certificate.toml"
-    source = certificate or (beside if beside.is_file() else None)
+    default = folder / "certificate.toml"
+    source = certificate or (default if default.is_file() else None)
     also: Further | None = None  # writes dcc.xml
     remark = ""
     if source is None and schema is not None:
@@ -106,7 +106,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     return 0
 
 
-def report_beside(folder: Path) -> Path | None:
+def report_written(folder: Path) -> Path | None:
     """Write the report of a finished command into its folder; if this fails, the result remains."""
     from compgen.report.html import write_report
 
@@ -191,7 +191,7 @@ def run_command(
         )
         if not no_report:
             show("drawing the report")
-        report = None if no_report else report_beside(out)
+        report = None if no_report else report_written(out)
     if report is not None:  # a new report replaces it; otherwise the earlier one is kept as PREVIOUS-...
         for path in result.earlier_report:
             path.unlink(missing_ok=True)

@@ -163,14 +163,14 @@ def covariance_of(errors: Path, table: ErrorTable, given: Path | None, *, indepe
     if given is not None:
         return read_covariance(given, errors)
     name = table.metadata.get("covariance")
-    beside = errors.parent / name if name else None
-    if beside is None or not beside.is_file():
+    covariance_file = errors.parent / name if name else None
+    if covariance_file is None or not covariance_file.is_file():
         return None
-    found = read_covariance(beside)
+    found = read_covariance(covariance_file)
     if found.errors_sha256 == sha256_of(read_bytes(errors)):
         return found
     warnings.warn(
-        f"{beside} belongs to another version of {errors.name}; u_value is used instead, independent from node to node",
+        f"{covariance_file} belongs to another version of {errors.name}; u_value is used instead, independent from node to node",
         CompgenWarning,
         stacklevel=2,
     )

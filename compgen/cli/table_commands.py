@@ -171,11 +171,13 @@ def export_command(
       volcomp export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
-    table, beside = open_errors(errors), {}
+    table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
-        beside["bare.errors.csv"] = format_errors(table, {"active_tables_removed": active.names, "lost_um": lost_um})
+        extra_files["bare.errors.csv"] = format_errors(
+            table, {"active_tables_removed": active.names, "lost_um": lost_um}
+        )
     exported = export(
         machine,
         table,
@@ -185,18 +187,18 @@ def export_command(
         provenance=provenance_of(machine.source, errors, reversal, *(active.paths if active else ())),
         reversal=both,
     )
-    beside |= check_files(machine, exported, table, templates, both)
+    extra_files |= check_files(machine, exported, table, templates, both)
     explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
     if explanation is not None:
-        beside["explain.md"] = explanation_markdown(explanation)
+        extra_files["explain.md"] = explanation_markdown(explanation)
     reasons: tuple[str, ...] = tuple(exported.violations)
     if not no_verify:
         verification = verified_export(machine, exported, table, both)
         reasons = verification.reasons
         prefix = REJECTED_PREFIX if reasons else ""
         named = tuple((prefix + name, digest) for name, digest in verification.files)
-        beside |= verification_files(replace(verification, files=named))
-    paths = exported.write(out, accepted=not reasons, beside=beside)
+        extra_files |= verification_files(replace(verification, files=named))
+    paths = exported.write(out, accepted=not reasons, beside=extra_files)
     for text in exported.warnings:
         complain(f"warning: {text}")
     for text in reasons:
@@ -211,7 +213,7 @@ def export_command(
         print_json({**exported.manifest, **verdict, **({"explain": explanation.as_dict()} if explanation else {})})
     else:
         if explanation is not None:
-            say(beside["explain.md"])
+            say(extra_files["explain.md"])
         say_paths(paths)
     return 1 if reasons else 0
 

@@ -35,28 +35,28 @@ from compgen.diagnose.search import (
     search,
 )
 
-# Evidence for and against a set of groups: lack of fit, what remains, changes from run to run, homogeneity.
+# Support for and against a set of groups: lack of fit, what remains, changes from run to run, homogeneity.
 
 
 #: Limits: standard normal deviate of the lack of fit, likelihood ratio of the runs, p-value of the homogeneity test.
 LACK_OF_FIT_Z = 3.0
 RUN_RATIO = 12.0
 HOMOGENEITY_P = 2e-3
-#: Least evidence for the best remaining generic group, in units of the criterion above its handicap.
+#: Least likelihood ratio (2 log) of the best remaining generic group, in units of the criterion above its handicap.
 DIRECTED, DIRECTED_SLOW = 20.0, 26.0
 
 
 @dataclass(frozen=True)
 class Remaining:
-    """A remaining generic group with its evidence (2 log, without handicap)."""
+    """A remaining generic group with its likelihood ratio (2 log, without handicap)."""
 
     group: int
-    evidence: float
+    log_ratio: float
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """Evidence for a set of groups.
+class Support:
+    """Support of a set of groups by the readings.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ class Evidence:
         return self.run_ratio > RUN_RATIO
 
 
-def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layout: MeasurementLayout) -> Evidence:
-    """Collect the evidence for a chosen set."""
+def support_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layout: MeasurementLayout) -> Support:
+    """Collect the support for a chosen set."""
     size = len(design.coordinates(chosen.members))
     left = design.total - chosen.chi2
     named = [g for g in chosen.members if design.groups[g].tier == "named"]
@@ -102,7 +102,7 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
         f_ratio = (left - noise.quadratic) / (freedom - noise.freedom) / error
         p = float(fdtrc(freedom - noise.freedom, noise.freedom, f_ratio)) if f_ratio > 0 else 1.0
         z = -10.0 if f_ratio <= 0 else float(-ndtri(p)) if p > 0 else 40.0
-    # generic groups whose remaining evidence exceeds chance
+    # generic groups whose remaining likelihood ratio exceeds chance
     generic = [
         g for g, group in enumerate(design.groups)
         if group.tier == "generic" and g not in chosen.members and design.size(g)
@@ -110,12 +110,12 @@ def evidence_of(design: Design, chosen: Chosen, noise: Noise, ratio: float, layo
     directed = []
     for g, gained in zip(generic, gains(design, remainder_of(design, chosen.members), generic), strict=True):
         k = design.size(g)
-        evidence = float(gained - k - k * np.log(max(gained / k, 1.0)))
-        if evidence > (DIRECTED_SLOW if design.groups[g].slow else DIRECTED):
-            directed.append(Remaining(g, evidence))
-    return Evidence(
+        log_ratio = float(gained - k - k * np.log(max(gained / k, 1.0)))
+        if log_ratio > (DIRECTED_SLOW if design.groups[g].slow else DIRECTED):
+            directed.append(Remaining(g, log_ratio))
+    return Support(
         z,
-        tuple(sorted(directed, key=lambda item: -item.evidence)),
+        tuple(sorted(directed, key=lambda item: -item.log_ratio)),
         ratio,
         {g: p for g, (p, _) in even.items()},
         {g: gained for g, (_, gained) in even.items()},
@@ -189,7 +189,7 @@ def homogeneity(design: Design, chosen: Chosen, member: int, layout: Measurement
     return float(fdtrc(k, freedom, gained / k / max(left / freedom, 1e-300))), gained
 
 
-# Diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, evidence.
+# Diagnosis of one measurement up to the chosen set: base fit, noise, groups, search, support.
 
 
 Show = Callable[[str], None]
@@ -209,7 +209,7 @@ class Analysis:
     design: Design
     rules: Rules
     chosen: Chosen
-    evidence: Evidence
+    support: Support
     missing: tuple[str, ...]
 
 
@@ -259,8 +259,8 @@ def analyse(
         chosen = search(design, rules)
     show("weighing the candidates")
     ratio = run_ratio(fit, [*fixed, *more], noise, RUN_RATIO)
-    evidence = evidence_of(design, chosen, noise, ratio, fit.observed.layout)
-    return Analysis(fit, noise, design, rules, chosen, evidence, tuple(missing))
+    support = support_of(design, chosen, noise, ratio, fit.observed.layout)
+    return Analysis(fit, noise, design, rules, chosen, support, tuple(missing))
 
 
 def _groups_of(fit: BaseFit, only: Sequence[str]) -> tuple[list[Group], list[str], list[Group]]:

@@ -56,7 +56,7 @@ LEAST_SHARE = 0.5
 #: The same for a drift found together with a smooth term in time, of which it could be a part.
 LEAST_SHARE_OF_DRIFT = 2.0
 #: Chi-square that a reversal needs if something unnamed was found, and if the runs do not repeat.
-LEAST_BESIDE, LEAST_BESIDE_RUNS = 40.0, 200.0
+LEAST_WITH_UNKNOWN, LEAST_WITH_UNKNOWN_RUNS = 40.0, 200.0
 #: An effect may vary with position, direction or time by at most this share of itself; p-value of the test.
 UNEVEN_SHARE, UNEVEN_P = 0.05, 1e-3
 #: Time constant of a fading step, as a share of the session; least readings of a disturbance to test it for fading.
@@ -141,7 +141,7 @@ class AxisFindings:
     figures: Mapping[str, Mapping[str, float]]
     residual_before_mm: FloatArray
     residual_after_mm: FloatArray
-    held_out: tuple[float, float] | None
+    left_out_rms_mm: tuple[float, float] | None
     suspects: tuple[tuple[str, float], ...]
     notes: tuple[str, ...]
     against: Mapping[str, Any] | None = None
@@ -204,8 +204,8 @@ def findings_of(
         freedom = len(session) - len(session.targets_mm)
         if freedom < LEAST_FREEDOM:
             raise InputError(
-                f"{session.letter}: {len(session)} readings leave {freedom} degrees of freedom beside the mean of every "
-                f"target; a diagnosis needs at least {LEAST_FREEDOM}: measure more runs"
+                f"{session.letter}: {len(session)} readings leave {freedom} degrees of freedom after the mean of each "
+                f"target is fitted; a diagnosis needs at least {LEAST_FREEDOM}: measure more runs"
             )
         show(f"comparing candidate effects of {session.letter}")
         with one_thread():
@@ -237,7 +237,7 @@ def _findings(
     if any({"time", "approach"} <= set(other.covariates) for other in unknown):
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
-        least = LEAST_BESIDE_RUNS if any("run" in other.covariates for other in unknown) else LEAST_BESIDE
+        least = LEAST_WITH_UNKNOWN_RUNS if any("run" in other.covariates for other in unknown) else LEAST_WITH_UNKNOWN
         static = [_doubted(i, "small compared with the unexplained part") if i.gain < least else i for i in static]
     effects, unknown = [*effects, *static], [*unknown, *irregular]
     if unknown:
@@ -246,13 +246,13 @@ def _findings(
         first = effects[0]
         unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
     effects = [_common_part(session, item, effects, changes) for item in effects]
-    removed, left_out, taken, figures, notes = _taken_off(session, effects)
+    removed, left_out, taken, figures, notes = _removal(session, effects)
     effects = [item if item.name in taken else replace(item, remains="") for item in effects]
     before, after = _residuals(session, grid, effects)
     return AxisFindings(
         session, tuple(effects), tuple(unknown), invisible_of(session),
         changes.sigma_mm if repeated else reversal.sigma_mm, changes.phi if repeated else 0.0, source,
-        removed, left_out, taken, figures, before, after, _held_out(session, effects, left_out),
+        removed, left_out, taken, figures, before, after, _left_out_rms(session, effects, left_out),
         search.suspects() if repeated else (), tuple(notes),
         None if against is None else _compared(changes, against),
     )  # fmt: skip
@@ -528,8 +528,8 @@ def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, f
         slope = np.where(inside, (number - 0.5 * (item.first + item.last)) / length, 0.0)
         fading = [slope, np.where(after, np.exp(-np.maximum(number - item.last, 0.0) / length), 0.0)]
     extra = np.column_stack([unit * session.s, unit * session.direction, unit * half, *fading])
-    beside = extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]
-    extra = extra[:, np.linalg.norm(beside, axis=0) > 0.05 * np.linalg.norm(extra, axis=0)]
+    outside = extra - columns @ np.linalg.lstsq(columns, extra, rcond=None)[0]
+    extra = extra[:, np.linalg.norm(outside, axis=0) > 0.05 * np.linalg.norm(extra, axis=0)]
     count = extra.shape[1]
     if not count or changes.freedom < count + 6:
         return 1.0, 0.0
@@ -763,7 +763,7 @@ def figures_of(session: AxisSession, deviation_mm: FloatArray, kept: IntArray) -
     return {key: float(figures[key].value) for key in SHOWN if key in figures}
 
 
-def _taken_off(
+def _removal(
     session: AxisSession, effects: Sequence[AxisEffect]
 ) -> tuple[FloatArray, IntArray, tuple[str, ...], dict[str, dict[str, float]], list[str]]:
     """What is subtracted from each reading, readings left out, names, figures before and after, and notes.
@@ -773,8 +773,8 @@ def _taken_off(
     everything = np.arange(len(session))
     before = figures_of(session, session.deviation_mm, everything)
     sure = [e for e in effects if e.grade != "tentative" or e.remains]
-    wanted = sorted((e for e in sure if not e.static), key=lambda e: (bool(e.remains), -e.gain))
-    kept_effects = list(wanted)
+    candidates = sorted((e for e in sure if not e.static), key=lambda e: (bool(e.remains), -e.gain))
+    kept_effects = list(candidates)
     notes: list[str] = []
     while True:
         left_out: IntArray = np.zeros(0, dtype=np.int64)
@@ -810,7 +810,9 @@ def _residuals(session: AxisSession, grid: NoiseGrid, effects: Sequence[AxisEffe
     return freed(session.deviation_mm), freed(session.deviation_mm - shift)
 
 
-def _held_out(session: AxisSession, effects: Sequence[AxisEffect], left_out: IntArray) -> tuple[float, float] | None:
+def _left_out_rms(
+    session: AxisSession, effects: Sequence[AxisEffect], left_out: IntArray
+) -> tuple[float, float] | None:
     """RMS of left-out readings minus their prediction, without and with the changes; one repeat per cell in turn."""
     changes = [item for item in effects if not item.static and not len(item.left_out)]
     if not changes or not session.repeated:
@@ -870,7 +872,9 @@ class AxisDiagnosis(DisplayedDiagnosis):
     @property
     def acceptable(self) -> bool:
         """Whether the misfit of left-out readings shrinks wherever a named effect predicts them."""
-        return all(part.held_out is None or part.held_out[1] < part.held_out[0] for part in self.axes)
+        return all(
+            part.left_out_rms_mm is None or part.left_out_rms_mm[1] < part.left_out_rms_mm[0] for part in self.axes
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``diagnosis.json``."""
@@ -919,11 +923,11 @@ class AxisDiagnosis(DisplayedDiagnosis):
     def _gap(self) -> dict[str, Any]:
         before = np.concatenate([part.residual_before_mm for part in self.axes])
         after = np.concatenate([part.residual_after_mm for part in self.axes])
-        held = [(part.held_out, len(part.session)) for part in self.axes if part.held_out is not None]
+        left_out = [(part.left_out_rms_mm, len(part.session)) for part in self.axes if part.left_out_rms_mm is not None]
         times = None
-        if held:
-            total = sum(count for _, count in held)
-            squares = [sum(pair[k] ** 2 * count for pair, count in held if pair) / total for k in (0, 1)]
+        if left_out:
+            total = sum(count for _, count in left_out)
+            squares = [sum(pair[k] ** 2 * count for pair, count in left_out if pair) / total for k in (0, 1)]
             times = _pair(np.sqrt(squares[0]), np.sqrt(squares[1]))
         sources = {part.noise_source for part in self.axes}
         floor = np.sqrt(np.mean([part.sigma_mm**2 for part in self.axes]))

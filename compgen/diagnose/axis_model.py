@@ -333,32 +333,32 @@ class Search:
         block = self._blocks[number]
         m, k = block.columns.shape[:2]
         crossed = [self._crossed(member)[number][point] for member in state.members]
-        beside = np.concatenate([np.zeros((m, k, 0)), *crossed], axis=2) @ state.turn[point]
-        right = block.right[point] - beside @ state.right[point]
+        projected = np.concatenate([np.zeros((m, k, 0)), *crossed], axis=2) @ state.turn[point]
+        right = block.right[point] - projected @ state.right[point]
         if k == 1:
-            size = block.value[point, :, 0] - np.sum(beside[:, 0] ** 2, axis=1)
+            size = block.value[point, :, 0] - np.sum(projected[:, 0] ** 2, axis=1)
             seen = size > LEAST_SEEN * block.size * max(state.trace[point], 1e-12)
             taken = np.where(seen, right[:, 0] ** 2 / np.where(seen, size, 1.0), 0.0)
             # a free column takes over part of what the columns with a prior could explain: their determinant decreases
-            alone = block.value[point, :, 0] - np.sum(beside[:, 0, : state.free[point]] ** 2, axis=1)
+            alone = block.value[point, :, 0] - np.sum(projected[:, 0, : state.free[point]] ** 2, axis=1)
             more = np.where(seen, np.log(np.where(seen, size / np.where(seen, alone, 1.0), 1.0)), 0.0)
             return taken[:, None], more[:, None]
         price = float(np.log(self.grid.freedom))
-        if beside.shape[2] < k:
+        if projected.shape[2] < k:
             # C'PC is diagonal with the eigenvalues (m, k), minus B B' with B (m, k, r), r < k: Woodbury's formula
             value = block.value[point]
             taken, determinant = _ridged(value, right, price)
-            if not beside.shape[2]:
+            if not projected.shape[2]:
                 return taken, determinant
             inverse = LAMBDAS / (1.0 + LAMBDAS * value[:, :, None])  # (m, k, lambdas)
-            scaled = inverse.transpose(0, 2, 1)[..., None] * beside[:, None]  # (m, lambdas, k, r)
-            middle = np.eye(beside.shape[2]) - beside.transpose(0, 2, 1)[:, None] @ scaled
+            scaled = inverse.transpose(0, 2, 1)[..., None] * projected[:, None]  # (m, lambdas, k, r)
+            middle = np.eye(projected.shape[2]) - projected.transpose(0, 2, 1)[:, None] @ scaled
             pulled = np.einsum("mlkr,mk->mlr", scaled, right)
             more = np.einsum("mlr,mlr->ml", pulled, np.linalg.solve(middle, pulled[..., None])[..., 0])
-            beside_of = np.linalg.slogdet(middle)[1]
-            beside_of[:, -1] = 0.0
-            return taken + more, determinant + beside_of
-        gram = np.eye(k) * block.value[point][:, None, :] - beside @ beside.transpose(0, 2, 1)
+            log_determinant = np.linalg.slogdet(middle)[1]
+            log_determinant[:, -1] = 0.0
+            return taken + more, determinant + log_determinant
+        gram = np.eye(k) * block.value[point][:, None, :] - projected @ projected.transpose(0, 2, 1)
         value, vector = np.linalg.eigh(gram)
         turned = np.einsum("mkl,mk->ml", vector, right)
         return _ridged(np.maximum(value, 0.0), turned, price)

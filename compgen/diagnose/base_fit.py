@@ -308,9 +308,9 @@ def fit_base(
 
 def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:
     """Least-squares step with the first unknowns kept near zero by weights ``hold`` (k,)."""
-    held = np.zeros((len(hold), design.shape[1]))
-    held[:, : len(hold)] = np.diag(hold)
-    return least_norm(np.vstack([design, held]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
+    damping = np.zeros((len(hold), design.shape[1]))
+    damping[:, : len(hold)] = np.diag(hold)
+    return least_norm(np.vstack([design, damping]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
 
 
 def _linearise(

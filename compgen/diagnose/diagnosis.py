@@ -382,8 +382,8 @@ class Diagnosis(DisplayedDiagnosis):
             "notes": list(self.notes),
             "noise": self._noise(),
             "evidence": {
-                "lack_of_fit_z": analysis.evidence.lack_of_fit_z,
-                "run_ratio": analysis.evidence.run_ratio,
+                "lack_of_fit_z": analysis.support.lack_of_fit_z,
+                "run_ratio": analysis.support.run_ratio,
                 "readings": len(analysis.fit.residual_mm),
                 "unknowns": analysis.fit.base_size,
                 "groups": len({group.name for group in analysis.design.groups}),

@@ -463,7 +463,7 @@ def fit_smooth(observed: Observed) -> BaseFit:
 
 
 def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
-    """Preselection: for each axis, the wider basis with the largest evidence, if one explains more than chance."""
+    """Preselection: for each axis, the wider basis with the largest likelihood ratio, if one explains more than chance."""
     if not fit.basis.errors:
         return ()
     poses, machine = fit.observed.poses, fit.observed.machine
@@ -483,9 +483,9 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
                 added.append(Part(after.name, slice(size_of(added), size_of(added) + more.shape[1]), more))
             columns = np.asarray(readings @ tip_columns(added, by_errors).reshape(-1, size_of(added)))
             gain, count = _gain(fit, base, columns)
-            evidence = gain - count * (1.0 + np.log(max(gain / max(count, 1), 1.0)))
-            if count and gain > count + CHANCE * np.sqrt(2.0 * count) and evidence > least:
-                best, least = (basis, columns), evidence
+            log_ratio = gain - count * (1.0 + np.log(max(gain / max(count, 1), 1.0)))
+            if count and gain > count + CHANCE * np.sqrt(2.0 * count) and log_ratio > least:
+                best, least = (basis, columns), log_ratio
         if best is not None:
             # the visible share of a group refers to its whole span, which includes the curves of the fit
             whole = Placed(np.hstack([fit.jacobian[:, : size_of(old)], best[1]]))

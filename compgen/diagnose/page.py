@@ -160,10 +160,10 @@ def suspects_picture(ranked: Sequence[tuple[str, float, float]], chosen: Contain
 def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
     """Name, chi-square on its own, and visible share of the strongest suspects."""
     design = found.analysis.design
-    wanted = [g for g, group in enumerate(design.groups) if group.tier == "named" and design.size(g)]
-    alone = gains(design, remainder_of(design, []), wanted) if wanted else np.zeros(0)
+    candidates = [g for g, group in enumerate(design.groups) if group.tier == "named" and design.size(g)]
+    alone = gains(design, remainder_of(design, []), candidates) if candidates else np.zeros(0)
     best: dict[str, tuple[float, float]] = {}
-    for g, chi2 in zip(wanted, alone, strict=True):
+    for g, chi2 in zip(candidates, alone, strict=True):
         name = design.groups[g].name
         if float(chi2) > best.get(name, (-1.0, 0.0))[0]:
             best[name] = (float(chi2), float(design.visible[g]))

@@ -358,15 +358,15 @@ def explained(design: Design, members: Sequence[int]) -> float:
     return float(design.kept[key])
 
 
-def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
-    """Gain in chi-square of each of the groups ``wanted`` when added to the set.
+def gains(design: Design, left: Remainder, candidates: Sequence[int]) -> FloatArray:
+    """Gain in chi-square of each of the groups ``candidates`` when added to the set.
 
     s' (I - c'c)^-1 s with the products c (r, k) of a group and the set, and the scores s of the group, for all groups
     of one size together; by (I - cc')^-1 if the set is smaller than the group.
     """
-    result = np.zeros(len(wanted))
-    sizes = design.facts.size[list(wanted)]
-    first = design.start[:-1][np.asarray(wanted, dtype=np.int64)]
+    result = np.zeros(len(candidates))
+    sizes = design.facts.size[list(candidates)]
+    first = design.start[:-1][np.asarray(candidates, dtype=np.int64)]
     for k in np.unique(sizes[sizes > 0]).tolist():
         alike = np.flatnonzero(sizes == k)
         at = first[alike][:, None] + np.arange(k)
@@ -385,8 +385,8 @@ def gains(design: Design, left: Remainder, wanted: Sequence[int]) -> FloatArray:
             safe = np.abs(np.linalg.det(apart)) > SAFE
         if safe.any():
             solved = np.linalg.solve(apart[safe], seen[safe][:, :, None])[:, :, 0]
-            further = np.einsum("gr,gr->g", seen[safe], solved)
-            result[alike[safe]] = found[safe] + further if short else further
+            gain = np.einsum("gr,gr->g", seen[safe], solved)
+            result[alike[safe]] = found[safe] + gain if short else gain
         for g in np.flatnonzero(~safe).tolist():
             values, vectors = np.linalg.eigh(np.eye(k) - cross[g].T @ cross[g])
             kept = values > LEAST_SQUARE

@@ -77,7 +77,7 @@ LEAST_SHARE = 0.1
 #: The same for a jump of the whole machine: of many possible times, one always fits a slow change to some extent.
 LEAST_JUMP_SHARE = 0.5
 #: Homogeneity p-value below which a name is not confirmed if something unnamed was also found.
-HOMOGENEITY_BESIDE_P = 0.01
+HOMOGENEITY_WITH_UNKNOWN_P = 0.01
 #: Unevenness that explains less than this share of the chi-square of a name is due to its inexact shape.
 SLIGHTLY_UNEVEN = 0.03
 #: A further name with a chi-square below this share of the largest is listed as a possible secondary effect.
@@ -139,16 +139,16 @@ class Verdict:
 
 def verdict_of(analysis: Analysis) -> Verdict:
     """Return the verdict."""
-    design, evidence = analysis.design, analysis.evidence
+    design, support = analysis.design, analysis.support
     members = analysis.chosen.members
     names = [g for g in members if design.groups[g].tier == "named"]
     generic = [g for g in members if design.groups[g].tier == "generic"]
     jumps = _common_jumps(analysis, names)
     names = [g for g in names if g not in jumps]
-    names.sort(key=lambda g: -evidence.chi2[g])
+    names.sort(key=lambda g: -support.chi2[g])
     shapes = {g: owner for g in generic if (owner := _owner(analysis, g, names)) is not None}
     leftover = [g for g in generic if g not in shapes]
-    owners = {*shapes.values(), *(_owner(analysis, d.group, names, d.evidence) for d in analysis.evidence.directed)}
+    owners = {*shapes.values(), *(_owner(analysis, d.group, names, d.log_ratio) for d in analysis.support.directed)}
     graded = [_graded(analysis, g, leftover, g in owners) for g in names]
     largest = max((item.chi2 for item in graded), default=0.0)
     secondary = [item for item in graded if item.chi2 < SECONDARY_SHARE * largest]
@@ -199,32 +199,32 @@ def _common_jumps(analysis: Analysis, names: list[int]) -> list[int]:
 
 def _owner(analysis: Analysis, generic: int, names: list[int], gain: float | None = None) -> int | None:
     """Named member whose inexact shape a generic group reflects, if any; ``gain`` if the group is not a member."""
-    design, evidence = analysis.design, analysis.evidence
-    gain = evidence.chi2[generic] if gain is None else gain
+    design, support = analysis.design, analysis.support
+    gain = support.chi2[generic] if gain is None else gain
     own = plain_covariates(design.groups[generic].covariates) - {"x", "y", "z"}
     for g in names:
         covariates = plain_covariates(design.groups[g].covariates)
         if design.groups[g].name.startswith(RUNOUT):  # any runout depends on the angles of its station's beam
             covariates |= {"azimuth", "elevation", f"station_{design.groups[g].name.removeprefix(RUNOUT)}"}
-        if own and own <= covariates and gain < SHAPE_SHARE * evidence.chi2[g]:
+        if own and own <= covariates and gain < SHAPE_SHARE * support.chi2[g]:
             return g
     return None
 
 
 def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -> Named:
-    design, evidence = analysis.design, analysis.evidence
-    name, chi2, p = design.groups[group].name, evidence.chi2[group], evidence.homogeneity_p[group]
+    design, support = analysis.design, analysis.support
+    name, chi2, p = design.groups[group].name, support.chi2[group], support.homogeneity_p[group]
     visible = float(design.visible[group])
     reasons = []
-    slight = evidence.uneven[group] < SLIGHTLY_UNEVEN * chi2
+    slight = support.uneven[group] < SLIGHTLY_UNEVEN * chi2
     inexact = inexact or (p < HOMOGENEITY_P and slight)
-    if p < (HOMOGENEITY_BESIDE_P if generic else HOMOGENEITY_P) and not (inexact or slight):
+    if p < (HOMOGENEITY_WITH_UNKNOWN_P if generic else HOMOGENEITY_P) and not (inexact or slight):
         reasons.append(f"does not behave like it everywhere (p = {p:.1e})")
-    if evidence.misfits and chi2 < evidence.excess:
+    if support.misfits and chi2 < support.excess:
         reasons.append("explains less than what remains unexplained")
-    failed = [g for g, own in evidence.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
+    failed = [g for g, own in support.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
     share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
-    if generic and chi2 < share * sum(evidence.chi2[g] for g in (*generic, *failed)):
+    if generic and chi2 < share * sum(support.chi2[g] for g in (*generic, *failed)):
         reasons.append("small compared with the unexplained part")
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(
@@ -249,17 +249,17 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
 
 
 def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: list[int]) -> list[Unknown]:
-    design, evidence = analysis.design, analysis.evidence
-    strongest = max((evidence.chi2[g] for g in names), default=0.0)
-    directed = [d for d in evidence.directed if _owner(analysis, d.group, names, d.evidence) is None]
-    shaped = len(directed) < len(evidence.directed) or len(generic) < sum(
+    design, support = analysis.design, analysis.support
+    strongest = max((support.chi2[g] for g in names), default=0.0)
+    directed = [d for d in support.directed if _owner(analysis, d.group, names, d.log_ratio) is None]
+    shaped = len(directed) < len(support.directed) or len(generic) < sum(
         design.groups[g].tier == "generic" for g in analysis.chosen.members
     )
-    shaped = shaped and not directed and evidence.excess < SHAPE_SHARE * strongest
+    shaped = shaped and not directed and support.excess < SHAPE_SHARE * strongest
     found = []
-    for g in sorted(generic, key=lambda g: -evidence.chi2[g]):
+    for g in sorted(generic, key=lambda g: -support.chi2[g]):
         group, shape = design.groups[g], contribution(design, analysis.chosen, g)[2]
-        rms_mm, nearest = float(np.sqrt(np.mean(shape**2))), _nearest(analysis, g, evidence.chi2[g])
+        rms_mm, nearest = float(np.sqrt(np.mean(shape**2))), _nearest(analysis, g, support.chi2[g])
         found.append(Unknown(group.covariates, group.direction, rms_mm, group.name, g, nearest))
     if jumps:
         at = design.groups[jumps[0]].position
@@ -267,11 +267,11 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
     if not found and directed:
         for item in directed[:3]:
             group = design.groups[item.group]
-            nearest = _nearest(analysis, item.group, item.evidence)
+            nearest = _nearest(analysis, item.group, item.log_ratio)
             found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group, nearest))
-    if not found and evidence.lack_of_fit_z > 3.0 and not shaped:
+    if not found and support.lack_of_fit_z > 3.0 and not shaped:
         found.append(Unknown((), "", float("nan"), "lines disagree with the model by more than their repeats do"))
-    if evidence.changes_between_runs:
+    if support.changes_between_runs:
         found.append(Unknown(("run",), "", float("nan"), "not repeatable from run to run"))
     return found
 

@@ -173,8 +173,8 @@ def with_twins(chosen: Iterable[MachineJob], every: Iterable[MachineJob]) -> lis
 def holds_one_of(other: OtherInbox, contents: Iterable[bytes]) -> bool:
     """Whether a matching file in another machine's inbox or a sub-folder has one of these non-empty contents."""
     searched = {(len(content), sha256_of(content)) for content in contents if content}
-    held = found_in(other, {size for size, _ in searched}) if other.held is None else other.held
-    return not searched.isdisjoint(held)
+    found = found_in(other, {size for size, _ in searched}) if other.found is None else other.found
+    return not searched.isdisjoint(found)
 
 
 def found_in(other: OtherInbox, sizes: Container[int]) -> frozenset[tuple[int, str]]:

@@ -271,13 +271,13 @@ class Policy:
 class OtherInbox:
     """The inbox of another machine of the job file, for files that came for both.
 
-    ``held`` contains size and SHA-256 of the files found in it, for a process that cannot read it; None: it is read.
+    ``found`` contains size and SHA-256 of the files found in it, for a process that cannot read it; None: it is read.
     """
 
     name: str
     inbox: Path
     patterns: tuple[str, ...]
-    held: frozenset[tuple[int, str]] | None = None
+    found: frozenset[tuple[int, str]] | None = None
 
 
 @dataclass(frozen=True)

@@ -324,12 +324,12 @@ class _Pass:
                 self.failed, text = True, attempt.message
                 self.messages.append(text if text.startswith(f"{name}:") else f"{name}: {text}")
         last = tables[-1] if tables else None
-        held = last is not None and last.state in HELD_BACK
-        if last is not None and held:
+        held_back = last is not None and last.state in HELD_BACK
+        if last is not None and held_back:
             self.messages.append(f"version {last.version} is {last.state}: {'; '.join(last.reasons)}")
         return MachineOutcome(
             machine=self.job.name,
-            state="failed" if self.failed else "held" if held else "ok",
+            state="failed" if self.failed else "held" if held_back else "ok",
             messages=tuple(dict.fromkeys(self.messages)),
             processed=tuple(self.processed),
             active=None if active is None else active.version,
@@ -417,7 +417,7 @@ class Parcel:
             files["templates"] = {path.relative_to(folder).as_posix(): read_bytes(path) for path in paths}
         every = range(sys.maxsize)
         others = tuple(
-            replace(item, inbox=item.inbox.resolve(), held=inbox.found_in(item, every)) for item in job.others
+            replace(item, inbox=item.inbox.resolve(), found=inbox.found_in(item, every)) for item in job.others
         )
         return cls(replace(job, inbox=job.inbox.resolve(), others=others, original=source), files)
 

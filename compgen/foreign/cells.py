@@ -284,10 +284,10 @@ def find_table(grid: CellGrid, decimal: str | None = None) -> Table:
     comments: dict[str, str] = {}
     for row in grid.rows[: best.top]:
         _note(row, metadata, comments)
-    _check_beside(grid, 0, best.top, 2)
+    _check_no_more_rows(grid, 0, best.top, 2)
     if not best.labels:
         return _table(grid, best, metadata, comments, decimal)
-    _check_beside(grid, best.end, len(grid.rows))
+    _check_no_more_rows(grid, best.end, len(grid.rows))
     return _turned(grid, best, metadata, comments, decimal)
 
 
@@ -454,7 +454,7 @@ def _turned(
     )
 
 
-def _check_beside(grid: CellGrid, start: int, end: int, least: int = 1) -> None:
+def _check_no_more_rows(grid: CellGrid, start: int, end: int, least: int = 1) -> None:
     """Refuse ``least`` adjacent rows of readings that do not belong to the table; statistics over the runs are allowed."""
     last, count = 0, 0
     for k in range(start, end):
@@ -548,7 +548,7 @@ def _table(
                     if again and len(_filled(other)) >= len(names):
                         message = f"rows of numbers follow again, below line {at} where the table ended: put each table into a"
                         raise grid.fail(f"{message} separate file or sheet", below)
-                _check_beside(grid, k, len(grid.rows))
+                _check_no_more_rows(grid, k, len(grid.rows))
                 notes.append(f"line {at} and everything below is not part of the table and was skipped")
                 break
             label = next(iter(_filled(row)))

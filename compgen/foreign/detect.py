@@ -79,7 +79,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         else:
             doubts.append(f"{named}: zero at every target; give --zero-runs drop if not measured, keep if measured")
     temperatures, measured_at, about = surroundings_of(
-        found.beside.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates
+        found.information.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates
     )
     notes += [*about, _SIGN_NOTE]
     axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
@@ -94,7 +94,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
         "instrument": found.keys.get("owner") or "Renishaw laser software",
         "encoding": found.encoding,
         **{key: found.keys[key] for key in _USER_TEXT if found.keys.get(key)},
-        **{section.lower(): dict(values) for section, values in found.beside.items()},
+        **{section.lower(): dict(values) for section, values in found.information.items()},
         "measured_at": measured_at,
         "temperatures_c": temperatures or None,
     }

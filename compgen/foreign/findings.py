@@ -146,7 +146,7 @@ class Imported:
     doubts : open questions; until the user answers them, no other command accepts the file.
     notes : remarks that require no decision.
     reversal : difference of both directions, if ``data`` contains only their mean.
-    beside : errors on other sheets of a workbook of axis runs (squareness, straightness).
+    other_errors : errors on other sheets of a workbook of axis runs (squareness, straightness).
     """
 
     path: Path
@@ -157,7 +157,7 @@ class Imported:
     doubts: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     reversal: ReversalCurves | None = None
-    beside: ErrorTable | None = None
+    other_errors: ErrorTable | None = None
 
     @property
     def file_name(self) -> str:
@@ -173,8 +173,8 @@ class Imported:
                 file=self.path,
             )
 
-        if self.beside is not None:
-            names = ", ".join(self.beside.names)
+        if self.other_errors is not None:
+            names = ", ".join(self.other_errors.names)
             raise InputError(
                 f"contains runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file for each; or read "
                 "one of them, with --ignore SHEET for the other",
@@ -186,8 +186,8 @@ class Imported:
         found = {self.file_name: _WRITERS[type(self.data)](self.data)}
         if self.reversal is not None:
             found[f"{self.path.stem}.reversal.csv"] = format_reversal(self.reversal)
-        if self.beside is not None:
-            found[f"{self.path.stem}{SUFFIXES['errors']}"] = format_errors(self.beside)
+        if self.other_errors is not None:
+            found[f"{self.path.stem}{SUFFIXES['errors']}"] = format_errors(self.other_errors)
         return found
 
     def summary(self) -> dict[str, Any]:

@@ -45,7 +45,7 @@ MOST_TARGETS, MOST_RUNS = 100_000, 1_000
 _SECTION = re.compile(r"\s{0,20}([A-Za-z][A-Za-z0-9 _\-]{0,40})::\s*")
 _KEY = re.compile(r"\s{0,40}([A-Za-z][^:]{0,60}?)\s{0,40}:(.*)")
 #: Sections about the surroundings and the instrument; their keys are not those of the machine.
-BESIDE = ("ENVIRONMENT", "EQUIPMENT")
+INFORMATION = ("ENVIRONMENT", "EQUIPMENT")
 #: Keys followed by numbers; a line of user text with the same key begins nothing.
 _BLOCKS = ("targets", "run target data")
 _SIGNS = ("run target data", "target-count", "run-count")
@@ -58,7 +58,7 @@ class _File:
     keys: dict[str, str] = field(default_factory=dict)
     targets: list[float] = field(default_factory=list)
     rows: list[tuple[int, int, int, float]] = field(default_factory=list)
-    beside: dict[str, dict[str, str]] = field(default_factory=dict)
+    information: dict[str, dict[str, str]] = field(default_factory=dict)
     unread: list[str] = field(default_factory=list)
     section: str = ""
     reading: str = ""
@@ -71,7 +71,7 @@ class Renishaw:
     """A text file of the laser software: ``letter`` of its type, axis runs in the file's unit, user text by key.
 
     ``one_way`` holds the run numbers of the file (n,); ``sorted_rows`` is True if the flags indicate two directions,
-    but all runs list their targets in the same order. ``beside`` has the keys of ENVIRONMENT and EQUIPMENT,
+    but all runs list their targets in the same order. ``information`` has the keys of ENVIRONMENT and EQUIPMENT,
     ``zero_runs`` the runs that are zero at every target while others are not; ``one_way_test`` is True if the flags
     indicate one direction only.
     """
@@ -83,7 +83,7 @@ class Renishaw:
     notes: tuple[str, ...]
     one_way: IntArray
     sorted_rows: bool
-    beside: Mapping[str, Mapping[str, str]]
+    information: Mapping[str, Mapping[str, str]]
     zero_runs: tuple[int, ...]
     one_way_test: bool
 
@@ -119,14 +119,23 @@ def read_renishaw(path: Path) -> Renishaw:
     if source.encoding not in ("utf-8", "utf-8-sig"):
         notes.append(f"is not UTF-8; user text was read as {source.encoding}")
     if found.unread:
-        notes.append(f"{len(found.unread)} lines in {' and '.join(BESIDE)} without a key were not used")
+        notes.append(f"{len(found.unread)} lines in {' and '.join(INFORMATION)} without a key were not used")
     flags = found.keys.get("flags", "").split()
     runs = OneAxis(position, direction, cycles(direction, run), value, numbers, in_time=bool(np.all(np.diff(run) >= 0)))
     two_ways = flags[:2] == ["0", "0"] and alternating
     numbered = np.unique(run).tolist()
     zero = tuple(number for number in numbered if not value[run == number].any()) if value.any() else ()
     return Renishaw(
-        letter, runs, found.keys, source.encoding, tuple(notes), run, two_ways, found.beside, zero, flags[1:2] == ["1"]
+        letter,
+        runs,
+        found.keys,
+        source.encoding,
+        tuple(notes),
+        run,
+        two_ways,
+        found.information,
+        zero,
+        flags[1:2] == ["1"],
     )
 
 
@@ -139,11 +148,11 @@ def _take_line(source: Text, found: _File, number: int, line: str) -> None:
     if not line.strip():
         return
     key = _KEY.fullmatch(line)
-    if found.section in BESIDE:
+    if found.section in INFORMATION:
         if key is None:
             found.unread.append(line.strip())
         else:
-            found.beside.setdefault(found.section, {}).setdefault(key.group(1).lower(), key.group(2).strip())
+            found.information.setdefault(found.section, {}).setdefault(key.group(1).lower(), key.group(2).strip())
         return
     if key and key.group(1).lower() in _BLOCKS and found.section != "USER-TEXT":
         found.reading, line = key.group(1).lower(), key.group(2)
@@ -341,8 +350,8 @@ def _take(
         keys[name] = text
         return 99
     if (first is None) or (second is not None) != (_ARRAYS[name] == 2):
-        due = "[target,cycle]" if _ARRAYS[name] == 2 else "[target]"
-        raise source.fail(f"{name} requires {due}, found {shown(content)}", number)
+        expected = "[target,cycle]" if _ARRAYS[name] == 2 else "[target]"
+        raise source.fail(f"{name} requires {expected}, found {shown(content)}", number)
     value = parse_number(text)
     if value is None:
         raise source.fail(f"{shown(text)} is not a number; is the file truncated?", number, name)

@@ -164,8 +164,8 @@ def check_error(error: str, axis: str | None, *, angular: bool) -> str:
         raise InputError(f"{error!r} is not an error over an axis; {nearest(error, CURVE_NAMES)}", field="--error")
     known = error_named(error)
     if (known.kind == "angular") != angular:
-        due = "an angle (EAX ... ECZ)" if angular else "a displacement (EXX ... EZZ)"
-        raise InputError(f"{error} does not fit: the file contains {due}", field="--error")
+        expected = "an angle (EAX ... ECZ)" if angular else "a displacement (EXX ... EZZ)"
+        raise InputError(f"{error} does not fit: the file contains {expected}", field="--error")
     if axis is not None and AXES[known.axis] != axis:
         raise InputError(f"{error} belongs to axis {AXES[known.axis]}, the file to {axis}", field="--error")
     return error

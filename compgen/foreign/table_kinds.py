@@ -112,10 +112,10 @@ def axis_readings(findings: TableFindings, *, angular: bool = False) -> tuple[di
         own = np.flatnonzero(np.array(letters) == letter)
         line = np.array(findings.table.lines, dtype=np.int64)[rows.row[own]]
         direction, run = _directions(findings, target[own], rows.run[own], rows.label[own], value[own])
-        beside = {name: values[rows.row[own]] for name, values in row_data.covariates.items()}
+        covariates = {name: values[rows.row[own]] for name, values in row_data.covariates.items()}
         by_rows = not rows.label[own].any() and findings.options.directions != "alternate"
         in_time = by_rows and bool(np.all(np.diff(rows.run[own]) >= 0))
-        found[letter] = OneAxis(target[own], direction, run, value[own], line, beside, in_time)
+        found[letter] = OneAxis(target[own], direction, run, value[own], line, covariates, in_time)
         findings.notes += remarks(found[letter], letter, angular=angular)
     return found, row_data
 
@@ -1018,7 +1018,7 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
         return first
     doubts = [f"sheet {name}: {text}" for name, item in parts for text in item.doubts]
     errors = [item.data for _, item in parts if isinstance(item.data, ErrorTable)]
-    beside = None
+    other_errors = None
     if kinds == {"axis"} or kinds == {"axis", "errors"}:
         read = [item.data for _, item in parts if isinstance(item.data, AxisRuns)]
         # with the covariates that all sheets have
@@ -1026,12 +1026,12 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
         kept = [replace(r, covariates={k: v for k, v in r.covariates.items() if k in common}) for r in read]
         runs = replace(join_axis_runs(kept), metadata=read[0].metadata)
         data: Data = runs
-        beside = _joined_errors(first, errors) if errors else None
+        other_errors = _joined_errors(first, errors) if errors else None
         for axis in runs.axes:
             name, rows = POSITIONING[axis], runs.axis == axis
-            if beside is not None and name in beside.curves:
+            if other_errors is not None and name in other_errors.curves:
                 mean, _, _ = two_way_mean(runs.position_mm[rows], runs.direction[rows], runs.deviation_mm[rows])
-                away = float(np.abs(mean.value - beside.curves[name].at(mean.position_mm)).max()) / MM_PER_UM
+                away = float(np.abs(mean.value - other_errors.curves[name].at(mean.position_mm)).max()) / MM_PER_UM
                 doubts.append(
                     f"a sheet contains {name}, and the runs of {AXES[axis]} give it, too (their means differ by up to "
                     f"{away:.3g} um); exclude one sheet with --ignore SHEET"
@@ -1043,7 +1043,9 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     understood = {f"sheet {name}": dict(item.understood) for name, item in parts}
     notes = tuple(dict.fromkeys(text for _, item in parts for text in item.notes))
     kind: Kind = "errors" if kinds == {"errors"} else "axis"
-    return replace(first, kind=kind, data=data, understood=understood, doubts=tuple(doubts), notes=notes, beside=beside)
+    return replace(
+        first, kind=kind, data=data, understood=understood, doubts=tuple(doubts), notes=notes, other_errors=other_errors
+    )
 
 
 def _together(parts: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:

@@ -154,11 +154,11 @@ class Conditions:
         return bool(np.any(self.growth_mm) or np.any(self.dead_share) or self.effects)
 
     def correction_mm(
-        self, lengths: Lengths, layout: ErrorParameters, state: State, group: IntArray, further_mm: FloatArray
+        self, lengths: Lengths, layout: ErrorParameters, state: State, group: IntArray, other_mm: FloatArray
     ) -> FloatArray:
         """Return what must be added to the readings (n,), mm, for stations, dead lengths and errors ``state``.
 
-        ``further_mm`` (n, 3) is another displacement of the tip to remove.
+        ``other_mm`` (n, 3) is another displacement of the tip to remove.
         """
         machine = layout.machine
         tool = tool_of(machine, lengths.tool_mm)
@@ -168,7 +168,7 @@ class Conditions:
         station = state.stations_mm[lengths.station]
         tip = tip_position(machine, values, lengths.position_mm, tool)
         moved, lengthened = self._effects_mm(lengths, station, tip)
-        grown = tip_position(machine, values, lengths.position_mm + self.growth_mm, tool) + further_mm + moved - station
+        grown = tip_position(machine, values, lengths.position_mm + self.growth_mm, tool) + other_mm + moved - station
         change = np.linalg.norm(tip - station, axis=1) - np.linalg.norm(grown, axis=1)
         return np.asarray(change - lengthened + self.dead_share * state.dead_length_mm[group])
 

@@ -173,8 +173,8 @@ def _metadata_number(readings: SixDof, key: str, default: float, allowed: tuple[
     return value
 
 
-def _check_complete(readings: SixDof, column: str, values: FloatArray, wanted: FloatArray) -> None:
-    missing = np.flatnonzero(~np.isfinite(values) & wanted)
+def _check_complete(readings: SixDof, column: str, values: FloatArray, required: FloatArray) -> None:
+    missing = np.flatnonzero(~np.isfinite(values) & required)
     if missing.size:
         raise _at_row(readings, int(missing[0]), column, "is given for only some of the rows; give it in every file")
 

@@ -212,8 +212,8 @@ class NodeIndex:
     @cached_property
     def even(self) -> bool:
         """Whether the nodes are equidistant up to rounding."""
-        due = np.linspace(self.nodes_mm[0], self.nodes_mm[-1], len(self.nodes_mm))
-        return bool(np.abs(self.nodes_mm - due).max() <= 4 * np.spacing(np.abs(self.nodes_mm).max()))
+        regular = np.linspace(self.nodes_mm[0], self.nodes_mm[-1], len(self.nodes_mm))
+        return bool(np.abs(self.nodes_mm - regular).max() <= 4 * np.spacing(np.abs(self.nodes_mm).max()))
 
     @cached_property
     def buckets_per_mm(self) -> float:

@@ -224,7 +224,7 @@ class AxisLaser:
             direction=mark[:, 1],
             run=mark[:, 2],
             deviation_mm=deviation + self.noise_um * MM_PER_UM * rng.standard_normal(len(axis)),
-            covariates=logged_beside(stops),
+            covariates=logged_with(stops),
             metadata={"instrument": "axis-laser", "u_deviation_um": f"{self.noise_um:g}"},
         )
 
@@ -254,7 +254,7 @@ def along_beam(
     return np.asarray(deviation)
 
 
-def logged_beside(stops: Stops) -> dict[str, FloatArray]:
+def logged_with(stops: Stops) -> dict[str, FloatArray]:
     """Return the columns written next to the readings: the time, the temperatures, and dwells that differ."""
     logged = {
         name: values for name, values in stops.covariates.items() if name.startswith("temp_") or name == "dwell_s"
@@ -372,7 +372,7 @@ class DiagonalLaser:
             direction=mark[:, 0],
             run=mark[:, 1],
             deviation_mm=deviation + self.noise_um * MM_PER_UM * rng.standard_normal(len(names)),
-            covariates=logged_beside(stops),
+            covariates=logged_with(stops),
             metadata={"instrument": "diagonal-laser", "u_deviation_um": f"{self.noise_um:g}"},
         )
 

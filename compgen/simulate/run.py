@@ -305,8 +305,8 @@ def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequ
             or not np.all(np.isfinite(moved_mm))
         ):
             name = getattr(effect, "__qualname__", type(effect).__qualname__)
-            wanted = f"an array {stops.position_mm.shape} of finite numbers in mm"
-            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; expected {wanted}")
+            expected = f"an array {stops.position_mm.shape} of finite numbers in mm"
+            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; expected {expected}")
         tip_mm = tip_mm + moved_mm.astype(np.float64)
     return tip_mm
 

@@ -339,14 +339,14 @@ def run_signals(
     position = run_positions(machine, instrument, axis, along_mm)
     offset = np.array(entry.target_offset_mm)
     origin, turn = tool_pose(machine, truth, position)
-    further = np.zeros((len(along_mm), 6)) if scatter is None else scatter
-    moved = origin + np.einsum("nij,j->ni", turn, offset) - position - offset + further[:, :3]
+    added = np.zeros((len(along_mm), 6)) if scatter is None else scatter
+    moved = origin + np.einsum("nij,j->ni", turn, offset) - position - offset + added[:, :3]
     at_tool = expected_away(machine, instrument)[axis] > 0
     tracer = Tracer(optics, axis, 1 if at_tool else 2, entry.set_up.beam_direction, entry.systematics)
     start = along_mm[0] if first_mm is None else first_mm
     travel = entry.set_up.beam_direction * (along_mm - start)
     tilt = np.zeros((len(along_mm), 2)) if drift_rad is None else drift_rad
-    angles = Rotation.from_matrix(turn).as_rotvec() + further[:, 3:]
+    angles = Rotation.from_matrix(turn).as_rotvec() + added[:, 3:]
     return np.array(
         [
             tracer.signals(

@@ -173,11 +173,11 @@ def bare_errors(
     solver = projector(machine, terms, anchored=False)
     position_mm = solver.position_mm
     added = active.correction(machine, _upwards(position_mm))
-    wanted = exact_error(machine, errors, position_mm) - added
+    required = exact_error(machine, errors, position_mm) - added
     values = np.concatenate([term.start for term in solver.basis])
     for _ in range(MOST_PASSES):
         found = _table(machine, errors, solver, values)
-        rest = wanted - exact_error(machine, found, position_mm + added)
+        rest = required - exact_error(machine, found, position_mm + added)
         change = solver.project_all(-rest[None])[0]
         values = values + change
         if np.max(np.abs(solver.field(change))) < CONVERGED_MM:
@@ -292,10 +292,10 @@ def merge_report(
         ]
         nodes.append(np.unique(np.concatenate(parts)))
     position_mm = volume_grid(machine, (nodes[0], nodes[1], nodes[2])).position_mm
-    wanted = total_correction(machine, errors, active, position_mm)
-    miss = merged.correction(machine, Points(position_mm, approach=np.ones_like(position_mm))) - wanted
+    required = total_correction(machine, errors, active, position_mm)
+    miss = merged.correction(machine, Points(position_mm, approach=np.ones_like(position_mm))) - required
     if merged.controller.anchored:
         miss = miss - miss.mean(axis=0)
     figures = figures_of(np.linalg.norm(miss, axis=1))
-    largest = float(np.max(np.linalg.norm(wanted, axis=1))) / MM_PER_UM
+    largest = float(np.max(np.linalg.norm(required, axis=1))) / MM_PER_UM
     return MergeReport(largest, figures["max_um"], figures["rms_um"], lost_um)

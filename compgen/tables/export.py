@@ -71,9 +71,9 @@ def set_aside_superseded(output: OutputFolder, targets: Sequence[str] = ("",)) -
         others = [path.name for path in found if path.name not in targets and not (path / "identify.json").exists()]
     for target in dict.fromkeys(["", *targets, *others]):
         base = PurePosixPath(target)
-        beside = {str(path.relative_to(base)): text for path, text in new.items() if path.is_relative_to(base)}
+        in_folder = {str(path.relative_to(base)): text for path, text in new.items() if path.is_relative_to(base)}
         if (output.folder / base).is_dir():
-            _set_aside_in(output, base, beside, names)
+            _set_aside_in(output, base, in_folder, names)
     report = [
         name for name in (*REPORT_FILES, "dcc.xml") if (output.folder / name).is_file() and name not in output.contents
     ]

@@ -491,9 +491,9 @@ def safety_of(
         along = node_positions(machine, nodes[axis], axis)
         lines = lines_along(machine, axis, along)
         added = np.concatenate([_on_lines(partial(correction, side=side), lines) for side in (1.0, -1.0)])
-        wanted = np.tile(_on_lines(best, lines), (2, 1, 1))
+        required = np.tile(_on_lines(best, lines), (2, 1, 1))
         for output in range(3):
-            profile = _Profile(axis, output, along, added[:, :, output], wanted[:, :, output], slack_um)
+            profile = _Profile(axis, output, along, added[:, :, output], required[:, :, output], slack_um)
             steps.append(profile.largest())
             reasons += profile.reasons(machine.axes[axis].range_mm, limits)
     reference = correction(np.array([machine.reference_point_mm], dtype=np.float64))[0] / MM_PER_UM

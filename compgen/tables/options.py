@@ -103,8 +103,8 @@ class Level:
             part = errors.only(name)
             added = np.zeros_like(position_mm)
             if self.solver is not None:
-                wanted = -volumetric_error(machine, part, position_mm)
-                added = self.solver.field(_best(self.solver, self.pitch, wanted))
+                required = -volumetric_error(machine, part, position_mm)
+                added = self.solver.field(_best(self.solver, self.pitch, required))
             for tool, left in zip(tools_mm, found, strict=True):
                 rest = volumetric_error(machine, part, position_mm, tool) + added
                 rest = rest - np.average(rest, axis=0, weights=weight) if anchored else rest
@@ -142,13 +142,13 @@ def _refined(nodes_mm: FloatArray) -> FloatArray:
     return np.asarray(np.interp(where, np.arange(len(nodes_mm)), nodes_mm))
 
 
-def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> FloatArray:
+def _best(solver: Projector, pitch: Projector | None, required_mm: FloatArray) -> FloatArray:
     """Return the table values (parameters,) closest to a target field (n, 3); with ``pitch`` those without squareness.
 
     Without squareness every straightness table is zero at both ends, since its slope is squareness; positioning is then
     fitted again to what is left.
     """
-    values = solver.project(wanted_mm)
+    values = solver.project(required_mm)
     if pitch is None:
         return values
     values, along = values.copy(), np.zeros(len(values), dtype=np.bool_)
@@ -157,7 +157,7 @@ def _best(solver: Projector, pitch: Projector | None, wanted_mm: FloatArray) -> 
             values[place], along[place] = 0.0, True
         else:
             values[place] -= np.interp(term.nodes_mm, term.nodes_mm[[0, -1]], values[place][[0, -1]])
-    values[along] = pitch.project(wanted_mm - solver.field(values))
+    values[along] = pitch.project(required_mm - solver.field(values))
     return values
 
 
@@ -181,12 +181,12 @@ def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | N
     solvers = {key: projector(machine, basis, anchored=False) for key, basis in bases.items()}
     found = [Level("nothing")]
     for key, solver in solvers.items():
-        wanted = wanted_correction(machine, errors, solver.position_mm)
+        required = wanted_correction(machine, errors, solver.position_mm)
         if key == "squareness":
-            values = _best(solver, solvers["pitch"], wanted)
+            values = _best(solver, solvers["pitch"], required)
             found.append(Level("straightness", solver, values, solvers["pitch"]))
         start = np.concatenate([term.start for term in solver.basis])
-        found.append(Level(key, solver, solver.project(wanted, start)))
+        found.append(Level(key, solver, solver.project(required, start)))
     if reversal is not None:
         found.append(replace(found[-1], key="directional", reversal=reversal))
     return found

@@ -185,26 +185,26 @@ class Projector:
     factor: FloatArray
     scale: FloatArray
 
-    def project(self, wanted_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
-        """Return all table values (parameters,) whose field is closest to ``wanted_mm`` (n, 3)."""
+    def project(self, required_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
+        """Return all table values (parameters,) whose field is closest to ``required_mm`` (n, 3)."""
         if start is None:
-            return np.asarray(self.project_all(wanted_mm[None])[0])
-        return np.asarray(start + self.project_all((wanted_mm - self.field(start))[None])[0])
+            return np.asarray(self.project_all(required_mm[None])[0])
+        return np.asarray(start + self.project_all((required_mm - self.field(start))[None])[0])
 
-    def project_all(self, wanted_mm: FloatArray) -> FloatArray:
+    def project_all(self, required_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
-        return self._solved(wanted_mm).T
+        return self._solved(required_mm).T
 
-    def left_of(self, wanted_mm: FloatArray) -> FloatArray:
-        """Return what the closest tables leave of k wanted fields (k, n, 3) at the sample points, (k, n, 3)."""
-        left, values = wanted_mm.copy(), self._solved(wanted_mm)  # a constant per axis is left to whoever asks
+    def left_of(self, required_mm: FloatArray) -> FloatArray:
+        """Return what the closest tables leave of k required fields (k, n, 3) at the sample points, (k, n, 3)."""
+        left, values = required_mm.copy(), self._solved(required_mm)  # a constant per axis is left to whoever asks
         for term in self.terms:
             term.take(values[term.place], left)
         return left
 
-    def _solved(self, wanted_mm: FloatArray) -> FloatArray:
-        """All table values (parameters, k) for k wanted fields (k, n, 3)."""
-        counting = wanted_mm * self.weight[:, None]
+    def _solved(self, required_mm: FloatArray) -> FloatArray:
+        """All table values (parameters, k) for k required fields (k, n, 3)."""
+        counting = required_mm * self.weight[:, None]
         right = self.freedom.gather(np.concatenate([term.gather(counting) for term in self.terms]))
         if self.offsets:
             right = np.concatenate([right, counting.sum(axis=1).T])
@@ -378,14 +378,14 @@ def best_values(
     """
     if machine.emphasis.tools_mm:
         solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
-    wanted_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
-    wanted = wanted_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
+    required_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
+    required = required_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
     start = np.concatenate([term.start for term in solver.basis])
-    values = solver.project(wanted, start)
+    values = solver.project(required, start)
     if applied is not None:
         tool_mm = np.broadcast_to(solver.sample_tool_mm, solver.position_mm.shape)
         points = Points(solver.position_mm, np.array(tool_mm))
         for _ in range(APPLIED_STEPS):
             beyond = applied(solver.by_name(values), points) - solver.field(values)
-            values = solver.project(wanted - beyond, start)
+            values = solver.project(required - beyond, start)
     return values

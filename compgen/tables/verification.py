@@ -759,13 +759,13 @@ def reasons_against(
         in_tables = control.reversal_in_tables(reversal)
         rounding_mm = 2.0 * control.resolution_mm()  # of both directions
         turned = reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
-    beside_best = judge.reasons(on_grid, on_lines)
-    if not beside_best:
+    against_best = judge.reasons(on_grid, on_lines)
+    if not against_best:
         check = entry_check(machine, judge, tables, reversal) if check is None else check.of(tables)
-        beside_best = check.reasons()
+        against_best = check.reasons()
     reasons = [
         *control.violations(tables.tables),
-        *beside_best,
+        *against_best,
         *turned,
         *tables.contradictions,
         *safety.reasons,
@@ -808,9 +808,9 @@ def _useless_reasons(
 def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
     """Return the largest displacement in um that the best table leaves of each single error (first order), if relevant."""
     names = errors.names
-    wanted = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
+    required = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
     found = {}
-    for name, rest in zip(names, solver.left_of(wanted), strict=True):
+    for name, rest in zip(names, solver.left_of(required), strict=True):
         if solver.offsets:
             rest = rest - np.average(rest, axis=0, weights=solver.weight)
         largest = float(np.max(np.linalg.norm(rest, axis=1)))

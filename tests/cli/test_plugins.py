@@ -215,7 +215,7 @@ def test_the_required_methods_are_those_of_the_base_class():
         ('    name = "shop-csv"\n', "", ["ShopCsv.name must be 'shop-csv', but is missing"]),
         ('    name = "shop-csv"', '    name = "shop"', ["ShopCsv.name must be 'shop-csv', but is 'shop'"]),
         ("    settings_class = Settings\n", "", ["ShopCsv has no settings_class"]),
-        ('{"shop-csv": ', '{"isg-csv": ', ["taken by a built-in one"]),
+        ('{"shop-csv": ', '{"isg-csv": ', ["already used by a built-in one"]),
         ('{"shop-csv": ', '{"Shop CSV": ', ["lower-case letters"]),
         ('{"shop-csv": ', "{1: ", ["lower-case letters"]),
         ('{"shop-csv": ShopCsv}', "[ShopCsv]", ["CONTROLLERS must be a dict from names to controls"]),
@@ -302,7 +302,7 @@ def test_the_second_of_two_plug_ins_with_one_name_is_refused_and_names_the_first
     shutil.copytree("shop", "other")
     compgen.load_plugins(["shop/shop_csv.py"], installed=False)
     compgen.load_plugins(["shop/../shop/shop_csv.py"], installed=False)
-    with pytest.raises(compgen.InputError, match=r"taken by plug-in .*shop/shop_csv\.py"):
+    with pytest.raises(compgen.InputError, match=r"already used by plug-in .*shop/shop_csv\.py"):
         compgen.load_plugins(["other/shop_csv.py"], installed=False)
 
 
@@ -344,7 +344,7 @@ def test_the_settings_of_a_plug_in_are_read_strictly(tutorial, call, small_machi
         ("EFFECTS = {'a': 3}", "its reader int is not a function; expected its reader int(section)"),
         ("def f():\n    return 1\nEFFECTS = {'a': f}", "its reader f() cannot be called as its reader f(section)"),
         ("def f(a, b):\n    return 1\nINSTRUMENTS = {'a': f}", "its reader f(a, b) cannot be called"),
-        ("def f(section):\n    return 1\nINSTRUMENTS = {'laser-tracer': f}", "taken by a built-in one"),
+        ("def f(section):\n    return 1\nINSTRUMENTS = {'laser-tracer': f}", "already used by a built-in one"),
         (
             "class Gauge:\n    passes = 1\ndef f(section) -> Gauge:\n    return Gauge()\nINSTRUMENTS = {'gauge': f}",
             "Gauge.observe(stops, tip_mm, rng) is missing",
@@ -460,7 +460,7 @@ def test_a_broken_installed_plug_in_is_a_warning_and_only_its_name_is_missing(in
 def test_an_installed_plug_in_does_not_take_a_built_in_name(install):
     install("[compgen.controllers]\nisg-csv = shop_csv:ShopCsv\n")
     built_in = CONTROLLERS["isg-csv"]
-    with pytest.warns(compgen.CompgenWarning, match="taken by a built-in one"):
+    with pytest.warns(compgen.CompgenWarning, match="already used by a built-in one"):
         load_entry_points(KINDS)
     assert controller_named("isg-csv") is built_in
 

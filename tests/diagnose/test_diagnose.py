@@ -384,8 +384,8 @@ def test_what_is_left_of_a_runout_of_another_law_is_its_inexact_shape(gantry):
         Group("beam elevation of A", ("elevation", "station_A")),
         Group("beam elevation of B", ("elevation", "station_B")),
     ]
-    evidence = type("Evidence", (), {"chi2": {0: 1800.0, 1: 45.0, 2: 45.0}})
-    analysis = type("Analysis", (), {"design": type("Design", (), {"groups": groups}), "evidence": evidence})
+    support = type("Support", (), {"chi2": {0: 1800.0, 1: 45.0, 2: 45.0}})
+    analysis = type("Analysis", (), {"design": type("Design", (), {"groups": groups}), "support": support})
     assert _owner(analysis, 1, [0]) == 0
     assert _owner(analysis, 2, [0]) is None
     assert _owner(analysis, 1, [0], 400.0) is None

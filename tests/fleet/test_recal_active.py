@@ -114,7 +114,7 @@ def test_readings_of_the_compensated_machine_that_count_as_bare_are_held_by_what
     running.write(policy="clock_minutes = 0")
     running.measure("wrong", on=running.on(), seed=2, active_table="none")
     reasons = held(running)
-    assert "seems to have changed by what version 1 adds (correlation +1.000, size 1.00; an arbitrary" in reasons
+    assert "seems to have changed by what version 1 adds (correlation +1.000, size 1.00; a random" in reasons
     assert "probability below 1e-09" in reasons
     assert "recal reprocess mill --measurement 2 --active-table v1 --reason" in reasons
 
@@ -340,7 +340,7 @@ def test_what_a_person_states_is_compared_with_the_data_too(running):
     assert "by what version 1 adds" in " ".join(done.table.reasons)
 
 
-@pytest.mark.parametrize(("said", "message"), [("v9", "no such tables"), ("nonsense", "give a version")])
+@pytest.mark.parametrize(("said", "message"), [("v9", "no such tables"), ("nonsense", "is not a version of the tables; give one")])
 def test_tables_that_do_not_exist_cannot_be_stated(running, said, message):
     running.measure("check", on=running.on(), seed=2)
     running.run()

@@ -501,13 +501,13 @@ def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_ur
     item = import_file(path)
     assert item.doubts == ()
     assert item.data.axes == (0, 1)
-    found = {name: 1e6 * value for name, (value, _) in item.beside.squareness.items()}
+    found = {name: 1e6 * value for name, (value, _) in item.other_errors.squareness.items()}
     assert found == pytest.approx(expected_urad, abs=1e-6)
     assert set(item.files()) == {"lab.axis.csv", "lab.errors.csv"}
     with pytest.raises(InputError, match="contains runs of axes and errors as well .E"):
         open_measurement([path])
     alone = import_file(path, ImportOptions(ignore=["Squareness"]))
-    assert alone.beside is None
+    assert alone.other_errors is None
     assert len(alone.data) == 24
 
 
@@ -545,7 +545,7 @@ def test_a_sheet_of_statistics_is_left_out_and_one_of_mean_errors_is_held_agains
     straight = workbook(tmp_path, {"X": axis_sheet(), "Geradheit": [[row[0], row[2]] for row in means]})
     item = import_file(straight)
     assert item.doubts == ()
-    assert item.beside.curves["EYX"].value.tolist() == pytest.approx([5e-4, 1e-3, 0], abs=ROUNDING_MM)
+    assert item.other_errors.curves["EYX"].value.tolist() == pytest.approx([5e-4, 1e-3, 0], abs=ROUNDING_MM)
 
 
 MORE = {

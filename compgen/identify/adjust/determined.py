@@ -36,7 +36,7 @@ USUAL_U, FINEST = 1.0, 1e-3
 #: Largest number of positions of each error that represent all at which it was read.
 MOST_SHOWN = 50
 #: A value is determined if less than this share of it is outside the determined directions.
-BESIDE = 1e-4
+MOST_OUTSIDE = 1e-4
 #: Assumed curvature of a curve between neighbouring nodes if too few nodes are seen to measure it, um and urad.
 USUAL_BEND = 2.0
 
@@ -210,9 +210,9 @@ def determined_values(layout: ErrorParameters, observations: Observations, rows:
     _, values, right = np.linalg.svd(rest / scale, full_matrices=False)
     directions = right[values > SHOWS * values.max(initial=1e-300)].T
     scaled = rows * unit / scale
-    beside = np.linalg.norm(scaled - scaled @ directions @ directions.T, axis=1)
+    outside = np.linalg.norm(scaled - scaled @ directions @ directions.T, axis=1)
     size = np.linalg.norm(scaled, axis=1)
-    return np.asarray((size > 0) & (beside <= BESIDE * size))
+    return np.asarray((size > 0) & (outside <= MOST_OUTSIDE * size))
 
 
 def least_squares(layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_]) -> Determined:
@@ -263,7 +263,7 @@ def _optimum(
     values = np.linalg.svd(whole / scale, compute_uv=False)
     inverse = np.linalg.pinv(whole / scale, rcond=RCOND) / scale[:, None]
     found = inverse @ target
-    seen, beside = found[: shown.shape[1]], found[shown.shape[1] :]
+    seen, other_values = found[: shown.shape[1]], found[shown.shape[1] :]
     spread = unit[:, None] * shown @ inverse[: shown.shape[1]]
     size, direction = np.linalg.eigh(spread @ spread.T)
     share = np.einsum("ij,ij->i", shown, shown)
@@ -271,9 +271,9 @@ def _optimum(
         layout,
         unknowns=unit * (shown @ seen),
         factor=direction * np.sqrt(np.maximum(size, 0.0)),  # as many columns as unknowns, not as readings
-        others=beside,
+        others=other_values,
         u_others=np.linalg.norm(inverse[shown.shape[1] :], axis=1),
-        residual=observations.value - errors @ (shown @ seen) - others @ beside,
+        residual=observations.value - errors @ (shown @ seen) - others @ other_values,
         rank=rank,
         freedom=int(np.count_nonzero(accepted)) - rank - _range(others).shape[1],
         condition=float(values[0] / values[values > RCOND * values[0]][-1]),

@@ -73,13 +73,13 @@ def draw_curve(
     if fitted is not None and name in fitted.curves:
         smooth = fitted.curves[name]
         series.append(CurveSeries("smoothed", smooth.position_mm, smooth.value * scale))
-    held = {
+    by_control = {
         number: CurveSeries(f"table {control}", item.position_mm, item.value)
         for number, (control, curves) in enumerate(tables.items())
         for item in curves
         if item.error and item.name == name
     }
-    series += held.values()
+    series += by_control.values()
     spread = COVERAGE * u if np.isfinite(u).all() else np.zeros_like(u)
     limits = limits_of(y + spread, y - spread, *(item.value for item in series), zero=True)
     plot = Plot(limits_of(x, margin=0.02), limits, x_label=f"{axis} (mm)", y_label=unit)
@@ -88,15 +88,15 @@ def draw_curve(
     plot.line(x, y, "line")
     if len(x) <= 40:
         plot.dots(x, y, "line")
-    if len(series) > len(held) + 1:
+    if len(series) > len(by_control) + 1:
         plot.line(series[1].position_mm, series[1].value, "fit", dash=DASHED)
-    for number, item in held.items():
+    for number, item in by_control.items():
         start = len(plot.drawn)
         plot.dots(item.position_mm, item.value, "table", size=3.0, square=True)
         plot.layer(f"control-{number}", start)
     title = f"{name}: {describe_error(name)}, {unit} over {axis} in mm"
-    shown = [item.data() for item in series[: len(series) - len(held)]]
-    shown += [{**item.data(), "control": number} for number, item in held.items()]
+    shown = [item.data() for item in series[: len(series) - len(by_control)]]
+    shown += [{**item.data(), "control": number} for number, item in by_control.items()]
     data = {**plot.data, "unit": unit, "series": shown}
     return Picture(f"curve-{name}", name, svg(f"curve-{name}", title, [plot]), data, describe_error(name))
 

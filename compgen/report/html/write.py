@@ -826,10 +826,10 @@ def write_report(
     """
     target = OutputFolder(out if out is not None else folder)
     report = build_report(folder)
-    further = also(report.data) if also is not None else {}
+    documents = also(report.data) if also is not None else {}
     for name, text in report.files.items():
         target.add(name, text)
-    for name, document in further.items():
+    for name, document in documents.items():
         target.add(name, document)
     return report, target.commit()
 
