@@ -340,7 +340,9 @@ def test_what_a_person_states_is_compared_with_the_data_too(running):
     assert "by what version 1 adds" in " ".join(done.table.reasons)
 
 
-@pytest.mark.parametrize(("said", "message"), [("v9", "no such tables"), ("nonsense", "is not a version of the tables; give one")])
+@pytest.mark.parametrize(
+    ("said", "message"), [("v9", "no such tables"), ("nonsense", "not a version of the tables; give one")]
+)
 def test_tables_that_do_not_exist_cannot_be_stated(running, said, message):
     running.measure("check", on=running.on(), seed=2)
     running.run()
