@@ -401,7 +401,7 @@ def reject_command(machine: str, version: int | None, job: Job, actor: str | Non
 @click.argument("machine")
 @job_option
 @click.option(
-    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the one before."
+    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the previous one."
 )
 @who_option(reason=True)
 @json_option

@@ -339,13 +339,13 @@ class Machine(Displayed):
     errors: ErrorSelection = toml_files.setting(
         _error_selection,
         "observable",
-        meaning="the errors that the model contains: what lengths show, 17, 21, or names",
+        meaning="the errors that the model contains: those that lengths show, 17, 21, or a list of names",
     )
     curves: CurveBasis = toml_files.setting(
         toml_files.choice("linear", "cubic"), "linear", meaning="shape of the error curves between nodes"
     )
     controllers: Mapping[str, toml_files.Section] = toml_files.part_setting(
-        factory=dict, meaning="what the export to each control needs"
+        factory=dict, meaning="settings for the export to each control"
     )
     source: Path | None = None
     emphasis: Emphasis = Emphasis()

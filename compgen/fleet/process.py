@@ -199,7 +199,7 @@ def judge_assumption(judgement: Judgement, case: Case) -> None:
         said = past.stated
         if said is None or version_said(said) != taken:
             judgement.hold.append(
-                "the store does not know which tables were on while the machine was measured: it never made any of "
+                "the store does not know which tables were on while the machine was measured: it has never made tables of "
                 f"{job.name} active. If none were on: {how_to_state(job.name, measurement, 'none')}; if tables were on, "
                 "switch them off and measure again"
             )
@@ -533,8 +533,8 @@ def process(
         warnings.simplefilter("always", CompgenWarning)
         was_active = None if taken is None else _tables_read(store, machine, taken, job.controllers[0])
         if taken is not None and was_active is None:
-            holds = f"version {taken.version} was active, but contains no tables of {job.controllers[0]}"
-            raise InputError(f"{holds}; is the control right?")
+            text = f"version {taken.version} was active, but contains no tables of {job.controllers[0]}"
+            raise InputError(f"{text}; is the control right?")
         outcome = run(
             machine,
             write_files(Path(folder) / "measurement", store.contents_of(measurement)),

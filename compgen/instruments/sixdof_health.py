@@ -127,8 +127,8 @@ def _second_beam(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Susp
     limit = max(STRAIGHT_MM, 5.0 * noise / np.sqrt(len(runs)))
     if lines["bow_mm"] > limit:
         text = (
-            f"Y_QD2 - Y_QD1 bends by {lines['bow_mm'] / MM_PER_UM:.2f} um; it is a straight line in L whatever the axis "
-            "does: a beam that is clipped, a spot that crosses an edge of its cube corner, or detectors that do not agree"
+            f"Y_QD2 - Y_QD1 bends by {lines['bow_mm'] / MM_PER_UM:.2f} um, but must be a straight line in L whatever the axis "
+            "does: a clipped beam, a spot that crosses an edge of its cube corner, or detectors that do not agree"
         )
         evidence = {"bow_um": lines["bow_mm"] / MM_PER_UM, "limit_um": limit / MM_PER_UM, "slope": lines["slope"]}
         yield Suspicion("second_beam", _letter(runs), text, evidence)

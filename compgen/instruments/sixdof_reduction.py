@@ -252,7 +252,7 @@ def errors_of_run(machine: Machine, instrument: SixDofInstrument, run: RelativeR
         text = (
             f"{AXES[run.axis]}: displacement_mm {'rises' if rises else 'falls'} with position_mm, which contradicts mode "
             f"{set_up.mode} and beam_direction {set_up.beam_direction} on this chain; taken as the motion of the moving body in "
-            "its own axes. Check mode, beam_direction and the chain: a wrong one turns signs"
+            "its own axes. Check mode, beam_direction and the chain: a wrong one reverses signs"
         )
         warnings.warn(text, CompgenWarning, stacklevel=2)
         motion = (run.shift_mm, run.turn_rad) if set_up.mode == 1 else motion_of_unit(instrument, run)

@@ -166,7 +166,7 @@ def options_markdown(result: Capability) -> str:
 #: An error counts as corrected, at least in part, if less than this share of it remains.
 LEAST_HELP = 0.9
 #: What a control of each level corrects, in words.
-HOLDS = {
+CORRECTS = {
     "pitch": "positioning along each axis",
     "squareness": "positioning, straightness and squareness",
     "products": "positioning, straightness, squareness, and angles as products of tables",
@@ -176,7 +176,7 @@ HOLDS = {
 
 def explanation_markdown(item: Explanation) -> str:
     """Return ``explain.md``."""
-    text = f"# {item.controller} on {item.machine}\n\nThis control corrects {HOLDS[item.level]}."
+    text = f"# {item.controller} on {item.machine}\n\nThis control corrects {CORRECTS[item.level]}."
     if item.own is not None and item.own.left is not None:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
         text += (
