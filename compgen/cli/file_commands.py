@@ -113,9 +113,9 @@ _APART = ("controllers", "effects", "machines")
 def schema_command(kind: str) -> int:
     """Print the JSON schema of a machine, job, scenario or instrument file, for editors.
 
-    The schema (draft 2020-12) says what an editor shows and completes: every key with its meaning, unit (mm, um, urad),
-    default and allowed values. It is made of what the reader of the file declares. An editor takes it from a first line
-    `#:schema machine.schema.json` (Even Better TOML, taplo).
+    The schema (draft 2020-12) tells an editor what to show and to complete: every key with its meaning, unit (mm, um,
+    urad), default and allowed values, as the reader of the file declares them. Editors (Even Better TOML, taplo) find it
+    through the first line of the file, `#:schema machine.schema.json`.
 
     \b
     Example:
@@ -134,9 +134,9 @@ def schema_command(kind: str) -> int:
 def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> int:
     """List every problem of machine, job, scenario and instrument files at once.
 
-    FILE is a TOML file, the name of a machine, or a folder, of which every *.toml file is looked at; a broken file does not
-    keep the others from being checked. A machine file is read with the settings of all of its controls. What is possible
-    but hardly meant is asked, such as a travel of 0.8 mm; that is no problem. Exit code 2 if there is one.
+    FILE is a TOML file, the name of a machine, or a folder: all *.toml files in it are checked, even if one is broken. A
+    machine file is read with the settings of all of its controls. Values that are possible but unlikely, such as a travel
+    of 0.8 mm, are listed as questions, not as problems. Exit code 2 if there is a problem.
 
     \b
     Example:
@@ -260,8 +260,8 @@ def init_command(
 ) -> int:
     """Write a commented machine file, NAME.toml, from a few answers (lengths in mm).
 
-    On a terminal what no option says is asked. Every key has a comment with its meaning and unit; settings of a control that
-    only its owner can know, such as the sign of a table, are left as comments to be stated.
+    On a terminal it asks for everything that no option gives. Every key has a comment with its meaning and unit; settings of
+    a control that only its owner can know, such as the sign of a table, are left as comments for you to complete.
 
     \b
     Example:

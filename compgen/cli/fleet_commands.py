@@ -213,7 +213,7 @@ def watch_command(
 @job_option
 @json_option
 def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
-    """Show the state of each of MACHINES (default: all): active version, versions that wait, last measurement, problems.
+    """Show the state of each of MACHINES (default: all): active version, waiting versions, last measurement, problems.
 
     Exit code 1 if the newest tables of a machine are held back, or its last measurement failed.
 
@@ -332,8 +332,8 @@ def approve_command(
 ) -> int:
     """Make VERSION of MACHINE's tables active.
 
-    Without VERSION, on a terminal, the only version that waits is shown and must be confirmed; elsewhere give the
-    VERSION that you checked, because another one may be waiting by now. Tables that the round trip did not accept can
+    Without VERSION, on a terminal, the only waiting version is shown and must be confirmed; elsewhere give the
+    VERSION that you checked, because another one may be waiting by now. Tables that the verification did not accept can
     never be approved.
 
     \b
@@ -386,7 +386,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
 @who_option(reason=True)
 @json_option
 def reject_command(machine: str, version: int | None, job: Job, actor: str | None, reason: str, as_json: bool) -> int:
-    """Refuse VERSION of MACHINE's tables (default: the only one that waits).
+    """Refuse VERSION of MACHINE's tables (default: the only waiting one).
 
     \b
     Example:
