@@ -138,7 +138,7 @@ def test_means_beside_the_runs_are_no_runs_and_are_held_against_them(tmp_path):
     assert sum("is a statistic over the runs" in note for note in item.notes) == 5
     wrong = [("Mittel zurück", ("3,05", "4,95", "7,55"))]
     item = import_file(written(tmp_path, sheet(NAMES["german"], extra=wrong)), options)
-    assert "'Mittel zurück' says 4.95 in line 3" in item.doubts[0]
+    assert "'Mittel zurück' states 4.95 in line 3" in item.doubts[0]
     assert "is 4.45: is a run missing" in item.doubts[0]
 
 
