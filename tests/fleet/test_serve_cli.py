@@ -83,7 +83,7 @@ def test_the_password_is_asked_for_twice_and_never_shown(tmp_path):
     ("words", "message"),
     [
         (["serve"], "give --store URL or --job FILE"),
-        (["serve", "--store", "x.sqlite", "--decide", "--host", "0.0.0.0"], "in the clear"),
+        (["serve", "--store", "x.sqlite", "--decide", "--host", "0.0.0.0"], "unencrypted"),
         (["serve", "--store", "postgresql://h/n", "--decide"], "needs a file of users"),
         (["serve", "--store", "x.sqlite", "--name", "http://a"], "is not a host name"),
         (["serve", "--store", "mysql://h/n"], "is not a store"),

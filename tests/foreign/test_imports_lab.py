@@ -156,7 +156,7 @@ def test_two_columns_of_one_run_and_different_units_are_refused(tmp_path):
     [
         ("Soll [mm];Ist [mm];Abweichung [µm]", None),
         ("Soll [mm];Ist [mm];Korrektur [µm]", "'Korrektur [µm]' has the opposite sign of 'Ist [mm]' minus target"),
-        ("Soll [mm];Ist [inch];Abweichung [µm]", "says in"),
+        ("Soll [mm];Ist [inch];Abweichung [µm]", "states in"),
     ],
 )
 def test_deviations_beside_readings_are_held_against_them(tmp_path, header, doubt):
