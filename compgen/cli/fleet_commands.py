@@ -401,7 +401,10 @@ def reject_command(machine: str, version: int | None, job: Job, actor: str | Non
 @click.argument("machine")
 @job_option
 @click.option(
-    "--to", type=click.IntRange(0), default=None, help="Version that was active; 0: no tables. Default: the previous one."
+    "--to",
+    type=click.IntRange(0),
+    default=None,
+    help="Version that was active; 0: no tables. Default: the previous one.",
 )
 @who_option(reason=True)
 @json_option

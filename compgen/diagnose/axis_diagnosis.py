@@ -900,7 +900,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             "unknown": unknown,
             "invisible": list(dict.fromkeys(name for part in self.axes for name in part.invisible)),
             "secondary": [],
-            "gap": self._gap(),
+            "gap": self._misfit(),
             "advice": self._advice(),
             "reasons": [f"{', '.join(assumed)}: {NO_REPEATS}"] if assumed else [],
             "notes": self._notes(),
@@ -920,7 +920,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             found["against"] = {"rms_um": rms, "changes": [entry for item in against for entry in item["changes"]]}
         return found
 
-    def _gap(self) -> dict[str, Any]:
+    def _misfit(self) -> dict[str, Any]:
         before = np.concatenate([part.residual_before_mm for part in self.axes])
         after = np.concatenate([part.residual_after_mm for part in self.axes])
         left_out = [(part.left_out_rms_mm, len(part.session)) for part in self.axes if part.left_out_rms_mm is not None]

@@ -21,7 +21,7 @@ from compgen.diagnose.analysis import Analysis, analyse
 from compgen.diagnose.axis_diagnosis import LEAST_FREEDOM, AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base_fit import BaseFit
-from compgen.diagnose.diagnosis import Classed, Diagnosis, gap_of, refit
+from compgen.diagnose.diagnosis import Classed, Diagnosis, misfit_before_after, refit
 from compgen.diagnose.gross import (
     classes_of,
     correction_of,
@@ -231,16 +231,16 @@ def _completed(
     predicting = [
         columns for g, columns in seen.items() if design.groups[g].tier != "base" and design.groups[g].predicts
     ]
-    gap = gap_of(analysis.fit, columns, predicting, analysis.noise, base)
+    misfit = misfit_before_after(analysis.fit, columns, predicting, analysis.noise, base)
     if before is not analysis.fit:
-        gap = replace(gap, train=replace(gap.train, before_mm=before.rms_mm))
+        misfit = replace(misfit, train=replace(misfit.train, before_mm=before.rms_mm))
     if analysis.fit.rms_mm > HOPELESS_MM:
         text = f"the readings do not fit the commanded positions: {analysis.fit.rms_mm:.3g} mm rms"
         verdict = replace(verdict, word="not_decidable", reasons=(*verdict.reasons, text))
     advice = advice_of(analysis, verdict)
     observed = analysis.fit.observed
     classes = [*classed, *classes_of(analysis, removed)]
-    done = Diagnosis(machine, analysis, verdict, found, gap, tuple(classes), advice)
+    done = Diagnosis(machine, analysis, verdict, found, misfit, tuple(classes), advice)
     if options.against is not None:
         against = compared(observed, analysis, options.against)
         done = replace(done, changes=against.changes, against_rms_mm=against.rms_mm)

@@ -153,7 +153,7 @@ class BeforeAfter:
 
 
 @dataclass(frozen=True)
-class Gap:
+class MisfitBeforeAfter:
     """The misfit of the readings used and of left-out parts; None where it cannot be computed."""
 
     train: BeforeAfter
@@ -166,13 +166,13 @@ class Gap:
     residual_after_mm: FloatArray
 
 
-def gap_of(
+def misfit_before_after(
     fit: BaseFit,
     added: Sequence[FloatArray],
     predicting: Sequence[FloatArray],
     noise: Noise,
     base: Sequence[FloatArray] = (),
-) -> Gap:
+) -> MisfitBeforeAfter:
     """Compute the misfit.
 
     Parameters
@@ -206,7 +206,7 @@ def gap_of(
         floor = float(np.sqrt(squares / max(size, 1)))
     else:
         floor = float(np.sqrt(noise.variances.total))
-    return Gap(
+    return MisfitBeforeAfter(
         _rms_pair(before, after),
         some.left_out(lines),
         None if stations is None else some.left_out(stations),
@@ -318,7 +318,7 @@ class Diagnosis(DisplayedDiagnosis):
     Parameters
     ----------
     machine : the machine.
-    analysis, verdict, refit, gap : the results of the steps.
+    analysis, verdict, refit, misfit : the results of the steps.
     classed : noise classes and gross errors.
     advice : texts on measurements that would decide between or separate effects.
     changes, against_rms_mm : errors that differ from the predicted ones, and the residual against the prediction.
@@ -329,7 +329,7 @@ class Diagnosis(DisplayedDiagnosis):
     analysis: Analysis
     verdict: Verdict
     refit: Refit
-    gap: Gap
+    misfit: MisfitBeforeAfter
     classed: tuple[Classed, ...] = ()
     advice: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
@@ -341,7 +341,7 @@ class Diagnosis(DisplayedDiagnosis):
         """Whether the verdict is decided and, if something was added, the misfit of left-out readings shrinks."""
         if self.verdict.word == "not_decidable":
             return False
-        left_out = self.gap.lines or self.gap.times
+        left_out = self.misfit.lines or self.misfit.times
         return not self.verdict.named or left_out is None or left_out.shrinks
 
     def to_dict(self) -> dict[str, Any]:
@@ -362,21 +362,21 @@ class Diagnosis(DisplayedDiagnosis):
             for item in self.classed
         ]
         word = "named" if verdict.word == "none" and self.classed else verdict.word
-        gap: dict[str, Any] = {"train": self.gap.train.to_dict()}
+        misfit: dict[str, Any] = {"train": self.misfit.train.to_dict()}
         for key, pair in (
-            ("heldout_lines", self.gap.lines),
-            ("heldout_stations", self.gap.stations),
-            ("heldout_times", self.gap.times),
+            ("heldout_lines", self.misfit.lines),
+            ("heldout_stations", self.misfit.stations),
+            ("heldout_times", self.misfit.times),
         ):
-            gap[key] = None if pair is None else pair.to_dict()
-        gap |= {"noise_floor_um": self.gap.floor_mm / MM_PER_UM, "noise_floor_source": self.gap.floor_source}
+            misfit[key] = None if pair is None else pair.to_dict()
+        misfit |= {"noise_floor_um": self.misfit.floor_mm / MM_PER_UM, "noise_floor_source": self.misfit.floor_source}
         return {
             "verdict": word,
             "effects": effects,
             "unknown": [_unknown(item) for item in verdict.unknown],
             "invisible": list(verdict.invisible),
             "secondary": [self._named(item) for item in verdict.secondary],
-            "gap": gap,
+            "gap": misfit,
             "advice": list(self.advice),
             "reasons": list(verdict.reasons),
             "notes": list(self.notes),

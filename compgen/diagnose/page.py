@@ -97,7 +97,7 @@ def residual_pictures(found: Diagnosis) -> list[Picture]:
         count = np.maximum(np.bincount(index, minlength=len(centres)), 1)
         drawn = []
         for side, role, residual_mm in (
-            (-1.0, "before", found.gap.residual_before_mm), (1.0, "after", found.gap.residual_after_mm),
+            (-1.0, "before", found.misfit.residual_before_mm), (1.0, "after", found.misfit.residual_after_mm),
         ):  # fmt: skip
             mean = np.bincount(index, residual_mm, len(centres)) / count
             square = np.bincount(index, residual_mm**2, len(centres)) / count
@@ -120,9 +120,9 @@ def volume_pictures(found: Diagnosis) -> list[Picture]:
     rows = np.arange(len(position))
     if len(position) > MOST_DOTS:
         rows = np.sort(np.random.default_rng(0).choice(rows, MOST_DOTS, replace=False))
-    largest = float(np.quantile(np.abs(found.gap.residual_before_mm), 0.99)) / MM_PER_UM or 1.0
+    largest = float(np.quantile(np.abs(found.misfit.residual_before_mm), 0.99)) / MM_PER_UM or 1.0
     pictures = []
-    for when, residual_mm in (("before", found.gap.residual_before_mm), ("after", found.gap.residual_after_mm)):
+    for when, residual_mm in (("before", found.misfit.residual_before_mm), ("after", found.misfit.residual_after_mm)):
         for a, b in ((0, 1), (0, 2), (1, 2)):
             x, y = position[rows, a], position[rows, b]
             limits = limits_of(x, margin=0.03), limits_of(y, margin=0.03)
@@ -185,7 +185,7 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
     legend = '<span class="key before"></span> before <span class="key after"></span> after'
     parts = [
         _effects(data),
-        _gap(data),
+        _misfit(data),
         f'<h2>Where model and measurement disagree</h2><p class="legend">Mean and scatter of the residuals: {legend}</p>',
         picture_grid(residual_pictures(found)),
         "<h2>Over the volume</h2>",
@@ -200,7 +200,7 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
 def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html`` for axis runs."""
     title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
-    parts = [_effects(data), _figures(data), _gap(data)]
+    parts = [_effects(data), _figures(data), _misfit(data)]
     for part in found.axes:
         parts += [
             f"<h2>Axis {escape(part.session.letter)}</h2><p>Scatter: deviation minus the mean of its target and direction, in "
@@ -274,7 +274,7 @@ def _figures(data: dict[str, Any]) -> str:
     return "".join(parts)
 
 
-def _gap(data: dict[str, Any]) -> str:
+def _misfit(data: dict[str, Any]) -> str:
     rows = "".join(
         f"<tr><td>{escape(key.replace('_', ' '))}</td><td>{pair['before_rms_um']:.3f}</td>"
         f"<td>{pair['after_rms_um']:.3f}</td></tr>"
@@ -338,17 +338,17 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
         if item.get("resembles"):
             lines.append(f"  * resembles {item['resembles']}, but this is not certain")
     lines += [f"* possible secondary effect: {item['name']}" for item in data["secondary"]]
-    gap = [
+    misfit = [
         (key.replace("_", " "), pair["before_rms_um"], pair["after_rms_um"])
         for key in ("train", "heldout_lines", "heldout_stations", "heldout_times")
         if (pair := data["gap"][key])
     ]
     if markdown:
         lines += ["", "| | before (um rms) | after |", "|---|---|---|"]
-        lines += [f"| {name} | {before:.3f} | {after:.3f} |" for name, before, after in gap]
+        lines += [f"| {name} | {before:.3f} | {after:.3f} |" for name, before, after in misfit]
     else:
         lines += ["", f"{'residual, um rms':20s} {'before':>10s} {'after':>10s}"]
-        lines += [f"{name:20s} {before:10.3f} {after:10.3f}" for name, before, after in gap]
+        lines += [f"{name:20s} {before:10.3f} {after:10.3f}" for name, before, after in misfit]
     if "against" in data:
         lines += ["", f"Against the given errors: {data['against']['rms_um']:.3f} um rms. Errors that have changed:"]
         for item in data["against"]["changes"]:

@@ -63,8 +63,8 @@ class DisplayedDiagnosis(Drawable):
 
     def panels(self) -> Sequence[Panel]:
         """RMS of the residuals before and after, for the readings used and the readings left out."""
-        gap = self.to_dict()["gap"]
-        shown = {key.removeprefix("heldout_"): pair for key, pair in gap.items() if isinstance(pair, dict)}
+        misfit = self.to_dict()["gap"]
+        shown = {key.removeprefix("heldout_"): pair for key, pair in misfit.items() if isinstance(pair, dict)}
         before = Bars("before", tuple(shown), tuple(pair["before_rms_um"] for pair in shown.values()))
         after = Bars("after", tuple(shown), tuple(pair["after_rms_um"] for pair in shown.values()))
         return [Panel("residuals of the readings used and left out", "rms (um)", bars=(before, after))]

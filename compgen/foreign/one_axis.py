@@ -177,12 +177,12 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
     See :func:`compgen.identify.axis_tests.two_way_mean`. The reversal is None for angles, for one direction, and below
     0.1 um.
     """
-    centre, gap, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)
+    centre, reversal, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)
     table = ErrorTable({error: centre}, {}, dict(metadata))
     name = error_named(error)
-    if name.kind != "linear" or gap is None or not worth_a_table(gap):
+    if name.kind != "linear" or reversal is None or not worth_a_table(reversal):
         return table, None
-    return table, ReversalCurves({(name.axis, name.direction): gap}, dict(metadata))
+    return table, ReversalCurves({(name.axis, name.direction): reversal}, dict(metadata))
 
 
 def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:

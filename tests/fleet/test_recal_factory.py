@@ -339,7 +339,7 @@ def prepared(example, tmp_path_factory):
         ("the time has no zone", "held", "has no zone", False),
         ("the file has no time and was copied", "held", "changes when it is copied", True),
         ("the server's clock ran ahead", "held", "the clock went back, so the time", True),
-        ("the machine has another name in the job file", "held", "never made any of mill-x active", True),
+        ("the machine has another name in the job file", "held", "never made tables of mill-x active", True),
         ("the store was deleted", "failed", "this store never made active", False),
         ("the store has 0 bytes", "stopped", r"0 bytes", False),
         ("the store is an older one", "failed", "this store never made active", False),
