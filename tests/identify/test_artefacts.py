@@ -90,7 +90,7 @@ def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, mach
     scale = np.sum(left * position) / np.sum(position[:, :2] ** 2)  # turning does not determine the common scale
     rest = compgen.without_rigid_motion(position, left - scale * position)
     assert np.abs(rest[:, :2]).max() < 8 * NOISE_MM
-    assert any(name in text for text in found.unobservable for name in ("EXX: a part", "EYY: a part"))
+    assert any(name in text for text in found.unobservable for name in ("EXX: part of it", "EYY: part of it"))
     wrong = written(tmp_path / "once.artefact.csv", rows[:36], "u_probe_um = 0.3")  # taken as calibrated
     assert identify_measurement(machine, open_measurement([wrong]), IdentifyOptions(reject=False)).rms_um > 5.0
 
