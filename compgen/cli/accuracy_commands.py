@@ -143,7 +143,6 @@ def accuracy_command(
     \b
     Example:
       volcomp accuracy zha-gantry identified/identified.errors.csv --out accuracy/
-      volcomp accuracy zha-gantry X.axis.csv --tolerance A=8 --certificate certificate.toml --out accuracy/
     """
     OutputFolder(out)
     laboratory = read_certificate(certificate) if certificate else None
