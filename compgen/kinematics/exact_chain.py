@@ -33,6 +33,8 @@ from compgen.kinematics.many_points import (
 # Kernels take f1 and f2 from the same series (``rotation_factors`` of :mod:`compgen.kinematics.compiled_kernels`).
 
 
+#: A vector at n points, by component.
+Vector = list[FloatArray]
 #: rad^2; below, the next terms of the series are less than 1e-21 (f1, f2) and 1e-16 (f3) of the result.
 SERIES_BELOW = 1e-4
 
@@ -51,12 +53,14 @@ def rotation_factors(square: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def rotate(eps_rad: FloatArray, vectors: FloatArray) -> FloatArray:
     """Turn vectors (n, 3), or every column of (n, 3, k), by rotation vectors (n, 3)."""
-    first, second = rotation_factors(np.einsum("ij,ij->i", eps_rad, eps_rad))
-    if vectors.ndim == 3:
-        eps_rad = eps_rad[:, :, None]
-    shape = (-1, *(1,) * (vectors.ndim - 1))
-    once = np.cross(eps_rad, vectors, axis=1)
-    return np.asarray(vectors + first.reshape(shape) * once + second.reshape(shape) * np.cross(eps_rad, once, axis=1))
+    return np.stack([one.T for one in _rotated(list(eps_rad.T), [vectors[:, k].T for k in range(3)])], axis=1)
+
+
+def _rotated(eps: Vector, vectors: Vector) -> Vector:
+    """R(eps) v by components: of a rotation vector (n,), of one or more vectors (..., n)."""
+    first, second = rotation_factors(np.einsum("in,in->n", eps, eps))
+    once = _cross(eps, vectors)
+    return [v + first * a + second * b for v, a, b in zip(vectors, once, _cross(eps, once), strict=True)]
 
 
 def level_rotations(eps_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -75,7 +79,8 @@ def level_rotations(eps_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def rotation_derivative(eps_rad: FloatArray, turned: FloatArray) -> FloatArray:
     """d(R(eps) v)/d eps = -[R v]x J_l(eps), shape (n, 3, 3); ``turned`` (n, 3) is R v."""
-    return -np.cross(turned[:, :, None], level_rotations(eps_rad)[1], axis=1)
+    jacobian = level_rotations(eps_rad)[1]
+    return -np.stack(_cross(list(turned.T[:, :, None]), [jacobian[:, k] for k in range(3)]), axis=1)
 
 
 def cross_matrices(vectors: FloatArray) -> FloatArray:
@@ -138,6 +143,10 @@ def tip_position(
     return tip
 
 
+#: The squareness errors that turn the direction of an axis: name, component and sign of the rotation vector.
+_TURNED_BY = ((("EC0Y", 2, -1.0),), (("EC0Y", 2, 1.0),), (("EA0Z", 0, 1.0), ("EB0Z", 1, 1.0)))
+
+
 def exact_columns(
     machine: Machine, values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
@@ -148,29 +157,35 @@ def exact_columns(
     travel = _travel(machine, values, position_mm)
     turns = _squareness_vectors(machine, values)
     tip = np.array(np.broadcast_to(tool_of(machine, tool_mm), position_mm.shape))
-    columns = np.zeros((len(position_mm), 3, len(ERRORS)))
+    # derivatives by component and error, in the order in which the bodies are passed: the others are still zero
+    parts, order = np.zeros((3, len(ERRORS), len(position_mm))), list[int]()
+
+    def turn(eps: FloatArray) -> None:
+        parts[:, : len(order)] = _rotated(list(eps.T), list(parts[:, : len(order)]))
+
     for axis, tool_side in passing_order(machine):
         delta, eps = values[:, 6 * axis : 6 * axis + 3], values[:, 6 * axis + 3 : 6 * axis + 6]
-        linear, angular = slice(6 * axis, 6 * axis + 3), slice(6 * axis + 3, 6 * axis + 6)
         if tool_side:
             turned = rotate(eps, tip)
-            columns = rotate(eps, columns)
+            turn(eps)
             tip = travel[axis] + delta + turned
         else:
             tip = tip + travel[axis] + delta
-        columns[:, :, linear] += np.eye(3)
+        angular = len(order) + 3
+        parts[:, len(order) : angular] = np.eye(3)[:, :, None]
+        order += range(6 * axis, 6 * axis + 6)
         # the travel vector turns with the squareness errors of its axis
         if axis == 2 or machine.squareness_reference == "YX"[axis]:
             by_turn = rotation_derivative(turns[axis], travel[axis])
-            if axis == 2:
-                columns[:, :, ERROR_INDEX["EA0Z"]] += by_turn[:, :, 0]
-                columns[:, :, ERROR_INDEX["EB0Z"]] += by_turn[:, :, 1]
-            else:
-                columns[:, :, ERROR_INDEX["EC0Y"]] += by_turn[:, :, 2] if axis == 1 else -by_turn[:, :, 2]
+            for name, component, sign in _TURNED_BY[axis]:
+                parts[:, len(order)] = sign * by_turn[:, :, component].T
+                order.append(ERROR_INDEX[name])
         if not tool_side:
             tip = turned = rotate(eps, tip)
-            columns = rotate(eps, columns)
-        columns[:, :, angular] += rotation_derivative(eps, turned)
+            turn(eps)
+        parts[:, angular : angular + 3] += rotation_derivative(eps, turned).transpose(1, 2, 0)
+    columns = np.zeros((len(position_mm), 3, len(ERRORS)))
+    columns[:, :, order] = parts[:, : len(order)].transpose(2, 0, 1)
     return tip, columns
 
 
@@ -216,8 +231,6 @@ def travel_directions(machine: Machine, squareness_rad: FloatArray) -> tuple[Flo
 #: From this number of points on, loading the kernels pays off for a single call.
 _POINTS_FOR_KERNELS = 5_000_000
 _SQUARENESS = ("EC0Y", "EB0Z", "EA0Z")
-
-Vector = list[FloatArray]
 
 
 def exact_error(
