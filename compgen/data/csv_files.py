@@ -11,8 +11,8 @@ import csv
 import math
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
@@ -20,11 +20,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.files import read_text
+from compgen.data.files import decoded, read_text
 from compgen.data.messages import doubled, nearest, visible_line
 from compgen.data.names import LARGEST, SMALLEST
 from compgen.errors import CompgenWarning, InputError
 
+#: How much of a large file is in memory at a time, bytes; also the longest line of such a file.
+PART_BYTES = 1 << 22
+_LINE_END = re.compile(r"\r\n|\r|\n")
 #: Quotes, comments and all ASCII white space except the line feed.
 _NOT_PLAIN = '"#\0\r\t\v\f \x1c\x1d\x1e\x1f'
 
@@ -97,7 +100,7 @@ def parse_any(source: Path, content: str) -> CsvFile:
     metadata: dict[str, str] = {}
     numbers: list[int] = []
     data: list[str] = []
-    for number, line in enumerate(re.split(r"\r\n|\r|\n", content), start=1):
+    for number, line in enumerate(_LINE_END.split(content), start=1):
         if not _note_metadata(line.strip(), metadata):
             numbers.append(number)
             data.append(line)
@@ -152,7 +155,7 @@ class CsvTable:
 
     def text(self, column: str) -> list[str]:
         """Return a column of labels, as passed to :func:`format_csv`; an empty cell is an error."""
-        cells = self.columns[column]
+        cells = self.words(column)
         for row, cell in enumerate(cells):
             if not cell:
                 raise self.fail(row, column, "is empty; every row needs a label here")
@@ -168,6 +171,22 @@ class CsvTable:
 
     def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
         """Return a column as finite numbers up to ``most``, shape (rows,); empty cells become ``empty`` if it is given."""
+        cells, values = self.columns[column], self.parsed(column, empty)
+        if not (np.abs(values) <= most).all():
+            row = next((k for k in range(len(cells)) if cells[k] and not abs(values[k]) <= most), None)
+            if row is not None:
+                finite = math.isfinite(values[row])
+                what = f"is larger than {most:g}, the largest number allowed" if finite else "is not a finite number"
+                raise self.fail(row, column, f"{cells[row]!r} {what}")
+        values[np.abs(values) < SMALLEST] = 0.0  # too small for a measured value, and its square would underflow
+        return values
+
+    def words(self, column: str) -> Sequence[str]:
+        """Return the cells of a column as text."""
+        return self.columns[column]
+
+    def parsed(self, column: str, empty: float | None) -> FloatArray:
+        """Return a column as numbers of any size, shape (rows,); empty cells become ``empty`` if it is given."""
         cells = self.columns[column]
         filled = list(cells) if empty is None else [cell or repr(empty) for cell in cells]
         try:
@@ -179,13 +198,6 @@ class CsvTable:
             "_" in together or not together.isascii()
         ):  # Python accepts 1_000 and digits of other scripts; files must not have them
             raise self._bad_number(column, filled)
-        if not (np.abs(values) <= most).all():
-            row = next((k for k in range(len(cells)) if cells[k] and not abs(values[k]) <= most), None)
-            if row is not None:
-                finite = math.isfinite(values[row])
-                what = f"is larger than {most:g}, the largest number allowed" if finite else "is not a finite number"
-                raise self.fail(row, column, f"{cells[row]!r} {what}")
-        values[np.abs(values) < SMALLEST] = 0.0  # too small for a measured value, and its square would underflow
         return values
 
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
@@ -252,30 +264,107 @@ def csv_table(
     source: Path, content: str, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
 ) -> CsvTable:
     """Read the text ``content`` of the file ``source`` as :func:`read_csv` does."""
-    required, prefixes = list(required), tuple(prefixes)
-    known = {*required, *optional}
     file = parse_plain(content) or parse_any(source, content)
-    if not file.header:
-        raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
+    required = list(required)
     _check_header(source, file.header_line, file.header, required)
     if not file.lines:
         raise InputError("has a header but no rows", file=source, line=file.header_line)
+    _check_widths(source, file, last=file.lines[-1])
+    _check_complete(source, content, file, len(file.lines))
+    kept = kept_columns(source, file.header_line, file.header, required, optional, prefixes)
+    return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
+
+
+def csv_parts(
+    path: str | Path, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
+) -> Iterator[CsvTable]:
+    """Read a CSV file of any size as strictly as :func:`read_csv`, with only a part of it in memory.
+
+    The parts have the line numbers of the file and share ``metadata``, which is complete after the last one.
+    """
+    source, kept, header, metadata = Path(path), dict[int, str](), "", dict[str, str]()
+    required = list(required)
+    count, before, header_line, content, file = 0, 0, 0, "", CsvFile(0, [], [], metadata)
+    for content in _parts(source):
+        # every part is read like a file that begins with the header; ``before`` are the lines above it
+        skipped = before - bool(header)
+        text = f"{header}\n{content}" if header else content
+        try:
+            part = parse_plain(text) or parse_any(source, text)
+        except InputError as error:
+            line = None if error.line is None else error.line + skipped
+            raise InputError(error.message, file=source, line=line, field=error.field) from error
+        metadata.update(part.metadata)
+        before += len(_LINE_END.findall(content)) if "\r" in content else content.count("\n")
+        if part.header and not header:
+            header_line = part.header_line + skipped
+            _check_header(source, header_line, part.header, required)
+            header = _LINE_END.split(text, part.header_line)[part.header_line - 1]
+        if part.lines:
+            file = replace(part, lines=[line + skipped for line in part.lines], metadata=metadata)
+            _check_widths(source, file, last=None)
+            if not count:
+                kept = kept_columns(source, header_line, part.header, required, optional, prefixes)
+            count += len(file.lines)
+            yield CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, metadata)
+    if not header:
+        _check_header(source, 0, [], required)
+    if not count:
+        raise InputError("has a header but no rows", file=source, line=header_line)
+    _check_complete(source, content, file, count)
+
+
+def _parts(source: Path) -> Iterator[str]:
+    """Yield a text in parts of about :data:`PART_BYTES`, each of whole lines; the last one also has the end of the file."""
+    lines, held, rest, encoding = 0, b"", b"", "utf-8-sig"
+    try:
+        with source.open("rb") as stream:
+            while block := stream.read(PART_BYTES):
+                whole, end, rest = (rest + block).rpartition(b"\n")
+                if len(rest) > PART_BYTES:
+                    line = lines + held.count(b"\n") + 1
+                    raise InputError("is too long for a line; is it a text file?", file=source, line=line)
+                if not end:
+                    continue
+                if held:
+                    yield decoded(held, source, encoding, lines)
+                    encoding, lines = "utf-8", lines + held.count(b"\n")
+                held = whole + end
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=source) from error
+    yield decoded(held + rest, source, encoding, lines)
+
+
+def kept_columns(
+    source: Path,
+    line: int,
+    header: Sequence[str],
+    required: Iterable[str],
+    optional: Iterable[str] = (),
+    prefixes: Iterable[str] = (),
+) -> dict[int, str]:
+    """Return number and name of the columns of a header that are read; InputError for an invalid one."""
+    required, patterns = list(required), tuple(prefixes)
+    known = {*required, *optional}
+    _check_header(source, line, header, required)
+    strange = [name for name in header if not _is_allowed(name, known, patterns)]
+    for name in strange[:_NAMED]:
+        message = f"column {_shown(name)!r} is unknown and ignored; {nearest(name[:_SHOWN], known)}"
+        warnings.warn(f"{source}:{line}: {message}", CompgenWarning, stacklevel=5)
+    if len(strange) > _NAMED:
+        warnings.warn(
+            f"{source}:{line}: {len(strange) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=5
+        )
+    return {k: name for k, name in enumerate(header) if _is_allowed(name, known, patterns)}
+
+
+def _check_widths(source: Path, file: CsvFile, last: int | None) -> None:
     if file.rows is not None:
         for row, line in zip(file.rows, file.lines, strict=True):
             if len(row) != len(file.header):
-                last = " (the last line: is the file truncated?)" if line == file.lines[-1] else ""
-                message = f"has {len(row)} fields, the header has {len(file.header)}{last}"
+                doubt = " (the last line: is the file truncated?)" if line == last else ""
+                message = f"has {len(row)} fields, the header has {len(file.header)}{doubt}"
                 raise InputError(message, file=source, line=line)
-    _check_complete(source, content, file)
-    place = f"{source}:{file.header_line}"
-    strange = [name for name in file.header if not _is_allowed(name, known, prefixes)]
-    for name in strange[:_NAMED]:
-        message = f"column {_shown(name)!r} is unknown and ignored; {nearest(name[:_SHOWN], known)}"
-        warnings.warn(f"{place}: {message}", CompgenWarning, stacklevel=4)
-    if len(strange) > _NAMED:
-        warnings.warn(f"{place}: {len(strange) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=4)
-    kept = {k: name for k, name in enumerate(file.header) if _is_allowed(name, known, prefixes)}
-    return CsvTable(source, {name: file.column(k) for k, name in kept.items()}, file.lines, file.metadata)
 
 
 def _shown(text: str) -> str:
@@ -287,7 +376,9 @@ def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
     return name in known or any(fnmatchcase(name, p if "*" in p else f"{p}*") for p in patterns)
 
 
-def _check_header(source: Path, line: int, header: list[str], required: list[str]) -> None:
+def _check_header(source: Path, line: int, header: Sequence[str], required: Iterable[str]) -> None:
+    if not header:
+        raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
     if len(header) > MOST_COLUMNS:
         message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are allowed: is this a table?"
         raise InputError(message, file=source, line=line)
@@ -302,12 +393,12 @@ def _check_header(source: Path, line: int, header: list[str], required: list[str
         raise InputError(message, file=source, line=line)
 
 
-def _check_complete(source: Path, content: str, file: CsvFile) -> None:
-    """Refuse a truncated file: by its declared rows, or by a shorter last number without line end.
+def _check_complete(source: Path, content: str, file: CsvFile, count: int) -> None:
+    """Refuse a truncated file of ``count`` rows: by its declared rows, or by a shorter last number without line end.
 
     A file that declares its rows was written by a program and ends with a line end; other files may lack it.
     """
-    declared, count, last_line = file.metadata.get("rows"), len(file.lines), file.lines[-1]
+    declared, last_line = file.metadata.get("rows"), file.lines[-1]
     if declared is not None and declared != str(count):
         raise InputError(f"declares {visible_line(declared)} rows but contains {count}: is it truncated?", file=source)
     if content.endswith(("\n", "\r")):

@@ -319,10 +319,10 @@ def read_text(path: str | Path) -> str:
     return decoded(read_bytes(path), path)
 
 
-def decoded(content: bytes, path: str | Path) -> str:
-    """Return the UTF-8 text of the contents of ``path`` like :func:`read_text`."""
+def decoded(content: bytes, path: str | Path, encoding: str = "utf-8-sig", before: int = 0) -> str:
+    """Return the UTF-8 text of the contents of ``path``, or of a part after ``before`` lines, like :func:`read_text`."""
     try:
-        return content.decode("utf-8-sig")
+        return content.decode(encoding)
     except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
+        line = before + content[: error.start].count(b"\n") + 1
         raise InputError("is not UTF-8 text; save it as UTF-8", file=path, line=line) from error

@@ -1,21 +1,37 @@
-"""Tracer lengths in binary form (``*.lengths.npz``): for measurements on the fly, never all in memory."""
+"""Tracer lengths that are never all in memory: from archives (``*.lengths.npz``), Parquet files, and large CSV files."""
 
 from __future__ import annotations
 
 import struct
+import warnings
+import weakref
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.lengths import MOST_WHOLE, Lengths
-from compgen.data.records import COVARIATE_COLUMNS, LABEL_COLUMNS, POSITION_COLUMNS
-from compgen.errors import InputError
+from compgen.data.csv_files import CsvTable, FloatArray, csv_parts, kept_columns
+from compgen.data.files import working_folder
+from compgen.data.lengths import LENGTHS, MOST_WHOLE, Lengths
+from compgen.data.records import (
+    APPROACH_COLUMNS,
+    ARCHIVE,
+    COVARIATE_COLUMNS,
+    LABEL_COLUMNS,
+    PARQUET,
+    POSITION_COLUMNS,
+    TOOL_COLUMNS,
+    detect_format,
+    may_be_large,
+)
+from compgen.errors import CompgenWarning, InputError
 
 #: Readings of which an identification from an archive keeps the residuals, and in which it searches for disturbances.
 SAMPLE = 20_000
@@ -45,13 +61,21 @@ class Column:
 class LengthArchive:
     """The columns of an archive, n readings.
 
-    ``columns`` have the names of a ``*.lengths.csv`` file, each (n,); ``station`` is an index into ``stations``.
+    ``columns`` have the names of a ``*.lengths.csv`` file, each (n,); ``station`` is an index into ``stations``, ``line``
+    the line of each reading if the file has lines.
     """
 
     path: Path
     stations: tuple[str, ...]
     columns: Mapping[str, Column]
     metadata: Mapping[str, str] = field(default_factory=dict)
+    line: Column | None = None
+
+    def lines(self, rows: slice | NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the lines of some readings in the file: their numbers, counted from 1, in a file without lines."""
+        if self.line is not None:
+            return np.asarray(self.line[rows], dtype=np.int64)
+        return (np.arange(len(self))[rows] if isinstance(rows, slice) else rows) + 1
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -82,7 +106,7 @@ class LengthArchive:
     def taken(self, rows: slice | NDArray[np.int64]) -> Lengths:
         """Return some of the readings; their points are numbered by row."""
         found = {name: column[rows] for name, column in self.columns.items()}
-        numbers = np.arange(len(self))[rows] if isinstance(rows, slice) else rows
+        numbers, lines = np.arange(len(self))[rows], self.lines(rows)
         labels = {name: found[name].astype(np.int64) for name in LABEL_COLUMNS if name in found}
         others = {name: found[name].astype(np.float64) for name in found if name.startswith("temp_")}
         others |= {name: found[name].astype(np.float64) for name in COVARIATE_COLUMNS if name in found}
@@ -95,7 +119,7 @@ class LengthArchive:
             labels=labels,
             covariates=others,
             metadata=self.metadata,
-            origin=[(str(self.path), int(number) + 1) for number in numbers],
+            origin=[(str(self.path), line) for line in lines.tolist()],
         )
 
     @cached_property
@@ -181,10 +205,7 @@ def read_archive(path: str | Path) -> Lengths:
     """Read a whole archive; InputError for more than ``MOST_WHOLE`` readings."""
     archive = open_archive(path)
     if len(archive) > MOST_WHOLE:
-        message = (
-            f"contains {len(archive)} readings; more than {MOST_WHOLE} can only be identified (volcomp identify, run)"
-        )
-        raise InputError(message, file=archive.path)
+        raise too_many(archive.path, len(archive))
     archive.check()
     return archive.taken(slice(None))
 
@@ -228,3 +249,194 @@ def write_archive(
             stream.close()
             Path(stream.name).unlink()
     return count
+
+
+# --- text and Parquet ----------------------------------------------------------------------------------------------
+
+#: Columns that an identification in parts does not use.
+UNUSED = (*APPROACH_COLUMNS, "approach")
+#: Rows whose hashes are compared at a time, and pairs with the same hash that are looked at.
+COMPARED, MOST_PAIRS = 1_000_000, 100
+
+
+def copied_archive(parts: Callable[[], Iterable[CsvTable]]) -> LengthArchive:
+    """Copy lengths that come in parts to columns in a temporary folder, which is removed with the result.
+
+    ``parts`` begins from the start with each call.
+
+    Raises
+    ------
+    InputError
+        for whatever :meth:`Schema.values` refuses, columns that need all readings at once, and readings given twice.
+    """
+    with ExitStack() as stack:
+        folder = stack.enter_context(working_folder("lengths-"))
+        stations, unused = dict[str, int](), dict[str, None]()
+        streams: dict[str, tuple[BinaryIO, np.dtype[Any]]] = {}
+        count = 0
+        for table in parts():
+            for name, values in archive_columns(table, stations).items():
+                if name not in streams:
+                    streams[name] = stack.enter_context((folder / name).open("wb")), values.dtype
+                streams[name][0].write(np.ascontiguousarray(values).data)
+            count += len(table)
+            unused |= dict.fromkeys(name for name in UNUSED if name in table.columns)
+        if unused:
+            message = f"the file is too large to separate reversals: {', '.join(unused)} are not used"
+            warnings.warn(f"{table.path}: {message}", CompgenWarning, stacklevel=5)
+        for stream, _ in streams.values():
+            stream.close()
+        columns = {name: Column(folder / name, 0, dtype, (count,)) for name, (_, dtype) in streams.items()}
+        for pair in same_hash(columns.pop("identity")):
+            found: list[tuple[CsvTable, int, object]] = []
+            first = 0
+            for part in parts():  # read once more: different rows may have the same hash
+                own = [row - first for row in pair if first <= row < first + len(part)]
+                identities = list(LENGTHS.identities(part)) if own else []
+                found += [(part, row, identities[row]) for row in own]
+                first += len(part)
+            (earlier, row, identity), (later, again, other) = found
+            if identity == other:
+                raise LENGTHS.fail_repeated(later, again, earlier.lines[row])
+        metadata = {key: value for key, value in table.metadata.items() if key != "rows"}
+        archive = LengthArchive(table.path, tuple(stations), columns, metadata, columns.pop("line"))
+        weakref.finalize(archive, stack.pop_all().close)
+    return archive
+
+
+def archive_columns(table: CsvTable, stations: dict[str, int]) -> dict[str, NDArray[Any]]:
+    """Return the columns of a part as an archive has them, with its lines and a hash of the identity of each row.
+
+    Stations that are not among ``stations`` are added to them.
+    """
+    for name in TOOL_COLUMNS:
+        if name in table.columns:
+            message = (
+                "needs all readings in memory, for which the file is too large; remove the column or split the file"
+            )
+            raise InputError(message, file=table.path, field=f"column {name}")
+    fields = {item.name: item.of_table(table) for item in LENGTHS.fields}
+    return {
+        "station": np.array([stations.setdefault(name, len(stations)) for name in fields["station"]], dtype=np.int32),
+        **dict(zip(POSITION_COLUMNS, fields["position_mm"].T, strict=True)),
+        "length_mm": fields["length_mm"],
+        **fields["labels"],
+        **{name: values for name, values in fields["covariates"].items() if name not in UNUSED},
+        "line": np.asarray(table.lines, dtype=np.int64),
+        "identity": np.fromiter(map(hash, LENGTHS.identities(table)), np.int64, len(table)),
+    }
+
+
+def same_hash(hashes: Column | NDArray[np.int64]) -> list[tuple[int, int]]:
+    """Return the first pairs of rows with the same hash; only a part of the hashes is in memory."""
+    count, found = hashes.shape[0], list[tuple[int, int]]()
+    groups = 1 + count // COMPARED
+    for group in range(groups):
+        rows, values = [], []
+        for first in range(0, count, CHUNK):
+            chunk = hashes[slice(first, min(first + CHUNK, count))]
+            own = np.flatnonzero(chunk % groups == group)
+            rows.append(first + own)
+            values.append(chunk[own])
+        row, value = np.concatenate(rows), np.concatenate(values)
+        order = np.argsort(value, kind="stable")  # equal ones in the order of their rows
+        twice = np.flatnonzero(np.diff(value[order]) == 0)
+        pairs = zip(row[order[twice]].tolist(), row[order[twice + 1]].tolist(), strict=True)
+        found = sorted([*found, *pairs], key=lambda pair: pair[1])[:MOST_PAIRS]
+    return found
+
+
+class ParquetTable(CsvTable):
+    """Rows of a Parquet file, as of a CSV file; ``lines`` are the numbers of the rows, from 1."""
+
+    def words(self, column: str) -> list[str]:
+        """Return the cells of a column of text or whole numbers as text."""
+        cells: Sequence[Any] = self.columns[column]
+        for row, cell in enumerate(cells):
+            if not isinstance(cell, str | int | None):
+                raise self.fail(row, column, f"{cell!r} is not a label; expected text or a whole number")
+        return ["" if cell is None else str(cell) for cell in cells]
+
+    def parsed(self, column: str, empty: float | None) -> FloatArray:
+        """Return a column of numbers, shape (rows,); there must be one in every row."""
+        cells: Sequence[Any] = self.columns[column]
+        for row, cell in enumerate(cells):
+            if isinstance(cell, str | bool) or cell is None:
+                raise self.fail(row, column, f"{'is empty' if cell is None else repr(cell)}; expected a number")
+        return np.array(cells, dtype=np.float64)
+
+
+@contextmanager
+def opened_parquet(path: Path) -> Iterator[Any]:
+    """Open a Parquet file; InputError without pyarrow, and for a file that is damaged or something else."""
+    try:
+        import pyarrow
+        from pyarrow import parquet  # imported here: an optional extra
+    except ImportError:
+        message = "is a Parquet file, which pyarrow reads; install compgen[parquet], or save the readings as CSV"
+        raise InputError(message, file=path) from None
+    try:
+        with parquet.ParquetFile(path) as file:
+            yield file
+    except FileNotFoundError as error:
+        raise InputError("no such file", file=path) from error
+    except (pyarrow.ArrowException, OSError) as error:
+        raise InputError(f"is not a Parquet file, or is damaged: {error}", file=path) from error
+
+
+def parquet_parts(path: str | Path) -> Iterator[ParquetTable]:
+    """Read lengths from a Parquet file in parts: columns as in a CSV file, key-value metadata for its comments.
+
+    Raises
+    ------
+    InputError
+        for a missing column or a file without rows, and as :func:`opened_parquet`.
+    """
+    source, first = Path(path), 1
+    with opened_parquet(source) as file:
+        known = file.schema_arrow.metadata or {}
+        metadata = {key.decode(): value.decode("utf-8", "replace") for key, value in known.items() if b":" not in key}
+        kept = list(kept_columns(source, 1, file.schema_arrow.names, *LENGTHS.columns).values())
+        for batch in file.iter_batches(CHUNK, columns=kept):
+            columns = {name: batch.column(name).to_pylist() for name in kept}
+            yield ParquetTable(source, columns, range(first, first + batch.num_rows), metadata)
+            first += batch.num_rows
+    if first == 1:
+        raise InputError("contains no readings", file=source)
+
+
+def parquet_table(path: str | Path) -> ParquetTable:
+    """Read lengths from a whole Parquet file; InputError for more than ``MOST_WHOLE`` readings, or one given twice."""
+    with opened_parquet(Path(path)) as file:
+        if file.metadata.num_rows > MOST_WHOLE:
+            raise too_many(Path(path), file.metadata.num_rows)
+    parts = list(parquet_parts(path))
+    columns = {name: list(chain.from_iterable(part.columns[name] for part in parts)) for name in parts[0].columns}
+    whole = ParquetTable(Path(path), columns, range(1, 1 + sum(map(len, parts))), parts[0].metadata)
+    LENGTHS.with_different_rows(whole)
+    return whole
+
+
+def too_many(path: Path, count: int) -> InputError:
+    """Return the error about a file whose readings cannot be in memory together."""
+    text = f"contains {count} readings; more than {MOST_WHOLE} can only be identified (volcomp identify, run)"
+    return InputError(text, file=path)
+
+
+def open_large(path: str | Path) -> LengthArchive | None:
+    """Return the readings of a file that is too large to be read whole; None for other files.
+
+    These are archives and Parquet files of more than ``MOST_WHOLE`` readings, and CSV files of lengths of more than
+    ``LARGE_TEXT`` bytes. Of a Parquet or CSV file a copy in binary form is made.
+    """
+    source, name = Path(path), str(path).lower()
+    if name.endswith(ARCHIVE):
+        archive = open_archive(source)
+        return archive if len(archive) > MOST_WHOLE else None
+    if name.endswith(PARQUET):
+        with opened_parquet(source) as file:
+            large = file.metadata.num_rows > MOST_WHOLE
+        return copied_archive(lambda: parquet_parts(source)) if large else None
+    if not may_be_large(source) or detect_format(source) != "lengths":
+        return None
+    return copied_archive(lambda: csv_parts(source, *LENGTHS.columns))

@@ -17,6 +17,7 @@ from compgen.data.records import (
     ARCHIVE,
     COVARIATES,
     LABELS,
+    PARQUET,
     POSITION,
     POSITION_COLUMNS,
     TOOL,
@@ -110,7 +111,8 @@ class Lengths(Displayed):
         return Overview(f"{len(self)} readings of {shortened(self.stations)}", ("station", "readings"), rows)
 
 
-_LENGTHS = Schema(
+#: The columns of lengths.
+LENGTHS = Schema(
     (
         Field("station", ("station",), CsvTable.names),
         Field("point", ("point",), CsvTable.text),
@@ -126,7 +128,7 @@ _LENGTHS = Schema(
 
 
 def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
-    """Read one or more ``*.lengths.csv`` (or ``*.lengths.npz``) files into one :class:`Lengths`.
+    """Read one or more ``*.lengths.csv`` (or ``*.lengths.npz``, ``*.parquet``) files into one :class:`Lengths`.
 
     Labels that only some of the files have are 0 in the others; the same station in two files is one station.
 
@@ -137,14 +139,16 @@ def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     'laser-tracer'
     """
     sources = [files] if isinstance(files, str | Path) else list(files)
-    binary = [source for source in sources if str(source).lower().endswith(ARCHIVE)]
+    binary = [source for source in sources if str(source).lower().endswith((ARCHIVE, PARQUET))]
     parts = []
-    if binary:
-        from compgen.data.length_archive import read_archive  # imported here: it depends on this module
-
-        parts = [read_archive(source) for source in binary]
     text = [source for source in sources if source not in binary]
-    for values in map(_LENGTHS.values, _LENGTHS.read_tables(text) if text or not binary else []):
+    tables = LENGTHS.read_tables(text) if text or not binary else []
+    if binary:
+        from compgen.data.length_archive import parquet_table, read_archive  # imported here: they depend on this module
+
+        parts = [read_archive(source) for source in binary if str(source).lower().endswith(ARCHIVE)]
+        tables += [parquet_table(source) for source in binary if str(source).lower().endswith(PARQUET)]
+    for values in map(LENGTHS.values, tables):
         stations = tuple(dict.fromkeys(values["station"]))
         parts.append(Lengths(**values | {"stations": stations, "station": _numbered(values["station"], stations)}))
     return join_lengths(parts)
@@ -160,13 +164,13 @@ def join_lengths(parts: Sequence[Lengths]) -> Lengths:
     stations = tuple(dict.fromkeys(name for part in parts for name in part.stations))
     numbers = [_numbered(part.stations, stations)[part.station] for part in parts]
     known = [replace(part, stations=stations, station=number) for part, number in zip(parts, numbers, strict=True)]
-    return _LENGTHS.joined(known)
+    return LENGTHS.joined(known)
 
 
 def format_lengths(lengths: Lengths) -> str:
     """Return the text of a ``*.lengths.csv`` file: positions with 6 decimals (1 nm), lengths with 7."""
-    named = replace(_LENGTHS.fields[0], encode=lambda station: [lengths.stations[k] for k in station])
-    return replace(_LENGTHS, fields=(named, *_LENGTHS.fields[1:])).format(lengths, lengths.metadata)
+    named = replace(LENGTHS.fields[0], encode=lambda station: [lengths.stations[k] for k in station])
+    return replace(LENGTHS, fields=(named, *LENGTHS.fields[1:])).format(lengths, lengths.metadata)
 
 
 # Lists of commanded points (``*.points.csv``), with or without results.

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from compgen.data.csv_files import CsvTable, FloatArray, format_csv, names_in_header, read_csv
-from compgen.data.files import read_text
+from compgen.data.files import read_bytes, read_text
 from compgen.data.messages import repeated
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
@@ -36,6 +36,12 @@ MEASURED_COLUMNS = ("mx_mm", "my_mm", "mz_mm")
 TEMPERATURES = "temp_*_c"
 #: Ending of lengths in binary form, the only format recognised by its name.
 ARCHIVE = ".lengths.npz"
+#: Ending of lengths in Parquet files, also recognised by the name.
+PARQUET = ".parquet"
+#: Larger texts of lengths are never read whole, bytes.
+LARGE_TEXT = 256_000_000
+#: The header of a large file is looked for in so many bytes, before the whole file is read.
+HEAD_BYTES = 65_536
 #: A larger deviation is rejected as a wrong unit, um.
 LARGEST_DEVIATION_UM = 1e5
 
@@ -182,24 +188,38 @@ class Schema:
     keys: tuple[str, ...] = ()
     needed: tuple[str, ...] = ()
 
-    def read_table(self, file: str | Path) -> CsvTable:
-        """Read the columns of one file."""
+    @property
+    def columns(self) -> tuple[Sequence[str], Sequence[str], Sequence[str]]:
+        """Required and optional columns, and patterns of further ones."""
         required = [name for field in self.fields if field.presence == "required" for name in field.columns]
         others = [name for field in self.fields if field.presence != "required" for name in field.columns]
-        table = read_csv(file, (*required, *self.needed), others, (TEMPERATURES,))
-        # two rows with the same keys must differ in a label, a direction, the tool or the time
+        return (*required, *self.needed), others, (TEMPERATURES,)
+
+    def read_table(self, file: str | Path) -> CsvTable:
+        """Read the columns of one file."""
+        return self.with_different_rows(read_csv(file, *self.columns))
+
+    def with_different_rows(self, table: CsvTable) -> CsvTable:
+        """Return the table; InputError if two of its rows are about the same reading."""
+        found = repeated(self.identities(table))
+        if found is not None:
+            raise self.fail_repeated(table, found[1], table.lines[found[0]])
+        return table
+
+    def identities(self, table: CsvTable) -> Iterable[tuple[Any, ...]]:
+        """Return what distinguishes each row: its keys, and labels, directions, the tool and the time."""
         names = (
             (*self.keys, "approach", *APPROACH_COLUMNS, *TOOL_COLUMNS, *LABEL_COLUMNS, "time_s") if self.keys else ()
         )
-        present = [name for name in names if name in table.columns]
-        found = repeated(zip(*(table.columns[name] for name in present), strict=True))
-        if found is not None:
-            first, row = found
-            keys = [name for name in self.keys if name in present]
-            what = " and ".join(f"{name} {table.columns[name][row]!r}" for name in keys)
-            message = f"{what} already appear in line {table.lines[first]}; give repeats a run or repeat column"
-            raise table.fail(row, keys[-1], message)
-        return table
+        return zip(*(table.columns[name] for name in names if name in table.columns), strict=True)
+
+    def fail_repeated(self, table: CsvTable, row: int, first_line: int) -> InputError:
+        """Return the error about a row whose reading already appears in another line."""
+        keys = [name for name in self.keys if name in table.columns]
+        what = " and ".join(f"{name} {table.columns[name][row]!r}" for name in keys)
+        return table.fail(
+            row, keys[-1], f"{what} already appear in line {first_line}; give repeats a run or repeat column"
+        )
 
     def read_tables(self, files: str | Path | Sequence[str | Path]) -> list[CsvTable]:
         """Read the columns of one or more files; the same rows must not occur twice."""
@@ -336,11 +356,20 @@ def detect_format(source: str | Path) -> str | None:
 
     ``lengths``, ``deviations``, ``part``, ``artefact``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
     """
-    if str(source).lower().endswith(ARCHIVE):
+    if str(source).lower().endswith((ARCHIVE, PARQUET)):
         return "lengths"
-    text = read_text(source)
+    head = read_bytes(source, HEAD_BYTES)
+    text = head.rpartition(b"\n")[0].decode("utf-8-sig", "replace") if len(head) == HEAD_BYTES else ""
+    if not any(names_in_header(text)):  # a small file, or a long head
+        text = read_text(source)
     kind = format_of_columns(names_in_header(text))
     return "artefact" if kind == "part" and is_artefact(source, text) else kind
+
+
+def may_be_large(source: str | Path) -> bool:
+    """Whether a file may hold more readings than are read whole: by its name, or as a text of many bytes."""
+    binary = str(source).lower().endswith((ARCHIVE, PARQUET))
+    return binary or (Path(source).is_file() and Path(source).stat().st_size > LARGE_TEXT)
 
 
 def is_artefact(source: str | Path, text: str) -> bool:

@@ -15,11 +15,11 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.files import read_bytes
+from compgen.data.records import HEAD_BYTES
 from compgen.errors import InputError
 from compgen.foreign.one_axis import IntArray, OneAxis, cycles, motion
 from compgen.foreign.source import (
     ENCODINGS_EAST,
-    HEAD_BYTES,
     MOST_CAPTURE_BYTES,
     Text,
     check_size,

@@ -14,7 +14,7 @@ from typing import Literal
 from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_bytes
-from compgen.data.records import ARCHIVE, format_of_columns, is_artefact
+from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
 from compgen.errors import InputError
 from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
@@ -25,14 +25,12 @@ MEGABYTE = 1_000_000
 #: Larger files are not a measurement in text form: a million tracer lengths have 80 MB.
 MOST_BYTES = 128 * MEGABYTE
 #: Native files are read faster, but they must also fit into the memory of a workstation.
-MOST_OWN_BYTES = 256 * MEGABYTE
+MOST_OWN_BYTES = LARGE_TEXT
 
 #: Captures over time are read in pieces.
 MOST_CAPTURE_BYTES = 4_000_000_000
 #: Larger numbers are refused (a number of 400 digits becomes infinite).
 LARGEST = 1e300
-#: Length of the beginning of a file that identifies it.
-HEAD_BYTES = 65_536
 #: Encodings tried in turn without a byte-order mark; the last one reads everything.
 ENCODINGS = ("utf-8", "cp1252", "latin-1")
 #: Instruments of one maker write user text in the code page of the computer (see :mod:`compgen.foreign.laser_files`).
@@ -396,9 +394,12 @@ _NATIVE_SUFFIXES = (
 )
 
 
-def native_format(path: Path) -> str | None:
-    """Return the kind of a native file, None for a foreign one; InputError for files without data."""
-    if path.name.lower().endswith(ARCHIVE):
+def native_format(path: Path, *, in_parts: bool = False) -> str | None:
+    """Return the kind of a native file, None for a foreign one; InputError for files without data.
+
+    With ``in_parts`` lengths may have any size.
+    """
+    if path.name.lower().endswith((ARCHIVE, PARQUET)):
         return "lengths"
     check_size(path, MOST_CAPTURE_BYTES)
     head = read_head(path)
@@ -408,7 +409,7 @@ def native_format(path: Path) -> str | None:
     kind = format_of_columns(names_in_header(text), complete=True)
     if kind == "part" and is_artefact(path, text):
         return "artefact"
-    if kind not in (None, "sixdof", "part"):
+    if kind not in (None, "sixdof", "part") and not (in_parts and kind == "lengths"):
         check_size(path, MOST_OWN_BYTES)
     return kind
 
@@ -433,7 +434,7 @@ def open_measurement(
     InputError
         for a foreign file that leaves something open (unit, sign, axis, direction), with what ``volcomp import`` needs.
     """
-    kinds = [native_format(Path(path)) for path in paths]
+    kinds = [native_format(Path(path), in_parts=len(paths) == 1) for path in paths]
     if axis is not None and any(kinds):
         known = paths[[kind is not None for kind in kinds].index(True)]
         raise InputError(

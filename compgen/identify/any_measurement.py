@@ -15,10 +15,10 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.error_table import ErrorTable
-from compgen.data.lengths import MOST_WHOLE, Lengths, read_lengths
+from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.records import ARCHIVE, detect_format
+from compgen.data.records import detect_format, may_be_large
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.identification import Identification
@@ -66,12 +66,12 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     InputError
         for six-DOF readings without an instrument file, or one without such readings.
     """
-    if len(paths) == 1 and instrument is None and str(paths[0]).lower().endswith(ARCHIVE):
-        from compgen.data.length_archive import open_archive
+    if len(paths) == 1 and instrument is None and may_be_large(paths[0]):
+        from compgen.data.length_archive import open_large
 
-        archive = open_archive(paths[0])
-        if len(archive) > MOST_WHOLE:
-            return archive
+        large = open_large(paths[0])
+        if large is not None:
+            return large
     kinds: dict[str, list[str | Path]] = {}
     for path in paths:
         found = detect_format(path)  # of a file that is no measurement, the reader of lengths says best what is missing

@@ -186,7 +186,8 @@ def identify_archive(
 
     def within(first: int, position_mm: FloatArray) -> None:
         if (position_mm.min(axis=1) < low).any() or (position_mm.max(axis=1) > high).any():
-            origin = [(str(archive.path), first + k + 1) for k in range(position_mm.shape[1])]
+            lines = archive.lines(slice(first, first + position_mm.shape[1])).tolist()
+            origin = [(str(archive.path), line) for line in lines]
             check_travel(machine, position_mm.T, origin)
 
     archive.check(within)
@@ -293,4 +294,5 @@ def _rejected(archive: LengthArchive, row: int, off_mm: float) -> Rejected:
     station = archive.stations[int(archive.columns["station"][row : row + 1][0])]
     off_um = -off_mm / MM_PER_UM
     reason = f"differs from the model by {off_um:+.1f} um; beam break or disturbed reading?"
-    return Rejected(row, station, str(row + 1), off_um, reason, str(archive.path), row + 1)
+    line = int(archive.lines(slice(row, row + 1))[0])
+    return Rejected(row, station, str(row + 1), off_um, reason, str(archive.path), line)

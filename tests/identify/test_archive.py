@@ -11,13 +11,12 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data import length_archive
-from compgen.data.length_archive import open_archive, read_archive
+from compgen.data.length_archive import open_archive
 from compgen.data.machine import Chain
 from compgen.errors import ConvergenceError, InputError, UndeterminedError
 from compgen.identify import (
     IdentifyOptions,
     SystematicInputs,
-    any_measurement,
     identify,
     identify_measurement,
     read_measurement,
@@ -69,7 +68,7 @@ def streamed(monkeypatch):
     """Archives of more than a few readings are not read at once, and chunks end in the middle of a stop."""
     monkeypatch.setattr(length_archive, "CHUNK", 7001)
     monkeypatch.setattr(streamed_lengths, "CHUNK", 7001)
-    monkeypatch.setattr(any_measurement, "MOST_WHOLE", 1000)
+    monkeypatch.setattr(length_archive, "MOST_WHOLE", 1000)
     monkeypatch.setattr(length_archive, "SAMPLE", 4000)
 
 
@@ -98,7 +97,7 @@ def test_an_archive_in_chunks_gives_what_the_readings_give_in_memory(machine, tr
     same = {"u_length_um": np.array(0.28), "u_length_um_per_m": np.array(0.0)}  # else weights follow the start values
     path = written(tmp_path, columns, **same)
     found = identify_measurement(machine, read_measurement([path]))
-    whole = identify(machine, read_archive(path))
+    whole = identify(machine, open_archive(path).taken(slice(None)))
     (value, u), (other, u_other) = values_of(found), values_of(whole)
     known = u > 0
     assert np.abs((value - other)[known] / u[known]).max() < 2e-3
@@ -294,7 +293,7 @@ def test_readings_on_the_fly_are_simulated_and_identified_as_a_user_does(tmp_pat
     assert made["readings"] == len(archive) > 10_000 and made["stations"] == ["LT1", "LT2", "LT3", "LT4"]
     step = np.linalg.norm(np.diff(archive.taken(slice(0, 400)).position_mm[::4], axis=0), axis=1)
     assert np.median(step) == pytest.approx(3000.0 / 60.0 / 5.0)
-    monkeypatch.setattr(any_measurement, "MOST_WHOLE", 1000)
+    monkeypatch.setattr(length_archive, "MOST_WHOLE", 1000)
     assert run_command(cli, ["identify", "zha-gantry", str(path), "--out", str(tmp_path / "found"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["readings"] == found["readings_used"] == len(archive)
