@@ -539,18 +539,18 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
                 )
         return table
 
-    def _read_records(self, file: SourceFile, beside: VolumeTable | None) -> VolumeTable:
+    def _read_records(self, file: SourceFile, table: VolumeTable | None) -> VolumeTable:
         """Read records in the control's style; the grid is from parameters 10803 ... 10814, else from the CSV."""
-        own, data = parted(list(read_records(file)))
+        records, data = parted(list(read_records(file)))
         parameters: dict[int, tuple[str, Record]] = {}
-        for record in own:
+        for record in records:
             _, words = type_word(record, record.words())
             if len(words) != 1 or words[0][0] != "P":
                 raise record.fail("expected a single value word P, e.g. P11")
             if record.number in parameters:
                 raise record.fail(f"is given a second time (first in line {parameters[record.number][1].line})")
             parameters[record.number] = words[0][1], record
-        shape = self._frame(file, parameters) if parameters else beside
+        shape = self._frame(file, parameters) if parameters else table
         if shape is None:
             raise file.fail("contains no parameters 10800 to 10814; also give VOLUME.csv, which contains the grid")
         values = self._values(file, data)

@@ -206,8 +206,8 @@ def _placed(settings: PitchSettings, blocks: Sequence[PitchBlock | None]) -> lis
     for axis, block in present.items():
         first, negative = firsts[axis], 0
         if block.negative:
-            own = sample.axes.get(settings.axis_numbers[axis])
-            shown = own.negative_first if own is not None and kept[axis] is not None else None
+            known_axis = sample.axes.get(settings.axis_numbers[axis])
+            shown = known_axis.negative_first if known_axis is not None and kept[axis] is not None else None
             count = len(block.negative)
             negative = lowest_free(taken, settings.negative_first_number, count) if shown is None else shown
             sample.check_free(settings.axis_numbers[axis], AXES[axis], negative, negative + count - 1)
@@ -488,8 +488,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             for low, high in axis.spans
         ]
         if sample.shows_points:
-            told = f"Kept: {'; '.join(others)}." if others else "No other axis of the sample has points."
-            found = [f"Of other axes: nothing. {told}"]
+            remark = f"Kept: {'; '.join(others)}." if others else "No other axis of the sample has points."
+            found = [f"Of other axes: nothing. {remark}"]
         else:
             given = (
                 "the sample has no parameters 3620 to 3622"
@@ -513,8 +513,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             ]
             old = {key: sample.values[key] for key, _ in block.points() if key in sample.values}
             changed = sum(1 for key, value in block.points() if key in old and old[key] != value)
-            told = f"; {changed} of them differ from the sample" if old else ""
-            found.append(f"Points of {name}: {' and '.join(texts)}{told}")
+            remark = f"; {changed} of them differ from the sample" if old else ""
+            found.append(f"Points of {name}: {' and '.join(texts)}{remark}")
         return found
 
     def _preflight_parameters(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:

@@ -614,7 +614,7 @@ def pitch_usage(settings: PitchSettings, tables: PitchTables) -> list[Usage]:
         step = max(int(np.max(np.abs(np.diff(curve)), initial=0)) for curve in block.curves(1))
         found.append(Usage(f"change over a section of {AXES[axis]}", step, settings.increment_limit, "counts"))
         if settings.max_feed_mm_min is not None:
-            least, own = settings.least_interval_mm, float(block.interval_mm)
-            found.append(Usage(f"shortest section at the feed, {AXES[axis]}", least, own, "mm"))
+            least, interval_mm = settings.least_interval_mm, float(block.interval_mm)
+            found.append(Usage(f"shortest section at the feed, {AXES[axis]}", least, interval_mm, "mm"))
     numbers = settings.last_number - settings.first_number + 1
     return [*found, Usage("compensation points", used, numbers, "points")]

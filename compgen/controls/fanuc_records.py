@@ -196,15 +196,15 @@ class FanucStyle:
             return str(int(value))
         if self.decimals is not None and self.decimals >= 2:
             return f"{value:.{self.decimals}f}"
-        before, _, behind = f"{value:f}".partition(".")
-        behind = behind.rstrip("0")
-        return f"{before}.{behind or ('' if self.decimals == 0 else '0')}"
+        before, _, decimals = f"{value:f}".partition(".")
+        decimals = decimals.rstrip("0")
+        return f"{before}.{decimals or ('' if self.decimals == 0 else '0')}"
 
     def record(self, number: int, words: Sequence[str], kind: int, *, point: bool = False) -> str:
         """Return a record: N word, words, and the type word ``kind`` if the style has one."""
         name = f"N{number:0{self.point_digits if point else self.digits}d}"
-        own = [f"Q{kind}"] if self.q_word else []
-        text = self.space.join([name, *words, *own] if self.q_last else [name, *own, *words]) + self.block_end
+        q_words = [f"Q{kind}"] if self.q_word else []
+        text = self.space.join([name, *words, *q_words] if self.q_last else [name, *q_words, *words]) + self.block_end
         return text + " " if self.even and len(text) % 2 else text
 
     def parameter(self, number: int, values: Iterable[tuple[int, str]], letter: str = "P") -> list[str]:
@@ -679,8 +679,8 @@ def frame_of(file: SourceFile, records: Sequence[Record], points: Sequence[Recor
             )
     marks = [k for k, piece in enumerate(pieces) if piece.strip().rstrip(";") == "%"]
     lines = sorted({record.line for record in records})
-    own = [pieces[line - 1] for line in lines]
-    padded = any(piece.endswith(" ") for piece in own) and all(len(piece) % 2 == 0 for piece in own)
+    used = [pieces[line - 1] for line in lines]
+    padded = any(piece.endswith(" ") for piece in used) and all(len(piece) % 2 == 0 for piece in used)
     comments = [(k + 1, piece.strip()) for k, piece in enumerate(pieces) if piece.strip().startswith("(")]
     first_point = points[0].line if points else 0
     first_other = next((record.line for record in records if record not in points), 0)
@@ -706,10 +706,10 @@ def spacing_of(style: FanucStyle, records: Sequence[Record]) -> FanucStyle:
     space = first.rest[: len(first.rest) - len(first.rest.lstrip())]
     has_q, last = any(letter == "Q" for letter, _ in words), words[-1][0] == "Q" and len(words) > 1
     for record in records:
-        own = record.words()
-        if any(letter == "Q" for letter, _ in own) != has_q:
+        here = record.words()
+        if any(letter == "Q" for letter, _ in here) != has_q:
             raise record.fail("some records have a type word Q and some do not; the style is not clear")
-        if own and (record.rest[: len(record.rest) - len(record.rest.lstrip())] != space):
+        if here and (record.rest[: len(record.rest) - len(record.rest.lstrip())] != space):
             raise record.fail("white space before the words changes from record to record; the style is not clear")
     return replace(style, space=space, q_word=has_q, q_last=has_q and last)
 

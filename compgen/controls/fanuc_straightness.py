@@ -129,9 +129,11 @@ def read_straightness_settings(machine: Machine) -> StraightnessSettings:
         same = {"detection_unit_um": pitch.detection_unit_um, "axis_numbers": pitch.axis_numbers}
         settings = toml_files.unless_stated(settings, section, **same)
         if settings.axis_numbers != pitch.axis_numbers:
-            own, stated = (", ".join(map(str, numbers)) for numbers in (settings.axis_numbers, pitch.axis_numbers))
+            numbers_here, stated = (
+                ", ".join(map(str, numbers)) for numbers in (settings.axis_numbers, pitch.axis_numbers)
+            )
             part = section.section("axis_numbers")
-            raise part.fail("X", f"the axis numbers are {own} here, but {stated} in [controllers.fanuc-pitch]")
+            raise part.fail("X", f"the axis numbers are {numbers_here} here, but {stated} in [controllers.fanuc-pitch]")
     settings.finish(section)
     settings = _with_points(machine, settings, points)
     for _, moving in settings.pairs or ():
@@ -155,7 +157,7 @@ def _with_points(machine: Machine, settings: StraightnessSettings, points: toml_
     of_pitch = [False, False, False]
     for axis, letter in enumerate(AXES):
         number = settings.axis_numbers[axis]
-        shown, own = sample.axes.get(number), pitch[axis]
+        shown, of_pitch_axis = sample.axes.get(number), pitch[axis]
         known = None if shown is None or not shown.grid.interval_mm else shown.grid
         if letter in points:
             grid = _grid(points.section(letter))
@@ -170,8 +172,8 @@ def _with_points(machine: Machine, settings: StraightnessSettings, points: toml_
         elif any((parameter, number) in sample.parameters for parameter in GRID_PARAMETERS):
             grids.append(None)
             continue
-        elif own is not None:
-            grid, of_pitch[axis] = own, True
+        elif of_pitch_axis is not None:
+            grid, of_pitch[axis] = of_pitch_axis, True
         else:
             used = [grid.last for grid in (*grids, *pitch) if grid is not None]
             used += [span[1] for _, span in sample.others(0)]
@@ -704,9 +706,9 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             {
                 "name": f"{number} ({names[axis]}, A{axis})",
                 "value": text,
-                "meaning": f"{meanings[number]}; must be the value that stored pitch error compensation uses{behind}",
+                "meaning": f"{meanings[number]}; must be the value that stored pitch error compensation uses{remark}",
             }
-            for part, behind in ((grids, ""), (not_written, ". COMPARE: not in `STRAIGHT.TXT`"))
+            for part, remark in ((grids, ""), (not_written, ". COMPARE: not in `STRAIGHT.TXT`"))
             for number, values in part.items()
             for axis, text in values
         ]

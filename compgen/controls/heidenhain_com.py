@@ -546,8 +546,8 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         """Return what goes into the column BACKLASH: reversals along the axis itself, unless it stays empty."""
         if self.settings.backlash == "empty":
             return ReversalCurves({})
-        own = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
-        return ReversalCurves(own, reversal.metadata)
+        along_itself = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
+        return ReversalCurves(along_itself, reversal.metadata)
 
     def with_reversal(self, tables: ComTables, reversal: ReversalCurves) -> ComTables:
         """Put half of each reversal into the column of the axis and the other direction into the column BACKLASH.

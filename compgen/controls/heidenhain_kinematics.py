@@ -319,10 +319,10 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
             for column in sorted(tables.tables[axis].columns) if axis in tables.tables else ():
                 name = COLUMNS[axis][column - 1]
                 rows.append([name, "Trans", self._direction(name), "", f"{settings.prefixes[axis]}..C{column}"])
-            own = [name for name in SQUARENESS_NAMES if name in tables.constants and name[3] == AXES[axis]]
-            rows += [self._constant(name, tables.constants[name], "") for name in own]
+            constants = [name for name in SQUARENESS_NAMES if name in tables.constants and name[3] == AXES[axis]]
+            rows += [self._constant(name, tables.constants[name], "") for name in constants]
             rows.append(["", "MachAxis", settings.axis_names[axis], "", ""])
-            rows += [self._constant(name, -tables.constants[name], "-") for name in reversed(own)]
+            rows += [self._constant(name, -tables.constants[name], "-") for name in reversed(constants)]
         return rows
 
     def _direction(self, name: str) -> str:

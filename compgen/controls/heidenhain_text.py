@@ -108,9 +108,9 @@ def read_table(file: SourceFile) -> TextTable:
     for number, line in enumerate(lines[header + 1 :], start=header + 2):
         text = line.strip()
         if text == END:
-            for behind, rest in enumerate(lines[number:], start=number + 1):
+            for place, rest in enumerate(lines[number:], start=number + 1):
                 if rest.strip():
-                    raise file.fail(f"{one_line(rest)[:20]!r} follows {END}, the end of the table", behind)
+                    raise file.fail(f"{one_line(rest)[:20]!r} follows {END}, the end of the table", place)
             before, after = tuple(lines[: header + 1]), tuple(lines[number - 1 :])
             return TextTable(file, words, before, columns, tuple(rows), after)
         if text and not text.startswith(";"):

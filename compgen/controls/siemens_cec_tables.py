@@ -102,12 +102,12 @@ def sum_into_axes(tables: CecMap, mode: str, outputs: Mapping[int, FloatArray]) 
     multipliers = {table.multiplier - 1 for table in tables.values() if table.multiplier}
     totals: list[FloatArray] = [np.zeros(())] * 3
     for index, table in tables.items():
-        own = outputs[index]
+        value = outputs[index]
         parts = []
         if (first_stays or not table.multiplier) and (multiplier_stays or index not in multipliers):
-            parts.append(own)
+            parts.append(value)
         if table.multiplier - 1 in tables:
-            parts.append(own * outputs[table.multiplier - 1])
+            parts.append(value * outputs[table.multiplier - 1])
         for part in parts:
             totals[table.output_axis] = totals[table.output_axis] + part
     return totals
@@ -459,8 +459,8 @@ def without_products(
     """
     ordinary = [term for term in terms if term.carrier[0].lever is None]
     gains = [_Gains.of(machine, errors, terms, given, output) for output in range(3)]
-    own = [[term for term in gain.terms if term in ordinary] for gain in gains]
-    missed, left_mm = _left_out(gains, own)
+    ordinary_of_axis = [[term for term in gain.terms if term in ordinary] for gain in gains]
+    missed, left_mm = _left_out(gains, ordinary_of_axis)
     named = _named(missed)
     if not named:
         return []
@@ -493,8 +493,8 @@ def terms_of_tables(
 
     Two sets may leave nearly the same error; then slightly different errors lead to a different choice.
     """
-    own = [term for term in terms if term.name in names]
-    if not choice.dropped or not own or table_count(own, mode) > (choice.allowed or 0):
+    existing = [term for term in terms if term.name in names]
+    if not choice.dropped or not existing or table_count(existing, mode) > (choice.allowed or 0):
         return choice.kept
     gains = [_Gains.of(machine, errors, terms, choice.given, output) for output in range(3)]
     left = [
@@ -502,9 +502,9 @@ def terms_of_tables(
             gain.target - gain.taken([term for term in part if term.carrier[0].output == k])
             for k, gain in enumerate(gains)
         )
-        for part in (own, choice.kept)
+        for part in (existing, choice.kept)
     ]
-    return own if left[0] <= _AS_GOOD**2 * left[1] else choice.kept
+    return existing if left[0] <= _AS_GOOD**2 * left[1] else choice.kept
 
 
 def _times_lever(
