@@ -17,6 +17,10 @@ PIP := $(BIN)/python $(PIP_INSTALL)
 PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
 
+# the tests of a file go to one process, which then prepares once what they share; three processes for two processors, because
+# some tests wait (for LinuxCNC, a browser, other processes); in the order of tests/conftest.py
+SPREAD := -n 3 --dist loadfile --no-loadscope-reorder
+
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -29,13 +33,12 @@ demo: .venv/ready
 
 extras: .venv/ready-extras
 
-# the tests of a file go to one process, which then prepares once what they share
 test: lint system
-	$(BIN)/python -m pytest -n 2 --dist loadfile -ra
+	$(BIN)/python -m pytest $(SPREAD) -ra
 
 # as the tests of `make test`; the figures are those of all processes together
 coverage: .venv/ready-dev system
-	$(BIN)/python -m pytest -n 2 --dist loadfile -q --cov=compgen --cov-branch --cov-report=term
+	$(BIN)/python -m pytest $(SPREAD) -q --cov=compgen --cov-branch --cov-report=term
 
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
 system:
@@ -44,7 +47,7 @@ system:
 lint: .venv/ready-dev
 	$(BIN)/ruff check compgen tests examples docs benchmarks
 	$(BIN)/ruff format --check compgen tests examples docs benchmarks
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "compgen needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }

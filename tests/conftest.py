@@ -25,6 +25,31 @@ def pytest_configure(config):
     os.environ["COMPGEN_CONFIG"] = ""  # the tests do not depend on the user's own defaults
 
 
+#: Files that take longest, in the order in which the processes of a run take them: at the end none waits for another.
+#: LinuxCNC keeps its own time and leaves the processors to the others.
+LONGEST = (
+    "tests/controls/test_linuxcnc_real.py",
+    "tests/fleet/test_recal_cluster.py",
+    "tests/fleet/test_recal_factory.py",
+    "tests/tables/test_crash.py",
+    "tests/tables/test_verdict.py",
+    "tests/identify/test_archive.py",
+    "tests/tables/test_best_tables.py",
+    "tests/controls/test_all_controllers.py",
+    "tests/test_papers.py",
+    "tests/tables/test_options.py",
+    "tests/diagnose/test_diagnosis_forms.py",
+    "tests/fleet/test_recal_active.py",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first; the others keep their order."""
+    place = {name: number for number, name in enumerate(LONGEST)}
+    assert all((ROOT / name).is_file() for name in LONGEST)
+    items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0], len(LONGEST)))
+
+
 #: Ranges, node counts and reference point differ between the axes; the reference lies inside the travel.
 SMALL_MACHINE = """\
 name = "small-gantry"
