@@ -176,12 +176,12 @@ def test_residuals_above_a_third_of_what_the_tables_take_away_are_not_accepted(t
 
     stations = {item.station: np.array(item.position_mm) for item in identify(machine, lengths).stations}
 
-    def length(row):
-        at = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"]])
-        here = at[0] + volumetric_error(machine, square, at)[0]
-        return float(np.linalg.norm(here - stations[row["station"]])) - 100.0 + 8e-3 * rng.standard_normal()
-
-    path = changed_lengths(tmp_path / "a.lengths.csv", lambda row: length(row) - float(row["length_mm"]))
+    position_mm = lengths.position_mm
+    tip_mm = position_mm + volumetric_error(machine, square, position_mm)
+    station_mm = np.array([stations[name] for name in lengths.stations])[lengths.station]
+    noise_mm = 8e-3 * rng.standard_normal(len(lengths))
+    length_mm = iter(np.linalg.norm(tip_mm - station_mm, axis=1) - 100.0 + noise_mm)
+    path = changed_lengths(tmp_path / "a.lengths.csv", lambda row: next(length_mm) - float(row["length_mm"]))
     code, result, _ = run(tmp_path, path)
     assert code == 1
     assert result["before_rigid_motion_removed"]["rms_um"] < 24.0
