@@ -166,7 +166,9 @@ def accuracy_command(
     if side.readings is not None or side.circles is not None:
         files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory)
     elif click.get_current_context().get_parameter_source("certificate") is ParameterSource.COMMANDLINE:
-        raise InputError("is for the sheet of axis runs or circles; this file has none", field="--certificate")
+        raise InputError(
+            "applies to the sheet of axis runs or circles, which this file does not contain", field="--certificate"
+        )
     if tolerances:
         data["tolerances"] = {
             name: {row.key: {"tolerance_um": row.tolerance, "verdict": row.verdict} for row in group if row.verdict}

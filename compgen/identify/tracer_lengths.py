@@ -331,7 +331,7 @@ def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> li
     """Return what makes the readings determine the errors, the most likely cause first; empty if nothing simple does."""
     span_mm = np.ptp(lengths.position_mm, axis=0)
     found = [
-        f"{AXES[k]} did not move (all readings at {lengths.position_mm[0, k]:g} mm): measure at several positions of it"
+        f"{AXES[k]} did not move (all readings at {lengths.position_mm[0, k]:g} mm): measure at several positions along it"
         for k in np.flatnonzero(span_mm < SAME_LEVEL_MM).tolist()
     ]
     task = task_of(machine, lengths)

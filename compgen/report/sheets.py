@@ -223,7 +223,7 @@ def draw_positioning(
     names = legend(WIDE_BOX[0] + 4, WIDE[1] - 6, [("c0", f"positive approach, mean and ±{k:g} s")])
     names += legend(WIDE_BOX[0] + 330, WIDE[1] - 6, [("c1", f"negative approach, mean and ±{k:g} s")])
     key, title = f"positioning-{axis}", f"Deviation of {axis} over its targets"
-    note = f"right: the ranges A, E and M; in the picture: the places of B and R; ± {k:g} s dashed"
+    note = f"right: the ranges A, E and M; in the picture: the positions of B and R; ± {k:g} s dashed"
     return Picture(key, title, svg(key, f"{title}; {note}", [plot, ranges], WIDE, more=names), note=note)
 
 
