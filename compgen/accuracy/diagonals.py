@@ -173,7 +173,7 @@ def _largest(
 
 _SQUARENESS_TEXT = (
     "squareness: an indication from differences of the diagonals' lengths (NPP - PPP = 2 EC0Y X Y / L, and so on); slopes of "
-    "straightness and angular errors act alike"
+    "straightness and angular errors have the same effect"
 )
 
 

@@ -400,7 +400,7 @@ def _restless(changes: _Changes) -> list[AxisUnknown]:
     if scale <= LEAST_MM or len(session) < 30:
         return []
     if float(np.mean(white**4)) / scale**4 - 3.0 > JUMPS:
-        text = "the readings jump now and then by more than they scatter, and do not repeat"
+        text = "the readings occasionally jump by more than their scatter, and do not repeat"
         return [AxisUnknown(text, ("time",), rms)]
     if abs(float(np.mean(white**3))) / scale**3 > LEANS * np.sqrt(6.0 / len(session)):
         text = "the readings creep to one side and slip back, and do not repeat"

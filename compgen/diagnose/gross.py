@@ -100,7 +100,7 @@ def _mappings(machine: Machine, lengths: Lengths) -> Iterator[tuple[str, Lengths
                 )
                 if not plain:
                     yield (
-                        _joined(what, "the tool offset likewise rotated"),
+                        _joined(what, "the tool offset is rotated in the same way"),
                         replace(lengths, position_mm=moved, tool_mm=lengths.tool_mm @ turn.T),
                     )
 

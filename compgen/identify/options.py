@@ -233,8 +233,8 @@ class IdentifyOptions:
     )
     nodes: Literal["machine", "from-data"] = option(
         "machine",
-        "Nodes of the curves identified from tracer lengths: those of the machine file, or from-data: as many of them, "
-        "at most, as the readings determine.",
+        "Nodes of the curves identified from tracer lengths: those of the machine file, or from-data: at most "
+        "as many of them as the readings determine.",
     )
     small_deviations: bool = option(
         False,

@@ -359,7 +359,7 @@ def _with_backlash(control: AnyController, own: dict[str, Any], reversal: Revers
     }
     warnings = [
         f"{name} is {value / MM_PER_UM:+.1f} um (reached in positive minus in negative direction); these tables act in both "
-        f"directions alike and do not contain it"
+        f"directions in the same way and do not contain it"
         for name, value in left.items()
     ]
     return {**own, "parameters": [*own["parameters"], *parameters], "warnings": [*own["warnings"], *warnings]}

@@ -577,7 +577,7 @@ def explain(
         for name in sorted(before, key=lambda name: -after[name])
     ]
     turned_um, kept_um = (left_by_reversal(part, corrected=False) for part in (reversal, rest))
-    why = "the tables act alike in both directions: the control's backlash parameter corrects the part along the axis"
+    why = "the tables act in the same way in both directions: the control's backlash parameter corrects the part along the axis"
     fates += [
         Fate(name, value, kept_um.get(name, 0.0), why if name in kept_um else "") for name, value in turned_um.items()
     ]

@@ -314,7 +314,7 @@ def _state(result: Mapping[str, Any]) -> str:
 def why_uncorrected(name: str) -> str:
     """Return why an error remains, by its name: what the control would need to correct it."""
     if name not in _KNOWN:
-        return "differs between the two directions of travel; these tables act alike in both"
+        return "differs between the two directions of travel; these tables act in the same way in both"
     error = error_named(name)
     if error.kind == "squareness":
         return "moves another axis in proportion to the travel; that needs a table of one axis over another"
