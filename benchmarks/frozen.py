@@ -2,6 +2,7 @@
 
     python benchmarks/frozen.py record DIR [--python PATH] [--only TEXT]   # runs the commands, writes what came out to DIR
     python benchmarks/frozen.py compare DIR DIR                            # lists what differs; exit code 1 if anything does
+    python benchmarks/frozen.py kinds DIR DIR                              # the same by kind: largest numbers, each wording once
 
 A change of structure must leave every byte as it was: files of all controls on three machines, JSON of every command,
 help texts, pages, rows of the store. Times, dates, versions and folders are taken out of the texts. The processor time of
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from difflib import SequenceMatcher
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -94,6 +96,9 @@ VOLATILE = (
     (re.compile(r"\b[0-9a-f]{64}\b"), "<sha256>"),
     (re.compile(r"\b[0-9a-f]{8}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{12}\b"), "<uuid>"),
 )
+
+#: A number in a text that is no part of a name or a date.
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?(?!\w)")
 
 
 def commands() -> dict[str, list[list[str]]]:
@@ -341,10 +346,58 @@ def compare(old: Path, new: Path) -> int:
     return differing
 
 
+def lines_of(path: Path) -> list[str]:
+    """Lines of a recorded file; of a page every tag and every text is one, and scripts and styles are left out."""
+    text = path.read_text(errors="replace")
+    if path.suffix == ".html":
+        text = re.sub(r"<(style|script)\b.*?</\1>", "", text, flags=re.DOTALL)
+        text = re.sub(r"\s*(<[^>]*>)\s*", r"\n\1\n", text)
+    return text.splitlines()
+
+
+def kinds(old: Path, new: Path) -> int:
+    """Print the differences by kind: of numbers the largest in files of one name, of words each line once (numbers as #).
+
+    Exit codes and keys are words: if they changed, they are among the lines.
+    """
+    names = {p.relative_to(top).as_posix() for top in (old, new) for p in top.rglob("*") if p.is_file()}
+    largest: dict[str, tuple[float, int, str, str]] = {}
+    words: dict[str, str] = {}
+    for name in sorted(name for name in names if not name.endswith("processor-time.json")):
+        if not ((old / name).exists() and (new / name).exists()):
+            print(f"only {'before' if (old / name).exists() else 'after'}: {name}")
+            continue
+        if (old / name).read_bytes() == (new / name).read_bytes():
+            continue
+        before, after = lines_of(old / name), lines_of(new / name)
+        plain = [[NUMBER.sub("#", line).strip() for line in side] for side in (before, after)]
+        size, count, *where = largest.get(Path(name).name, (0.0, 0, "", ""))
+        # for texts of the same words there is nothing to match; a page is too long for the exact way
+        page = name.endswith(".html")
+        same = plain[0] == plain[1]
+        matched = [("equal", 0, len(before), 0, len(after))] if same else []
+        for what, i, i_end, j, j_end in matched or SequenceMatcher(None, plain[0], plain[1], autojunk=page).get_opcodes():
+            if what != "equal":
+                removed, added = plain[0][i:i_end], plain[1][j:j_end]
+                words |= {f"- {line}": name for line in removed} | {f"+ {line}": name for line in added}
+                continue
+            for one, other in zip(before[i:i_end], after[j:j_end], strict=True):
+                pairs = zip(NUMBER.findall(one), NUMBER.findall(other), strict=True)
+                apart = max((abs(float(a) - float(b)) for a, b in pairs), default=0.0)
+                if apart > size:
+                    size, where = apart, [name, f"{one.strip()[:150]}  ->  {other.strip()[:150]}"]
+        largest[Path(name).name] = (size, count + 1, *(where or ("", "")))
+    for kind, (size, count, name, line) in sorted(largest.items(), key=lambda item: -item[1][0]):
+        print(f"{size:9.2g} at most in {count} x {kind}" + (f", {name}: {line}" if size else " (words only)"))
+    for line, name in words.items():
+        print(f"{line[:300]}   [{name}]")
+    return len(largest)
+
+
 def main() -> int:
     """Read the arguments, record or compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("action", choices=["record", "compare"])
+    parser.add_argument("action", choices=["record", "compare", "kinds"])
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--only", default="")
@@ -352,7 +405,7 @@ def main() -> int:
     if given.action == "record":
         record(given.folders[0].resolve(), given.python, given.only)
         return 0
-    return int(compare(*given.folders) > 0)
+    return int((kinds if given.action == "kinds" else compare)(*given.folders) > 0)
 
 
 if __name__ == "__main__":
