@@ -372,11 +372,11 @@ def kinds(old: Path, new: Path) -> int:
         before, after = lines_of(old / name), lines_of(new / name)
         plain = [[NUMBER.sub("#", line).strip() for line in side] for side in (before, after)]
         size, count, *where = largest.get(Path(name).name, (0.0, 0, "", ""))
-        # for texts of the same words there is nothing to match; a page is too long for the exact way
-        page = name.endswith(".html")
-        same = plain[0] == plain[1]
-        matched = [("equal", 0, len(before), 0, len(after))] if same else []
-        for what, i, i_end, j, j_end in matched or SequenceMatcher(None, plain[0], plain[1], autojunk=page).get_opcodes():
+        # texts of the same words need no matching, and a page is too long for the exact way
+        blocks = [("equal", 0, len(before), 0, len(after))]
+        if plain[0] != plain[1]:
+            blocks = SequenceMatcher(None, plain[0], plain[1], autojunk=name.endswith(".html")).get_opcodes()
+        for what, i, i_end, j, j_end in blocks:
             if what != "equal":
                 removed, added = plain[0][i:i_end], plain[1][j:j_end]
                 words |= {f"- {line}": name for line in removed} | {f"+ {line}": name for line in added}
