@@ -438,9 +438,11 @@ class EntryCheck:
     def _turned(self, sample: _Sample, own_tool: _Sample) -> list[str]:
         own, best = sample.own_mm - own_tool.own_mm, sample.best_mm - own_tool.best_mm
         share = POINT_SHARE * np.ptp(best.reshape(-1, 3), axis=0)
-        slack = sample.slack_mm + own_tool.slack_mm + POINT_UNCERTAINTIES * self._u_mm(sample)
-        limit = np.maximum(self.judge.goal_mm, share) + slack
-        return sample.worst(np.maximum(own - np.maximum(best, 0.0), np.minimum(best, 0.0) - own) - limit)
+        beyond = np.maximum(own - np.maximum(best, 0.0), np.minimum(best, 0.0) - own)
+        limit = np.maximum(self.judge.goal_mm, share) + (sample.slack_mm + own_tool.slack_mm)
+        if (beyond <= limit).all():  # the usual case; the uncertainty of the errors only widens the limit
+            return []
+        return sample.worst(beyond - (limit + POINT_UNCERTAINTIES * self._u_mm(sample)))
 
 
 def _ends(machine: Machine) -> list[FloatArray]:

@@ -11,18 +11,18 @@ import numpy as np
 
 from compgen.controls import AnyController
 from compgen.controls.shared.grids import curve_nodes_mm
-from compgen.data.comparison import residuals_twice, rms
+from compgen.data.comparison import Residuals, residuals_twice, rms
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, reversal_name
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.first_order import coefficients, factor, tool_of
 from compgen.kinematics.many_points import VolumeGrid, full_grid, volume_grid
-from compgen.tables.synthesis import Projector, best_values, projector
+from compgen.tables.synthesis import Projector, best_values, error_at, kept, projector
 
 # A field on a full grid, split into parts that depend on one axis, on a pair of axes, and on all three.
 #
@@ -88,6 +88,7 @@ def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray
     return np.vstack(lines)
 
 
+@kept
 def displacement_uncertainty(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
@@ -95,10 +96,29 @@ def displacement_uncertainty(
 
     Correlations are ignored; an unknown uncertainty counts as zero.
     """
-    curves = {name: replace(curve, value=np.nan_to_num(curve.u)) for name, curve in errors.curves.items()}
-    squareness = {name: (float(np.nan_to_num(u)), 0.0) for name, (_, u) in errors.squareness.items()}
-    u = ErrorTable(curves, squareness).at(position_mm)
-    return np.asarray(np.sqrt(np.einsum("nij,nj->ni", c_matrix(machine, position_mm, tool_mm) ** 2, u**2)).max(axis=0))
+    tool_mm, u = tool_of(machine, tool_mm), {}
+    for name, curve in errors.curves.items():
+        known = replace(curve, value=np.nan_to_num(curve.u))
+        u[name] = known.at(position_mm[:, error_named(name).axis])
+    u |= {name: np.nan_to_num(value) for name, (_, value) in errors.squareness.items()}
+    entries: dict[tuple[str, int], FloatArray] = {}  # of C: the sums of their monomials
+    for part in coefficients(machine.chain, machine.squareness_reference):
+        if part.error in u:
+            term = part.sign * factor(part.lever, position_mm, tool_mm)
+            key = part.error, part.output
+            entries[key] = entries[key] + term if key in entries else term
+    variance = np.zeros((3, len(position_mm)))
+    for (name, output), entry in entries.items():
+        variance[output] += (entry * u[name]) ** 2
+    return np.asarray(np.sqrt(variance.max(axis=1, initial=0.0)))
+
+
+@kept
+def residuals_before(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
+) -> tuple[Residuals, Residuals]:
+    """Return the figures of the exact error at commanded positions (n, 3), as it is and with the rigid motion removed."""
+    return residuals_twice(position_mm + tool_of(machine, tool_mm), error_at(machine, errors, position_mm, tool_mm))
 
 
 def point_reasons(
@@ -178,10 +198,15 @@ class Judge:
     u_mm: FloatArray
     resolution_mm: float
 
-    def reasons(self, grid_correction_mm: FloatArray, line_correction_mm: FloatArray) -> list[str]:
-        """Say why a correction, given on the grid (n, 3) and on the lines (m, 3), is not acceptable; empty if it is."""
+    def reasons(
+        self, grid_correction_mm: FloatArray, line_correction_mm: FloatArray, left: Residuals | None = None
+    ) -> list[str]:
+        """Say why a correction, given on the grid (n, 3) and on the lines (m, 3), is not acceptable; empty if it is.
+
+        ``left`` are the figures of what it leaves on the grid, rigid motion removed, where they are known.
+        """
         return [
-            *self.shrink_reasons(grid_correction_mm),
+            *self.shrink_reasons(grid_correction_mm, left),
             *self.component_reasons(grid_correction_mm),
             *point_reasons(
                 self.line_mm, line_correction_mm, self.line_best_mm, self.bent_mm, self.u_mm, self.resolution_mm
@@ -199,13 +224,7 @@ class Judge:
     @cached_property
     def rms_before_mm(self) -> float:
         """Exact residual without any correction, rigid motion taken out, mm rms."""
-        return self._rms_left_mm(np.zeros_like(self.best_mm))
-
-    def _rms_left_mm(self, correction_mm: FloatArray) -> float:
-        position_mm = self.grid.position_mm
-        error = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
-        nominal = position_mm + tool_of(self.machine, None)
-        return residuals_twice(nominal, error)[1].rms_um * MM_PER_UM
+        return residuals_before(self.machine, self.errors, self.grid.position_mm)[1].rms_um * MM_PER_UM
 
     def component_reasons(self, correction_mm: FloatArray) -> list[str]:
         """Describe every component of the correction (n, 3) that misses the best possible one by more than its share."""
@@ -224,9 +243,13 @@ class Judge:
             )
         return reasons
 
-    def shrink_reasons(self, correction_mm: FloatArray) -> list[str]:
+    def shrink_reasons(self, correction_mm: FloatArray, left: Residuals | None = None) -> list[str]:
         """Return a reason if the exact residual grows with the correction (n, 3), rigid motion removed."""
-        rms_before, rms_after = self.rms_before_mm, self._rms_left_mm(correction_mm)
+        if left is None:
+            position_mm = self.grid.position_mm
+            error = exact_error(self.machine, self.errors, position_mm + correction_mm) + correction_mm
+            left = residuals_twice(position_mm + tool_of(self.machine, None), error)[1]
+        rms_before, rms_after = self.rms_before_mm, left.rms_um * MM_PER_UM
         if rms_after <= rms_before + 1e-9 or rms_after <= self.resolution_mm:
             return []
         return [

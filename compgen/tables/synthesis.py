@@ -6,10 +6,13 @@ contains what a first-order model leaves out, e.g. the 4 um over a metre that co
 
 from __future__ import annotations
 
+import hashlib
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -23,7 +26,7 @@ from compgen.data.machine import Machine, Vector3
 from compgen.errors import ConvergenceError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.kernel_switch import lapack
+from compgen.kinematics.kernel_switch import kernel_choice, lapack
 from compgen.kinematics.many_points import volume_sample
 
 #: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
@@ -34,13 +37,67 @@ RIDGE = 1e-11
 LEAST_SHARE = 0.5
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
+#: Results at more points are not kept.
+MOST_KEPT = 50_000
 #: Up to so many fields are summed one by one, more by a matrix product unless the matrix has more entries than that.
 _FEW, _LARGEST_HAT = 3, 4_000_000
 
+Result = TypeVar("Result")
 #: What a control adds to the commands: values by term, points -> (n, 3), mm.
 Applied = Callable[[Mapping[str, FloatArray], Points], FloatArray]
 
 
+@dataclass(frozen=True)
+class _Call:
+    """Arguments of a calculation; two are equal if all numbers in them are, of which ``key`` is a digest."""
+
+    key: bytes
+    machine: Machine = field(compare=False)
+    errors: ErrorTable = field(compare=False)
+    position_mm: FloatArray = field(compare=False)
+    more: tuple[Any, ...] = field(compare=False)
+
+    @classmethod
+    def of(cls, machine: Machine, errors: ErrorTable, position_mm: FloatArray, *more: Any) -> _Call:
+        """Take the digest of everything that the errors of the machine at points (n, 3) depend on, and of ``more``."""
+        model = (machine.chain.name, machine.squareness_reference, machine.tool_offset_mm, kernel_choice())
+        sizes = [(name, len(curve.position_mm)) for name, curve in errors.curves.items()]
+        digest = hashlib.blake2b(repr((model, sizes, dict(errors.squareness), position_mm.shape)).encode())
+        for curve in errors.curves.values():
+            for part in (curve.position_mm, curve.value, curve.u):
+                digest.update(part.astype(np.float64).tobytes())
+        digest.update(position_mm.astype(np.float64).tobytes())
+        digest.update(pickle.dumps(more))
+        return cls(digest.digest(), machine, errors, position_mm, more)
+
+
+def kept(calculation: Callable[..., Result]) -> Callable[..., Result]:
+    """Keep the last results of a calculation (machine, errors, points (n, 3), more): the next control needs them, too.
+
+    Controls with the same nodes are exported and judged at the same points. Equal numbers are recognised, whatever
+    objects hold them. The caller gets a copy.
+    """
+
+    @lru_cache(maxsize=8)
+    def result_of(call: _Call) -> Result:
+        return calculation(call.machine, call.errors, call.position_mm, *call.more)
+
+    @wraps(calculation)
+    def wrapper(machine: Machine, errors: ErrorTable, position_mm: FloatArray, *more: Any) -> Result:
+        if len(position_mm) > MOST_KEPT:
+            return calculation(machine, errors, position_mm, *more)
+        while more and more[-1] is None:  # as if it were not given
+            more = more[:-1]
+        return copy(result_of(_Call.of(machine, errors, position_mm, *more)))
+
+    return wrapper
+
+
+#: :func:`exact_error` at commanded points.
+error_at = kept(exact_error)
+
+
+@kept
 def wanted_correction(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
@@ -131,36 +188,45 @@ class SampledTerm:
         outputs = tuple(sorted({part.output for part in term.carrier}))
         return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, term.carrier_field(position_mm, tool_mm))
 
-    def gather(self, fields_mm: FloatArray) -> FloatArray:
-        """Products of the values' fields with k fields (n, 3) in a row, (values, k)."""
-        along = np.zeros(fields_mm.shape[:2])
+    def gather(self, fields_mm: FloatArray, hats: _Hats) -> FloatArray:
+        """Products of the values' fields with k fields (3, k, n), (values, k)."""
+        along = np.zeros(fields_mm.shape[1:])
         for output in self.outputs:
-            along += self.carrier[:, output] * fields_mm[:, :, output]
-        hat = self._hat(len(fields_mm))
+            along += self.carrier[:, output] * fields_mm[output]
+        hat = hats.of(self, len(along))
         if hat is not None:
             return np.asarray(hat @ along.T)
         size = self.place.stop - self.place.start
         return np.stack([np.bincount(self.node.ravel(), (self.share * one).ravel(), size) for one in along], axis=1)
 
-    def take(self, values: FloatArray, fields_mm: FloatArray) -> None:
-        """Subtract the fields of k sets of values (values, k) from k fields (k, n, 3)."""
-        hat = self._hat(len(fields_mm))
+    def take(self, values: FloatArray, fields_mm: FloatArray, hats: _Hats) -> None:
+        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n)."""
+        hat = hats.of(self, values.shape[1])
         if hat is not None:
             along = values.T @ hat
         else:
             along = (self.share[0] * values.T[:, self.node[0]]) + (self.share[1] * values.T[:, self.node[1]])
         for output in self.outputs:
-            fields_mm[:, :, output] -= self.carrier[:, output] * along
+            fields_mm[output] -= self.carrier[:, output] * along
 
-    def _hat(self, fields: int) -> FloatArray | None:
-        """Matrix (values, n) of the shares, where it serves several fields and is not too large."""
-        size, points = self.place.stop - self.place.start, np.arange(len(self.carrier))
+
+class _Hats:
+    """Matrices (values, n) of the shares of terms, for one calculation: terms with the same nodes have the same."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[int | None, bytes], FloatArray] = {}
+
+    def of(self, term: SampledTerm, fields: int) -> FloatArray | None:
+        """Return the matrix of a term, None if it would serve too few fields, or be too large."""
+        size, points = term.place.stop - term.place.start, np.arange(len(term.carrier))
         if fields <= _FEW or size * len(points) > _LARGEST_HAT:
             return None
-        hat = np.zeros((size, len(points)))
-        hat[self.node[0], points] = self.share[0]
-        hat[self.node[1], points] += self.share[1]
-        return hat
+        if term.hat not in self._found:
+            hat = np.zeros((size, len(points)))
+            hat[term.node[0], points] = term.share[0]
+            hat[term.node[1], points] += term.share[1]
+            self._found[term.hat] = hat
+        return self._found[term.hat]
 
 
 @dataclass(frozen=True)
@@ -193,21 +259,22 @@ class Projector:
 
     def project_all(self, required_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
-        return self._solved(required_mm).T
+        return self._solved(np.ascontiguousarray(np.moveaxis(required_mm, 2, 0)), _Hats()).T
 
     def left_of(self, required_mm: FloatArray) -> FloatArray:
         """Return what the closest tables leave of k required fields (k, n, 3) at the sample points, (k, n, 3)."""
-        left, values = required_mm.copy(), self._solved(required_mm)  # a constant per axis is left to whoever asks
+        left, hats = np.ascontiguousarray(np.moveaxis(required_mm, 2, 0)), _Hats()
+        values = self._solved(left, hats)  # a constant per axis is left to whoever asks
         for term in self.terms:
-            term.take(values[term.place], left)
-        return left
+            term.take(values[term.place], left, hats)
+        return np.moveaxis(left, 0, 2)
 
-    def _solved(self, required_mm: FloatArray) -> FloatArray:
-        """All table values (parameters, k) for k required fields (k, n, 3)."""
-        counting = required_mm * self.weight[:, None]
-        right = self.freedom.gather(np.concatenate([term.gather(counting) for term in self.terms]))
+    def _solved(self, required_mm: FloatArray, hats: _Hats) -> FloatArray:
+        """All table values (parameters, k) for k required fields (3, k, n)."""
+        counting = required_mm * self.weight
+        right = self.freedom.gather(np.concatenate([term.gather(counting, hats) for term in self.terms]))
         if self.offsets:
-            right = np.concatenate([right, counting.sum(axis=1).T])
+            right = np.concatenate([right, counting.sum(axis=2)])
         solution = self.scale[:, None] * lapack().dpotrs(self.factor, right * self.scale[:, None], lower=1)[0]
         return self.freedom.expand(solution[: len(self.freedom.free)])
 
@@ -252,20 +319,28 @@ def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArr
     size = terms[-1].place.stop
     normal = np.zeros((size, size))
     entries: dict[tuple[object, object], tuple[NDArray[np.int64], FloatArray]] = {}
-    for k, one in enumerate(terms):
-        counting = weight[:, None] * one.carrier
-        for other in terms[k:]:
+    done: dict[tuple[object, object, bytes], tuple[slice, slice]] = {}  # e.g. EXX with EXY is as EYX with EYY
+    carriers = [np.ascontiguousarray(term.carrier.T) for term in terms]
+    for k, (one, carrier) in enumerate(zip(terms, carriers, strict=True)):
+        counting = weight * carrier
+        for other, across in zip(terms[k:], carriers[k:], strict=True):
             common = [output for output in one.outputs if output in other.outputs]
             if not common:
                 continue
-            width = other.place.stop - other.place.start
+            height, width = (part.place.stop - part.place.start for part in (one, other))
             if (one.hat, other.hat) not in entries:
                 where = one.node[:, None] * width + other.node[None]
                 entries[one.hat, other.hat] = where.ravel(), one.share[:, None] * other.share[None]
-            where, share = entries[one.hat, other.hat]
-            product = np.einsum("nc,nc->n", counting[:, common], other.carrier[:, common])
-            height = one.place.stop - one.place.start
-            block = np.bincount(where, (share * product).ravel(), height * width).reshape(height, width)
+            product = counting[common[0]] * across[common[0]]
+            for output in common[1:]:
+                product += counting[output] * across[output]
+            key = one.hat, other.hat, product.tobytes()
+            if key not in done:
+                where, share = entries[one.hat, other.hat]
+                block = np.bincount(where, (share * product).ravel(), height * width).reshape(height, width)
+            else:
+                block = normal[done[key]]
+            done.setdefault(key, (one.place, other.place))
             normal[one.place, other.place] = block
             normal[other.place, one.place] = block.T
     return normal
@@ -322,8 +397,8 @@ def _factorised(problem: _Problem) -> Projector:
     normal = np.zeros((free + offsets, free + offsets))
     normal[:free, :free] = freedom.gather(freedom.gather(_normal_matrix(terms, weight)).T)
     if offsets:
-        constant = weight[:, None] * np.eye(3)[:, None]
-        across = freedom.gather(np.concatenate([term.gather(constant) for term in terms]))
+        constant = weight * np.eye(3)[:, :, None]
+        across = freedom.gather(np.concatenate([term.gather(constant, _Hats()) for term in terms]))
         normal[:free, free:], normal[free:, :free] = across, across.T
         normal[free:, free:] = weight.sum() * np.eye(3)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
@@ -378,8 +453,8 @@ def best_values(
     """
     if machine.emphasis.tools_mm:
         solver = projector(machine, solver.basis, anchored=bool(solver.offsets), tools_mm=machine.emphasis.tools_mm)
-    required_at = (lambda *given: -exact_error(*given)) if at_axes else wanted_correction
-    required = required_at(machine, errors, solver.position_mm, solver.sample_tool_mm)
+    sample = (solver.position_mm, solver.sample_tool_mm)
+    required = -error_at(machine, errors, *sample) if at_axes else wanted_correction(machine, errors, *sample)
     start = np.concatenate([term.start for term in solver.basis])
     values = solver.project(required, start)
     if applied is not None:

@@ -27,7 +27,7 @@ from compgen.identify.covariance import Covariance, covariance_or_independent, e
 from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import observable_errors, tool_of
-from compgen.kinematics.many_points import volumetric_error
+from compgen.kinematics.many_points import blocks, volumetric_error
 from compgen.tables.entries import EntryCheck, entry_check
 from compgen.tables.judge import (
     Judge,
@@ -37,10 +37,11 @@ from compgen.tables.judge import (
     judge_of,
     left_by_reversal,
     mean_correction,
+    residuals_before,
     reversal_reasons,
     safety_of,
 )
-from compgen.tables.synthesis import Projector, wanted_correction
+from compgen.tables.synthesis import Projector, error_at, kept, wanted_correction
 
 # The verdict on tables and on the measurement behind them: one state, one headline, and the objections.
 #
@@ -164,6 +165,7 @@ class FigureUncertainty:
         }
 
 
+@kept
 def figure_uncertainty(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
 ) -> FigureUncertainty | None:
@@ -257,6 +259,8 @@ MOST_BYTES, MOST_LINES = 20_000_000, 250_000
 
 #: A smaller correction counts as none; 1e-9 mm is far below what any control resolves.
 ZERO_MM = 1e-9
+#: Points that are tried at a time for a correction that is not zero.
+FEW_POINTS = 512
 #: A control that cannot express more than this share of the largest error gives a partial compensation.
 PARTIAL_SHARE = 0.1
 
@@ -693,7 +697,7 @@ def verify(
         where = in_both_directions(where)
     # the exact model without and with the correction, which is looked up at the commanded position
     correction = tables.correction(machine, where)
-    before = exact_error(machine, errors, where.position_mm, where.tool_mm)
+    before = error_at(machine, errors, where.position_mm, where.tool_mm)
     after = exact_error(machine, errors, where.position_mm + correction, where.tool_mm) + correction
     not_in_tables = None
     if reversal is not None:
@@ -705,8 +709,16 @@ def verify(
     rest = wanted_correction(machine, errors, grid_mm) - judge.best_mm
     if control.anchored:
         rest = rest - rest.mean(axis=0)
-    figures, rigid_removed = zip(*(residuals_twice(nominal, error) for error in (before, after)), strict=True)
-    safety, reasons = reasons_against(machine, tables, judge, limits, reversal)
+    twice_before = (
+        residuals_twice(nominal, before)
+        if reversal is not None
+        else residuals_before(machine, errors, where.position_mm, where.tool_mm)
+    )
+    figures, rigid_removed = zip(twice_before, residuals_twice(nominal, after), strict=True)
+    # on the grid, tables of both directions say the same to the judge
+    same = points is None and reversal is None and not control.bidirectional
+    on_grid = (correction, rigid_removed[1]) if same else None
+    safety, reasons = reasons_against(machine, tables, judge, limits, reversal, on_grid=on_grid)
     useless = _useless_reasons(
         machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed
     )
@@ -746,20 +758,23 @@ def reasons_against(
     limits: SafetyLimits | None = None,
     reversal: ReversalCurves | None = None,
     check: EntryCheck | None = None,
+    on_grid: tuple[FloatArray, Residuals] | None = None,
 ) -> tuple[Safety, tuple[str, ...]]:
     """Return what parsed tables would make the axes do, and every reason not to accept them, each once.
 
-    ``check`` is that of other tables of the same control, errors and reversal, if there is one.
+    ``check`` is that of other tables of the same control, errors and reversal, if there is one; ``on_grid`` what the
+    tables add on the judge's grid (n, 3), and the figures of what they leave there without rigid motion, where known.
     """
     control = tables.controller
-    on_grid, on_lines = (tables.mean_correction(machine, part) for part in (judge.grid.position_mm, judge.line_mm))
+    added, left = on_grid or (tables.mean_correction(machine, judge.grid.position_mm), None)
+    on_lines = tables.mean_correction(machine, judge.line_mm)
     safety = safety_of(machine, control, tables.tables, lambda part: judge.solver.field(judge.values, part), limits)
     turned: list[str] = []
     if reversal is not None and control.bidirectional:
         in_tables = control.reversal_in_tables(reversal)
         rounding_mm = 2.0 * control.resolution_mm()  # of both directions
         turned = reversal_reasons(machine, lambda points: tables.correction(machine, points), in_tables, rounding_mm)
-    against_best = judge.reasons(on_grid, on_lines)
+    against_best = judge.reasons(added, on_lines, left)
     if not against_best:
         check = entry_check(machine, judge, tables, reversal) if check is None else check.of(tables)
         against_best = check.reasons()
@@ -785,13 +800,14 @@ def _useless_reasons(
 
     ``figures`` are before and after with the reference point fixed, ``removed`` with the best-fit rigid motion removed.
     """
-    largest = 0.0
-    for position_mm in points_mm:
-        for side in (1.0, -1.0):
-            points = Points(position_mm, approach=np.full_like(position_mm, side))
-            largest = max(largest, float(np.abs(tables.correction(machine, points)).max()))
     step_um = tables.controller.resolution_mm() / MM_PER_UM
-    if largest < ZERO_MM:
+    parts = (
+        Points(position_mm[part], approach=np.full_like(position_mm[part], side))
+        for position_mm in points_mm
+        for part in blocks(len(position_mm), FEW_POINTS)  # tables that do something show it at the first points
+        for side in (1.0, -1.0)
+    )
+    if all((np.abs(tables.correction(machine, points)) < ZERO_MM).all() for points in parts):
         return [
             f"the tables contain only zeros, while the errors reach {um_text(figures[0].max_um)} um: either this "
             f"control has no table for them, or its smallest step is too coarse (rounding of an entry: up to {step_um:.3g} um)"
