@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterable
 from importlib import import_module
@@ -23,14 +24,22 @@ def data_folder(kind: str) -> Path:
     raise FileNotFoundError(f"no folder {kind!r} in {candidates[0]} or {candidates[1]}: the installation is incomplete")
 
 
+def cache_folder(kind: str) -> Path:
+    """Folder for what can be made again, in the user's cache folder; nothing is written next to the program."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "compgen" / kind
+
+
+#: The only place of the version: the metadata of the package and the documentation take it from here.
+VERSION = "0.1.0"
+
+
 def program_version() -> str:
     """Return the version of the running compgen."""
-    from importlib.metadata import PackageNotFoundError, version  # takes as long to load as the rest of the help
-
-    try:
-        return version("compgen")
-    except PackageNotFoundError:
-        return "unknown"
+    return VERSION
 
 
 def on_first_use(name: str, home: str) -> property:

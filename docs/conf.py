@@ -10,11 +10,13 @@ from sphinx import addnodes
 from sphinx.transforms import SphinxTransform
 
 ROOT = Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+RESOURCES = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["version"]
+VERSION = re.search(RESOURCES["pattern"], (ROOT / RESOURCES["path"]).read_text(encoding="utf-8"))
+assert VERSION, "no version"
 
 project = "volcomp"
 author = "the compgen authors"
-version = release = PROJECT["version"]
+version = release = VERSION["version"]
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_copybutton"]
 source_suffix = {".md": "markdown"}

@@ -27,7 +27,7 @@ from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import c_matrix, tool_of
-from compgen.kinematics.many_points import full_grid, volumetric_error
+from compgen.kinematics.many_points import blocks, full_grid, volumetric_error
 
 # One figure of accuracy with its uncertainty, and how two of them compare.
 
@@ -366,31 +366,47 @@ def _place(field: ErrorField, row: int) -> str:
     return ", ".join(f"{value:.6g}" for value in field.position_mm[row])
 
 
+#: Share of the largest value that rounding of products may take away; distances of this share of the volume are none.
+_ROUNDING, _NO_DISTANCE = 1e-6, 1e-6
+
+
 def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the rows of the pair with the largest difference of vectors, and of the pair with the largest length error."""
-    best = [(-1.0, (0, 0)), (-1.0, (0, 0))]
-    tip, error = field.tip_mm, field.error_mm
-    for first in range(0, len(tip), block):
-        rows = slice(first, first + block)
-        # One component after the other: arrays of pairs that stay in the processor's cache.
-        squares, before, after, gain = np.zeros((4, len(tip[rows]), len(tip) - first))
-        for k in range(3):
-            apart = np.subtract.outer(error[rows, k], error[first:, k])
-            line = np.subtract.outer(tip[rows, k], tip[first:, k])
-            squares += apart * apart
-            before += line * line
-            gain += line * apart
-            line += apart
-            after += line * line
-        # |line + apart| - |line| without the cancellation of the difference of two roots
-        before, after, gain = np.sqrt(before), np.sqrt(after), 2.0 * gain + squares
-        sizes = np.abs(np.divide(gain, before + after, out=np.zeros_like(gain), where=(before + after) > 0.0))
-        for k, values in enumerate((squares, sizes)):
-            at = int(np.argmax(values))
-            if values.flat[at] > best[k][0]:
-                i, j = divmod(at, len(tip) - first)
-                best[k] = (float(values.flat[at]), (first + i, first + j))
-    return best[0][1], best[1][1]
+    """Return the rows of the pair with the largest difference of vectors, and of the pair with the largest length error.
+
+    With a = ``apart`` and l = ``line`` of a pair, products of matrices give a.a, l.l and l.a of all pairs at once:
+    (u_i - u_j).(v_i - v_j) = u_i.v_i + u_j.v_j - u_i.v_j - v_i.u_j. These differences lose digits, so the pairs that may
+    be the largest are then evaluated from their coordinates.
+    """
+    tip, error = field.tip_mm - field.tip_mm.mean(axis=0), field.error_mm - field.error_mm.mean(axis=0)
+    sides = []
+    for u, v in ((error, error), (tip, tip), (tip, error)):
+        own, ones = np.einsum("ij,ij->i", u, v), np.ones(len(u))
+        sides.append((np.column_stack([own, ones, -u, -v]), np.vstack([ones, own, v.T, u.T])))
+    none = (_NO_DISTANCE * float(np.abs(tip).max())) ** 2
+    largest, rows = [0.0, 0.0], ([np.zeros((0, 2), dtype=np.int64)], [np.zeros((0, 2), dtype=np.int64)])
+    for part in blocks(len(tip), block):
+        squares, before, gain = (left[part] @ right[:, part.start :] for left, right in sides)
+        gain = 2.0 * gain + squares  # |l + a|^2 - |l|^2, hence |l + a| - |l| = gain / (|l + a| + |l|)
+        beside, before = before <= none, np.maximum(before, none)
+        sizes = np.abs(gain) / (np.sqrt(np.maximum(before + gain, 0.0)) + np.sqrt(before))
+        sizes[beside] = 0.0  # not known so well: to be evaluated
+        for k, (values, unknown) in enumerate(((squares, False), (sizes, beside))):
+            largest[k] = max(largest[k], float(values.max()))
+            i, j = np.nonzero((values > (1.0 - _ROUNDING) * largest[k]) | unknown)
+            rows[k].append(part.start + np.stack([i, j], axis=1)[j > i])
+    found = [(0, 0), (0, 0)]
+    for k, pairs in enumerate(np.concatenate(some) for some in rows):
+        apart, line = (values[pairs[:, 0]].T - values[pairs[:, 1]].T for values in (field.error_mm, field.tip_mm))
+        squares, before, after, gain = (
+            u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+            for u, v in ((apart, apart), (line, line), (line + apart, line + apart), (line, apart))
+        )
+        gain, lengths = 2.0 * gain + squares, np.sqrt(before) + np.sqrt(after)
+        sizes = np.abs(np.divide(gain, lengths, out=np.zeros_like(gain), where=lengths > 0.0))
+        if len(pairs):
+            i, j = pairs[int(np.argmax((squares, sizes)[k]))]
+            found[k] = int(i), int(j)
+    return found[0], found[1]
 
 
 # Errors of a machine with their uncertainty, if known, as a source of fields at any points.

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import atexit
 import gc
+import json
 import os
 import sys
+import zlib
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -19,6 +21,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import load_for, output_options, plugin_option, run_command
+from compgen.resources import cache_folder
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
 _COMMANDS = {
@@ -88,15 +91,88 @@ class Unloaded(click.Command):
         return output_options(plugin_option(command))  # type: ignore[no-any-return]
 
 
+class Sketch(click.Command):
+    """Options of a command as noted when a shell asked for them last: enough to name them without loading the command.
+
+    The note has the size and time of every file of the program that was read for it. If one of them has changed, the note
+    is not used. Values are completed by the command itself.
+    """
+
+    #: What a note has of each parameter.
+    KEYS = ("nargs", "multiple", "is_flag", "count", "hidden", "help")
+
+    def __init__(self, command: Unloaded, noted: list[dict[str, Any]]) -> None:
+        def values(ctx: click.Context, parameter: click.Parameter, incomplete: str) -> list[Any]:
+            known = next(item for item in command.loaded.params if item.name == parameter.name)
+            return known.shell_complete(ctx, incomplete)
+
+        super().__init__(command.name)
+        for item in noted:
+            words = item.pop("words")
+            kind = click.Option if words[-1].startswith("-") else click.Argument
+            self.params.append(kind(words, shell_complete=values, **item))
+
+    @classmethod
+    def of(cls, command: Unloaded) -> Sketch | None:
+        """Return the sketch of a command, None if there is no note of it, or an old one."""
+        try:
+            note = json.loads(cls.file(command).read_bytes())
+            if all([(stat := os.stat(path)).st_mtime_ns, stat.st_size] == known for path, *known in note["files"]):
+                return cls(command, note["parameters"])
+        except (OSError, ValueError, LookupError, TypeError):
+            pass
+        return None
+
+    @classmethod
+    def note(cls, command: Unloaded) -> None:
+        """Note the options of a command that has been loaded."""
+        noted = []
+        for item in command.loaded.params:
+            if item.secondary_opts or isinstance(command.loaded, click.Group):
+                return
+            keys = cls.KEYS if isinstance(item, click.Option) else ("nargs",)
+            words = [item.name, *item.opts] if isinstance(item, click.Option) else [item.name]
+            noted.append({"words": words, **{key: getattr(item, key) for key in keys}})
+        sources = [getattr(module, "__file__", None) for name, module in sys.modules.items() if name[:7] == "compgen"]
+        files = [
+            (path, (stat := os.stat(path)).st_mtime_ns, stat.st_size) for path in (click.__file__, *sources) if path
+        ]
+        target = cls.file(command)
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            part = target.with_suffix(f".{os.getpid()}")
+            part.write_text(json.dumps({"files": files, "parameters": noted}), encoding="utf-8")
+            os.replace(part, target)
+        except OSError:  # a folder that nobody may write to
+            pass
+
+    @staticmethod
+    def file(command: Unloaded) -> Path:
+        """Return where the note of a command is kept, for each installation of the program."""
+        place = f"{sys.implementation.cache_tag}{Path(__file__).resolve()}".encode()
+        return cache_folder("completion") / f"{command.name}-{zlib.crc32(place):08x}.json"
+
+
 class CommandTable(click.Group):
     """A group that imports each command when it is called; help and completion need only the names."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find the command that ``args`` begin with, and import it."""
+        """Find the command that ``args`` begin with, and import it, unless a shell asks only for its options."""
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command.loaded if isinstance(command, Unloaded) else command, rest
+        if not isinstance(command, Unloaded):
+            return name, command, rest
+        # plug-ins may add values, so whoever loads some gets the command itself
+        asked = (
+            ctx.resilient_parsing
+            and "COMPGEN_PLUGINS" not in os.environ
+            and not any("--plugin" in word for word in rest)
+        )
+        sketch = Sketch.of(command) if asked else None
+        if asked and sketch is None:
+            Sketch.note(command)
+        return name, sketch or command.loaded, rest
 
 
 def _show_version(context: click.Context, parameter: click.Parameter, value: bool) -> None:

@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.grids import Cell, ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
 from compgen.controls.shared.scanner import MOST_LINES, check_complete, content_lines, floating, uses_exponent
 from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, fixed
@@ -472,7 +472,8 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         signs[[letter in negate for letter in AXES]] *= -1.0
         signs[[letter in blank for letter in AXES]] = 0.0
         # E = C P (squareness reference X) from the parsed numbers
-        values = {name: item.at(position) for name, item in tables.fields.items()}
+        cells: dict[tuple[int, bytes], Cell] = {}
+        values = {name: item.at(position, cells) for name, item in tables.fields.items()}
         result = np.zeros((len(position), 3))
         for part in coefficients(chain, "X"):
             if part.error in values:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from threadpoolctl import ThreadpoolController
 
 from compgen.errors import InputError
+from compgen.resources import cache_folder
 
 # The switch between compiled kernels (numba, ``pip install compgen[fast]``) and their plain forms (numpy).
 #
@@ -84,15 +85,6 @@ def load_kernels() -> bool:
         return False
     os.environ[VARIABLE] = COMPILED
     return True
-
-
-def cache_folder(kind: str) -> Path:
-    """Folder for compiled code of a kind, in the user's cache folder; nothing is written next to the program."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
-    else:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "compgen" / kind
 
 
 @contextmanager

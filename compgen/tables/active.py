@@ -168,7 +168,10 @@ def bare_errors(
     measured = [curve_nodes_mm(machine, errors, axis) for axis in range(3)]
     control = active.tables.controller
     own = control.table_nodes_mm(active.tables.tables)
-    both = [np.unique(np.concatenate([measured[k], _within(machine, k, own[k])])) for k in range(3)]
+    both = []
+    for axis, nodes in enumerate(own):
+        low, high = machine.axes[axis].range_mm
+        both.append(np.unique(np.concatenate([measured[axis], nodes[(nodes >= low) & (nodes <= high)]])))
     terms = _model_terms(machine, errors, both if keep_nodes else measured)
     solver = projector(machine, terms, anchored=False)
     position_mm = solver.position_mm
@@ -191,11 +194,6 @@ def bare_errors(
 def _upwards(position_mm: FloatArray) -> Points:
     """Return points approached upwards on every axis, for direction-dependent tables."""
     return Points(position_mm, approach=np.ones_like(position_mm))
-
-
-def _within(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatArray:
-    low, high = machine.axes[axis].range_mm
-    return np.asarray(nodes_mm[(nodes_mm >= low) & (nodes_mm <= high)])
 
 
 def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:

@@ -276,8 +276,7 @@ class EntryCheck:
             levels = [nodes[k] if k == axis else ends[k] for k in range(3)]
             position_mm = full_grid(levels)
             own_tool = self._sample(position_mm, None, None)
-            for tool in self.machine.tool_corners_mm:
-                sample = self._sample(position_mm, np.array(tool), None)
+            for sample in self._with_tools(position_mm):
                 if np.array_equal(sample.own_mm, own_tool.own_mm):
                     break  # these tables do not depend on the tool
                 found = self._wrong_numbers(sample) or self._spikes(sample) or self._turned(sample, own_tool)
@@ -337,6 +336,18 @@ class EntryCheck:
                     own = own - np.median(own - self._added(self.given, flat, tool_mm, None), axis=0)
         parts = (np.asarray(part).reshape(shape) for part in (own, best, made, slack))
         return _Sample(position_mm, tool_mm, *parts)
+
+    def _with_tools(self, position_mm: FloatArray) -> Iterator[_Sample]:
+        """Yield the sample with each tool: the first alone, since most tables depend on no tool, then all others at once."""
+        tools, points = np.array(self.machine.tool_corners_mm).reshape(-1, 3), position_mm.reshape(-1, 3)
+        for some in (tools[:1], tools[1:]):
+            every = np.tile(points, (len(some), 1)).reshape(1, 1, -1, 3)
+            if not len(some):
+                return
+            found = self._sample(every, np.repeat(some, len(points), axis=0), None)
+            parts = (found.own_mm, found.best_mm, found.made_mm, found.slack_mm)
+            for k, tool in enumerate(some):
+                yield _Sample(position_mm, tool, *(x.reshape(len(some), *position_mm.shape)[k] for x in parts))
 
     def _added(
         self, tables: ReadTables, position_mm: FloatArray, tool_mm: FloatArray | None, side: float | None

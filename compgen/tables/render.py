@@ -32,8 +32,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, ERRORS
 from compgen.errors import InputError
-from compgen.kinematics.kernel_switch import cache_folder
-from compgen.resources import data_folder
+from compgen.resources import cache_folder, data_folder
 
 # Controller files through Jinja2: strict about missing values, sandboxed; text of a user is never executed.
 

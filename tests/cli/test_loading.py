@@ -6,7 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import pytest
+from click.core import ParameterSource
+
+from compgen.cli import Sketch, cli
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Libraries that take long to load. The lists below name those that a program may have loaded when it ends.
@@ -58,7 +62,7 @@ def test_the_main_help_loads_neither_numpy_nor_any_command(tmp_path, words):
 
 def completed(tmp_path, line):
     variables = {"_VOLCOMP_COMPLETE": "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
-    return loaded(tmp_path, PROGRAM.format([]), **variables)
+    return loaded(tmp_path, PROGRAM.format([]), XDG_CACHE_HOME=str(tmp_path / "cache"), **variables)
 
 
 def test_completion_of_a_command_loads_no_command(tmp_path):
@@ -72,6 +76,45 @@ def test_completion_of_an_option_knows_the_options_and_loads_that_command_alone(
     assert output.split() == ["plain,--max-abs", "plain,--max-slope", "plain,--max-curvature"]
     assert commands == {"fit_commands"}
     assert libraries <= TABLES
+
+
+def test_a_second_completion_of_an_option_loads_no_command_unless_the_program_has_changed(tmp_path):
+    first = completed(tmp_path, "volcomp fit --max")
+    assert completed(tmp_path, "volcomp fit --max") == (set(), set(), first[2])
+    # a value belongs to the command, which must then be loaded
+    assert completed(tmp_path, "volcomp fit --smoothness ")[1] == {"fit_commands"}
+    (note,) = (tmp_path / "cache" / "compgen" / "completion").glob("fit-*.json")
+    content = json.loads(note.read_text())
+    assert any(path.endswith("fit/bounds.py") for path, *_ in content["files"])
+    content["parameters"] = [item for item in content["parameters"] if "--max-abs" not in item["words"]]
+    note.write_text(json.dumps(content))
+    assert "--max-abs" not in completed(tmp_path, "volcomp fit --max")[2]  # the note is used
+    content["files"][-1][1] -= 1  # as if this file had been written since
+    note.write_text(json.dumps(content))
+    assert completed(tmp_path, "volcomp fit --max") == first
+    for damaged in ("", "[]", '{"files": [["gone.py", 1, 2]], "parameters": []}'):
+        note.write_text(damaged)
+        assert completed(tmp_path, "volcomp fit --max") == first
+
+
+@pytest.mark.parametrize("name", [name for name, command in cli.commands.items() if name != "recal"])
+def test_the_note_of_a_command_has_its_options_and_their_help(tmp_path, monkeypatch, name):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    command = cli.commands[name]
+    Sketch.note(command)
+    sketch = Sketch.of(command)
+    if isinstance(command.loaded, click.Group):
+        assert sketch is None
+        return
+    found = []
+    for one in (sketch, command.loaded):
+        context = click.Context(one, info_name=name, resilient_parsing=True)
+        found.append([(item.value, item.help) for item in one.shell_complete(context, "--")])
+        given = one.make_context(name, ["a", "b", "--json", "--out", "c"], resilient_parsing=True)
+        found[-1].append(
+            sorted(k for k in given.params if given.get_parameter_source(k) == ParameterSource.COMMANDLINE)
+        )
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize(

@@ -359,6 +359,10 @@ def trilinear(vertices: FloatArray, start_mm: FloatArray, step_mm: FloatArray, p
 # Values over a grid of axis positions with uneven spacing, and reading it from rows in any order.
 
 
+#: Index of the node before and after each position, and the weight of the one after.
+Cell = tuple[np.ndarray, np.ndarray, FloatArray]
+
+
 @dataclass(frozen=True)
 class ParameterGrid:
     """One parameter over a grid of axis positions, linear between nodes, constant outside.
@@ -374,20 +378,28 @@ class ParameterGrid:
     nodes_mm: tuple[FloatArray, ...]
     values: FloatArray
 
-    def at(self, position_mm: FloatArray) -> FloatArray:
-        """Values at axis positions (n, 3), shape (n,): multilinear between the 2^k nodes around each position."""
+    def at(self, position_mm: FloatArray, cells: dict[tuple[int, bytes], Cell] | None = None) -> FloatArray:
+        """Values at axis positions (n, 3), shape (n,): multilinear between the 2^k nodes around each position.
+
+        ``cells`` keeps the cells of these positions for other parameters with the same nodes.
+        """
+        known: dict[tuple[int, bytes], Cell] = {} if cells is None else cells
+        own = []
+        for axis, nodes in zip(self.axes, self.nodes_mm, strict=True):
+            key = axis, nodes.tobytes()
+            if key not in known:
+                known[key] = _cell(nodes, position_mm[:, axis])
+            own.append(known[key])
         result = np.zeros(len(position_mm))
-        cells = [_cell(nodes, position_mm[:, axis]) for axis, nodes in zip(self.axes, self.nodes_mm, strict=True)]
-        for corner in product((0, 1), repeat=len(cells)):
-            weight = np.ones(len(position_mm))
-            for side, (_, _, share) in zip(corner, cells, strict=True):
-                weight = weight * (share if side else 1.0 - share)
-            index = tuple(cell[side] for side, cell in zip(corner, cells, strict=True))
-            result += weight * self.values[index]
+        for corner in product((0, 1), repeat=len(own)):
+            value = self.values[tuple(cell[side] for side, cell in zip(corner, own, strict=True))]
+            for side, (_, _, share) in zip(corner, own, strict=True):
+                value = value * (share if side else 1.0 - share)
+            result += value
         return result
 
 
-def _cell(nodes_mm: FloatArray, along_mm: FloatArray) -> tuple[np.ndarray, np.ndarray, FloatArray]:
+def _cell(nodes_mm: FloatArray, along_mm: FloatArray) -> Cell:
     """Index of the node before and after each position, and the weight of the one after; clamped outside."""
     if len(nodes_mm) == 1:
         zero = np.zeros(len(along_mm), dtype=np.intp)

@@ -18,7 +18,7 @@ from rich.console import Group
 from rich.text import Text
 
 from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_errors, statements_of, volume_fields
-from compgen.accuracy.field import Figure, error_source, volume_figures
+from compgen.accuracy.field import ErrorSource, Figure, error_source, volume_figures
 from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, json_text, json_values
@@ -101,7 +101,7 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
     with_tables = []
     for control in source.controls:
         if control.tables is not None:
-            moved = error_source(machine, errors, None, control.correction)
+            moved = ErrorSource(machine, errors, correction=control.correction)  # only the values are shown
             figures = {**axis_figures(moved), **diagonal_figures(moved)}
             with_tables.append({"name": control.name, "figures": {key: item.value for key, item in figures.items()}})
     return {
