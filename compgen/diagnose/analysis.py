@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import fdtrc, ndtri
 
 from compgen.data.csv_files import FloatArray
-from compgen.diagnose.base_fit import BaseFit, legendre
+from compgen.diagnose.base_fit import BaseFit, least_norm, legendre, orthonormal
 from compgen.diagnose.groups import (
     Group,
     Wider,
@@ -29,7 +30,6 @@ from compgen.diagnose.search import (
     design_of,
     gain_of,
     gains,
-    orthonormal,
     remainder_of,
     rules_of,
     search,
@@ -211,6 +211,17 @@ class Analysis:
     chosen: Chosen
     support: Support
     missing: tuple[str, ...]
+
+    @cached_property
+    def left_mm(self) -> FloatArray:
+        """Residuals (n,) of an unweighted fit of the base model and all members to all readings."""
+        columns = self.columns()
+        return self.fit.residual_mm - columns @ least_norm(columns, self.fit.residual_mm)
+
+    def columns(self) -> FloatArray:
+        """Columns (n, k) of the base model and of all members."""
+        design = self.design
+        return np.hstack([self.fit.jacobian, *(design.groups[g].columns @ design.maps[g] for g in self.chosen.members)])
 
 
 def analyse(

@@ -19,6 +19,7 @@ from compgen.errors import InputError
 from compgen.identify.adjust.unknowns import DistinctPoses
 from compgen.kinematics.exact_chain import exact_columns
 from compgen.kinematics.first_order import modelled_errors
+from compgen.kinematics.kernel_switch import lapack
 
 # Base model of a diagnosis: smooth curves for the errors of the machine file, rich enough for the data.
 #
@@ -202,6 +203,8 @@ SMALL_MM = 1e-8
 #: where the data are informative, but what the data hardly determine stays near zero instead of diverging.
 LIKELY, READING_MM = 0.1, 1e-3
 LIKELY_RAD = 1e-4
+#: Columns of a panel of :func:`tall_qr`.
+PANEL = 32
 
 
 @dataclass(frozen=True)
@@ -247,13 +250,40 @@ class _Linearised:
     readings: Readings
 
 
+def tall_qr(columns: FloatArray) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
+    """Factor R (r, p) of columns (n, p), r = min(n, p), and a function that multiplies Q (n, r) by a matrix (r, k).
+
+    LAPACK's recursive panels: numpy's QR of a matrix with many more rows than columns takes three times as long.
+    """
+    count, rank = len(columns), min(columns.shape)
+    compact, blocks, _ = lapack().dgeqrt(min(PANEL, rank), columns)
+
+    def of_basis(small: FloatArray) -> FloatArray:
+        padded = np.zeros((count, small.shape[1]), order="F")
+        padded[:rank] = small
+        return np.ascontiguousarray(lapack().dgemqrt(compact, blocks, padded, overwrite_c=1)[0])
+
+    return np.triu(compact[:rank]), of_basis
+
+
+def orthonormal(columns: FloatArray, least: float = 1e-9) -> FloatArray:
+    """Orthonormal basis of the span of columns (n, p)."""
+    norm = np.linalg.norm(columns, axis=0)
+    kept = norm > 0
+    r, of_basis = tall_qr(columns[:, kept] / norm[kept])
+    u, singular, _ = np.linalg.svd(r, full_matrices=False)
+    return of_basis(u[:, singular > least * singular[0]])
+
+
 def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least-squares solution with scaled columns; directions without information get zero."""
     scale = np.linalg.norm(design, axis=0)
     scale[scale == 0.0] = 1.0
     count = design.shape[1]
-    # the last column of R is Q' target
-    both = np.asarray(np.linalg.qr(np.column_stack([design / scale, target]), mode="r"))
+    scaled = np.empty((len(design), count + 1), order="F")
+    np.divide(design, scale, out=scaled[:, :count])
+    scaled[:, count] = target
+    both = tall_qr(scaled)[0]  # its last column is Q' target
     u, singular, vt = np.linalg.svd(both[:count, :count], full_matrices=False)
     kept = singular > LEAST_SINGULAR * singular[0]
     return np.asarray((vt[kept].T @ ((u[:, kept].T @ both[:count, count]) / singular[kept])) / scale)

@@ -8,6 +8,7 @@ from itertools import permutations, product
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
@@ -236,18 +237,22 @@ def classes_of(analysis: Analysis, removed: int = 0) -> list[Classed]:
 
 def gross_readings(analysis: Analysis) -> IntArray:
     """Rows of readings far from their neighbours after subtracting all findings; none if there are many."""
-    fit, design = analysis.fit, analysis.design
-    added = [design.groups[g].columns @ design.maps[g] for g in analysis.chosen.members]
-    columns = np.hstack([fit.jacobian, *added])
-    kept = np.ones(len(columns), dtype=bool)
+    fit, left = analysis.fit, analysis.left_mm
+    kept = np.ones(len(left), dtype=bool)
     for _ in range(ROUNDS):
-        left = fit.residual_mm - columns @ least_norm(columns[kept], fit.residual_mm[kept])
         size = _apart(fit.observed.layout, left / analysis.noise.scale) * kept
         if size.max() <= GROSS:
             break
         kept &= size < max(GROSS, 0.5 * float(size.max()))
+        left = _left_without(analysis, kept)
     found = np.flatnonzero(~kept)
-    return found if len(found) <= MOST_GROSS * len(columns) else np.zeros(0, dtype=np.int64)
+    return found if len(found) <= MOST_GROSS * len(kept) else np.zeros(0, dtype=np.int64)
+
+
+def _left_without(analysis: Analysis, kept: NDArray[np.bool_]) -> FloatArray:
+    """Residuals of all readings after a fit to those ``kept``, (n,)."""
+    columns, residual_mm = analysis.columns(), analysis.fit.residual_mm
+    return np.asarray(residual_mm - columns @ least_norm(columns[kept], residual_mm[kept]))
 
 
 def _apart(layout: MeasurementLayout, left: FloatArray) -> FloatArray:
@@ -291,20 +296,16 @@ def disturbed_readings(analysis: Analysis) -> list[Burst]:
     Residuals are compared between windows of equal length, which scales with the noise, including slow noise. The fit
     is repeated without each burst because a burst distorts it.
     """
-    fit, design = analysis.fit, analysis.design
-    layout = fit.observed.layout
-    added = [design.groups[g].columns @ design.maps[g] for g in analysis.chosen.members]
-    columns = np.hstack([fit.jacobian, *added])
-    kept = np.ones(len(columns), dtype=bool)
+    layout, left = analysis.fit.observed.layout, analysis.left_mm
+    kept = np.ones(len(left), dtype=bool)
     found: list[Burst] = []
     for _ in range(MOST_BURSTS):
-        left = fit.residual_mm - columns @ least_norm(columns[kept], fit.residual_mm[kept])
         window = _loudest(layout, (left / analysis.noise.scale) ** 2 * kept)
         if window is None:
             break
         rows = np.flatnonzero((layout.stop >= window[0]) & (layout.stop <= window[1]) & kept)
         kept[rows] = False
-        left = fit.residual_mm - columns @ least_norm(columns[kept], fit.residual_mm[kept])
+        left = _left_without(analysis, kept)
         first, last = (float(layout.time[stop]) for stop in window)
         found.append(Burst(rows, first, last, float(np.sqrt(np.mean(left[rows] ** 2))), layout.timed))
     return found

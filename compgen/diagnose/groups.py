@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from compgen.diagnose.base_fit import (
     first_basis,
     fit_base,
     legendre,
+    orthonormal,
     size_of,
     tip_columns,
     values_of,
@@ -154,14 +156,8 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
                     found.append((position, fixed, columns))
             if not found:
                 continue
-            dense = np.hstack([columns for _, _, columns in found])
+            source = source_of([columns for _, _, columns in found])
             ends = np.cumsum([0, *(columns.shape[1] for _, _, columns in found)]).tolist()
-            source: Placed | Scanned = Placed(dense)
-            if len(set(np.diff(ends))) == 1 < len(found):  # scanning a degree changes the number of columns
-                changes = dense.copy()
-                changes[:, ends[1] :] -= dense[:, : -ends[1]]
-                if np.count_nonzero(changes) < LEAST_CHANGED * changes.size:
-                    source = Scanned(csr_array(changes), ends[1])
             for k, (position, fixed, _) in enumerate(found):
                 place, card = slice(ends[k], ends[k + 1]), fixed.card
                 groups.append(
@@ -180,6 +176,20 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
         if len(groups) == before:
             missing.append(name)
     return groups, missing
+
+
+def source_of(every: Sequence[FloatArray]) -> Placed | Scanned:
+    """Columns of neighbouring scan positions: all of them, or their changes if those are few."""
+    width = every[0].shape[1]
+    if len(every) > 1 and all(columns.shape[1] == width for columns in every):  # scanning a degree changes the number
+        changes = [every[0], *(after - before for before, after in pairwise(every))]
+        if sum(map(np.count_nonzero, changes)) < LEAST_CHANGED * len(changes) * changes[0].size:
+            places = [np.nonzero(change) for change in changes]
+            values = np.concatenate([change[place] for change, place in zip(changes, places, strict=True)])
+            rows = np.concatenate([rows for rows, _ in places])
+            columns = np.concatenate([width * k + column for k, (_, column) in enumerate(places)])
+            return Scanned(csr_array((values, (rows, columns)), shape=(len(every[0]), width * len(every))), width)
+    return Placed(np.hstack(every))
 
 
 def check_names(names: Sequence[str], stations: Sequence[str]) -> None:
@@ -471,7 +481,7 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
     errors = values_of(old, fit.unknowns, len(poses.position_mm))
     by_errors = exact_columns(machine, errors, poses.position_mm, poses.tool_mm)[1]
     readings = along(fit.readings.direction, poses)
-    base = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))[0]
+    base = orthonormal(fit.jacobian)
     found: list[Wider] = []
     for axis in range(3):
         best, least = None, -np.inf

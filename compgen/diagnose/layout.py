@@ -7,7 +7,8 @@ run is a sequence of stops under one condition; stops of one cell agree in every
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,7 @@ class MeasurementLayout:
     run, condition, cell : labels of each stop, (T,); runs are numbered in time, equal cells are repeats.
     in_run : number of the stop within its run, standardised, (T,).
     blocks : stops grouped by their channels.
+    kept : cache of what depends on the layout alone.
     """
 
     stop: IntArray
@@ -59,6 +61,7 @@ class MeasurementLayout:
     cell: IntArray
     in_run: FloatArray
     blocks: tuple[Block, ...]
+    kept: dict[Any, Any] = field(default_factory=dict)
 
     @property
     def stops(self) -> int:

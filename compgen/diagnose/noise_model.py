@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import lapack, solve_triangular
 from scipy.sparse import csr_array, eye_array
 
 from compgen.data.csv_files import FloatArray
-from compgen.diagnose.base_fit import BaseFit
+from compgen.diagnose.base_fit import BaseFit, orthonormal
 from compgen.diagnose.groups import Group
 from compgen.diagnose.layout import Block, IntArray, MeasurementLayout
+from compgen.kinematics.kernel_switch import lapack
 
 # Noise of a measurement: white, slow parts per channel and common to all, and parts that change from run to run.
 #
@@ -74,16 +75,14 @@ class Noise:
 
 def kernels(
     time: FloatArray, spacing: float, run: IntArray, in_run: FloatArray, *, runs: bool = True
-) -> list[FloatArray]:
-    """Correlation matrices (T, T) of a block: one per time constant, then two for single runs."""
-    apart = np.abs(time[:, None] - time[None, :]) / spacing
-    found = [np.exp(-apart / tau) for tau in TAU]
-    if runs:
-        same = (run[:, None] == run[None, :]).astype(np.float64)
-        found += [same, same * np.outer(in_run, in_run)]
-    else:
-        found += [np.zeros_like(apart)] * 2
-    return found
+) -> Iterator[FloatArray]:
+    """Correlation matrices (T, T) of a block, in turn: one per time constant, then two for single runs."""
+    apart = np.abs(time[:, None] - time[None, :]) / -spacing
+    for tau in TAU:
+        yield np.exp(apart / tau)
+    same = (run[:, None] == run[None, :]).astype(np.float64) if runs else np.zeros_like(apart)
+    yield same
+    yield same * np.outer(in_run, in_run)
 
 
 def rotation(channels: int) -> FloatArray:
@@ -131,11 +130,43 @@ def difference_matrix(layout: MeasurementLayout, block: Block) -> csr_array:
 
 @dataclass(frozen=True)
 class _Part:
-    """Differences of one block: kernels (K, d, d), data (c, d), fixed effects (c, d, q)."""
+    """Differences of one block: kernels (K, d (d + 1) / 2), fixed effects and data (c, d, q + 1).
+
+    Symmetric matrices are in LAPACK's rectangular packed form: half the memory, and half the operations of each sum.
+    """
 
     kernels: FloatArray
-    data: FloatArray
-    fixed: FloatArray
+    columns: FloatArray
+
+    @property
+    def data(self) -> FloatArray:
+        """The differences, (c, d)."""
+        return self.columns[:, :, -1]
+
+    def summed(self, variances: FloatArray, white: float) -> FloatArray:
+        """Packed covariances (m, ...) for the variances (m, K) of the kernels and of the white part."""
+        covariances = variances @ self.kernels
+        covariances[:, self.diagonal] += white
+        return np.asarray(covariances)
+
+    @cached_property
+    def diagonal(self) -> IntArray:
+        """Places of the diagonal in the packed form, (d,)."""
+        size = self.columns.shape[1]
+        packed = _packed(np.diag(np.arange(1.0, size + 1.0)))
+        places = np.flatnonzero(packed)
+        return np.asarray(places[np.argsort(packed[places])], dtype=np.int64)
+
+    def traces(self, packed: FloatArray) -> FloatArray:
+        """Traces (K,) of the products of a packed matrix, which is overwritten, with each kernel."""
+        packed *= 2.0
+        packed[self.diagonal] *= 0.5
+        return np.asarray(self.kernels @ packed)
+
+
+def _packed(matrix: FloatArray) -> FloatArray:
+    """Lower triangle of a symmetric matrix (d, d) in LAPACK's rectangular packed form."""
+    return np.asarray(lapack().dtrttf(matrix, uplo="L")[0])
 
 
 @dataclass
@@ -150,47 +181,47 @@ class Reml:
     def value(self, log_variance: FloatArray) -> tuple[float, FloatArray, float]:
         """Criterion, its gradient, and d' P d."""
         theta = np.exp(log_variance)
-        count = len(TAU) + 2
+        count, q, routines = len(TAU) + 2, self.fixed, lapack()
         own, shared = theta[1 : 1 + count], theta[1 + count :] if self.common else np.zeros(count)
-        normal, right = np.zeros((self.fixed, self.fixed)), np.zeros(self.fixed)
-        logdet = quadratic = 0.0
-        # the mean of the channels and their contrasts, each with its kernels, channels and inverse covariance
-        solved: list[tuple[_Part, int, FloatArray, FloatArray, FloatArray]] = []
+        products, logdet = np.zeros((q + 1, q + 1)), 0.0
+        # the mean of the channels and their contrasts, each with its channels, inverse covariance and weighted columns
+        solved: list[tuple[_Part, int, int, FloatArray, FloatArray]] = []
         for part in self.parts:
             channels, size = part.data.shape
             split = channels > 1 and bool(shared.any())
-            for mine, times in ((slice(0, 1), channels), (slice(1, None), 0)) if split else ((slice(None), 0),):
-                covariance = np.tensordot(own + times * shared, part.kernels, 1)
-                covariance.flat[:: size + 1] += theta[0]
-                factor, failed = lapack.dpotrf(covariance.T, lower=1, clean=1, overwrite_a=1)
+            kinds = ((slice(0, 1), channels), (slice(1, None), 0)) if split else ((slice(None), 0),)
+            covariances = part.summed(np.stack([own + times * shared for _, times in kinds]), theta[0])
+            for (mine, times), covariance in zip(kinds, covariances, strict=True):
+                factor, failed = routines.dpftrf(size, covariance, uplo="L", overwrite_a=1)
                 if failed:
                     raise np.linalg.LinAlgError("the covariance is not positive definite")
-                logdet += 2.0 * len(part.data[mine]) * float(np.log(np.diag(factor)).sum())
-                lower = lapack.dpotri(factor, lower=1, overwrite_c=1)[0]
-                inverse = np.asarray(lower + lower.T)
-                inverse.flat[:: size + 1] *= 0.5
-                weighted, data = inverse @ part.fixed[mine], part.data[mine] @ inverse
-                normal += np.einsum("cdq,cdr->qr", part.fixed[mine], weighted, optimize=True)
-                right += np.einsum("cdq,cd->q", weighted, part.data[mine])
-                quadratic += float(np.sum(part.data[mine] * data))
-                solved.append((part, channels if times or not split else 0, inverse, weighted, data))
-        beta, between = right, np.zeros_like(normal)
-        if self.fixed:
-            between[:] = np.linalg.inv(normal)
-            beta = between @ right
-            quadratic -= float(right @ beta)
-            logdet += float(np.linalg.slogdet(normal)[1])
+                columns = part.columns[mine]
+                logdet += 2.0 * len(columns) * float(np.log(factor[part.diagonal]).sum())
+                side_by_side = np.array(columns.transpose(1, 0, 2).reshape(size, -1), order="F")
+                half = routines.dtfsm(1.0, factor, side_by_side, uplo="L", overwrite_b=1)
+                for white in np.split(half, len(columns), axis=1):
+                    products += white.T @ white
+                weighted = routines.dtfsm(1.0, factor, half, uplo="L", trans="T", overwrite_b=1)
+                inverse = routines.dpftri(size, factor, uplo="L", overwrite_a=1)[0]
+                solved.append((part, len(columns), channels if times or not split else 0, inverse, weighted))
+        # eliminate the fixed effects: ``turn`` maps weighted columns to those of P d, and to the root of what P lacks
+        turn, quadratic = np.eye(q + 1), float(products[q, q])
+        if q:
+            root = np.linalg.cholesky(products[:q, :q])
+            turn[:q, :q] = np.linalg.inv(root).T
+            seen = products[:q, q] @ turn[:q, :q]
+            turn[:q, q] = -turn[:q, :q] @ seen
+            quadratic -= float(seen @ seen)
+            logdet += 2.0 * float(np.log(np.diag(root)).sum())
         gradient = np.zeros(len(log_variance))
-        for part, times, inverse, weighted, data in solved:
-            # 1/2 (tr(P K) - d' P K P d) for every kernel K, with P d = data - weighted beta
-            tall = np.hstack([*weighted])
-            p = len(data) * inverse - tall @ np.hstack([*(weighted @ between)]).T
-            vectors = data - weighted @ beta
-            p -= vectors.T @ vectors
-            trace = part.kernels.reshape(count, -1) @ p.ravel()
-            gradient[0] += 0.5 * np.trace(p)
+        for part, channels, times, inverse, weighted in solved:
+            # 1/2 (tr(P K) - d' P K P d) for every kernel K
+            turned = np.asfortranarray((weighted.reshape(len(weighted), channels, -1) @ turn).reshape(weighted.shape))
+            lacking = routines.dsfrk(*turned.shape, -1.0, turned, channels, inverse, uplo="L", overwrite_c=1)
+            gradient[0] += 0.5 * float(lacking[part.diagonal].sum())
+            trace = part.traces(lacking)
             gradient[1 : 1 + count] += 0.5 * trace
-            if self.common and len(part.data) > 1:
+            if self.common and len(part.columns) > 1:
                 gradient[1 + count :] += 0.5 * times * trace
         return 0.5 * (logdet + quadratic), gradient * theta, quadratic
 
@@ -209,30 +240,40 @@ def reml_problem(
     Without ``repeats`` the residuals themselves are used; they must then contain only noise. ``numbered``: noise
     evolves from stop to stop, regardless of the time between them.
     """
-    time = np.arange(layout.stops, dtype=np.float64) if numbered else layout.time
-    spacing = 1.0 if numbered else spacing_of(layout)
-    parts, columns = [], np.column_stack([residual, fixed])
-    for block in layout.blocks:
-        turned = rotated(block, columns)
-        size = len(block.stop)
-        kept = min(size, MOST_STOPS)
-        matrix = difference_matrix(layout, block)[:MOST_DIFFERENCES] if repeats else eye_array(kept, size, format="csr")
-        if not matrix.shape[0]:
-            continue
-        taken = np.unique(matrix.indices)
-        stop, few = block.stop[taken], matrix[:, taken]
-        run = layout.run[stop]  # with only one run, the part common to a run is a constant, which the fit absorbs
-        pattern = kernels(time[stop], spacing, run, layout.in_run[stop], runs=runs and len(np.unique(run)) > 1)
-        between = np.stack([np.ascontiguousarray(few @ (few @ kernel).T) for kernel in pattern])
-        channels = np.stack([matrix @ turned[c] for c in range(block.channels)])
-        parts.append(_Part(between, np.ascontiguousarray(channels[:, :, 0]), channels[:, :, 1:]))
+    columns = np.column_stack([fixed, residual])
+    key = "differences", repeats, runs, numbered
+    if key not in layout.kept:
+        layout.kept[key] = [_differences(layout, block, *key[1:]) for block in layout.blocks]
+    parts = []
+    for block, (matrix, packed) in zip(layout.blocks, layout.kept[key], strict=True):
+        if matrix.shape[0]:
+            turned = rotated(block, columns)
+            parts.append(_Part(packed, np.stack([matrix @ turned[c] for c in range(block.channels)])))
     return _with_fixed(parts)
+
+
+def _differences(
+    layout: MeasurementLayout, block: Block, repeats: bool, runs: bool, numbered: bool
+) -> tuple[csr_array, FloatArray]:
+    """Differences (d, T) of a block (or its stops), and the packed kernels of their covariance, (K, d (d + 1) / 2)."""
+    time = np.arange(layout.stops, dtype=np.float64) if numbered else layout.time
+    size = len(block.stop)
+    few = eye_array(min(size, MOST_STOPS), size, format="csr")
+    matrix = difference_matrix(layout, block)[:MOST_DIFFERENCES] if repeats else few
+    taken = np.unique(matrix.indices)
+    stop, few = block.stop[taken], matrix[:, taken]
+    run = layout.run[stop]  # with only one run, the part common to a run is a constant, which the fit absorbs
+    several = runs and len(np.unique(run)) > 1
+    pattern = kernels(time[stop], 1.0 if numbered else spacing_of(layout), run, layout.in_run[stop], runs=several)
+    packed = [_packed(np.asarray(few @ (few @ kernel).T)) for kernel in pattern] if len(stop) else []
+    return matrix, np.array(packed)
 
 
 def _with_fixed(parts: list[_Part]) -> Reml:
     """Orthonormalise the fixed effects over all parts, without directions that do not vary."""
-    common = any(part.data.shape[0] > 1 for part in parts)
-    stacked = np.concatenate([part.fixed.reshape(part.data.size, part.fixed.shape[2]) for part in parts])
+    common = any(len(part.columns) > 1 for part in parts)
+    stacked = np.concatenate([part.columns.reshape(-1, part.columns.shape[2]) for part in parts])
+    stacked, raw = stacked[:, :-1], stacked[:, -1]
     norm = np.linalg.norm(stacked, axis=0)
     varying = norm > 1e-9
     stacked = stacked[:, varying] / norm[varying]
@@ -240,13 +281,12 @@ def _with_fixed(parts: list[_Part]) -> Reml:
     if stacked.shape[1]:
         u, singular, _ = np.linalg.svd(stacked, full_matrices=False)
         basis = u[:, singular > 1e-3 * singular[0]]
-    raw = np.concatenate([part.data.ravel() for part in parts])
     start = float(np.mean((raw - basis @ (basis.T @ raw)) ** 2))
     done, at = [], 0
     for part in parts:
-        rows = part.data.size
-        fixed = basis[at : at + rows].reshape(*part.data.shape, basis.shape[1])
-        done.append(_Part(part.kernels, part.data, np.ascontiguousarray(fixed)))
+        rows, shape = part.data.size, part.data.shape
+        both = np.column_stack([basis[at : at + rows], raw[at : at + rows]])
+        done.append(_Part(part.kernels, both.reshape(*shape, both.shape[1])))
         at += rows
     count = len(TAU) + 2
     variances = np.full(1 + count * (2 if common else 1), 0.02 * start)
@@ -329,9 +369,9 @@ def noise_of(
         # from the residuals after the base model and the groups ``fixed``: an assumption, not a measurement
         residual, count = fit.residual_mm, len(fit.residual_mm)
         design = np.hstack([fit.jacobian, _unit_columns(fixed, count)])
-        q = np.linalg.qr(design / np.maximum(np.linalg.norm(design, axis=0), 1e-300))[0]
+        q = orthonormal(design)
         residual = residual - q @ (q.T @ residual)
-        residual = residual * np.sqrt(count / max(count - design.shape[1], 1))
+        residual = residual * np.sqrt(count / max(count - q.shape[1], 1))
         scale = np.ones(count) if sigma_mm is None else sigma_mm / np.sqrt(np.mean(sigma_mm**2))
         problem = reml_problem(layout, residual / scale, np.zeros((count, 0)), repeats=False, runs=False)
         variances, quadratic, criterion, _ = fit_reml(problem, steps=20)
@@ -526,10 +566,10 @@ def pieces_of(
         for variance, kernel in zip(variances, kernels(time[rows], 1.0, run[rows], in_run[rows]), strict=True):
             if variance > 0.0:
                 covariance += variance * kernel
-        factor, failed = lapack.dpotrf(covariance, lower=1, clean=1)
+        factor, failed = lapack().dpotrf(covariance, lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError("the covariance of the noise is not positive definite")
-        inverse = solve_triangular(factor, np.eye(end - first), lower=True, check_finite=False)
+        inverse = lapack().dtrtri(factor, lower=1)[0]
         after = min(end, len(time) - 1)
         kept = np.append(np.exp(-(time[after] - time[first]) / np.array(TAU)), [float(run[after] == run[first])] * 2)
         learnt = (variances[:, None] * seen(rows, after).T - (kept[:, None] * explained) @ here.T) @ inverse.T
@@ -549,10 +589,14 @@ class Whitener:
     scale: FloatArray
     pieces: tuple[tuple[tuple[Piece, ...], tuple[Piece, ...]], ...]
 
-    def __call__(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n, k) or one column (n,)."""
+    def __call__(self, columns: FloatArray, *, centred: bool = False) -> FloatArray:
+        """Whiten columns (n, k) or one column (n,); ``centred``: less their mean on each channel."""
         wide = columns.reshape(len(columns), -1)
         result, at = np.empty(wide.shape), 0
+        owner = self.layout.channel
+        if centred:
+            summed = csr_array((np.ones(len(owner)), owner, np.arange(len(owner) + 1))).T @ wide
+            average = np.asarray(summed) / np.bincount(owner)[:, None]
         for block, both in zip(self.layout.blocks, self.pieces, strict=True):
             turn = rotation(block.channels)
             states = np.zeros((block.channels, len(both[0][0].kept), wide.shape[1]))
@@ -561,13 +605,15 @@ class Whitener:
             for mean, contrast in zip(*both, strict=True):
                 rows = block.rows[mean.first : mean.last]
                 # (c, b, k): the channels of the piece, rotated to their mean and contrasts
-                picked = wide[rows.T] / self.scale[rows.T][:, :, None]
+                picked = wide[rows.T]
+                if centred:
+                    picked -= average[owner[rows[0]]][:, None]
+                picked /= self.scale[rows.T][:, :, None]
                 turned = (turn @ picked.reshape(block.channels, -1)).reshape(picked.shape)
-                for channel in range(block.channels):
-                    piece = contrast if channel else mean
-                    white = piece.inverse @ turned[channel] - piece.known @ states[channel]
-                    states[channel] = piece.kept[:, None] * states[channel] + piece.learnt @ white
-                    whitened[channel, piece.first : piece.last] = white
+                for piece, own in ((mean, slice(0, 1)), (contrast, slice(1, None))):
+                    white = np.matmul(piece.inverse, turned[own], out=whitened[own, piece.first : piece.last])
+                    white -= piece.known @ states[own]
+                    states[own] = piece.kept[:, None] * states[own] + piece.learnt @ white
             at += size * block.channels
         return result.reshape(columns.shape)
 
@@ -581,11 +627,10 @@ class Whitener:
             parts = whitened[at : at + size * block.channels].reshape(block.channels, size, -1)
             for mean, contrast in zip(both[0][::-1], both[1][::-1], strict=True):
                 turned = np.empty((block.channels, mean.last - mean.first, whitened.shape[1]))
-                for channel in range(block.channels):
-                    piece = contrast if channel else mean
-                    white = parts[channel, piece.first : piece.last] + piece.learnt.T @ states[channel]
-                    turned[channel] = piece.inverse.T @ white
-                    states[channel] = piece.kept[:, None] * states[channel] - piece.known.T @ white
+                for piece, own in ((mean, slice(0, 1)), (contrast, slice(1, None))):
+                    white = parts[own, piece.first : piece.last] + piece.learnt.T @ states[own]
+                    turned[own] = piece.inverse.T @ white
+                    states[own] = piece.kept[:, None] * states[own] - piece.known.T @ white
                 rows = block.rows[mean.first : mean.last].T
                 picked = (turn.T @ turned.reshape(block.channels, -1)).reshape(turned.shape)
                 result[rows] = picked / self.scale[rows][:, :, None]

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from scipy.special import fdtrc
 
 from compgen.data.csv_files import FloatArray
-from compgen.diagnose.base_fit import BaseFit
+from compgen.diagnose.base_fit import BaseFit, orthonormal
 from compgen.diagnose.groups import Group, Placed, Scanned
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.noise_model import Whitener
@@ -118,7 +118,7 @@ class Design:
         """Coordinates of the given groups as whitened columns, (N, r)."""
         if not members:
             return np.zeros((self.count, 0))
-        left = self.projected(np.hstack([_centred(self.fit, self.groups[g].columns) for g in members]))
+        left = self.projected(np.hstack([self.groups[g].columns for g in members]), centred=True)
         ends = np.cumsum([0, *(len(self.maps[g]) for g in members)])
         return np.hstack([left[:, ends[k] : ends[k + 1]] @ self.maps[g] for k, g in enumerate(members)])
 
@@ -177,19 +177,13 @@ class Design:
         parts = [np.arange(self.start[g], self.start[g + 1]) for g in members]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
-    def projected(self, columns: FloatArray) -> FloatArray:
-        """Whiten columns (n, k) and project out the base model."""
-        white = self.whiten(columns)
+    def projected(self, columns: FloatArray, *, centred: bool = False) -> FloatArray:
+        """Whiten columns (n, k) and project out the base model.
+
+        ``centred``: less their mean on each channel, which a dead length would absorb.
+        """
+        white = self.whiten(columns, centred=centred)
         return np.asarray(white - self.base @ (self.base.T @ white))
-
-
-def orthonormal(columns: FloatArray, least: float = 1e-9) -> FloatArray:
-    """Orthonormal basis of the span of columns (n, p)."""
-    norm = np.linalg.norm(columns, axis=0)
-    kept = norm > 0
-    q, r = np.linalg.qr(columns[:, kept] / norm[kept])
-    u, singular, _ = np.linalg.svd(r, full_matrices=False)
-    return np.asarray(q @ u[:, singular > least * singular[0]])
 
 
 def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design:
@@ -205,13 +199,21 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
     for own in [*owners.values(), []]:
         width = sum(groups[of[0]].source.width for of in (*chunk, own) if of)
         if chunk and (not own or width > CHUNK):
-            tall = whiten(_centred(fit, np.hstack([groups[of[0]].source.columns() for of in chunk])))
+            # less the mean on each channel, which a dead length would absorb
+            tall = whiten(np.hstack([groups[of[0]].source.columns() for of in chunk]), centred=True)
             seen, score, at = base.T @ tall, residual @ tall, 0
+            whole = np.einsum("nk,nk->k", tall, tall)
+            left = np.maximum(whole - np.einsum("pk,pk->k", seen, seen), 0.0)
+            shares = np.sqrt(left / np.where(whole > 0.0, whole, np.inf))
             for of in chunk:
                 for g in of:
                     where = range(at, at + groups[g].source.width)[groups[g].place or slice(None)]
                     mine = slice(where.start, where.stop)
-                    mapping, share = _reduced(tall[:, mine], seen[:, mine], base)
+                    if len(where) == 1:
+                        share = float(shares[where[0]])
+                        mapping = np.full((1, int(share > LEAST_VISIBLE)), 1.0) / np.sqrt(left[mine])
+                    else:
+                        mapping, share = _reduced(tall[:, mine], seen[:, mine], base)
                     reduced[g] = mapping, mapping.T @ score[mine], share
                 at += groups[of[0]].source.width
             chunk = []
@@ -222,25 +224,14 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
     return Design(tuple(groups), start, tuple(maps), stacked, np.array(visible), residual, base, whiten, fit)
 
 
-def _centred(fit: BaseFit, columns: FloatArray) -> FloatArray:
-    """Columns minus their mean on each channel, which a dead length would absorb."""
-    channel = fit.observed.layout.channel
-    member = csr_array((np.ones(len(channel)), (np.arange(len(channel)), channel)))
-    mean = np.asarray(member.T @ columns) / np.bincount(channel)[:, None]
-    return np.asarray(columns - mean[channel])
-
-
 def _reduced(raw: FloatArray, seen: FloatArray, base: FloatArray) -> tuple[FloatArray, float]:
     """Map (k, m) from orthonormal visible directions to the parameters, and the visible share.
 
-    ``raw`` (N, k) are whitened columns, ``seen`` (p, k) their products with the base model. The raw columns are
+    ``raw`` (N, k > 1) are whitened columns, ``seen`` (p, k) their products with the base model. The raw columns are
     orthonormalised first; the eigenvalues of the remainder are then squared shares.
     """
     whole = raw.T @ raw
     left = whole - seen.T @ seen
-    if len(whole) == 1:
-        share = float(np.sqrt(max(left[0, 0], 0.0) / whole[0, 0])) if whole[0, 0] > 0.0 else 0.0
-        return (np.array([[1.0 / np.sqrt(left[0, 0])]]) if share > LEAST_VISIBLE else np.zeros((1, 0))), share
     norm = np.sqrt(np.diag(whole))
     if not norm.any():
         return np.zeros((len(whole), 0)), 0.0
@@ -268,6 +259,9 @@ def _reduced(raw: FloatArray, seen: FloatArray, base: FloatArray) -> tuple[Float
 HANDICAP, SLOW_HANDICAP = 21.0, 27.0
 MOST_MEMBERS = 6
 BEAM, ADDITIONS = 2, 3
+#: Criteria that agree to this many decimals are equal: of exact aliases the first in the catalogue is taken, whatever the
+#: rounding errors.
+DECIMALS = 4
 #: Largest p-value of a member, corrected for the number of groups and scan positions.
 LARGEST_P = 1e-3
 #: Directions with less than this (squared) left after projecting out the other members are ignored.
@@ -437,8 +431,7 @@ def _best_additions(design: Design, rules: Rules, members: Sequence[int], most: 
         allowed = allowed_with(design, rules, members)
         gained = gains(design, remainder_of(design, members), allowed)
         merit = gained - penalties(design, rules, allowed, gained)
-        # of exact aliases, take the first in the catalogue regardless of rounding
-        first = np.argsort(-np.round(merit, 6), kind="stable")[: 4 * max(ADDITIONS, most)]
+        first = np.argsort(-np.round(merit, DECIMALS), kind="stable")[: 4 * max(ADDITIONS, most)]
         design.kept[key] = [(allowed[k], float(merit[k])) for k in first]
     best: dict[str, int] = {}
     for g, merit in design.kept[key][: 4 * most]:
@@ -474,11 +467,11 @@ def _forward(design: Design, rules: Rules, start: Sequence[int]) -> Chosen:
                 found[frozenset(chosen.members)] = chosen
         if not found:
             break
-        beam = sorted(found.values(), key=lambda item: item.criterion)[:BEAM]
+        beam = sorted(found.values(), key=lambda item: round(item.criterion, DECIMALS))[:BEAM]
         beam = [_improved(design, rules, item) for item in beam]
         if beam[0].criterion >= best.criterion - 1e-6:
             break
-        best = min(beam, key=lambda item: item.criterion)
+        best = min(beam, key=lambda item: round(item.criterion, DECIMALS))
     return prune(design, rules, _improved(design, rules, best))
 
 

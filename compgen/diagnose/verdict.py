@@ -16,14 +16,13 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.diagnose.analysis import HOMOGENEITY_P, Analysis, contribution
-from compgen.diagnose.base_fit import Part, least_norm, size_of
+from compgen.diagnose.base_fit import Part, least_norm, orthonormal, size_of
 from compgen.diagnose.observed import Observed
 from compgen.diagnose.search import (
     Alternative,
     Design,
     alternatives,
     gains,
-    orthonormal,
     plain_covariates,
     remainder_of,
 )

@@ -12,7 +12,7 @@ from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import load_machine, read_machine
 from compgen.diagnose import DiagnoseOptions, diagnose
-from compgen.diagnose.base_fit import first_basis, fit_base, least_norm
+from compgen.diagnose.base_fit import first_basis, fit_base, least_norm, orthonormal
 from compgen.diagnose.diagnose import observed_of
 from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.noise_model import (
@@ -25,7 +25,6 @@ from compgen.diagnose.noise_model import (
     rotation,
     whitener,
 )
-from compgen.diagnose.search import orthonormal
 from compgen.errors import InputError
 from compgen.kinematics.kernel_switch import one_thread
 
@@ -170,7 +169,7 @@ def test_whitening_turns_the_covariance_into_the_identity(gantry):
     variances = replace(noise.variances, own=np.full(7, 2e-8), common=np.full(7, 3e-8))
     layout = observed.layout
     white = whitener(layout, replace(noise, variances=variances))
-    pattern = kernels(layout.time, 9.0, layout.run, layout.in_run)
+    pattern = [*kernels(layout.time, 9.0, layout.run, layout.in_run)]
     own, common = 2e-8 * sum(pattern), 3e-8 * sum(pattern)
     stop, station = layout.stop, observed.lengths.station
     covariance = common[np.ix_(stop, stop)] + own[np.ix_(stop, stop)] * (station[:, None] == station[None, :])
