@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import PLANES, Circles
@@ -198,59 +199,82 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     UndeterminedError
         if arcs are too short to separate squareness from the centre and the scales.
     """
-    position_mm = _positions(machine, circles)
-    columns = _columns(machine, circles, position_mm)
-    design = np.column_stack([column.values for column in columns])
-    scale = np.linalg.norm(design, axis=0)
-    left, size, right = np.linalg.svd(design / scale, full_matrices=False)
-    shown = size > RCOND * size[0]
-    inverse = (right[shown].T / size[shown]) @ left[:, shown].T / scale[:, None]
-    share = np.einsum("ij,ij->j", right[shown], right[shown])
-    names = [column.key for k, column in enumerate(columns) if column.kind == "squareness" and share[k] > 1 - 1e-6]
-    if not names:
-        raise UndeterminedError("the arcs are too short to separate squareness from the centre and the scales", [])
-    found = inverse @ circles.deviation_mm
-    residual = design @ found - circles.deviation_mm
-    freedom = len(circles) - int(np.count_nonzero(shown))
-    if freedom < 1:
-        raise UndeterminedError(f"{len(circles)} readings for {np.count_nonzero(shown)} unknowns", [])
+    columns = _columns(machine, circles, _positions(machine, circles))
+    solution = _Solution.of(circles, columns)
+    shown = [(column, k) for k, column in enumerate(columns) if solution.shown[k]]
     for k, name in enumerate(PLANES):
         if len(np.unique(circles.direction[circles.plane == k])) == 1:
-            text = f"{name} was measured in one direction only: a servo mismatch is taken for squareness; measure both directions"
+            text = f"{name} was measured in one direction only: a servo mismatch counts as squareness; measure both directions"
             warnings.warn(text, CompgenWarning, stacklevel=2)
-    spread = float(np.sqrt(residual @ residual / freedom * _correlated(circles, residual)))
-    factor = spread * inverse
-    u = np.linalg.norm(factor, axis=1)
-    rows = [k for k, column in enumerate(columns) if column.kind == "squareness" and column.key in names]
-    order = sorted(rows, key=lambda k: SQUARENESS_NAMES.index(columns[k].key))
-    squareness = {columns[k].key: (float(found[k]), float(u[k])) for k in order}
+    rows = {column.key: k for column, k in shown if column.kind == "squareness"}
+    order = [rows[name] for name in SQUARENESS_NAMES if name in rows]
+    squareness = {columns[k].key: (float(solution.value[k]), float(solution.u[k])) for k in order}
     errors = ErrorTable({}, squareness, metadata_of(machine, circles.metadata))
-    for name in set(_of_planes(circles)) - set(names):
+    for name in set(_of_planes(circles)) - set(rows):
         warnings.warn(
-            f"the arcs do not separate {name} from the centre, the scales or the servo mismatch",
+            f"the arcs do not tell {name} from the centre, the scales or the servo mismatch",
             CompgenWarning,
             stacklevel=2,
         )
     curves = {
-        (column.key, column.key): Curve(np.zeros(1), found[k : k + 1], u[k : k + 1])
-        for k, column in enumerate(columns)
-        if column.kind == "reversal" and share[k] > 1 - 1e-6
+        (column.key, column.key): Curve(np.zeros(1), solution.value[k : k + 1], solution.u[k : k + 1])
+        for column, k in shown
+        if column.kind == "reversal"
     }
     reversal = {key: curve for key, curve in curves.items() if worth_a_table(curve)}
     return replace(
-        without_adjustment(machine, errors, residual, "scatter", "circles do not show it"),
-        degrees_of_freedom=freedom,
-        u_length_um=spread / MM_PER_UM,
-        rank=int(np.count_nonzero(shown)),
+        without_adjustment(machine, errors, solution.residual, "scatter", "circles do not show it"),
+        degrees_of_freedom=solution.freedom,
+        u_length_um=solution.spread_mm / MM_PER_UM,
+        rank=len(circles) - solution.freedom,
         unknowns=len(columns),
-        condition=float(size[0] / size[shown][-1]),
-        values_factor=factor[order],
+        condition=solution.condition,
+        values_factor=solution.factor[order],
         reversal_curves=ReversalCurves(reversal, {"machine": machine.name}) if reversal else None,
         method="circles",
-        details={
-            "unknowns": [_described(column, found[k], u[k]) for k, column in enumerate(columns) if share[k] > 1 - 1e-6]
-        },
+        details={"unknowns": [_described(column, solution.value[k], solution.u[k]) for column, k in shown]},
     )
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Least squares of circular readings: values (m,) with a factor (m, n) of their covariance, and what is determined.
+
+    ``shown`` (m,) says which unknowns the readings determine; ``residual`` (n,) is model minus reading, mm.
+    """
+
+    value: FloatArray
+    factor: FloatArray
+    shown: NDArray[np.bool_]
+    residual: FloatArray
+    freedom: int
+    spread_mm: float
+    condition: float
+
+    @property
+    def u(self) -> FloatArray:
+        """Standard uncertainties (m,)."""
+        return np.asarray(np.linalg.norm(self.factor, axis=1))
+
+    @classmethod
+    def of(cls, circles: Circles, columns: Sequence[_Column]) -> _Solution:
+        """Solve in the directions that the readings show; UndeterminedError if they show no squareness."""
+        design = np.column_stack([column.values for column in columns])
+        scale = np.linalg.norm(design, axis=0)
+        left, size, right = np.linalg.svd(design / scale, full_matrices=False)
+        used = size > RCOND * size[0]
+        inverse = (right[used].T / size[used]) @ left[:, used].T / scale[:, None]
+        shown = np.einsum("ij,ij->j", right[used], right[used]) > 1 - 1e-6
+        if not any(column.kind == "squareness" and shown[k] for k, column in enumerate(columns)):
+            raise UndeterminedError("the arcs are too short to tell squareness from the centre and the scales", [])
+        value = inverse @ circles.deviation_mm
+        residual = design @ value - circles.deviation_mm
+        rank = int(np.count_nonzero(used))
+        freedom = len(circles) - rank
+        if freedom < 1:
+            raise UndeterminedError(f"{len(circles)} readings for {rank} unknowns", [])
+        spread = float(np.sqrt(residual @ residual / freedom * _correlated(circles, residual)))
+        return cls(value, spread * inverse, shown, residual, freedom, spread, float(size[0] / size[used][-1]))
 
 
 def _positions(machine: Machine, circles: Circles) -> FloatArray:
