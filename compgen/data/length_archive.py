@@ -85,19 +85,19 @@ class LengthArchive:
         """Rows in memory at a time."""
         return (slice(first, min(first + CHUNK, len(self))) for first in range(0, len(self), CHUNK))
 
-    def check(self, look: Callable[[int, NDArray[np.float64]], None] = lambda *_: None) -> None:
+    def check(self, look: Callable[[int, list[FloatArray]], None] = lambda *_: None) -> None:
         """Raise InputError for numbers that are not finite, and for stations that are not in the list.
 
-        ``look`` gets the first row and the positions (3, k) of each chunk.
+        ``look`` gets the first row and the coordinates x, y, z (k,) of each chunk.
         """
         for rows in self.chunks():
-            found = np.stack([self.columns[name][rows] for name in (*POSITION_COLUMNS, "length_mm")]).astype(np.float64)
-            if not np.isfinite(found.sum()):  # not finite if any number is not
-                for k, name in enumerate((*POSITION_COLUMNS, "length_mm")):
-                    for row in np.flatnonzero(~np.isfinite(found[k]))[:1].tolist():
+            found = {name: self.columns[name][rows] for name in (*POSITION_COLUMNS, "length_mm")}
+            for name, values in found.items():
+                if not np.isfinite(values.sum(dtype=np.float64)):  # not finite if any number is not
+                    for row in np.flatnonzero(~np.isfinite(values))[:1].tolist():
                         message = f"reading {rows.start + row + 1} is not a finite number"
                         raise InputError(message, file=self.path, field=name)
-            look(rows.start, found[:3])
+            look(rows.start, [found[name].astype(np.float64, copy=False) for name in POSITION_COLUMNS])
             station = self.columns["station"][rows]
             if station.min() < 0 or station.max() >= len(self.stations):
                 message = f"contains a number that is not one of the {len(self.stations)} stations, 0 to "

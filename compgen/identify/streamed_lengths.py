@@ -184,11 +184,11 @@ def identify_archive(
         )
     low, high = (np.array(ends) for ends in (machine.lower_mm, machine.upper_mm))
 
-    def within(first: int, position_mm: FloatArray) -> None:
-        if (position_mm.min(axis=1) < low).any() or (position_mm.max(axis=1) > high).any():
-            lines = archive.lines(slice(first, first + position_mm.shape[1])).tolist()
+    def within(first: int, xyz_mm: list[FloatArray]) -> None:
+        if any(one.min() < low[k] or one.max() > high[k] for k, one in enumerate(xyz_mm)):
+            lines = archive.lines(slice(first, first + len(xyz_mm[0]))).tolist()
             origin = [(str(archive.path), line) for line in lines]
-            check_travel(machine, position_mm.T, origin)
+            check_travel(machine, np.column_stack(xyz_mm), origin)
 
     archive.check(within)
     sample = archive.taken(archive.sample_rows)
