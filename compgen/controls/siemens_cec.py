@@ -254,9 +254,9 @@ class SiemensCec(Controller[CecSettings, CecTables]):
         documents do not say what a control does before the first motion.
         """
         settings = self.settings
-        outputs = {}
+        outputs, position_mm = {}, np.ascontiguousarray(points.position_mm.T)
         for index, entry in tables.tables.items():
-            outputs[index] = entry.at(points.position_mm[:, entry.input_axis])
+            outputs[index] = entry.at(position_mm[entry.input_axis])
             if entry.direction:
                 unknown = np.zeros(len(points))
                 travel = unknown if points.approach is None else np.sign(points.approach[:, entry.input_axis])

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,12 +194,12 @@ class LinearTable:
         """Number of steps from the first to the last node, exact; a whole number in a valid table."""
         return (Fraction(self.last_mm) - Fraction(self.start_mm)) / Fraction(self.step_mm)
 
-    @property
+    @cached_property
     def nodes_mm(self) -> FloatArray:
         """Node positions, shape (n,)."""
         return np.array([float(self.start_mm + n * self.step_mm) for n in range(len(self.values))])
 
-    @property
+    @cached_property
     def numbers(self) -> FloatArray:
         """Values, shape (n,)."""
         return np.array([float(value) for value in self.values])

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, Decimal
+from functools import cached_property, lru_cache
 from itertools import product
 from typing import Any
 
@@ -100,7 +101,7 @@ class EquidistantGrid:
         """Position of the last node, exact."""
         return self.start + (self.count - 1) * self.step
 
-    @property
+    @cached_property
     def nodes_mm(self) -> FloatArray:
         """Node positions, shape (count,)."""
         return np.array([float(self.start + k * self.step) for k in range(self.count)])
@@ -165,20 +166,21 @@ def equidistant_grid(
     output : only curves that move this axis count; default: all.
     products : False if the control multiplies curves with levers itself: only the curves have to be represented.
     """
-    low, high = machine.axes[axis].range_mm
+    low, high = (Decimal(repr(end)) for end in machine.axes[axis].range_mm)
+    travel = low, high, Decimal(repr(machine.reference_point_mm[axis])) if anchor else low
     if step_mm is not None:
-        return _grid(machine, axis, Decimal(repr(step_mm)), anchor)
+        return _grid(*travel, Decimal(repr(step_mm)))
     curves = [
         _ToleratedCurve.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)
     ]
     curves = curves if products else [replace(item, bent=False) for item in curves]
     tried: list[tuple[float, EquidistantGrid]] = []
-    for grid in _candidates(machine, errors, axis, anchor, most):
+    for grid in _candidates(*travel, common_step(machine, errors, axis, anchor=anchor), most):
         nodes_mm = grid.nodes_mm
         tried.append((max((item.loss(nodes_mm) for item in curves), default=0.0), grid))
         if tried[-1][0] <= 1.0:
             return grid
-    return nearly_best(tried) or _grid(machine, axis, _round_up(Decimal(repr(high - low))), anchor)
+    return nearly_best(tried) or _grid(*travel, _round_up(high - low))
 
 
 def nearly_best(tried: Sequence[tuple[float, EquidistantGrid]]) -> EquidistantGrid | None:
@@ -255,19 +257,20 @@ def _missed(nodes_mm: FloatArray, where_mm: FloatArray, at_nodes: FloatArray, ex
     return float(np.max(np.abs(np.interp(where_mm, nodes_mm, at_nodes) - exact)))
 
 
-def _candidates(machine: Machine, errors: ErrorTable, axis: int, anchor: bool, most: int) -> list[EquidistantGrid]:
+@lru_cache(maxsize=64)  # a run asks for those of an axis a dozen times, a fleet of equal machines always for the same
+def _candidates(
+    low: Decimal, high: Decimal, origin: Decimal, common: Decimal, most: int
+) -> tuple[EquidistantGrid, ...]:
     """Grids of at most ``most`` nodes, by number: equal parts of the travel, and steps that hit the curves' nodes."""
-    low, high = machine.axes[axis].range_mm
-    length = Decimal(repr(high)) - Decimal(repr(low))
+    length = high - low
     counts = list(range(1, EVERY_COUNT + 1))
     while counts[-1] < MOST_INTERVALS:
         counts.append(int(1.05 * counts[-1]))
     steps = {_round_up(length / count) for count in counts if count < most}
-    common = common_step(machine, errors, axis, anchor=anchor)
     parts = (common / part for part in range(1, 11))
     steps |= {step for step in parts if step % STEP_QUANTUM == 0 and length / step <= most}
-    grids = [_grid(machine, axis, step, anchor) for step in steps]
-    return sorted((grid for grid in grids if grid.count <= most), key=lambda grid: (grid.count, grid.step))
+    grids = [_grid(low, high, origin, step) for step in steps]
+    return tuple(sorted((grid for grid in grids if grid.count <= most), key=lambda grid: (grid.count, grid.step)))
 
 
 def common_step(machine: Machine, errors: ErrorTable, axis: int, *, anchor: bool) -> Decimal:
@@ -281,9 +284,7 @@ def _round_up(step: Decimal) -> Decimal:
     return max(step.quantize(STEP_QUANTUM, rounding=ROUND_CEILING), STEP_QUANTUM)
 
 
-def _grid(machine: Machine, axis: int, step: Decimal, anchor: bool) -> EquidistantGrid:
-    low, high = (Decimal(repr(end)) for end in machine.axes[axis].range_mm)
-    origin = Decimal(repr(machine.reference_point_mm[axis])) if anchor else low
+def _grid(low: Decimal, high: Decimal, origin: Decimal, step: Decimal) -> EquidistantGrid:
     below = math.ceil((origin - low) / step)
     above = math.ceil((high - origin) / step)
     return EquidistantGrid(origin - below * step, step, below + above + 1)

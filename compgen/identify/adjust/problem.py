@@ -339,10 +339,12 @@ class SeparationProblem(MachinePoses):
         rest = self.residuals(state).reshape(-1, 3)
         own = self.station_information @ state.dead_length_mm
         cost = 0.5 * float(np.einsum("mi,mij,mj->", rest, self.information, rest) + state.dead_length_mm @ own)
-        gradient = np.zeros(self.size)
-        for equations, design in self._equations(state):
-            equations.add_gradient(design, gradient)
-        gradient[self.parameters.size + 6 :] += own
+        gradient, size = np.zeros(self.size), self.parameters.size
+        back, _ = frame_rotation(-state.stations_mm[1])
+        for _, design, by_own, pull in self._pulled(state):
+            gradient[:size] += design.reshape(-1, size).T @ (pull @ back).ravel()
+            gradient[size:] += np.einsum("miq,mi->q", by_own, pull)
+        gradient[size + 6 :] += own
         return cost, gradient
 
     def normal_matrix(self, state: State) -> FloatArray:
@@ -356,12 +358,8 @@ class SeparationProblem(MachinePoses):
 
     def _equations(self, state: State) -> Iterator[tuple[PointEquations, FloatArray]]:
         """Return the five sums: derivatives of r_j by its tip R(-w), by shift and rotation of the placement, by stations -L_j."""
-        back, jacobian = frame_rotation(-state.stations_mm[1])
-        for rows, tip, design in self.chunks(state):
-            seen = self._seen(state, tip)
-            turn = cross_matrices(seen) @ jacobian / LEVER_MM
-            by_own = np.concatenate([np.broadcast_to(-back, turn.shape), turn, -self.lever[rows]], axis=2)
-            pull = np.einsum("mij,mj->mi", self.information[rows], self._rest(state, rows, seen))
+        back, _ = frame_rotation(-state.stations_mm[1])
+        for rows, design, by_own, pull in self._pulled(state):
             weighted = self.information[rows] @ by_own
             size = by_own.shape[2]
             yield (
@@ -374,6 +372,15 @@ class SeparationProblem(MachinePoses):
                 ),
                 design,
             )
+
+    def _pulled(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
+        """Points, derivatives of their tips, of r_j by placement and stations, and U_j r_j (p, 3): enough for a gradient."""
+        back, jacobian = frame_rotation(-state.stations_mm[1])
+        for rows, tip, design in self.chunks(state):
+            seen = self._seen(state, tip)
+            turn = cross_matrices(seen) @ jacobian / LEVER_MM
+            by_own = np.concatenate([np.broadcast_to(-back, turn.shape), turn, -self.lever[rows]], axis=2)
+            yield rows, design, by_own, np.einsum("mij,mj->mi", self.information[rows], self._rest(state, rows, seen))
 
     def unknown_names(self, station_unknowns: tuple[str, ...] = ()) -> list[str]:
         """Names of all unknowns for messages; ``station_unknowns`` (q,) names b."""
