@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,14 +37,14 @@ from compgen.data.circles import Circles
 from compgen.data.csv_files import FloatArray, names_in_header, read_csv
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ERROR_COLUMNS, ErrorTable
-from compgen.data.files import read_bytes, sha256_of
+from compgen.data.files import read_bytes
 from compgen.data.lengths import POSITION_COLUMNS, Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import InputError, UndeterminedError
 from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
 from compgen.identify.any_measurement import Measurement
-from compgen.identify.covariance import Covariance, read_covariance
+from compgen.identify.covariance import covariance_named_by
 from compgen.tables import ReadTables
 
 # What the two sides of a comparison can be: error files, measurements of any kind, predictions.
@@ -149,23 +148,6 @@ def read_side(
     found = identify_measurement(machine, measurement)
     known = _source_of(machine, found)
     return Side(machine, source, "six-DOF readings", source=known, reversal=identified_reversal(found))
-
-
-def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
-    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match."""
-    name = errors.metadata.get("covariance")
-    covariance_file = path.parent / name if name else None
-    if covariance_file is None or not covariance_file.is_file():
-        return None
-    found = read_covariance(covariance_file)
-    if found.errors_sha256 == sha256_of(read_bytes(path)):
-        return found
-    message = (
-        f"{covariance_file} belongs to another version of {path.name}; u_value is used instead, "
-        "independent from node to node"
-    )
-    warnings.warn(message, CompgenWarning, stacklevel=2)
-    return None
 
 
 def _source_of(machine: Machine, found: Identification) -> ErrorSource:

@@ -148,26 +148,26 @@ plugin_option: Callable[[Any], Any] = click.option(
 VERBOSE = "compgen.verbose"
 
 
-def _quiet(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    if value and not context.resilient_parsing:
+def _set_output(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    """Take -q and -v at once, for all that follows."""
+    if not value or context.resilient_parsing:
+        return
+    if parameter.name == "verbose":
+        context.meta[VERBOSE] = True
+    else:
         from compgen.cli.terminal import stdout
 
         stdout.quiet = True
         context.find_root().call_on_close(functools.partial(setattr, stdout, "quiet", False))
 
 
-def _verbose(context: click.Context, parameter: click.Parameter, value: bool) -> None:
-    if value:
-        context.meta[VERBOSE] = True
-
-
 def output_options(command: Any) -> Any:
     """Add -q and -v, before the command or among its options; they are in force before anything else is read."""
-    how: dict[str, Any] = {"is_flag": True, "expose_value": False, "is_eager": True}
+    how: dict[str, Any] = {"is_flag": True, "expose_value": False, "is_eager": True, "callback": _set_output}
     text = "Print no result, only warnings and errors; files and the exit code are the same."
-    command = click.option("-q", "--quiet", callback=_quiet, help=text, **how)(command)
+    command = click.option("-q", "--quiet", help=text, **how)(command)
     text = "Print each step with the time since the start to stderr, and where an internal error occurred."
-    return click.option("-v", "--verbose", callback=_verbose, help=text, **how)(command)
+    return click.option("-v", "--verbose", help=text, **how)(command)
 
 
 def fleet_options(command: Command) -> Command:

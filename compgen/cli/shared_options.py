@@ -16,11 +16,11 @@ from compgen import effects
 from compgen.cli.common import PATH, Command, options_of
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.error_table import ErrorTable
-from compgen.data.files import read_bytes, sha256_of
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.data.messages import nearest
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
+from compgen.identify.covariance import covariance_named_by
 from compgen.identify.options import StatedNumbers
 from compgen.resources import data_folder
 
@@ -162,19 +162,7 @@ def covariance_of(errors: Path, table: ErrorTable, given: Path | None, *, indepe
         return None
     if given is not None:
         return read_covariance(given, errors)
-    name = table.metadata.get("covariance")
-    covariance_file = errors.parent / name if name else None
-    if covariance_file is None or not covariance_file.is_file():
-        return None
-    found = read_covariance(covariance_file)
-    if found.errors_sha256 == sha256_of(read_bytes(errors)):
-        return found
-    warnings.warn(
-        f"{covariance_file} belongs to another version of {errors.name}; u_value is used instead, independent from node to node",
-        CompgenWarning,
-        stacklevel=2,
-    )
-    return None
+    return covariance_named_by(errors, table)
 
 
 # Options that say where tables must be most accurate: work zone and tools.

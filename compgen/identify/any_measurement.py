@@ -206,26 +206,26 @@ def _check_options(measurement: OneKind, options: IdentifyOptions) -> None:
 
     stated = options.u_length_um is not None or options.u_length_um_per_m is not None
     other = stated or options.method != "joint" or options.stations is not None
-    other = other or options.systematic != SystematicInputs()
+    other = other or options.systematic != SystematicInputs() or options.nodes != "machine"
     if isinstance(measurement, Deviations):
         text = (
-            "--method, --stations, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
+            "--method, --stations, --nodes, --u-length-... and the systematic inputs apply to tracer lengths; the files contain "
             "deviations, for which use --u-deviation-um"
         )
     elif isinstance(measurement, Artefact):
         text = (
-            "--method, --stations, --u-length-... apply to tracer lengths; the files contain an artefact, which takes "
+            "--method, --stations, --nodes, --u-length-... apply to tracer lengths; the files contain an artefact, which takes "
             "--u-deviation-um"
         )
     elif isinstance(measurement, AxisRuns | Circles):
         what = "axis runs" if isinstance(measurement, AxisRuns) else "circles"
         text = (
-            f"--method, --stations, --u-... apply to other kinds of measurement; the files contain {what}, whose "
+            f"--method, --stations, --nodes, --u-... apply to other kinds of measurement; the files contain {what}, whose "
             "uncertainty comes from their scatter"
         )
     else:
         text = (
-            "--method, --stations, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "
+            "--method, --stations, --nodes, --u-... apply to tracer lengths and deviations; the files contain six-DOF readings, "
             "whose uncertainties the instrument file gives ([noise], [u_constants], [u_systematics])"
         )
     takes_u = isinstance(measurement, Deviations | Artefact)

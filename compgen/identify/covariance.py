@@ -8,6 +8,7 @@ itself is never formed.
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -24,7 +25,7 @@ from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.identify.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
@@ -308,6 +309,20 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
                 file=source,
             )
     return covariance
+
+
+def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
+    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match."""
+    name = errors.metadata.get("covariance")
+    covariance_file = path.parent / name if name else None
+    if covariance_file is None or not covariance_file.is_file():
+        return None
+    found = read_covariance(covariance_file)
+    if found.errors_sha256 == sha256_of(read_bytes(path)):
+        return found
+    message = f"{covariance_file} belongs to another version of {path.name}; u_value is used instead"
+    warnings.warn(f"{message}, independent from node to node", CompgenWarning, stacklevel=2)
+    return None
 
 
 def parse_covariance(content: bytes, source: Path) -> Covariance:

@@ -65,7 +65,7 @@ def test_the_laboratory_of_the_configuration_is_on_sheets_and_stops_nothing_else
     code, _, stderr = call(
         "accuracy", "zha-gantry", errors, "--certificate", tmp_path / "lab.toml", "--out", tmp_path / "again"
     )
-    assert (code, "--certificate: is for the sheet" in stderr) == (2, True)
+    assert (code, "--certificate: applies to the sheet" in stderr) == (2, True)
 
 
 @pytest.mark.parametrize(
