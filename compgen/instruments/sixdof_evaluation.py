@@ -121,8 +121,21 @@ def evaluate(machine: Machine, instrument: SixDofInstrument, runs: Sequence[Axis
     return evaluate_axes(machine, instrument, axes)
 
 
-def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[int, AxisErrors]) -> Evaluation:
-    """Return errors and squareness from the means of each axis."""
+#: Curves and slopes of each axis by the identity of its means, which are kept for that, and the turn removed from them.
+KnownAxes = dict[tuple[int, bytes], tuple[AxisErrors, dict[str, Curve], dict[str, float]]]
+
+
+def evaluate_axes(
+    machine: Machine,
+    instrument: SixDofInstrument,
+    axes: Mapping[int, AxisErrors],
+    known: KnownAxes | None = None,
+) -> Evaluation:
+    """Return errors and squareness from the means of each axis.
+
+    ``known`` keeps what was computed for an axis, for the next call with the same means of that axis.
+    """
+    known = {} if known is None else known
     turns = {axis: zeroed(machine, axis, entry.position_mm, entry.eps_rad) for axis, entry in axes.items()}
     curves: dict[str, Curve] = {}
     slopes: dict[str, float] = {}
@@ -130,18 +143,25 @@ def evaluate_axes(machine: Machine, instrument: SixDofInstrument, axes: Mapping[
         # remove what the rotation of the other axes, where they were, adds to the measured translations
         stood, turn = instrument.axes[axis].position_mm or (0.0, 0.0, 0.0), np.zeros(3)
         for other, times in entry.turned_by.items():
-            if other in axes:
+            if other in axes and times:
                 at = axes[other].position_mm
                 turn += [times * np.interp(stood[other], at, turns[other][:, k]) for k in range(3)]
-        delta = entry.delta_mm - np.cross(turn, along(axis, entry.position_mm))
-        for component in range(3):
-            name, value = f"E{AXES[component]}{AXES[axis]}", delta[:, component]
-            if component != axis:
-                constant, slope = fitted_line(entry.position_mm, value, instrument.line)
-                slopes[name], value = slope, value - constant - slope * entry.position_mm
-            curves[name] = _as_curve(entry.position_mm, zeroed(machine, axis, entry.position_mm, value[:, None])[:, 0])
-            angle = f"E{'ABC'[component]}{AXES[axis]}"
-            curves[angle] = _as_curve(entry.position_mm, turns[axis][:, component])
+        key = id(entry), turn.tobytes()
+        if key not in known:
+            delta = entry.delta_mm - np.cross(turn, along(axis, entry.position_mm))
+            own: dict[str, Curve] = {}
+            lines: dict[str, float] = {}
+            for component in range(3):
+                name, value = f"E{AXES[component]}{AXES[axis]}", delta[:, component]
+                if component != axis:
+                    constant, slope = fitted_line(entry.position_mm, value, instrument.line)
+                    lines[name], value = slope, value - constant - slope * entry.position_mm
+                own[name] = _as_curve(entry.position_mm, zeroed(machine, axis, entry.position_mm, value[:, None])[:, 0])
+                angle = f"E{'ABC'[component]}{AXES[axis]}"
+                own[angle] = _as_curve(entry.position_mm, turns[axis][:, component])
+            known[key] = entry, own, lines
+        curves |= known[key][1]
+        slopes |= known[key][2]
     measured = {
         name: sum(slopes[f"E{AXES[component]}{AXES[axis]}"] for component, axis in pair)
         for name, pair in zip(SQUARENESS, SLOPES, strict=True)

@@ -22,6 +22,7 @@ from compgen.errors import CompgenWarning
 from compgen.instruments.sixdof_evaluation import (
     AxisErrors,
     Evaluation,
+    KnownAxes,
     axis_errors,
     axis_runs,
     each_run,
@@ -400,6 +401,7 @@ def _responses(
     """Derivatives (k, 6) of all values by the body's motion at each group of readings, moved in all runs at once."""
     axis = runs[0].axis
     at_tool = unit_moves(machine, instrument, runs[0])
+    known: KnownAxes = {}  # the other axes stay as they are
 
     def values(group: int, component: int, step: float) -> FloatArray:
         moved = []
@@ -408,7 +410,7 @@ def _responses(
             change[rows == group, component] = step
             moved.append(moved_run(instrument, run, at_tool, change))
         changed = {**means, axis: _means(machine, instrument, moved)}
-        return evaluate_axes(machine, instrument, changed).errors.values()
+        return evaluate_axes(machine, instrument, changed, known).errors.values()
 
     base = values(-1, 0, 0.0)
     two_sided = instrument.line == "minzone"
