@@ -33,6 +33,10 @@ demo: .venv/ready
 
 extras: .venv/ready-extras
 
+# as a command does it (compgen/cli): a second thread of the numerical libraries only waits, and keeps a processor busy
+test coverage: export OPENBLAS_NUM_THREADS ?= 1
+test coverage: export MKL_NUM_THREADS ?= 1
+
 test: lint system
 	$(BIN)/python -m pytest $(SPREAD) -ra
 
