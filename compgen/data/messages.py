@@ -73,6 +73,8 @@ def visible_line(text: object) -> str:
 def one_line(text: object) -> str:
     """Return ``text`` as printable ASCII on one line, so that it is safe in a comment of a controller file."""
     flat = " ".join(str(text).split())
+    if flat.isascii() and flat.isprintable():  # the usual case, and much faster
+        return flat
     return "".join(char if " " <= char <= "~" else "?" for char in flat)
 
 
