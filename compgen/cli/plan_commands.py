@@ -45,12 +45,14 @@ from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
 from compgen.report.terminal import plan_table, suggestion_table, trajectory_table, visibility_table
 from compgen.simulate import (
     AxisLaser,
+    Ballbar,
     DiagonalLaser,
     LaserTracer,
     MovingSimulation,
     SimulatedReadings,
     SimulatedSixDof,
     Simulation,
+    TouchProbe,
     read_scenario,
     simulate,
     simulate_axis_runs,
@@ -207,8 +209,9 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     """Simulate a machine and its measurement: writes *.lengths.csv (mm) and truth.errors.csv (um, urad) to DIR.
 
     A scenario whose instrument has type = "sixdof" writes *.sixdof.csv instead of lengths, one with "axis-laser"
-    *.axis.csv, with "diagonal-laser" *.diagonals.csv (um). A laser-tracer with rate_hz reads while the machine moves
-    and writes *.lengths.npz, the binary form of lengths.
+    *.axis.csv, with "diagonal-laser" *.diagonals.csv, with "ballbar" *.circle.csv (um), with "touch-probe"
+    *.artefact.csv (mm). A laser-tracer with rate_hz reads while the machine moves and writes *.lengths.npz, the binary
+    form of lengths.
 
     \b
     Example:
@@ -220,7 +223,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
         simulation: Simulation | SimulatedReadings | MovingSimulation
         if isinstance(planned.instrument, LaserTracer) and planned.instrument.rate_hz is not None:
             simulation = simulate_moving(machine, planned, seed)
-        elif isinstance(planned.instrument, AxisLaser | DiagonalLaser):
+        elif isinstance(planned.instrument, AxisLaser | DiagonalLaser | Ballbar | TouchProbe):
             simulation = simulate_axis_runs(machine, planned, seed)
         elif isinstance(planned.instrument, SimulatedSixDof):
             simulation = simulate_sixdof(machine, planned, seed)

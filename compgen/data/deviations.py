@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,7 @@ __all__ = [
     "Deviations",
     "RoughPose",
     "aligned",
+    "format_artefact",
     "format_deviations",
     "read_artefacts",
     "read_deviations",
@@ -299,9 +301,9 @@ _ARTEFACTS = Schema(
         Field("feature", ("feature",), CsvTable.names),
         Field("xy_mm", POSITION_COLUMNS[:2]),
         Field("z_mm", POSITION_COLUMNS[2:], presence="filled", fill=0.0),
-        Field("u_nominal_mm", ("u_x_um", "u_y_um", "u_z_um"), unit=MM_PER_UM, presence="filled"),
+        Field("u_nominal_mm", ("u_x_um", "u_y_um", "u_z_um"), unit=MM_PER_UM, digits=4, presence="filled"),
         Field("measured_mm", MEASURED_COLUMNS, presence="filled"),
-        Field("setup", ("setup",), CsvTable.labels, presence="filled", fill=0),
+        Field("setup", ("setup",), CsvTable.labels, digits=0, presence="filled", fill=0),
         TOOL,
     )
 )
@@ -358,6 +360,21 @@ def read_artefacts(files: str | Path | Sequence[str | Path]) -> Artefact:
         origin=[place for part in parts for place in part.origin],
         **joined,
     )
+
+
+def format_artefact(artefact: Artefact) -> str:
+    """Return the text of an ``*.artefact.csv`` file: coordinates in mm with 6 decimals (1 nm), uncertainties in um with 4.
+
+    A component must be measured everywhere or nowhere. InputError if some features are calibrated and others not, which
+    one file cannot state.
+    """
+    if artefact.calibrated.any() != artefact.calibrated.all():
+        raise InputError("calibrated and uncalibrated features need a file each; write them separately")
+    columns = SimpleNamespace(**vars(artefact), xy_mm=artefact.nominal_mm[:, :2], z_mm=artefact.nominal_mm[:, 2])
+    calibrated = "true" if artefact.calibrated.all() else "false"
+    # the place of a component that was not measured already contains the origin
+    metadata = {key: value for key, value in artefact.metadata.items() if key != "origin_mm"}
+    return _ARTEFACTS.format(columns, {**metadata, "calibrated": calibrated})
 
 
 def setups_of(deviations: Deviations) -> NDArray[np.int64]:

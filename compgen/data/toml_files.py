@@ -803,6 +803,23 @@ def word_for(values: Mapping[str, T]) -> Callable[[Any], T]:
     return accepts(accepted(check))(lambda value: values[check(value)])
 
 
+def several_of(values: Mapping[str, T], what: str) -> Callable[[Any], tuple[T, ...]]:
+    """A list of different words of the given ones, converted to their values; ``what`` names them in the plural."""
+
+    @accepts({**array_schema({"enum": list(values)}, 1), "uniqueItems": True})
+    def check(value: Any) -> tuple[T, ...]:
+        if (
+            not isinstance(value, list)
+            or not value
+            or any(item not in [*values] for item in value)
+            or len(set(value)) < len(value)
+        ):
+            raise ValueError(f"expected a list of different {what}")
+        return tuple(values[item] for item in value)
+
+    return check
+
+
 def bounded(expected: str, **limits: float) -> Callable[[Any], float]:
     """A number within limits, which have their names in a JSON schema (``minimum``, ``exclusiveMaximum``, ...)."""
     holds = {"minimum": ge, "exclusiveMinimum": gt, "maximum": le, "exclusiveMaximum": lt}

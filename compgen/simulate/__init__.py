@@ -1,6 +1,7 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
 from compgen.simulate.effects import EFFECTS, Effect
+from compgen.simulate.gauges import Ballbar, TouchProbe
 from compgen.simulate.lasers import AxisLaser, DiagonalLaser, LaserTracer, Station
 from compgen.simulate.run import (
     INSTRUMENTS,
@@ -25,6 +26,7 @@ __all__ = [
     "EFFECTS",
     "INSTRUMENTS",
     "AxisLaser",
+    "Ballbar",
     "DiagonalLaser",
     "Effect",
     "Instrument",
@@ -38,6 +40,7 @@ __all__ = [
     "SimulatedReadings",
     "Station",
     "Stops",
+    "TouchProbe",
     "Trajectory",
     "TruthPlan",
     "actual_tips",

@@ -129,18 +129,6 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
 OVERRUN = 0.02
 
 
-@accepts({**toml_files.array_schema({"enum": list(AXES)}, 1), "uniqueItems": True})
-def _axes(value: Any) -> tuple[int, ...]:
-    if (
-        not isinstance(value, list)
-        or not value
-        or any(item not in AXES for item in value)
-        or len(set(value)) < len(value)
-    ):
-        raise ValueError("expected a list of different axes, e.g. ['X', 'Y']")
-    return tuple(AXES.index(letter) for letter in value)
-
-
 @accepts(
     {
         "anyOf": [
@@ -168,7 +156,9 @@ class AxisLaser:
     at_mm : position of the other axes; None: the machine's reference point.
     """
 
-    axes: tuple[int, ...] = setting(_axes, (0, 1, 2))
+    axes: tuple[int, ...] = setting(
+        toml_files.several_of({letter: k for k, letter in enumerate(AXES)}, "axes, e.g. ['X', 'Y']"), (0, 1, 2)
+    )
     targets: int = setting(toml_files.whole(2, 1000), 11)
     cycles: int = setting(toml_files.whole(1, 1000), 5)
     noise_um: float = setting(toml_files.not_negative, 0.2)
@@ -276,18 +266,6 @@ def read_axis_laser(section: toml_files.Section) -> AxisLaser:
 # A simulated laser along diagonals of the travel (ISO 230-6): ``*.diagonals.csv``.
 
 
-@accepts({**toml_files.array_schema({"enum": list(DIAGONALS)}, 1), "uniqueItems": True})
-def _names(value: Any) -> tuple[str, ...]:
-    if (
-        not isinstance(value, list)
-        or not value
-        or any(item not in [*DIAGONALS] for item in value)
-        or len(set(value)) < len(value)
-    ):
-        raise ValueError(f"expected a list of different diagonals, of {', '.join(DIAGONALS)}")
-    return tuple(value)
-
-
 @dataclass(frozen=True)
 class DiagonalLaser:
     """Runs in both directions along diagonals, one after another; the beam is along the diagonal.
@@ -303,7 +281,10 @@ class DiagonalLaser:
         both directions can approach them.
     """
 
-    diagonals: tuple[str, ...] = setting(_names, tuple(BODY_DIAGONALS))
+    diagonals: tuple[str, ...] = setting(
+        toml_files.several_of({name: name for name in DIAGONALS}, f"diagonals, of {', '.join(DIAGONALS)}"),
+        tuple(BODY_DIAGONALS),
+    )
     targets: int = setting(toml_files.whole(2, 1000), 11)
     cycles: int = setting(toml_files.whole(1, 1000), 5)
     noise_um: float = setting(toml_files.not_negative, 0.2)

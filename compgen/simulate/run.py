@@ -19,7 +19,9 @@ import numpy as np
 
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns, Diagonals, format_axis_runs, format_diagonals
+from compgen.data.circles import Circles, format_circles
 from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Artefact, format_artefact
 from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, format_errors
 from compgen.data.files import OutputFolder
@@ -42,6 +44,7 @@ from compgen.simulate.effects import (
     effects_schema,
     read_effects,
 )
+from compgen.simulate.gauges import Ballbar, TouchProbe, read_ballbar, read_touch_probe
 from compgen.simulate.lasers import (
     AxisLaser,
     DiagonalLaser,
@@ -134,14 +137,17 @@ class Instrument(Protocol):
         """Return the readings at stops whose true tips are ``tip_mm`` (n, 3) in the workpiece frame."""
 
 
-LineLaser = AxisLaser | DiagonalLaser
-AnyInstrument = Instrument | SimulatedSixDof | LineLaser
+#: Instruments that bring the path of the machine with them, and need no trajectory.
+OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe
+AnyInstrument = Instrument | SimulatedSixDof | OwnPath
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
 INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
     "laser-tracer": read_laser_tracer,
     "sixdof": read_sixdof_measurement,
     "axis-laser": read_axis_laser,
     "diagonal-laser": read_diagonal_laser,
+    "ballbar": read_ballbar,
+    "touch-probe": read_touch_probe,
 }
 
 
@@ -236,7 +242,7 @@ def scenario_of(root: toml_files.Section, source: Path) -> Scenario:
         session=read_session(root.section("session")) if "session" in root else None,
         temperatures=read_temperatures(root.section("temperatures", required=False)),
     )
-    if not isinstance(scenario.instrument, SimulatedSixDof | LineLaser):
+    if not isinstance(scenario.instrument, SimulatedSixDof | OwnPath):
         problems = instrument_problems(scenario.instrument)
         if problems:
             raise instrument.fail("type", "; ".join(problems))
@@ -244,8 +250,10 @@ def scenario_of(root: toml_files.Section, source: Path) -> Scenario:
     others: tuple[str, ...] = ()
     if isinstance(scenario.instrument, SimulatedSixDof):
         others, text = ("trajectory", "effects", "session", "temperatures"), "a six-DOF instrument runs along the axes"
-    elif isinstance(scenario.instrument, LineLaser):
+    elif isinstance(scenario.instrument, AxisLaser | DiagonalLaser):
         others, text = ("trajectory", "session"), "a laser along axes or diagonals runs in both directions along each"
+    elif isinstance(scenario.instrument, OwnPath):
+        others, text = ("trajectory", "session"), "a ballbar or touch probe states in [instrument] where it measures"
     for key in others:
         if key in root.data:
             raise root.fail(key, f"applies to other instruments; {text}")
@@ -284,13 +292,13 @@ class Simulation(Displayed):
 
 @dataclass(frozen=True)
 class SimulatedReadings:
-    """Runs along axes or diagonals, or six-DOF readings, of a virtual machine, and its true errors in mm and rad.
+    """Readings of a virtual machine that are not lengths (axis runs, circles, ...), and its true errors in mm and rad.
 
     ``name`` begins the file names.
     """
 
     name: str
-    readings: AxisRuns | Diagonals | SixDof
+    readings: AxisRuns | Diagonals | Circles | Artefact | SixDof
     truth: ErrorTable
 
 
@@ -346,8 +354,8 @@ def simulate(
     instrument = scenario.instrument
     if isinstance(instrument, SimulatedSixDof):
         raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
-    if isinstance(instrument, LineLaser):
-        raise InputError("runs along lines and has no lengths; call simulate_axis_runs", file=scenario.source)
+    if isinstance(instrument, OwnPath):
+        raise InputError("brings its own path and has no lengths; call simulate_axis_runs", file=scenario.source)
     if isinstance(instrument, LaserTracer) and instrument.rate_hz is not None:
         raise InputError("reads while the machine moves; call simulate_moving", file=scenario.source)
     for effect in scenario.effects:
@@ -476,15 +484,17 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
 
 
 def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = None) -> SimulatedReadings:
-    """Measure a virtual machine with the scenario's laser along axes or diagonals; InputError for another instrument."""
+    """Measure with the scenario's laser along axes or diagonals, ballbar or touch probe; InputError for another one."""
     instrument = scenario.instrument
-    if not isinstance(instrument, LineLaser):
+    if not isinstance(instrument, OwnPath):
         raise InputError(
-            "is not a laser along axes or diagonals; call simulate", file=scenario.source, field="[instrument] type"
+            "is not a laser along axes or diagonals, ballbar or touch probe; call simulate",
+            file=scenario.source,
+            field="[instrument] type",
         )
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
 
-    def measure(truth: ErrorTable, rng: np.random.Generator) -> AxisRuns | Diagonals:
+    def measure(truth: ErrorTable, rng: np.random.Generator) -> AxisRuns | Diagonals | Circles | Artefact:
         def tips(stops: Stops) -> FloatArray:
             return actual_tips(machine, truth, stops, moving)
 
@@ -497,7 +507,7 @@ def _measured(
     machine: Machine,
     scenario: Scenario,
     seed: int | None,
-    measure: Callable[[ErrorTable, np.random.Generator], AxisRuns | Diagonals | SixDof],
+    measure: Callable[[ErrorTable, np.random.Generator], AxisRuns | Diagonals | Circles | Artefact | SixDof],
 ) -> SimulatedReadings:
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
@@ -521,6 +531,8 @@ def _described(machine: Machine, truth: ErrorTable, seed: int) -> ErrorTable:
 _FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
     Diagonals: (".diagonals.csv", format_diagonals),
     AxisRuns: (".axis.csv", format_axis_runs),
+    Circles: (".circle.csv", format_circles),
+    Artefact: (".artefact.csv", format_artefact),
     SixDof: (".sixdof.csv", format_sixdof),
     Lengths: (".lengths.csv", format_lengths),
 }

@@ -271,7 +271,9 @@ def _times(moves: FloatArray, trajectory: Trajectory) -> FloatArray:
 LEAD_IN = 0.05
 
 
-def _different(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ...]]:
+def different_numbers(check: Callable[[Any], float]) -> Callable[[Any], tuple[float, ...]]:
+    """A list of different numbers, each of which passes ``check``."""
+
     @toml_files.accepts({**toml_files.array_schema(toml_files.accepted(check), 1), "uniqueItems": True})
     def conditions(value: Any) -> tuple[float, ...]:
         items = tuple(toml_files.not_negative(item) for item in toml_files.numbers(value))
@@ -296,8 +298,8 @@ class Session:
     """
 
     repeats: int = setting(toml_files.whole(1, 1000), 1)
-    loads_kg: tuple[float, ...] = setting(_different(toml_files.not_negative), ())
-    feeds_mm_min: tuple[float, ...] = setting(_different(toml_files.positive), ())
+    loads_kg: tuple[float, ...] = setting(different_numbers(toml_files.not_negative), ())
+    feeds_mm_min: tuple[float, ...] = setting(different_numbers(toml_files.positive), ())
     shuffled: bool = setting(toml_files.word_for({"as-listed": False, "random": True}), False, key="order")
     jitter: float = setting(toml_files.share(0.5, "the line's length"), 0.0)
 
