@@ -120,7 +120,8 @@ _SAMPLE_LINES, _SAMPLE_CHARACTERS, _HEADER_LINES = 200, 20_000, 200
 _MEASURED_ROWS = 5_000
 #: A number in any notation, which is determined later.
 _NUMERAL = re.compile(r"[+\-\u2212]?(\d[\d.,' \u00a0\u202f]*)?[.,]?\d(e[+\-]?\d+)?", re.IGNORECASE)
-_SQUARENESS = re.compile(r"(?i)rechtwinkl|square|perpendic|equerr|ortogonal|\u5782\u76f4|E[ABC]0[YZ]")
+#: Words for squareness, and its names in ISO 230-1.
+SQUARENESS_WORDS = re.compile(r"(?i)rechtwinkl|square|perpendic|equerr|ortogonal|\u5782\u76f4|E[ABC]0[YZ]")
 _ALL_WORDS = frozenset(word for words in FIELDS.values() for word in words)
 #: Cells in a row of units that mean: no unit.
 _NO_UNIT = ("", "-", "\u2013", "--", "/", "1")
@@ -475,7 +476,9 @@ def holds_readings(grid: CellGrid) -> bool:
     labels = [next(iter(_filled(row)), "") for row in grid.rows]
     data = [k for k, count in enumerate(counts) if count >= 2 and statistic_in(labels[k]) is None]
     text = " ".join([*grid.notes, *(cell for row in grid.rows for cell in row)])
-    return (len(data) >= 2 and not _is_summary(grid, data[0])) or (any(counts) and _SQUARENESS.search(text) is not None)
+    return (len(data) >= 2 and not _is_summary(grid, data[0])) or (
+        any(counts) and SQUARENESS_WORDS.search(text) is not None
+    )
 
 
 def _is_summary(grid: CellGrid, first: int) -> bool:

@@ -52,7 +52,8 @@ def converted_parts(
     ``kinds`` are those of the native ones. Where all imported files of a kind say when they were measured, their times count
     from the earliest of them.
     """
-    found = [(Path(path).name, _measured(Path(path), kind, axis)) for path, kind in zip(paths, kinds, strict=True)]
+    read = [(Path(path).name, _measured(Path(path), kind, axis)) for path, kind in zip(paths, kinds, strict=True)]
+    found = [(name if k == 0 else f"{name} (errors)", data) for name, both in read for k, data in enumerate(both)]
     parts: list[tuple[str, Plain | ErrorTable]] = []
     for kind in dict.fromkeys(type(data) for _, data in found):
         own = [(name, data) for name, data in found if type(data) is kind]
@@ -100,13 +101,14 @@ def _described(table: CsvTable, name: str) -> str:
     return f"{known.min():.6g} to {known.max():.6g}" if known.size else "empty"
 
 
-def _measured(path: Path, kind: str | None, axis: str | None) -> Plain | ErrorTable:
+def _measured(path: Path, kind: str | None, axis: str | None) -> Sequence[Plain | ErrorTable]:
+    """Return what a file contains: one measurement, and the errors on other sheets of a workbook."""
     if kind in _NATIVE_READERS:
-        return _NATIVE_READERS[kind](path)
-    data = _settled(path, axis).data
-    if isinstance(data, Capture):
+        return [_NATIVE_READERS[kind](path)]
+    item = _settled(path, axis)
+    if isinstance(item.data, Capture):
         raise InputError("contains a capture over time, from which no errors are identified", file=path)
-    return data
+    return [item.data] if item.other_errors is None else [item.data, item.other_errors]
 
 
 def _settled(path: Path, axis: str | None = None) -> Imported:
@@ -119,7 +121,15 @@ def _settled(path: Path, axis: str | None = None) -> Imported:
 
 def converted_errors(source: Path, kind: str | None) -> ErrorTable:
     """Return the errors of a foreign file, or of axis runs, also native ones (``kind`` "axis"): their bidirectional means."""
-    data = read_axis_runs(source) if kind == "axis" else _settled(source).data
+    item = None if kind == "axis" else _settled(source)
+    if item is not None and item.other_errors is not None:
+        names = ", ".join(item.other_errors.names)
+        raise InputError(
+            f"contains runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file for each; or read "
+            "one of them, with --ignore SHEET for the other",
+            file=source,
+        )
+    data = read_axis_runs(source) if item is None else item.data
     if isinstance(data, AxisRuns):
         table, reversal, _ = positioning_errors(data, data.metadata)
         if reversal is not None:

@@ -19,11 +19,13 @@ from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, InputError
-from compgen.foreign.cells import chosen_sheet, grid_of_text, holds_readings, read_sheets
+from compgen.foreign.cells import CellGrid, chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
 from compgen.foreign.covariates import surroundings_of
+from compgen.foreign.error_tables import squareness_in
 from compgen.foreign.findings import (
     ABSURD_DECADES,
+    TABLE_SIGNS,
     USUAL_URAD,
     Imported,
     ImportOptions,
@@ -368,7 +370,11 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
             raise InputError("give linear= or angle= for this format", file=source, field=f"--unit {key}")
         if key not in ("value", "linear", "angle"):
             check_field(key, "--unit")
-    item = import_table(grid_of_text(read_source(source)), chosen) if form == "table" else READERS[form](source, chosen)
+    item = (
+        _of_grid(grid_of_text(read_source(source)), chosen, form) if form == "table" else READERS[form](source, chosen)
+    )
+    if chosen.sign not in (None, *TABLE_SIGNS) and "sign_of_squareness" not in str(item.understood):
+        raise InputError(f"{chosen.sign} applies to squareness, and there is none", file=source, field="--sign")
     if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
         check_largest(item.data.deviation_mm, item.data.origin)
     # refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant
@@ -391,12 +397,12 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
         raise InputError("no sheet is left to read", file=path, field="--ignore")
     one = chosen_sheet(path, sheets, options.sheet)
     if one is not None:
-        item = _of_sheet(import_table(one[1], options, "xlsx"), one[0])
+        item = _of_sheet(_of_grid(one[1], options, "xlsx"), one[0])
         return replace(item, notes=(*item.notes, *aside))
     read, reasons, open_sheets = [], [], []
     for name, grid in sheets:
         try:
-            read.append((name, _of_sheet(import_table(grid, options, "xlsx"), name)))
+            read.append((name, _of_sheet(_of_grid(grid, options, "xlsx"), name)))
         except CompgenError as error:
             reason = f"sheet skipped: {shown(name)}: {error}"
             if holds_readings(grid):
@@ -413,6 +419,18 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
         )
     item = merged_sheets(read)
     return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))
+
+
+def _of_grid(grid: CellGrid, options: ImportOptions, form: str) -> Imported:
+    """Import one table, or a list of squareness errors."""
+    plain = options if options.sign in TABLE_SIGNS else replace(options, sign=None)
+    try:
+        return import_table(grid, plain, form)
+    except InputError:
+        found = squareness_in(grid, options, form)
+        if found is None:
+            raise
+    return found
 
 
 def _of_sheet(item: Imported, name: str) -> Imported:

@@ -46,6 +46,8 @@ SUFFIXES = {
     "errors": ".errors.csv",
     "capture": ".capture.csv",
 }
+#: Answers to ``--sign`` for all tables; the others are for squareness.
+TABLE_SIGNS = ("error", "correction")
 Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
@@ -67,7 +69,8 @@ class ImportOptions:
     units : unit by field; the field "value" is for deviations, lengths and errors.
     axis : X, Y or Z, for files that measure along one axis and do not state it.
     error : name of the error (EYX, ECX, ...) in the file, for straightness and angles.
-    sign : "error" (measured minus commanded) or "correction" (what is to be added; the sign is reversed on import).
+    sign : "error" (measured minus commanded) or "correction" (what is to be added; the sign is reversed on import); of
+        squareness by pairs of axes "angle-above-90", "angle-below-90" or "rotation" (as EC0Y, EB0Z, EA0Z).
     directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
     sheet : name of the sheet of a workbook.
     decimal : decimal mark of a table, if its numbers do not show it.
@@ -97,9 +100,11 @@ class ImportOptions:
     error: str | None = option(
         None, "Name of the error in the file (EYX, ECX, ...), for straightness and angles.", metavar="NAME"
     )
-    sign: Literal["error", "correction"] | None = option(
+    sign: Literal["error", "correction", "angle-above-90", "angle-below-90", "rotation"] | None = option(
         None,
-        "error: measured minus commanded (default if the format defines it); correction: the sign is to be reversed.",
+        "error: measured minus commanded (default if the format defines it); correction: the sign is to be reversed. Of "
+        "squareness by pairs of axes, what a positive number means: angle-above-90, angle-below-90 (between the positive "
+        "axes), rotation (EC0Y, EB0Z, EA0Z of ISO 230-1).",
     )
     directions: Literal["labels", "motion", "alternate"] | None = option(
         None,
@@ -165,19 +170,11 @@ class Imported:
         return f"{self.path.stem}{SUFFIXES[self.kind]}"
 
     def check_settled(self) -> None:
-        """Raise InputError if something is in doubt, or the file holds two measurements."""
+        """Raise InputError if something is in doubt."""
         if self.doubts:
             raise InputError(
                 f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and accepts what is "
                 "missing; pass its result to this command",
-                file=self.path,
-            )
-
-        if self.other_errors is not None:
-            names = ", ".join(self.other_errors.names)
-            raise InputError(
-                f"contains runs of axes and errors as well ({names}): 'volcomp import --out DIR' writes a file for each; or read "
-                "one of them, with --ignore SHEET for the other",
                 file=self.path,
             )
 

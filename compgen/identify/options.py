@@ -419,6 +419,7 @@ class StatedNumbers:
                     for item in meant
                 ]
                 what = f"{name!r} is not a squareness error; {'this may be' if key in _ABOUT else 'these are'} {'; '.join(shown)}"
+                what += " (drawings: docs/instruments.md)"
                 raise InputError(what, field="--squareness")
             squareness[name] = _value(text, ANGLES, "--squareness", name)
         curves = {}

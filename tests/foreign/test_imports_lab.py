@@ -8,8 +8,8 @@ import pytest
 
 from compgen.data.axis_runs import read_axis_runs
 from compgen.data.lengths import Lengths
-from compgen.errors import InputError
-from compgen.foreign import ImportOptions, import_file, open_measurement
+from compgen.errors import CompgenWarning, InputError
+from compgen.foreign import ImportOptions, import_file, open_errors, open_measurement
 from compgen.foreign.column_names import run_columns, statistic_in, way
 
 #: One axis, worked by hand: deviations at three targets in two runs each way, um.
@@ -506,8 +506,14 @@ def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_ur
     found = {name: 1e6 * value for name, (value, _) in item.other_errors.squareness.items()}
     assert found == pytest.approx(expected_urad, abs=1e-6)
     assert set(item.files()) == {"lab.axis.csv", "lab.errors.csv"}
-    with pytest.raises(InputError, match="contains runs of axes and errors as well .E"):
-        open_measurement([path])
+    with pytest.warns(CompgenWarning, match="was read as"):
+        (_, runs), (name, errors) = open_measurement([path]).parts
+    assert (runs.axes, name) == ((0, 1), "lab.xlsx (errors)")
+    assert {name: 1e6 * value for name, (value, _) in errors.squareness.items()} == pytest.approx(
+        expected_urad, abs=1e-6
+    )
+    with pytest.warns(CompgenWarning), pytest.raises(InputError, match="contains runs of axes and errors as well .E"):
+        open_errors(path)
     alone = import_file(path, ImportOptions(ignore=["Squareness"]))
     assert alone.other_errors is None
     assert len(alone.data) == 24
