@@ -1023,6 +1023,7 @@ def test_a_file_cut_anywhere_is_refused(simple):
         "\0\n" * 1_000_000,
         "$AN_CEC[0,0] " + " " * 5_000_000 + "= x",
     ],
+    ids=["brackets", "digits", "names", "comments", "blank lines", "NUL", "blanks"],  # not these texts themselves
 )
 def test_huge_garbage_is_refused_within_a_second(simple, garbage):
     machine, control, own = simple()

@@ -294,7 +294,11 @@ def test_an_exported_list_that_is_cut_is_refused(make_errors):
             parsed(text[:end])
 
 
-@pytest.mark.parametrize("text", ["\xff" * 30_000_000, "1\n" * 20_000_000, "kw.ssfk.unit 1\n" * 1_000_000])
+@pytest.mark.parametrize(
+    "text",
+    ["\xff" * 30_000_000, "1\n" * 20_000_000, "kw.ssfk.unit 1\n" * 1_000_000],
+    ids=["one line", "numbers", "keys"],  # not these texts themselves
+)
 def test_huge_garbage_is_refused_within_a_second(text):
     start = time.perf_counter()
     with pytest.raises(InputError):
