@@ -22,11 +22,11 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.names import COVERAGE, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.names import COVERAGE, ERROR_INDEX, ERRORS, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.first_order import coefficients, factor, tool_of
 from compgen.kinematics.many_points import blocks, full_grid, volumetric_error
 
 # One figure of accuracy with its uncertainty, and how two of them compare.
@@ -455,11 +455,13 @@ class ErrorSource:
         def spread(weight: FloatArray) -> float:
             # derivative (k,) of sum(weight * E) over points by the values of the table; E = C P is linear in them
             used = np.any(weight != 0.0, axis=1)
-            position = position_mm[used]
-            through = np.einsum("nij,ni->nj", c_matrix(self.machine, position), weight[used])
+            position, given = position_mm[used], np.ascontiguousarray(weight[used].T)
+            through, tool = np.zeros((len(ERRORS), len(position))), tool_of(self.machine, None)
+            for part in coefficients(self.machine.chain, self.machine.squareness_reference):
+                through[ERROR_INDEX[part.error]] += part.sign * factor(part.lever, position, tool) * given[part.output]
             gradient = np.empty(len(self.errors.values()))
             for name, rows in self.errors.rows().items():
-                column = through[:, ERROR_INDEX[name]]
+                column = through[ERROR_INDEX[name]]
                 if name in SQUARENESS_NAMES:
                     gradient[rows] = column.sum()
                 else:

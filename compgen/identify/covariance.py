@@ -254,7 +254,8 @@ def error_design(
             design[:, :, columns] = column[:, :, None]
         else:
             basis = hat_matrix(covariance.position_mm[columns], position_mm[:, error_named(name).axis])
-            design[:, :, columns] = column[:, :, None] * basis[:, None, :]
+            for output in np.flatnonzero(column.any(axis=0)):
+                design[:, output, columns] = column[:, output, None] * basis
     return design
 
 
