@@ -53,7 +53,13 @@ class Row:
                 cwd=folder,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
-                env={**inherited, **self.extra, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+                env={
+                    **inherited,
+                    **self.extra,
+                    "OMP_NUM_THREADS": "1",
+                    "OPENBLAS_NUM_THREADS": "1",
+                    "XDG_CACHE_HOME": str(folder / "cache"),  # filled by the round that is not counted
+                },
             )
             _, status, usage = os.wait4(child.pid, 0)
             child.returncode = os.waitstatus_to_exitcode(status)

@@ -829,7 +829,8 @@ def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dic
     for name, rest in zip(names, solver.left_of(required), strict=True):
         if solver.offsets:
             rest = rest - np.average(rest, axis=0, weights=solver.weight)
-        largest = float(np.max(np.linalg.norm(rest, axis=1)))
+        x, y, z = rest.T
+        largest = float(np.sqrt(np.max(x * x + y * y + z * z)))
         if largest > NAMED_FROM_MM:
             found[name] = round(largest / MM_PER_UM, 3)
     return dict(sorted(found.items(), key=lambda item: -item[1]))

@@ -22,7 +22,7 @@ from compgen.accuracy import (
     volume_figures,
 )
 from compgen.accuracy.evaluate import diagonal_deviation, diagonal_points, squareness_figure, volume_fields
-from compgen.accuracy.field import grid_points
+from compgen.accuracy.field import ErrorField, grid_points, unknown_spread
 from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import read_machine
 from compgen.data.names import CURVE_NAMES, error_named
@@ -35,6 +35,36 @@ EXACT = 1e-9
 #: Deviations in um at 0, 100 ... 400 mm: mean + s (-1, -1, 0, 1, 1), so that means and estimators are whole numbers.
 GOLDEN_UP = [(2, 1), (6, 2), (0, 1), (-2, 2), (5, 3)]
 GOLDEN_DOWN = [(-1, 1), (2, 1), (-3, 2), (-6, 1), (2, 2)]
+
+
+def pairs_by_hand(tip, error):
+    """Largest difference of vectors and largest error of a distance, um, by trying every pair."""
+    every = []
+    for i, j in itertools.combinations(range(len(tip)), 2):
+        line, apart = tip[i] - tip[j], error[i] - error[j]
+        every.append((np.linalg.norm(apart), abs(np.linalg.norm(line + apart) - np.linalg.norm(line))))
+    return [1e3 * max(values) for values in zip(*every, strict=True)]
+
+
+@pytest.mark.parametrize("kind", ["random", "sheared", "turned", "measured twice", "ties", "one place", "none"])
+def test_the_largest_pairs_are_those_of_all_pairs(kind):
+    rng = np.random.default_rng(5)
+    tip, error = rng.uniform(-900.0, 0.0, (90, 3)), rng.normal(0.0, 0.01, (90, 3))
+    if kind == "sheared":
+        error += tip[:, [1]] * [3e-3, 0.0, 0.0]
+    elif kind == "turned":  # a rigid rotation to first order: no distance changes, but by its square
+        error = np.cross([1e-4, -2e-4, 5e-4], tip)
+    elif kind == "measured twice":
+        tip[45:] = tip[:45]
+    elif kind == "ties":
+        error = np.round(error, 2)
+    elif kind == "one place":
+        tip[:] = tip[0]
+    elif kind == "none":
+        error[:] = 0.0
+    figures = volume_figures(ErrorField(tip, tip, error, unknown_spread))
+    found = [figures["difference"].value, figures["length"].value]
+    assert found == pytest.approx(pairs_by_hand(tip, error), rel=1e-9, abs=1e-9)
 
 
 def golden_readings():

@@ -12,8 +12,9 @@ from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import Section
 from compgen.errors import ConvergenceError
 from compgen.kinematics import modelled_errors
-from compgen.kinematics.exact_chain import tip_position
+from compgen.kinematics.exact_chain import exact_error, tip_position
 from compgen.tables import projector, synthesize, wanted_correction
+from compgen.tables.synthesis import error_at
 
 PICOMETRE = 1e-9
 NANOMETRE = 1e-6
@@ -29,6 +30,37 @@ def random_positions(machine, count=200, seed=1):
 def terms_of(name, machine, errors):
     control = CONTROLLERS[name]
     return control(machine).basis(errors)
+
+
+def test_kept_results_are_those_of_the_same_numbers_and_no_others(small_machine, small_errors):
+    position = random_positions(small_machine)
+    curve = small_errors.curves["EAX"]
+    longer = replace(small_machine, tool_offset_mm=(1.0, 2.0, 3.0))
+    steeper = small_errors.replace(curves={**small_errors.curves, "EAX": replace(curve, value=1.5 * curve.value)})
+    shifted = small_errors.replace(
+        curves={**small_errors.curves, "EAX": replace(curve, position_mm=curve.position_mm + 5.0)}
+    )
+    leaning = small_errors.replace(squareness={**small_errors.squareness, "EC0Y": (1e-3, 0.0)})
+    other_chain = replace(small_machine, chain=Chain("WXYFZT"))
+    other_reference = replace(small_machine, squareness_reference="Y")
+    calls = [
+        *((small_machine, errors, position) for errors in (small_errors, steeper, shifted, leaning)),
+        *((machine, small_errors, position) for machine in (longer, other_chain, other_reference)),
+        (small_machine, small_errors, position + 1.0),
+        (small_machine, small_errors, position, np.array([0.0, 0.0, -50.0])),
+        (small_machine, small_errors, position, position),
+    ]
+    for _ in range(2):  # the second time they are known
+        for call in calls:
+            found = error_at(*call)
+            assert np.array_equal(found, exact_error(*call))
+            found[:] = np.nan  # a copy: nobody else sees this
+    equal = small_errors.replace(
+        curves={name: replace(item, value=item.value.copy()) for name, item in small_errors.curves.items()}
+    )
+    assert np.array_equal(
+        error_at(small_machine, equal, position.copy()), exact_error(small_machine, small_errors, position)
+    )
 
 
 # --- the wanted correction -------------------------------------------------------------------------------------------
