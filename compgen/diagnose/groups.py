@@ -150,9 +150,9 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
         for first in range(0, len(choices), TOGETHER):
             found = []
             for position in choices[first : first + TOGETHER]:
-                fixed = effect if position is None else effect.at(position)
-                columns = fixed.columns(readings)
-                if columns is not None and np.isfinite(columns).all() and np.any(columns):
+                fixed = (effect if position is None else effect.at(position)).shown(readings)
+                columns = None if fixed is None else fixed.columns(readings)
+                if fixed is not None and columns is not None and np.isfinite(columns).all() and np.any(columns):
                     found.append((position, fixed, columns))
             if not found:
                 continue

@@ -301,14 +301,20 @@ def _invisible(analysis: Analysis) -> tuple[str, ...]:
     of_base = {f"squareness_{name[1:]}" for name in SQUARENESS_NAMES if name in analysis.fit.basis.errors}
     hidden = [name for name, share in best.items() if share < INVISIBLE]
     readings = analysis.fit.readings
-    cards = {name: effect.card for name, effect in catalogue(readings.stations).items()}
+    effects = catalogue(readings.stations)
     lacking = []
-    for name in analysis.missing:  # effects that would have columns if more covariates had been logged or varied
+    for (
+        name
+    ) in analysis.missing:  # effects that would have columns at other positions, or if more had been logged or varied
+        every = [effects[name].at(position) for position in effects[name].positions(readings)] or [effects[name]]
+        if all(effect.shown(readings) is None for effect in every):
+            lacking.append(name)
+            continue
         if name.startswith("lever_"):
             if name.removeprefix("lever_") not in analysis.fit.basis.errors:
                 lacking.append(name)
             continue
-        for covariate in cards[name].covariates:
+        for covariate in effects[name].card.covariates:
             logged = readings.covariates.get(covariate)
             known = covariate in readings.covariates or covariate.startswith(("temp_", "feed", "load", "time"))
             constant = known and (logged is None or np.isnan(logged).any() or np.ptp(logged) == 0.0)

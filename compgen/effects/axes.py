@@ -5,7 +5,9 @@ The card of a class is a template: ``{A}`` and ``{a}`` are replaced by the axis 
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 
@@ -149,6 +151,11 @@ class LostMotion(SingleAxisEffect):
 LEADS_MM = (4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 12.5, 15.0, 16.0, 20.0, 24.0, 25.0, 30.0, 32.0, 40.0, 50.0)
 
 
+#: RMS below which readings do not show a wave of amplitude 1: positions vary by this much if they are 1 % of the pitch
+#: away from its multiples.
+LEAST_WAVE = 0.05
+
+
 class Periodic(SingleAxisEffect):
     """d_a = s1 sin w + c1 cos w + s2 sin 2w + c2 cos 2w with w = 2 pi p_a / pitch."""
 
@@ -171,6 +178,8 @@ class Periodic(SingleAxisEffect):
         settings=(Setting("pitch_mm", "pitch; default: screw_pitch_mm of the axis"),),
         scan="pitch_mm",
     )
+    #: 1 for each wave that counts, 0 for the others, (4,).
+    visible: FloatArray = np.ones(4)
 
     def pitch_mm(self, machine: Machine) -> float | None:
         """Pitch in mm: from the setting, else from the machine file; None if neither is known."""
@@ -193,8 +202,30 @@ class Periodic(SingleAxisEffect):
         if pitch_mm is None:
             return None
         angle = 2.0 * np.pi * readings.position_mm[:, self.axis] / pitch_mm
-        waves = [np.sin(angle), np.cos(angle), np.sin(2.0 * angle), np.cos(2.0 * angle)]
-        return along(self.axis, np.column_stack(waves))
+        waves = np.column_stack([np.sin(angle), np.cos(angle), np.sin(2.0 * angle), np.cos(2.0 * angle)])
+        return along(self.axis, waves * self.visible)
+
+    def shown(self, readings: Readings) -> Self | None:
+        """The effect without waves that at these positions are constant, or equal to sums of those before them.
+
+        At steps of the pitch, or of a simple fraction of it, they are so except for the rounding of the positions; the
+        smallest misfit would then be explained by an enormous amplitude.
+        """
+        moved = self.displacement(readings)
+        if moved is None:
+            return self
+        left = moved[:, self.axis] - moved[:, self.axis].mean(axis=0)
+        visible = np.zeros(left.shape[1])
+        for k in range(left.shape[1]):
+            size = float(np.sqrt(np.mean(left[:, k] ** 2)))
+            if size > LEAST_WAVE:
+                visible[k] = 1.0
+                left -= np.outer(left[:, k], left[:, k] @ left / (len(left) * size**2))
+        if not visible.any():
+            return None
+        chosen = copy.copy(self)
+        chosen.visible = visible
+        return chosen
 
 
 # Servo lag: the axis follows its command with a time delay, so its error grows with velocity.

@@ -114,6 +114,10 @@ class Effect(ABC):
     def columns(self, readings: Readings) -> FloatArray | None:
         """Change of every reading in mm per SI unit of every parameter, (n, k); None if a covariate is missing."""
 
+    def shown(self, readings: Readings) -> Self | None:
+        """Return the effect with only what the positions of the readings can show; None if they show nothing of it."""
+        return self
+
     def positions(self, readings: Readings) -> Sequence[float]:
         """Scan positions (e.g. times of a step) to be tried; empty if there is nothing to scan."""
         return () if self.card.scan in self.settings else self.candidates(readings)

@@ -9,6 +9,7 @@ import pytest
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
+from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import load_machine, read_machine
 from compgen.diagnose import DiagnoseOptions, diagnose
@@ -388,3 +389,20 @@ def test_what_is_left_of_a_runout_of_another_law_is_its_inexact_shape(gantry):
     assert _owner(analysis, 1, [0]) == 0
     assert _owner(analysis, 2, [0]) is None
     assert _owner(analysis, 1, [0], 400.0) is None
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_at_steps_of_the_pitch_no_periodic_error_is_named_and_the_diagnosis_says_so(gantry, step):
+    """Every level has its own deviation; waves of the rounded positions would fit them, with amplitudes of metres."""
+    pitch_mm = 25.4 / 3
+    machine = replace(gantry, axes=(replace(gantry.axes[0], screw_pitch_mm=pitch_mm), *gantry.axes[1:]))
+    rng = np.random.default_rng(3)
+    levels = np.round(step * pitch_mm * np.arange(-88 // step, 0, 8), 3)
+    grid = np.array([[x, y, z] for x in levels for y in (-900.0, -500.0, -100.0) for z in (-300.0, -50.0)])
+    own_mm = 1.5 * MICROMETRE * rng.normal(size=len(levels))
+    deviation_mm = np.vstack([0.3 * MICROMETRE * rng.normal(size=grid.shape) for _ in range(2)])
+    deviation_mm[:, 0] += np.tile(np.repeat(own_mm, 6), 2)
+    measured = Deviations(np.vstack([grid, grid]), deviation_mm, labels={"repeat": np.repeat([1, 2], len(grid))})
+    found = diagnose(machine, measured, DiagnoseOptions(effects=("periodic_X",))).to_dict()
+    assert not found["effects"] and "periodic_X" in found["invisible"]
+    assert any(text.startswith("steps that are not a multiple of the pitch") for text in found["advice"])

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from compgen.data import toml_files
+from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Chain, load_machine
-from compgen.effects import FAMILIES, DisplacementEffect, catalogue, listed, readings_of_lengths
+from compgen.effects import FAMILIES, DisplacementEffect, catalogue, listed, readings_of_deviations, readings_of_lengths
 from compgen.effects.readings import step_times_s, velocity_mm_s
 from compgen.kinematics.exact_chain import tip_position
 from compgen.simulate.effects import LengthEffect, Sights, read_effects
@@ -192,6 +193,34 @@ def test_periodic_errors_are_looked_for_at_usual_leads_where_the_machine_names_n
     axes = (replace(machine.axes[0], screw_pitch_mm=12.0), *machine.axes[1:])
     known = replace(readings, machine=replace(machine, axes=axes))
     assert not list(effect.positions(known)) and effect.used(known) == {"pitch_mm": 12.0}
+
+
+@pytest.mark.parametrize(
+    ("step", "shown"),
+    [
+        (1, ()),
+        (2, ()),
+        (1 / 2, ("c1",)),
+        (1 / 3, ("s1", "c1")),
+        (1 / 4, ("s1", "c1", "c2")),
+        (0.37, ("s1", "c1", "s2", "c2")),
+    ],
+)
+def test_periodic_errors_keep_only_the_waves_that_the_positions_show(machine, step, shown):
+    """At n / 2 the sines are 0 and cos 2w is 1; at n / 3 sin 2w = -sin w, cos 2w = cos w; at n / 4 sin 2w is 0."""
+    axes = (replace(machine.axes[0], screw_pitch_mm=25.4 / 3), *machine.axes[1:])
+    position_mm = np.zeros((40, 3))
+    position_mm[:, 0] = np.round(25.4 / 3 * step * np.arange(-40, 0), 3)  # as in a file
+    deviations = Deviations(position_mm, np.zeros((40, 3)))
+    readings = readings_of_deviations(replace(machine, axes=axes), deviations)
+    effect = catalogue()["periodic_X"]
+    found = effect.shown(readings)
+    if not shown:
+        assert found is None
+        return
+    own = np.any(found.columns(readings), axis=0)
+    assert [p.name for p, seen in zip(effect.card.parameters, own, strict=True) if seen] == [f"{w}_um" for w in shown]
+    assert np.array_equal(found.columns(readings)[:, own], effect.columns(readings)[:, own])
 
 
 def test_warm_up_is_an_exponential_in_measuring_order():
