@@ -273,7 +273,7 @@ def main() -> None:
     long as the process: to search them for garbage while they are loaded, and all objects once more when the process
     ends, would take a tenth of the time of a short command.
     """
-    gc.set_threshold(50_000, 20, 20)
+    gc.set_threshold(200_000, 20, 20)
     atexit.register(gc.freeze)
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

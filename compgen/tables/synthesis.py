@@ -65,8 +65,8 @@ class _Call:
         digest = hashlib.blake2b(repr((model, sizes, dict(errors.squareness), position_mm.shape)).encode())
         for curve in errors.curves.values():
             for part in (curve.position_mm, curve.value, curve.u):
-                digest.update(part.astype(np.float64).tobytes())
-        digest.update(position_mm.astype(np.float64).tobytes())
+                digest.update(np.asarray(part, dtype=np.float64).tobytes())
+        digest.update(np.asarray(position_mm, dtype=np.float64).tobytes())
         digest.update(pickle.dumps(more))
         return cls(digest.digest(), machine, errors, position_mm, more)
 
