@@ -244,11 +244,8 @@ def weights(fixed: FixedCurve, unit: float) -> tuple[FloatArray, float | None]:
 
 
 def _least(u: FloatArray) -> float:
-    ordered = np.sort(u[u > 0])
-    last = len(ordered) - 1
-    # np.median would load the masked arrays of numpy
-    middle = 0.5 * float(ordered[last // 2] + ordered[(last + 1) // 2]) if len(ordered) else 0.0
-    return max(_LEAST, _LEAST_FRACTION * middle)
+    positive = u[u > 0]
+    return max(_LEAST, _LEAST_FRACTION * float(np.median(positive))) if positive.size else _LEAST
 
 
 def prepare(name: str, fixed: FixedCurve, options: FitOptions, trust: FloatArray | None = None) -> Prepared:

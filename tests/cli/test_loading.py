@@ -190,7 +190,7 @@ def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_pa
     rooms = {name.partition(".")[0] for name in modules}
     assert not rooms & {"simulate", "plan", "diagnose", "fleet", "accuracy", "plugins"}
     assert not {name for name in modules if name.startswith("scipy.")} - {"scipy.linalg._flapack"}
-    assert not modules & {"importlib.metadata", "numpy.ma"}  # slow to load, for a version and a median
+    assert "importlib.metadata" not in modules
     assert not modules & {
         "effects.catalogue",
         "foreign.detect",
