@@ -29,6 +29,7 @@ from compgen.foreign.column_names import (
     is_index,
     is_known_name,
     known_unit,
+    motion_in,
     names_run,
     run_in,
     split_name,
@@ -383,7 +384,7 @@ def _joined_names(grid: CellGrid, k: int) -> tuple[int, list[str]]:
             break  # the names give the run of a column
         over, last = grid.rows[top - 1], ""
         group = _filled(over[1:])  # runs, directions or deviations, which several columns have in common
-        if not group or _has_number(over[:1]) or not all(is_known_name(cell) for cell in group):
+        if not group or _has_number(over[:1]) or not all(is_known_name(cell) or motion_in(cell) for cell in group):
             break
         top -= 1
         for n in range(1, max(len(names), len(over))):

@@ -457,9 +457,10 @@ def split_name(name: str) -> NamedColumn:
     """
     if name.lower().endswith("_mm_min"):
         return NamedColumn(name, _word(name[: -len("_mm_min")]), "mm/min")
-    bracket = _BRACKETS.search(name)
-    unit = bracket and (known_unit(bracket.group(1)) or covariate_unit(bracket.group(1)))
-    if bracket and unit:
+    for bracket in _BRACKETS.finditer(name):  # the first one with a unit: U (k=2) [um]
+        unit = known_unit(bracket.group(1)) or covariate_unit(bracket.group(1))
+        if unit is None:
+            continue
         return NamedColumn(name, _word(f"{name[: bracket.start()]} {name[bracket.end() :]}"), unit)
     suffix = _SUFFIX.match(name.strip())
     if suffix:
@@ -521,7 +522,13 @@ def is_index(name: str) -> bool:
 
 def check_field(key: str, option: str) -> None:
     """Raise InputError for a name that is not a field of a table."""
-    if key not in FIELDS and key != "temperature" and not CHANNEL.fullmatch(key) and not RUN_FIELD.fullmatch(key):
+    if (
+        key not in FIELDS
+        and key not in ERROR_NAMES
+        and key != "temperature"
+        and not CHANNEL.fullmatch(key)
+        and not RUN_FIELD.fullmatch(key)
+    ):
         known = [*FIELDS, "temperature", "temp_NAME", "run1+", "run1-"]
         raise InputError(f"{key!r} is not a field; {nearest(key, known)}", field=option)
 
@@ -530,3 +537,92 @@ def error_columns(header: Sequence[str]) -> dict[str, NamedColumn]:
     """Return the columns named like the errors of ISO 230-1."""
     columns = [split_name(name) for name in header]
     return {column.word.upper(): column for column in columns if column.word.upper() in ERROR_NAMES}
+
+
+# Names of error motions in words: straightness, pitch, yaw, roll.
+
+
+_ENDING = r"(?:en|ing|winkel|bewegung|fehler|abweichung|error|angle)?(?![a-z])"
+#: Parts of words without accents, in English, German, French, Italian and Spanish.
+_MOTIONS = {
+    "straightness": re.compile(r"straight[a-z]*|gerad[a-z]*|rectitud[a-z]*|rettiline[a-z]*"),
+    "pitch": re.compile(rf"(?<![a-z])(?:pitch|nick|tangage|beccheggio|cabeceo){_ENDING}"),
+    "yaw": re.compile(rf"(?<![a-z])(?:yaw|gier|lacet|imbardata|guinada){_ENDING}"),
+    "roll": re.compile(rf"(?<![a-z])(?:roll|wank|roulis|rollio|alabeo){_ENDING}"),
+    "error": re.compile(r"(?<![a-z])e_?([xyzabc])_?([xyz])(?![a-z0-9])"),
+}
+_SIDES = {"H": re.compile(r"horiz[a-z]*|waag[a-z]*|orizz[a-z]*"), "V": re.compile(r"verti[a-z]*|senkr[a-z]*")}
+_LETTER = re.compile(r"(?<![a-z])([xyz])(?![a-z0-9])")
+#: Words of such names that say nothing more.
+_BESIDE_AXIS = re.compile(r"-?(?<![a-z])(?:axis|achse|axe|asse|eje|von|along|angle|winkel|level|libelle)(?![a-z/])")
+#: Errors by words where Z is vertical; H and V are straightness, horizontal and vertical.
+_BY_WORDS = {
+    "X": {"pitch": "EBX", "yaw": "ECX", "roll": "EAX", "H": "EYX", "V": "EZX"},
+    "Y": {"pitch": "EAY", "yaw": "ECY", "roll": "EBY", "H": "EXY", "V": "EZY"},
+    "Z": {"roll": "ECZ"},
+}
+
+
+@dataclass(frozen=True)
+class MotionColumn:
+    """A column of one error motion: its run, the motion in words or as in ISO 230-1, and letters X, Y, Z, H, V of its name."""
+
+    run: RunColumn
+    motion: str
+    letters: frozenset[str] = frozenset()
+
+    @property
+    def exact(self) -> bool:
+        """Whether it is named as in ISO 230-1, which states the sign."""
+        return self.motion in ERROR_NAMES
+
+    def error(self, axis: str) -> str | None:
+        """Return the name of the error of an axis, with Z vertical; None if the words do not say which one it is."""
+        across = self.letters - {axis}
+        if self.exact:
+            return self.motion
+        if self.motion != "straightness":
+            return None if across else _BY_WORDS[axis].get(self.motion)
+        if len(across) != 1:
+            return None
+        (side,) = across
+        return _BY_WORDS[axis].get(side) if side in _SIDES else f"E{side}{axis}"
+
+
+def motions_in(name: str) -> list[str]:
+    """Return the error motions that a name mentions, whatever else it says."""
+    flat = unaccented(name)
+    return [motion for motion, pattern in _MOTIONS.items() if pattern.search(flat)]
+
+
+def motion_in(name: str) -> MotionColumn | None:
+    """Return the error motion of a column, None if a word of its name is not understood.
+
+    >>> motion_in("Geradheit Y vor [\u00b5m]").error("X"), motion_in("Pitch run 2 - [arcsec]").run.number, motion_in("pitch mean")
+    ('EYX', 2, None)
+    """
+    unit, suffix = split_name(name).unit, _SUFFIX.match(name.strip())
+    within = [bracket for bracket in _BRACKETS.finditer(name) if known_unit(bracket.group(1))]
+    text = name
+    if unit and within:
+        text = f"{name[: within[0].start()]} {name[within[0].end() :]}"
+    elif unit and suffix:
+        text = suffix.group(1)
+    flat = unaccented(text)
+    flat = flat if _MOTIONS["error"].search(flat) else flat.replace("_", " ")
+    motions = motions_in(flat)
+    if len(motions) != 1:
+        return None
+    # a dash between words is no direction
+    rest = _BESIDE_AXIS.sub(" ", _MOTIONS[motions[0]].sub(" ", re.sub(r"(?<=\w)\s+-\s+(?=[a-z])", " ", flat)))
+    letters = [letter.upper() for letter in _LETTER.findall(rest)]
+    rest = _LETTER.sub(" ", rest)
+    for side, pattern in _SIDES.items():
+        letters += [side] if pattern.search(rest) else []
+        rest = pattern.sub(" ", rest)
+    words = _read(rest)
+    if words.unknown or words.statistics or len(words.numbers) > 1 or len(words.ways) > 1:
+        return None
+    run = RunColumn(name, next(iter(words.numbers), 0), next(iter(words.ways), 0))
+    exact = _MOTIONS["error"].search(flat)
+    return MotionColumn(run, f"E{exact[1]}{exact[2]}".upper() if exact else motions[0], frozenset(letters))

@@ -42,7 +42,7 @@ def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> 
         findings.used.add(column.name)
         values = np.array(findings.table.numbers(column.name, empty=True))
         known = np.flatnonzero(np.isfinite(values[order]))
-        si = _si(findings, name, column, values[order][known], float(np.ptp(position)))
+        si = si_values(findings, name, column, values[order][known], float(np.ptp(position)))
         if name in SQUARENESS_NAMES:
             if np.ptp(si) > 0:
                 raise findings.table.grid.fail(f"{name} is a single number, but there are several", None, column.name)
@@ -70,7 +70,9 @@ def long_errors(findings: TableFindings) -> ErrorTable:
     u_column = findings.fields.get("u_value")
     for name in dict.fromkeys(names):
         rows = np.flatnonzero(np.array(names) == name)
-        si = _si(findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0)
+        si = si_values(
+            findings, name, findings.fields["value"], values[rows], float(np.ptp(span)) if span.size else 0.0
+        )
         u_si = np.full(len(rows), np.nan)
         if u_column is not None:  # in its unit, otherwise in that of the values
             u = np.array(table.numbers(u_column.name, empty=True))[rows]
@@ -94,7 +96,9 @@ def long_errors(findings: TableFindings) -> ErrorTable:
     return _finished(findings, curves, squareness)
 
 
-def _si(findings: TableFindings, name: str, column: NamedColumn, values: np.ndarray, span_mm: float) -> np.ndarray:
+def si_values(
+    findings: TableFindings, name: str, column: NamedColumn, values: np.ndarray, span_mm: float
+) -> np.ndarray:
     """Values of one error in mm or rad; an angle unit such as um/m is allowed for squareness only."""
     if not len(values):
         raise findings.table.grid.fail("contains no value", findings.table.header_line, column.name)

@@ -83,7 +83,7 @@ class ImportOptions:
     columns: Mapping[str, str] = option(
         factory=dict,
         text="FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, "
-        "point; dx, dy, dz, xa, ya, za; error, value; temperature, temp_NAME, time, date, feed, load, tool_x, "
+        "point; dx, dy, dz, xa, ya, za; error, value, EBX (an error); temperature, temp_NAME, time, date, feed, load, tool_x, "
         "approach_x, repeat, line, block, setup, pose, u_value; run1+, run1-, run2 (a column of one run). May be given "
         "several times.",
         name="--map",

@@ -19,18 +19,22 @@ from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Lengths
 from compgen.data.messages import doubled
-from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM
 from compgen.data.records import LARGEST_DEVIATION_UM
 from compgen.errors import InputError
 from compgen.foreign.cells import CellGrid, find_table
 from compgen.foreign.column_names import (
     FIELDS,
     MM_PER_LENGTH,
+    RAD_PER_ANGLE,
     RUN_FIELD,
+    MotionColumn,
     RunColumn,
     error_columns,
     fields_of,
     is_deviation,
+    motion_in,
+    motions_in,
     run_columns,
     run_in,
     split_name,
@@ -38,7 +42,7 @@ from compgen.foreign.column_names import (
     unaccented,
 )
 from compgen.foreign.covariates import RowData, directions_of, labels_of, metadata_of, row_data_of
-from compgen.foreign.error_tables import long_errors, wide_errors
+from compgen.foreign.error_tables import long_errors, si_values, wide_errors
 from compgen.foreign.findings import (
     USUAL_URAD,
     Data,
@@ -288,7 +292,7 @@ def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
     taken = {*findings.used, *(column.name for column in findings.fields.values()), *findings.options.ignore}
     for name in findings.table.header:
         found = statistic_in(name)
-        if name in taken or found is None:
+        if name in taken or found is None or motions_in(name) != motions_in(columns[0].name):
             continue
         kind, way_of = found
         findings.used.add(name)
@@ -497,6 +501,92 @@ def _contradicted(target: FloatArray, run: IntArray, label: IntArray) -> bool:
             if len(steps):
                 ways[sign].add(int(np.sign(steps[0])) if np.all(np.sign(steps) == np.sign(steps[0])) else 0)
     return ways[1] == {-1} and ways[-1] == {1}
+
+
+# Tables of error motions in words: straightness, pitch, yaw and roll of one axis, with a column for each, or for each run.
+
+
+#: What the answers to ``--sign`` mean for errors that are named in words.
+_MEANING = (
+    "--sign error: positive straightness is towards +X, +Y, +Z, and positive angles are right-handed about +X, +Y, +Z, both of "
+    "the tool relative to the workpiece; --sign correction: all have the opposite sign; if they differ, import the columns one "
+    "after the other, with --ignore for the others (docs/instruments.md, Level, Straightness)"
+)
+
+
+def motion_columns(findings: TableFindings) -> list[MotionColumn]:
+    """Return the columns of error motions, if one is named in words, or has a run or a direction; otherwise none."""
+    given = {name: column.name for name, column in findings.fields.items() if name in CURVE_NAMES}
+    taken = {*(column.name for column in findings.fields.values()), *findings.options.ignore}
+    found = [motion for name in findings.table.header if name not in taken and (motion := motion_in(name))]
+    exact = error_columns(findings.table.header)
+    if not given and all(motion.run.name in [column.name for column in exact.values()] for motion in found):
+        return []
+    return [*(MotionColumn(RunColumn(column, 0, 0), name, frozenset()) for name, column in given.items()), *found]
+
+
+def error_motions(findings: TableFindings, columns: Sequence[MotionColumn]) -> tuple[ErrorTable, ReversalCurves | None]:
+    """Return the errors of one axis, as the means of both directions over all runs, and the reversals of straightness.
+
+    A name in words does not state the sign: the user gives it. The uncertainty is that of the mean, from the scatter.
+    """
+    letters = {column.motion[2] for column in columns if column.exact}
+    if len(letters) != 1 or findings.options.axis:
+        letters = set(_axes(findings, np.arange(len(findings.table.rows), dtype=np.int64)))
+    if len(letters) > 1:
+        raise findings.table.grid.fail("errors of several axes share the columns; give one table for each axis")
+    letter = letters.pop() or "X"
+    found: dict[str, list[RunColumn]] = {}
+    read = []
+    for column in columns:
+        name = column.error(letter)
+        if name is None or not name.endswith(letter):
+            raise findings.table.grid.fail(
+                f"which error of {letter} this is remains open; name it by --map E..{letter}=COLUMN (EB{letter}: rotation about "
+                f"Y, EY{letter}: straightness in Y), or exclude it: --ignore {shown(column.run.name)}",
+                findings.table.header_line,
+                column.run.name,
+            )
+        found.setdefault(name, []).append(column.run)
+        read += [] if column.exact or findings.options.sign else [f"{shown(column.run.name)} is {name}"]
+    if "deviation" in findings.fields:
+        found[f"E{letter}{letter}"] = [RunColumn(findings.fields["deviation"].name, 0, 0)]
+    if read:
+        findings.doubts.append(
+            f"{', '.join(read)} (Z vertical; otherwise --map), but their sign is not stated; give {_MEANING}"
+        )
+    findings.used |= {findings.fields[key].name for key in ("axis", "direction", "run") if key in findings.fields}
+    results = [_over_position(findings, name, runs) for name, runs in found.items()]
+    metadata = metadata_of(findings, row_data_of(findings, "errors"))
+    curves = {name: curve for table, _ in results for name, curve in table.curves.items()}
+    reversals = {key: curve for _, item in results if item is not None for key, curve in item.curves.items()}
+    if reversals:
+        findings.notes.append(
+            "both directions differ: the mean is used, and import writes the reversal to a separate file"
+        )
+    findings.understood |= {"errors": list(curves), "sign": findings.options.sign or "errors"}
+    return ErrorTable(curves, {}, metadata), ReversalCurves(reversals, metadata) if reversals else None
+
+
+def _over_position(
+    findings: TableFindings, name: str, columns: Sequence[RunColumn]
+) -> tuple[ErrorTable, ReversalCurves | None]:
+    """Return one error over the positions from all of its columns, and its reversal."""
+    rows = _wide(findings, columns)
+    unit, kind = split_name(rows.name).unit, "angle" if name[1] in "ABC" else "length"
+    if unit is not None and unit not in (RAD_PER_ANGLE if kind == "angle" else MM_PER_LENGTH):
+        text = f"is in {unit}, and {name} expected a unit of {kind}"
+        raise findings.table.grid.fail(text, findings.table.header_line, rows.name)
+    target = findings.positions_mm("position", findings.numbers("position"))[rows.row]
+    value = si_values(findings, name, split_name(rows.name), rows.value, float(np.ptp(target)))
+    one_way = rows.run
+    if "run" in findings.fields and not one_way.any():
+        one_way = _runs_in_cells(findings)[0][rows.row]
+    direction, run = _directions(findings, target, one_way, rows.label, value)
+    line = np.array(findings.table.lines, dtype=np.int64)[rows.row]
+    runs = OneAxis(target, direction, run, -value if findings.options.sign == "correction" else value, line)
+    findings.notes += remarks(runs, name[2], angular=name[1] in "ABC")
+    return errors_of(runs, name, {})
 
 
 # Tables of tracer lengths, and of measured positions, in space.
@@ -715,6 +805,8 @@ def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") ->
         data = lengths_of(findings)
     elif kind == "deviations":
         data = deviations_of(findings)
+    elif kind == "errors" and options.error is None and (motions := motion_columns(findings)):
+        data, reversal = error_motions(findings, motions)
     elif kind == "errors" and options.error is None:
         columns = error_columns(table.header)
         if not columns:
@@ -765,6 +857,8 @@ def _kind(findings: TableFindings) -> Kind:
     if space and not {"dx", "dy", "dz", "xa", "ya", "za"}.isdisjoint(fields):
         return "deviations"
     if "position" in fields and (error_columns(findings.table.header) or {"error", "value"} <= set(fields)):
+        return "errors"
+    if "position" in fields and findings.options.error is None and motion_columns(findings):
         return "errors"
     if "position" in fields:
         return "axis"
@@ -865,8 +959,21 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     understood = {f"sheet {name}": dict(item.understood) for name, item in parts}
     notes = tuple(dict.fromkeys(text for _, item in parts for text in item.notes))
     kind: Kind = "errors" if kinds == {"errors"} else "axis"
+    reversals = {key: curve for _, item in parts if item.reversal for key, curve in item.reversal.curves.items()}
+    reversal = (
+        ReversalCurves(reversals, next(item.reversal.metadata for _, item in parts if item.reversal))
+        if reversals
+        else None
+    )
     return replace(
-        first, kind=kind, data=data, understood=understood, doubts=tuple(doubts), notes=notes, other_errors=other_errors
+        first,
+        kind=kind,
+        data=data,
+        understood=understood,
+        doubts=tuple(doubts),
+        notes=notes,
+        other_errors=other_errors,
+        reversal=reversal,
     )
 
 

@@ -181,3 +181,144 @@ def test_an_open_sign_on_one_sheet_stops_the_whole_workbook(call, tmp_path, list
     code, _, err = call("import", path, "--sign", "angle-below-90", "--out", tmp_path / "o")
     assert code == 0, err
     assert read_errors(tmp_path / "o" / "lab.errors.csv").squareness["EC0Y"][0] == pytest.approx(-25e-6)
+
+
+#: Straightness and angles of X, worked by hand: targets, and for each error the two runs forth and back.
+ENGLISH = """\
+Axis;X
+Position [mm];Straightness Y fwd 1 [um];Straightness Y bwd 1 [um];Straightness Y fwd 2 [um];\
+Straightness Y bwd 2 [um];Pitch [arcsec];Yaw (arcsec);Roll [um/m]
+0;0;3;0,4;3,4;0;0;0
+200;2;5;2,4;5,4;1;-2;5
+400;1;4;1,4;4,4;2;-3;4
+"""
+GERMAN = """\
+X-Achse
+Position [mm];Geradheit Y vor 1 [µm];Geradheit Y zurück 1 [µm];Geradheit Y vor 2 [µm];Geradheit Y zurück 2 [µm];Nicken [arcsec];\
+Gieren [arcsec];Rollen [µm/m]
+0;0;3;0,4;3,4;0;0;0
+200;2;5;2,4;5,4;1;-2;5
+400;1;4;1,4;4,4;2;-3;4
+"""
+#: Mean over both directions and runs, um and urad.
+MEANS = {
+    "EYX": (1.7, 3.7, 2.7),
+    "EBX": (0, ARCSEC_URAD, 2 * ARCSEC_URAD),
+    "ECX": (0, -2 * ARCSEC_URAD, -3 * ARCSEC_URAD),
+    "EAX": (0, 5, 4),
+}
+
+
+@pytest.mark.parametrize("text", [ENGLISH, GERMAN])
+def test_straightness_pitch_yaw_and_roll_of_an_axis_in_one_table(tmp_path, text):
+    path = written(tmp_path, text)
+    (doubt,) = import_file(path).doubts
+    for words in (
+        "is EYX",
+        "is EBX",
+        "is ECX",
+        "is EAX",
+        "--sign error",
+        "right-handed",
+        "docs/instruments.md",
+        "--map",
+    ):
+        assert words in doubt
+    for sign, factor in (("error", 1.0), ("correction", -1.0)):
+        item = import_file(path, ImportOptions(sign=sign))
+        assert item.doubts == ()
+        curves = item.data.curves
+        assert set(curves) == set(MEANS)
+        for name, values in MEANS.items():
+            scale = 1e-3 if name == "EYX" else 1e-6
+            assert curves[name].position_mm.tolist() == [0, 200, 400]
+            assert curves[name].value == pytest.approx([factor * scale * v for v in values], abs=1e-15)
+        # runs 0.4 apart: variance 0.08 um^2 in each of 6 cells; mean of two cells of two runs: sqrt(0.08 / 4)
+        assert curves["EYX"].u == pytest.approx([1e-3 * np.sqrt(0.02)] * 3)
+        assert np.isnan(curves["EBX"].u).all()
+        # backwards 3 um more than forth
+        assert item.reversal.curves[0, 1].value == pytest.approx([-3e-3 * factor] * 3)
+
+
+def test_rows_of_runs_with_directions_are_averaged(tmp_path):
+    rows = [
+        f"{x};{way};{pitch}" for way, add in (("+", 0), ("-", 4)) for x in (0, 100, 200) for pitch in (x / 100 + add,)
+    ]
+    path = written(tmp_path, "Y axis\nPosition [mm];Direction;Pitch [urad]\n" + "\n".join(rows) + "\n")
+    curve = import_file(path, ImportOptions(sign="error")).data.curves["EAY"]
+    assert curve.value == pytest.approx([2e-6, 3e-6, 4e-6])
+
+
+@pytest.mark.parametrize(
+    ("axis", "heading", "error"),
+    [
+        # Z vertical: pitch turns about the horizontal axis across the travel, yaw about the vertical, roll about the travel
+        ("X", "Pitch [urad]", "EBX"),
+        ("X", "Gieren [urad]", "ECX"),
+        ("X", "Rollwinkel [urad]", "EAX"),
+        ("Y", "Nickwinkel [urad]", "EAY"),
+        ("Y", "Yaw [urad]", "ECY"),
+        ("Y", "Roll [urad]", "EBY"),
+        ("Z", "Roll [urad]", "ECZ"),
+        ("X", "Geradheit vertikal [um]", "EZX"),
+        ("Y", "Straightness horizontal [um]", "EXY"),
+        ("Z", "Straightness X [um]", "EXZ"),
+        ("Y", "Geradheitsabweichung Z [um]", "EZY"),
+    ],
+)
+def test_words_and_the_axis_name_the_error(tmp_path, axis, heading, error):
+    path = written(tmp_path, f"Achse: {axis}\nPosition [mm];{heading}\n0;0\n100;2\n200;3\n")
+    assert f"is {error}" in import_file(path).doubts[0]
+    assert set(import_file(path, ImportOptions(sign="error")).data.curves) == {error}
+
+
+@pytest.mark.parametrize(
+    "heading", ["Pitch [urad]", "Yaw [urad]", "Straightness vertical [um]", "Straightness Z [um]", "Straightness [um]"]
+)
+def test_what_the_words_do_not_say_is_named_by_the_user(call, tmp_path, listing, heading):
+    path = written(tmp_path, f"Axis: Z\nPosition [mm];{heading}\n0;0\n100;2\n200;3\n")
+    before = listing(tmp_path)
+    code, _, err = call("import", path, "--sign", "error", "--out", tmp_path / "o")
+    assert code == 2
+    assert "sheet.csv:2" in err
+    assert "which error of Z this is remains open; name it by --map" in err
+    assert listing(tmp_path) == before
+    error = "EBZ" if "urad" in heading else "EXZ"
+    curves = import_file(path, ImportOptions(columns={error: heading})).data.curves
+    assert {name: curve.value[1] for name, curve in curves.items()} == pytest.approx(
+        {error: 2e-6 if "urad" in heading else 2e-3}
+    )
+
+
+def test_what_stands_beside_the_errors_is_never_left_out(tmp_path):
+    path = written(
+        tmp_path, "X axis\nPosition [mm];Pitch [urad];Yaw [urad];Pitch mean [urad];Nonsense\n0;0;1;0;1\n100;2;1;2;5\n"
+    )
+    (doubt,) = import_file(path, ImportOptions(sign="error")).doubts
+    assert "'Nonsense'" in doubt
+    item = import_file(path, ImportOptions(sign="error", ignore=["Nonsense"]))
+    assert (item.doubts, set(item.data.curves)) == ((), {"EBX", "ECX"})
+    assert any("'Pitch mean [urad]' is a statistic" in note for note in item.notes)
+    path.write_text(path.read_text().replace("100;2;1;2;5", "100;2;1;9;5"))
+    assert "states 9" in " ".join(import_file(path, ImportOptions(sign="error", ignore=["Nonsense"])).doubts)
+
+
+def test_a_unit_of_length_is_no_angle(tmp_path):
+    path = written(tmp_path, "X axis\nPosition [mm];Pitch [um]\n0;0\n100;2\n")
+    with pytest.raises(InputError, match="expected a unit of angle"):
+        import_file(path, ImportOptions(sign="error"))
+
+
+@pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT"])
+def test_a_workbook_of_runs_angles_and_squareness_in_one_command(call, tmp_path, chain):
+    machine = tmp_path / "machine.toml"
+    machine.write_text(MACHINE.format(chain=chain))
+    angles = [["X axis"], ["Position [mm]", "EBX + [urad]", "EBX - [urad]"], [0, 1, 3], [200, 5, 7], [400, 9, 11]]
+    sheets = {"X": axis_sheet("X", 20, 0, 400), "Winkel": angles, "Rechtwinkligkeit": [["EC0Y", "25 urad"]]}
+    code, _, err = call("identify", machine, workbook(tmp_path, sheets), "--out", tmp_path / "o")
+    assert code == 0, err
+    errors = read_errors(tmp_path / "o" / "identified.errors.csv")
+    # the mean of both directions, 2, 6, 10 urad, zero at the reference point
+    assert 1e6 * errors.curves["EBX"].at(400.0) == pytest.approx(8, abs=1e-6)
+    assert 1e6 * errors.squareness["EC0Y"][0] == pytest.approx(25, abs=1e-3)
+    assert 1e3 * errors.curves["EXX"].at(400.0) == pytest.approx(8, abs=1e-6)
