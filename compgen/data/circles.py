@@ -62,6 +62,16 @@ class Circles(Displayed):
         """Planes that were measured."""
         return tuple(name for k, name in enumerate(PLANES) if (self.plane == k).any())
 
+    def part(self, rows: NDArray[np.int64]) -> Circles:
+        """Return some of the readings."""
+        columns = ("plane", "angle_rad", "radius_mm", "deviation_mm", "direction", "run", "setup", "centre_mm", "u_mm")
+        return replace(
+            self,
+            **{name: getattr(self, name)[rows] for name in columns},
+            covariates={name: values[rows] for name, values in self.covariates.items()},
+            origin=[self.origin[k] for k in rows] if self.origin else (),
+        )
+
     def radial(self) -> FloatArray:
         """Unit vectors from the centre outwards, (n, 3)."""
         unit = np.zeros((len(self), 3))

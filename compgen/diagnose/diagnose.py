@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns
+from compgen.data.circles import Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable
@@ -21,6 +22,7 @@ from compgen.diagnose.analysis import Analysis, analyse
 from compgen.diagnose.axis_diagnosis import LEAST_FREEDOM, AxisDiagnosis, findings_of
 from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base_fit import BaseFit
+from compgen.diagnose.circle_diagnosis import CircleDiagnosis, diagnose_circles
 from compgen.diagnose.diagnosis import Classed, Diagnosis, misfit_before_after, refit
 from compgen.diagnose.gross import (
     classes_of,
@@ -90,13 +92,13 @@ def diagnose(
     options: DiagnoseOptions | None = None,
     *,
     show: Show = lambda _: None,
-) -> Diagnosis | AxisDiagnosis:
+) -> Diagnosis | AxisDiagnosis | CircleDiagnosis:
     """Diagnose a measurement.
 
     Parameters
     ----------
     machine : kinematic chain, travel, and the errors that its model contains.
-    measurement : tracer lengths, measured deviations, or axis runs.
+    measurement : tracer lengths, measured deviations, axis runs, or circles.
     options : options of the diagnosis.
     show : called with a description of each step.
 
@@ -106,6 +108,20 @@ def diagnose(
         for names that are not effects, and for too few readings.
     """
     chosen = options or DiagnoseOptions()
+    if chosen.order != "auto" and not isinstance(measurement, AxisRuns):
+        raise InputError("--order applies to axis runs only; other measurements are ordered by time_s")
+    if isinstance(measurement, Circles):
+        if chosen.against is not None:
+            raise InputError("--against cannot be used with circles; identify them, and compare the errors")
+        return diagnose_circles(
+            machine,
+            measurement,
+            most=chosen.max_effects,
+            only=chosen.effects,
+            add=chosen.add,
+            u_um=chosen.u_um,
+            show=show,
+        )
     known = catalogue(measurement.stations if isinstance(measurement, Lengths) else ())
     for name in chosen.effects:
         if name not in known:
@@ -118,8 +134,6 @@ def diagnose(
             u_um=chosen.u_um, against=chosen.against, show=show,
         )  # fmt: skip
         return AxisDiagnosis(machine, measurement, tuple(found))
-    if chosen.order != "auto":
-        raise InputError("--order applies to axis runs only; other measurements are ordered by time_s")
     with one_thread():
         show("fitting the base model")
         observed = observed_of(machine, measurement)

@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, read_axis_runs
+from compgen.data.circles import Circles, read_circles
 from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations, read_deviations
@@ -221,11 +222,11 @@ class ObservedDeviations(Observed):
 # Measurements that can be diagnosed, distinguished by the columns of their files.
 
 
-Measurement = Lengths | Deviations | AxisRuns
+Measurement = Lengths | Deviations | AxisRuns | Circles
 
 
 def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
-    """Read measurement files of one kind: tracer lengths, measured deviations or axis runs."""
+    """Read measurement files of one kind: tracer lengths, measured deviations, axis runs or circles."""
     kinds = {path: _kind(path) for path in paths}
     if len(set(kinds.values())) > 1:
         odd = next(path for path, kind in kinds.items() if kind != kinds[paths[0]])
@@ -234,6 +235,8 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
     kind, files = kinds[paths[0]], list(paths)
     if kind == "axis runs":
         return read_axis_runs(files)
+    if kind == "circles":
+        return read_circles(files)
     return read_deviations(files) if kind == "deviations" else read_lengths(files)
 
 
@@ -244,10 +247,9 @@ def _kind(path: str | Path) -> str:
             "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
         )
         raise InputError(message, file=path)
-    others = {"part": "features of a part", "artefact": "an artefact", "circle": "circles", "errors": "errors"}
+    others = {"part": "features of a part", "artefact": "an artefact", "errors": "errors"}
     if kind in others:
-        message = (
-            f"contains {others[kind]}, which only identify can read; diagnose reads lengths, deviations and axis runs"
-        )
+        known = "lengths, deviations, axis runs and circles"
+        message = f"contains {others[kind]}, which only identify can read; diagnose reads {known}"
         raise InputError(message, file=path)
-    return {"axis": "axis runs", "deviations": "deviations"}.get(str(kind), "lengths")
+    return {"axis": "axis runs", "circle": "circles", "deviations": "deviations"}.get(str(kind), "lengths")

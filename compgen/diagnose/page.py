@@ -19,9 +19,11 @@ from compgen.data.charts import (
     picture_grid,
     svg,
 )
+from compgen.data.circles import PLANES
 from compgen.data.files import json_text
 from compgen.data.names import MM_PER_UM
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
+from compgen.diagnose.circle_diagnosis import CircleDiagnosis
 from compgen.diagnose.diagnosis import Diagnosis
 from compgen.diagnose.search import gains, remainder_of
 
@@ -212,6 +214,36 @@ def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
     return _page(title, parts, data)
 
 
+def circle_page(found: CircleDiagnosis, data: dict[str, Any]) -> str:
+    """Return the text of ``index.html`` for circles."""
+    title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    pictures, circles = [], found.circles
+    angle = np.degrees(circles.angle_rad)
+    for k, plane in enumerate(PLANES):
+        for way, told in ((1, "counter-clockwise"), (-1, "clockwise")):
+            rows = np.flatnonzero((circles.plane == k) & (circles.direction == way))
+            if not rows.size:
+                continue
+            rows = rows[:: len(rows) // MOST_DOTS + 1]
+            before, after = (values[rows] / MM_PER_UM for values in (found.residual_before_mm, found.residual_after_mm))
+            limits = limits_of(before, after, zero=True)
+            plot = Plot(limits_of(angle[rows], margin=0.03), limits, x_label="angle (degrees)", y_label="µm")
+            plot.across(0.0)
+            plot.dots(angle[rows], before, "before")
+            plot.dots(angle[rows], after, "after")
+            key = f"circle-{plane}-{way:+d}"
+            drawn = svg(key, f"Radial deviation {plane}, {told}, before and after", [plot])
+            pictures.append(Picture(key, f"{plane}, {told}", drawn))
+    legend = '<span class="key before"></span> as measured, without centre and radius <span class="key after"></span> left over'
+    parts = [
+        _effects(data),
+        _misfit(data),
+        f'<h2>Radial deviations over the angle</h2><p class="legend">{legend}</p>',
+        picture_grid(pictures),
+    ]
+    return _page(title, parts, data)
+
+
 def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
     """The page with its parts and the common end of all pages."""
     parts = [
@@ -297,10 +329,12 @@ def _list(title: str, items: list[str]) -> str:
 # The files of a diagnosis: JSON, text, extended machine.
 
 
-def diagnosis_files(found: Diagnosis | AxisDiagnosis) -> dict[str, str]:
+def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis) -> dict[str, str]:
     """Return the content of each file, keyed by file name."""
     data = found.to_dict()
     files = {"diagnosis.json": json_text(data), "diagnosis.md": summary(found.machine.name, data, markdown=True)}
+    if isinstance(found, CircleDiagnosis):
+        return {**files, "index.html": circle_page(found, data)}
     if isinstance(found, AxisDiagnosis):
         files["index.html"] = axis_page(found, data)
         files["removed.csv"] = found.removed_csv()

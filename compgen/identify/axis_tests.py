@@ -199,7 +199,7 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     UndeterminedError
         if arcs are too short to separate squareness from the centre and the scales.
     """
-    columns = _columns(machine, circles, _positions(machine, circles))
+    columns = _columns(machine, circles, circle_positions(machine, circles))
     solution = _Solution.of(circles, columns)
     shown = [(column, k) for k, column in enumerate(columns) if solution.shown[k]]
     for k, name in enumerate(PLANES):
@@ -273,11 +273,11 @@ class _Solution:
         freedom = len(circles) - rank
         if freedom < 1:
             raise UndeterminedError(f"{len(circles)} readings for {rank} unknowns", [])
-        spread = float(np.sqrt(residual @ residual / freedom * _correlated(circles, residual)))
+        spread = float(np.sqrt(residual @ residual / freedom * correlated(circles, residual)))
         return cls(value, spread * inverse, shown, residual, freedom, spread, float(size[0] / size[used][-1]))
 
 
-def _positions(machine: Machine, circles: Circles) -> FloatArray:
+def circle_positions(machine: Machine, circles: Circles) -> FloatArray:
     """Commanded positions (n, 3); InputError where one is outside the travel."""
     middle = np.array([np.mean(axis.range_mm) for axis in machine.axes])
     unknown = np.isnan(circles.centre_mm).any(axis=1)
@@ -302,9 +302,13 @@ def _positions(machine: Machine, circles: Circles) -> FloatArray:
     return position
 
 
+#: The squareness error that a circle in each plane shows.
+SQUARENESS_OF = {"XY": "EC0Y", "YZ": "EA0Z", "ZX": "EB0Z"}
+
+
 def _of_planes(circles: Circles) -> list[str]:
     """Squareness errors of the measured planes."""
-    return [{"XY": "EC0Y", "YZ": "EA0Z", "ZX": "EB0Z"}[name] for name in circles.planes]
+    return [SQUARENESS_OF[name] for name in circles.planes]
 
 
 def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> list[_Column]:
@@ -346,7 +350,7 @@ def _columns(machine: Machine, circles: Circles, position_mm: FloatArray) -> lis
     return columns
 
 
-def _correlated(circles: Circles, residual: FloatArray) -> float:
+def correlated(circles: Circles, residual: FloatArray) -> float:
     """How many successive readings count as one: 1 + twice the sum of correlations along the path, while above 0."""
     total, weight = 0.0, 0
     keys = np.column_stack([circles.plane, circles.setup, circles.run, circles.direction])

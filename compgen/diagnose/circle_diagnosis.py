@@ -1,0 +1,618 @@
+"""Diagnosis of circular tests (ISO 230-4): which effects make the circle, how large they are, and what is left.
+
+At angle t on a circle of radius R, run in the direction d = +1 or -1 at the angular speed w, with unit vector n:
+
+    scale mismatch      R/2 cos 2t (s1 - s2)
+    squareness          n . C S                             +-R/2 sin 2t, alike in both directions
+    servo mismatch      d R/2 sin 2t w (tau1 - tau2)        opposite in both directions
+    servo delay         -R/2 w^2 tau^2                      the radius shrinks with the feed: needs two feeds
+    backlash            n_i dir_i c                         steps at the quadrants; the reversal is 2 c
+    reversal spike      -n_i dir_i c exp(-time since the reversal / T)
+    periodic error      n_i (s sin + c cos)(2 pi x_i / pitch)
+    straightness        cos 3t, sin 3t, cos 4t, sin 4t      bows and waves of both guides, and scales that are not linear
+
+The centre of each set-up and the constant of the gauge are free. Names are taken one after another, the one that explains
+most first. What counts as significant is fixed beforehand, by the residuals of the model with all effects and by their
+correlation along the path; so an effect that is none of these makes the names less likely, not more.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from compgen.data.circles import PLANES, Circles
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine
+from compgen.data.messages import nearest
+from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
+from compgen.diagnose.verdict import DisplayedDiagnosis
+from compgen.errors import InputError
+from compgen.identify.axis_tests import SQUARENESS_OF, circle_positions, correlated
+from compgen.kinematics.first_order import c_matrix
+
+Show = Callable[[str], None]
+
+#: Degrees of freedom that a diagnosis needs.
+LEAST_FREEDOM = 20
+#: Chi-square from which an effect of one parameter is named, before the number of places is counted at which it was tried.
+NAMED_CHI2 = 30.0
+#: Root mean square of what an effect explains of the readings that it acts on, below which it has no name, mm: a fifth of
+#: the resolution of a ballbar. Many readings show less, but also what the equations above leave out.
+NAMED_MM = 2e-5
+#: Share of what is left that a spike or a periodic error has to explain.
+SEARCHED_SHARE = 0.2
+#: Names in each plane for each one of ``--max-effects``: a plane has two axes.
+NAMES_PER_MOST = 2
+#: Share of its columns that has to be left beside centre, radius and other names.
+LEAST_VISIBLE = 0.05
+#: Canonical correlation from which two effects are not told apart.
+ALIKE = 0.95
+#: A structure in the residuals is unknown from this share of the noise, and from this size, mm.
+UNKNOWN_SHARE, UNKNOWN_MM = 0.5, 1e-4
+#: Successive residuals that count as one, from which they are a structure.
+UNKNOWN_CORRELATED = 3.0
+#: Times in which a spike may decay (ms), or angles if the feed is not known (degrees).
+SPIKE_MS = (4.0, 8.0, 15.0, 30.0, 60.0, 120.0, 240.0)
+SPIKE_DEG = (0.2, 0.4, 0.8, 1.6, 3.2)
+#: A pitch is looked for from this many readings to this share of the radius: a longer one imitates any few lobes.
+PITCH_STEPS, PITCH_SHARE = 4.0, 0.3
+#: The shortest pitch is no less than this share of the longest one: more readings would not make the search longer.
+MOST_PITCHES = 100.0
+#: Harmonics of the residuals that are looked at.
+HARMONICS = range(2, 61)
+#: Sectors that are left out together, degrees, and the number of groups of them.
+SECTOR_DEG, FOLDS = 30.0, 4
+
+WORDS = {
+    "squareness": (
+        "the axes of {of} are out of square: an ellipse at 45 degrees, alike in both directions",
+        "export the squareness (volcomp run), or align the axes",
+    ),
+    "servo_mismatch": (
+        "the axes of {of} follow their commands with different delays: an ellipse at 45 degrees that turns with the direction",
+        "match the position loops (KV, feed-forward) of both axes; tables cannot correct it",
+    ),
+    "scale_mismatch": (
+        "one axis of {of} travels further than the other: an ellipse along the axes",
+        "measure the positioning of both axes (axis runs), and export it: a circle shows only the difference",
+    ),
+    "servo_delay": (
+        "the circle in {of} shrinks with the square of the feed",
+        "raise the gain or velocity feed-forward of the position loops, or mill circles more slowly; tables cannot correct it",
+    ),
+    "straightness": (
+        "the circle in {of} has three or four lobes: guides that are not straight, or scales that are not linear",
+        "measure the straightness and the positioning of both axes; a circle shows only part of them",
+    ),
+    "backlash": (
+        "{of} is late after each reversal: steps where it turns",
+        "enter the reversal (twice c) in the control, or export it (volcomp run); look for play in screw and bearings",
+    ),
+    "reversal_spike": (
+        "{of} sticks when it reverses: spikes that decay (negative: it jumps ahead)",
+        "adjust the friction (quadrant error) compensation of the control; check lubrication and guides",
+    ),
+    "periodic": (
+        "{of} has an error that repeats with the pitch",
+        "check screw run-out, coupling and encoder; use table positions at a fraction of the pitch",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class CircleCandidate:
+    """An effect that may be named: its columns (n, k), a parameter each with the SI unit of its name.
+
+    ``trials`` counts the places at which it was tried; ``settings`` are the ones found, ``slope`` the derivative of the
+    columns by the logarithm of the setting (n, k).
+    """
+
+    name: str
+    of: str
+    columns: FloatArray
+    parameters: tuple[tuple[str, float], ...]
+    trials: int = 1
+    settings: Mapping[str, float] = field(default_factory=dict)
+    slope: FloatArray | None = None
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """What it is, and what to do."""
+        what, todo = next(words for family, words in WORDS.items() if self.name.startswith(family))
+        return what.format(of=self.of), todo
+
+
+@dataclass(frozen=True)
+class NamedCircleEffect:
+    """A named effect with value and standard uncertainty of each parameter, in the unit of its name."""
+
+    candidate: CircleCandidate
+    values: Mapping[str, tuple[float, float]]
+    chi2: float
+    alias: tuple[str, ...]
+    visible: float
+
+
+@dataclass(frozen=True)
+class CircleSpace:
+    """Orthonormal basis of the columns that are in the model, (n, r), and the readings without it, (n,)."""
+
+    basis: FloatArray
+    left: FloatArray
+
+    @classmethod
+    def of(cls, columns: FloatArray, value: FloatArray) -> CircleSpace:
+        """The space of columns (n, k)."""
+        size = np.linalg.norm(columns, axis=0)
+        basis, singular, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+        basis = basis[:, singular > 1e-7 * singular[0]]
+        return cls(basis, value - basis @ (basis.T @ value))
+
+    def without(self, columns: FloatArray) -> FloatArray:
+        """Columns (n, k) without their part in the space."""
+        return np.asarray(columns - self.basis @ (self.basis.T @ columns))
+
+    def gain(self, columns: FloatArray) -> float:
+        """By how much columns reduce the sum of squares; 0 for columns that are hardly seen."""
+        seen = self.without(columns)
+        if np.linalg.norm(seen) < LEAST_VISIBLE * np.linalg.norm(columns):
+            return 0.0
+        found = np.linalg.lstsq(seen, self.left, rcond=1e-6)[0]
+        return float(np.sum((seen @ found) ** 2))
+
+
+def candidates_of(machine: Machine, circles: Circles, position_mm: FloatArray) -> list[CircleCandidate]:
+    """All effects without settings, in the order in which one of two equal ones is preferred."""
+    radial, travel, angle = circles.radial(), circles.travel(), circles.angle_rad
+    half, speed = 0.5 * circles.radius_mm, angular_speed(circles)
+    both = c_matrix(machine, position_mm)
+    found = []
+    for k, plane in enumerate(PLANES):
+        own = (circles.plane == k).astype(np.float64)
+        if not own.any():
+            continue
+        name = SQUARENESS_OF[plane]
+        square = own * np.einsum("ij,ij->i", radial, both[:, :, ERROR_INDEX[name]])
+        found.append(CircleCandidate(f"squareness_{name[1:]}", plane, square[:, None], (("c_urad", 1e-6),)))
+        scales = own * half * np.cos(2 * angle)
+        found.append(CircleCandidate(f"scale_mismatch_{plane}", plane, scales[:, None], (("c_um_per_m", 1e-6),)))
+        mismatch = own * half * np.sin(2 * angle) * circles.direction
+        if speed is None:
+            found.append(CircleCandidate(f"servo_mismatch_{plane}", plane, mismatch[:, None], (("c_um_per_m", 1e-6),)))
+        else:
+            lag, shrink = (mismatch * speed)[:, None], (-own * half * speed**2)[:, None]
+            found.append(CircleCandidate(f"servo_mismatch_{plane}", plane, lag, (("tau_ms", 1e-3),)))
+            found.append(CircleCandidate(f"servo_delay_{plane}", plane, shrink, (("tau_squared_ms2", 1e-6),)))
+        waves = [own * wave(n * angle) for n in (3, 4) for wave in (np.cos, np.sin)]
+        names = tuple((f"{letter}{n}_um", MM_PER_UM) for n in (3, 4) for letter in "cs")
+        found.append(CircleCandidate(f"straightness_{plane}", plane, np.column_stack(waves), names))
+    for axis, letter in enumerate(AXES):
+        column = radial[:, [axis]] * travel[:, [axis]]
+        if column.any():
+            found.append(CircleCandidate(f"backlash_{letter}", letter, column, (("c_um", MM_PER_UM),)))
+    return found
+
+
+def angular_speed(circles: Circles) -> FloatArray | None:
+    """Angular speed of every reading (n,), rad/s; None if a feed is not known."""
+    feed = circles.covariates.get("feed_mm_min")
+    if feed is None or not np.all(np.nan_to_num(feed) > 0):
+        return None
+    return np.asarray(feed / SECONDS_PER_MIN / circles.radius_mm)
+
+
+def base_columns(circles: Circles) -> FloatArray:
+    """Centre and constant of the gauge of every circle that was set up, (n, 3 m)."""
+    keys = np.column_stack([circles.plane, circles.setup, circles.radius_mm, np.nan_to_num(circles.centre_mm)])
+    _, number = np.unique(keys, axis=0, return_inverse=True)
+    own = np.eye(int(number.max()) + 1)[number.ravel()]
+    cosine, sine = np.cos(circles.angle_rad)[:, None], np.sin(circles.angle_rad)[:, None]
+    return np.hstack([own, own * cosine, own * sine])
+
+
+def spike(circles: Circles, axis: int, trials: int, decay: float) -> CircleCandidate:
+    """Spikes of one axis that decay in ``decay`` ms, or degrees without feeds."""
+    speed, key = angular_speed(circles), "decay_deg"
+    angle = np.full(len(circles), np.radians(decay))
+    if speed is not None:
+        angle, key = speed * decay * 1e-3, "decay_ms"
+    # progress since the last reversal: of the first axis of the plane at 0 and 180 degrees, of the second at 90 and 270
+    second = np.array(list(PLANES.values()))[circles.plane, 1] == axis
+    since = circles.direction * (circles.angle_rad - 0.5 * np.pi * second) % np.pi
+    stuck = -circles.radial()[:, axis] * circles.travel()[:, axis] * np.exp(-since / angle)
+    slope = (stuck * since / angle)[:, None]
+    name, parameters = f"reversal_spike_{AXES[axis]}", (("c_um", MM_PER_UM),)
+    return CircleCandidate(name, AXES[axis], stuck[:, None], parameters, trials, {key: decay}, slope)
+
+
+def periodic(
+    circles: Circles, position_mm: FloatArray, axis: int, trials: int, found: bool, pitch_mm: float
+) -> CircleCandidate:
+    """A periodic error of one axis, of a known pitch or one that was ``found``."""
+    turn = 2 * np.pi * position_mm[:, axis] / pitch_mm
+    radial = circles.radial()[:, axis]
+    columns = np.column_stack([radial * np.sin(turn), radial * np.cos(turn)])
+    phase = turn - turn.mean()  # about the middle of the circle, so that the pitch does not shift the phase
+    slope = np.column_stack([-columns[:, 1] * phase, columns[:, 0] * phase]) if found else None
+    parameters, settings = (("s1_um", MM_PER_UM), ("c1_um", MM_PER_UM)), {"pitch_mm": pitch_mm}
+    return CircleCandidate(f"periodic_{AXES[axis]}", AXES[axis], columns, parameters, trials, settings, slope)
+
+
+def sharpened(make: Callable[[float], CircleCandidate], space: CircleSpace, at: float, ratio: float) -> CircleCandidate:
+    """The candidate with the setting near ``at`` (within a factor ``ratio``) that explains most, by golden section."""
+    low, high = math.log(at / ratio), math.log(at * ratio)
+    share = 0.5 * (math.sqrt(5.0) - 1.0)
+    for _ in range(24):
+        first, second = high - share * (high - low), low + share * (high - low)
+        if space.gain(make(math.exp(first)).columns) < space.gain(make(math.exp(second)).columns):
+            low = first
+        else:
+            high = second
+    return make(math.exp(0.5 * (low + high)))
+
+
+def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space: CircleSpace) -> list[CircleCandidate]:
+    """Spikes and periodic errors of every axis, with the settings that explain most beside ``space``."""
+    found: list[CircleCandidate] = []
+    axes = [axis for axis in range(3) if np.any(circles.radial()[:, axis])]
+    grid = SPIKE_DEG if angular_speed(circles) is None else SPIKE_MS
+    for axis in axes:
+        make = partial(spike, circles, axis, len(grid))
+        best = max(grid, key=lambda decay, make=make: space.gain(make(decay).columns))
+        found.append(sharpened(make, space, best, 2.0))
+    # with the spikes that matter, so that a short period does not take their place
+    strong = [item.columns for item in found if space.gain(item.columns) > 0.1 * float(space.left @ space.left)]
+    left = CircleSpace.of(np.hstack([space.basis, *strong]), space.left)
+    path = np.diff(np.sort(circles.angle_rad[circles.run == circles.run[0]]))
+    step_mm = float(np.median(path[path > 1e-9])) * float(circles.radius_mm.max()) if np.any(path > 1e-9) else 0.0
+    for axis in axes:
+        extent = float(np.ptp(position_mm[:, axis]))
+        longest, known = PITCH_SHARE * float(circles.radius_mm.max()), machine.axes[axis].screw_pitch_mm
+        shortest = max(PITCH_STEPS * step_mm, longest / MOST_PITCHES)
+        # a quarter of a period more or less over the circle does not hide a period
+        pitches = [known] if known else (1.0 / np.arange(1.0 / longest, 1.0 / shortest, 0.25 / extent)).tolist()
+        if pitches:
+            make = partial(periodic, circles, position_mm, axis, len(pitches), not known)
+            best = max(pitches, key=lambda pitch, make=make: left.gain(make(pitch).columns))
+            found.append(make(best) if known else sharpened(make, left, best, 1.0 + 0.25 * best / extent))
+    return found
+
+
+# The steps: all candidates, the noise, names one after another, what is left.
+
+
+def noise_floor(circles: Circles, residual_mm: FloatArray, u_um: float | None) -> tuple[float, str]:
+    """Standard deviation of a reading by itself, mm, and where it is from: stated, repeats, or neighbouring readings."""
+    if u_um is not None:
+        return u_um * MM_PER_UM, "stated"
+    keys = [circles.plane, circles.setup, circles.direction, circles.covariates.get("feed_mm_min", 0 * residual_mm)]
+    _, path = np.unique(np.column_stack(keys), axis=0, return_inverse=True)
+    places = np.column_stack([path.ravel(), np.round(np.degrees(circles.angle_rad), 3)])
+    _, place, count = np.unique(places, axis=0, return_inverse=True, return_counts=True)
+    freedom = len(residual_mm) - len(count)
+    if freedom >= LEAST_FREEDOM:
+        mean = np.bincount(place.ravel(), residual_mm) / count
+        return float(np.sqrt(np.sum((residual_mm - mean[place.ravel()]) ** 2) / freedom)), "repeats"
+    order = np.lexsort((circles.angle_rad, circles.run, path.ravel()))
+    second = np.diff(residual_mm[order], 2)
+    # white noise has six times its variance in second differences; the median leaves out ends of paths and spikes
+    return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)), "neighbouring readings"
+
+
+def unknown_of(circles: Circles, residual_mm: FloatArray, floor_mm: float) -> list[dict[str, Any]]:
+    """Structures in the residuals that none of the effects explains, by plane, as in ``diagnosis.json``."""
+    found = []
+    for k, plane in enumerate(PLANES):
+        rows = np.flatnonzero(circles.plane == k)
+        if not rows.size:
+            continue
+        own, left = circles.part(rows), residual_mm[rows]
+        structure = math.sqrt(max(float(np.mean(left**2)) - floor_mm**2, 0.0))
+        if structure < max(UNKNOWN_SHARE * floor_mm, UNKNOWN_MM) or correlated(own, left) < UNKNOWN_CORRELATED:
+            continue
+        power = {}
+        for n in HARMONICS:
+            wave = np.exp(1j * n * own.angle_rad)
+            alike, opposite = (2.0 * abs(np.mean(left * way * wave)) for way in (1.0, own.direction))
+            power[n, "alike in both directions"], power[n, "opposite in both directions"] = alike, opposite
+        one_way = len(np.unique(own.direction)) == 1
+        (n, how), size = max(power.items(), key=lambda item: item[1])
+        text = f"{plane}: a pattern that none of the effects explains; strongest: {n} waves a turn"
+        text += f", {size / MM_PER_UM:.2g} um" + ("" if one_way else f", {how}")
+        found.append(
+            {"covariates": ["angle_deg"], "direction": plane, "rms_um": structure / MM_PER_UM, "text": text,
+             "resembles": None, "plane": plane}
+        )  # fmt: skip
+    return found
+
+
+@dataclass(frozen=True, repr=False)
+class CircleDiagnosis(DisplayedDiagnosis):
+    """Diagnosis of circular tests.
+
+    Parameters
+    ----------
+    machine, circles : what was diagnosed.
+    effects : the named effects, the one that explains most first.
+    unknown : structures without a name, as in ``diagnosis.json``.
+    invisible : effects that these circles cannot show.
+    residual_before_mm, residual_after_mm : readings without centre and radius, and also without the named effects, (n,).
+    left_out_rms_mm : rms of sectors left out, before and after.
+    floor_mm, floor_source : standard deviation of a reading by itself.
+    """
+
+    machine: Machine
+    circles: Circles
+    effects: tuple[NamedCircleEffect, ...]
+    unknown: tuple[dict[str, Any], ...]
+    invisible: tuple[str, ...]
+    residual_before_mm: FloatArray
+    residual_after_mm: FloatArray
+    left_out_rms_mm: tuple[float, float]
+    floor_mm: float
+    floor_source: str
+
+    @property
+    def acceptable(self) -> bool:
+        """Whether the misfit of the sectors left out shrinks, if something was named."""
+        return not self.effects or self.left_out_rms_mm[1] < self.left_out_rms_mm[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``diagnosis.json``."""
+        rms = [float(np.sqrt(np.mean(values**2))) for values in (self.residual_before_mm, self.residual_after_mm)]
+        return {
+            "verdict": "named" if self.effects else "unknown" if self.unknown else "none",
+            "effects": [self._effect(item) for item in self.effects],
+            "unknown": list(self.unknown),
+            "invisible": list(self.invisible),
+            "secondary": [],
+            "gap": {
+                "train": _um(rms),
+                "heldout_lines": _um(self.left_out_rms_mm),
+                "heldout_stations": None,
+                "heldout_times": None,
+                "noise_floor_um": self.floor_mm / MM_PER_UM,
+                "noise_floor_source": self.floor_source,
+            },
+            "advice": self._advice(),
+            "reasons": [],
+            "notes": [f"heldout_lines: sectors of {SECTOR_DEG:g} degrees, a quarter of them left out at a time"],
+            "evidence": {"readings": len(self.circles), "planes": list(self.circles.planes)},
+        }
+
+    def _effect(self, item: NamedCircleEffect) -> dict[str, Any]:
+        what, todo = item.candidate.words
+        names = [item.candidate.name, *item.alias]
+        amount = ""
+        if item.candidate.name.startswith("backlash"):
+            value, u = item.values["c_um"]
+            amount = f"; reversal {2 * value:+.2f} um, u {2 * u:.2g}"
+        elif item.candidate.name.startswith("periodic"):
+            amount = f"; amplitude {math.hypot(item.values['s1_um'][0], item.values['c1_um'][0]):.2f} um"
+        elif item.values.get("tau_squared_ms2", (0.0, 0.0))[0] < 0:
+            amount = "; here it grows: the feed-forward is too strong"
+        grade = "tentative" if item.alias else "beside_unknown" if self.unknown else "confirmed"
+        return {
+            "name": item.candidate.name,
+            "alias_set": [{"name": name, "weight": 1.0 / len(names)} for name in names],
+            "parameters": {key: {"value": value, "u": u} for key, (value, u) in item.values.items()},
+            "settings": dict(item.candidate.settings),
+            "confidence": 1.0 / len(names),
+            "grade": grade,
+            "visible_fraction": item.visible,
+            "chi2": item.chi2,
+            "text": what + amount,
+            "what_to_do": todo,
+        }
+
+    def _advice(self) -> list[str]:
+        found = []
+        alike = [f"{item.candidate.name} from {', '.join(item.alias)}" for item in self.effects if item.alias]
+        if alike:
+            found.append(f"measure whole circles in both directions: separates {'; '.join(alike)}")
+        delay = [name for name in self.invisible if name.startswith("servo_delay")]
+        if delay:
+            found.append(
+                f"measure at two feeds (feed_mm_min), one of them high: would show {', '.join(delay)}, which these circles cannot"
+            )
+        if self.floor_source == "neighbouring readings":
+            found.append("measure each circle twice (column run): only repeats separate noise from short patterns")
+        return found
+
+
+def _um(pair: Sequence[float]) -> dict[str, float]:
+    return {"before_rms_um": pair[0] / MM_PER_UM, "after_rms_um": pair[1] / MM_PER_UM}
+
+
+def diagnose_circles(
+    machine: Machine,
+    circles: Circles,
+    *,
+    most: int,
+    only: Sequence[str] = (),
+    add: Sequence[str] = (),
+    u_um: float | None = None,
+    show: Show = lambda _: None,
+) -> CircleDiagnosis:
+    """Diagnose circular tests.
+
+    Parameters
+    ----------
+    machine : chain, travel, and pitches of the screws if they are known.
+    circles : readings in one or more planes.
+    most : half the largest number of names in each plane.
+    only, add : names to look for, and names to add whether they are found or not.
+    u_um : standard uncertainty of a reading, if it is known.
+    show : called with a description of each step.
+
+    Raises
+    ------
+    InputError
+        for unknown names and too few readings.
+    """
+    position_mm = circle_positions(machine, circles)
+    # each feed is a path of its own
+    feed = circles.covariates.get("feed_mm_min", np.zeros(len(circles)))
+    _, path = np.unique(np.column_stack([circles.run, feed]), axis=0, return_inverse=True)
+    circles, value = replace(circles, run=path.ravel().astype(np.int64)), circles.deviation_mm
+    base = base_columns(circles)
+    start = CircleSpace.of(base, value)
+    fixed = candidates_of(machine, circles, position_mm)
+    show("searching for spikes and periods")
+    linear = CircleSpace.of(np.hstack([base, *(item.columns for item in fixed)]), value)
+    every = fixed + searched(machine, circles, position_mm, linear)
+    for name in (*only, *add):
+        if name not in [item.name for item in every]:
+            message = f"{name!r} is not an effect of these circles; {nearest(name, [item.name for item in every])}"
+            raise InputError(message, field="--effects" if name in only else "--add")
+    full = CircleSpace.of(np.hstack([base, *(item.columns for item in every)]), value)
+    freedom = len(circles) - full.basis.shape[1]
+    if freedom < LEAST_FREEDOM:
+        raise InputError(
+            f"{len(circles)} readings with {full.basis.shape[1]} unknowns leave {freedom} degrees of freedom; a diagnosis "
+            f"needs at least {LEAST_FREEDOM}: record more readings on each circle"
+        )
+    show("naming effects")
+    floor_mm, source = noise_floor(circles, full.left, u_um)
+    variance = max(float(full.left @ full.left) / freedom, floor_mm**2) * correlated(circles, full.left)
+    most_named = NAMES_PER_MOST * most * len(circles.planes)
+    allowed = [item for item in every if (not only or item.name in only) and item.name not in add]
+    forced = [item for item in every if item.name in add]
+    named = chosen_of(circles, base, allowed, forced, (variance, floor_mm), most_named)
+    chi2 = {}
+    for item in named:
+        others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
+        chi2[item.name] = others.gain(item.columns) / variance
+    effects, after = solved(circles, base, named, every, chi2)
+    show("testing on sectors left out")
+    return CircleDiagnosis(
+        machine, circles, tuple(effects), tuple(unknown_of(circles, after, floor_mm)),
+        invisible_of(circles, start, every), start.left, after, left_out(circles, base, named), floor_mm, source,
+    )  # fmt: skip
+
+
+def chosen_of(
+    circles: Circles,
+    base: FloatArray,
+    allowed: Sequence[CircleCandidate],
+    forced: Sequence[CircleCandidate],
+    noise: tuple[float, float],
+    most: int,
+) -> list[CircleCandidate]:
+    """The effects that the readings show: ``forced`` ones, then the one that explains most, and so on, at most ``most``.
+
+    Names that are no longer needed beside later ones are taken back. ``noise`` is the variance (mm^2) that stands for one
+    in chi-square, and the standard deviation of a reading by itself (mm).
+    """
+    variance, floor_mm = noise
+    named, value = list(forced), circles.deviation_mm
+
+    def worth(item: CircleCandidate, space: CircleSpace) -> float:
+        """Chi-square of an effect beside ``space``; 0 if that is too little for a name."""
+        gain = space.gain(item.columns)
+        least = variance * (NAMED_CHI2 + 2.0 * math.log(item.trials))
+        least = max(least, NAMED_MM**2 * np.count_nonzero(item.columns.any(axis=1)))
+        if item.settings:  # of many settings one always imitates a part of what has no name
+            least = max(least, SEARCHED_SHARE * (float(space.left @ space.left) - len(value) * floor_mm**2))
+        return gain / variance if gain > least else 0.0
+
+    def beside(items: Sequence[CircleCandidate]) -> CircleSpace:
+        return CircleSpace.of(np.hstack([base, *(item.columns for item in items)]), value)
+
+    while len(named) < most + len(forced):
+        space = beside(named)
+        others = [item for item in allowed if item not in named]
+        gains = [worth(item, space) for item in others]
+        if max(gains, default=0.0) == 0.0:
+            break
+        # of two that explain the same, the first
+        named.append(next(item for item, gain in zip(others, gains, strict=True) if gain > max(gains) * (1 - 1e-9)))
+    for item in [one for one in reversed(named) if one not in forced]:
+        rest = [one for one in named if one is not item]
+        if worth(item, beside(rest)) == 0.0:
+            named = rest
+    return named
+
+
+def solved(
+    circles: Circles,
+    base: FloatArray,
+    named: Sequence[CircleCandidate],
+    every: Sequence[CircleCandidate],
+    chi2: Mapping[str, float],
+) -> tuple[list[NamedCircleEffect], FloatArray]:
+    """Values and uncertainties of the named effects in one adjustment, and the residuals without them (n,), mm."""
+    blocks = [item.columns for item in named]
+    columns = np.hstack([base, *blocks])
+    value = circles.deviation_mm
+    found = np.linalg.lstsq(columns, value, rcond=1e-9)[0]
+    after = value - columns @ found
+    # settings that were searched for are unknowns, too: their slopes at the solution widen the uncertainties
+    starts = base.shape[1] + np.cumsum([0, *(block.shape[1] for block in blocks)])
+    slopes = [
+        (item.slope @ found[at : at + item.slope.shape[1]])[:, None]
+        for item, at in zip(named, starts, strict=False)
+        if item.slope is not None
+    ]
+    wide = np.hstack([columns, *slopes])
+    size = np.linalg.norm(wide, axis=0)
+    size[size == 0] = 1.0
+    inverse = np.linalg.pinv(wide / size, rcond=1e-7) / size[:, None]
+    variance = float(after @ after) / max(len(value) - wide.shape[1], 1) * correlated(circles, after)
+    u = np.sqrt(variance) * np.linalg.norm(inverse, axis=1)
+    effects = []
+    for item, at in zip(named, starts, strict=False):
+        values = {
+            key: (float(found[at + k]) / unit, float(u[at + k]) / unit) for k, (key, unit) in enumerate(item.parameters)
+        }
+        square, u_square = values.get("tau_squared_ms2", (0.0, 0.0))
+        if square > 0:
+            values = {"tau_ms": (math.sqrt(square), u_square / (2.0 * math.sqrt(square)))}
+        others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
+        own = others.without(item.columns)
+        alias = [
+            one.name for one in every if one not in named and _alike(own, others.without(one.columns), one.columns)
+        ]
+        visible = float(np.linalg.norm(own) / np.linalg.norm(item.columns))
+        effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible))
+    return effects, after
+
+
+def _alike(first: FloatArray, second: FloatArray, whole: FloatArray) -> bool:
+    """Whether two sets of columns, without the rest of the model, say the same; ``whole`` is the second one with it."""
+    if np.linalg.norm(second) < LEAST_VISIBLE * np.linalg.norm(whole):
+        return False
+    a, b = np.linalg.qr(first)[0], np.linalg.qr(second)[0]
+    return float(np.linalg.svd(a.T @ b, compute_uv=False).min()) > ALIKE
+
+
+def invisible_of(circles: Circles, start: CircleSpace, every: Sequence[CircleCandidate]) -> tuple[str, ...]:
+    """Effects that these circles cannot show, whatever their size."""
+    found = [
+        item.name
+        for item in every
+        if np.linalg.norm(start.without(item.columns)) < LEAST_VISIBLE * np.linalg.norm(item.columns)
+    ]
+    names = [item.name for item in every]
+    return (*found, *(f"servo_delay_{plane}" for plane in circles.planes if f"servo_delay_{plane}" not in names))
+
+
+def left_out(circles: Circles, base: FloatArray, named: Sequence[CircleCandidate]) -> tuple[float, float]:
+    """Rms of the readings in sectors that the fit did not see, mm: without the named effects, and with them."""
+    fold = (np.degrees(circles.angle_rad) // SECTOR_DEG).astype(np.int64) % FOLDS
+    squares = []
+    for columns in (base, np.hstack([base, *(item.columns for item in named)])):
+        left = np.zeros(len(circles))
+        for k in range(FOLDS):
+            out = fold == k
+            if out.any() and not out.all():
+                found = np.linalg.lstsq(columns[~out], circles.deviation_mm[~out], rcond=1e-7)[0]
+                left[out] = circles.deviation_mm[out] - columns[out] @ found
+        squares.append(float(np.sqrt(np.mean(left**2))))
+    return squares[0], squares[1]
