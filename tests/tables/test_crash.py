@@ -73,14 +73,14 @@ def test_a_flip_that_changes_nothing_does_not_count(small_machine):
 
 def test_a_judgement_that_accepts_everything_fails_the_test(small_machine, small_errors, monkeypatch):
     monkeypatch.setattr(Judge, "component_reasons", lambda self, correction: [])
-    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines: [])
+    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines, left=None: [])
     result = crash_test(small_machine, small_errors, "siemens-cec")
     assert not result.passed
     assert result.count("ACCEPTED") >= 90
 
 
 def test_tables_that_are_wrong_from_the_start_are_named(small_machine, small_errors, monkeypatch):
-    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines: ["never good"])
+    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines, left=None: ["never good"])
     result = crash_test(small_machine, small_errors, "isg-csv")
     assert result.baseline == ("never good",)
     assert not result.passed
@@ -118,7 +118,7 @@ def test_the_command_prints_the_verdict_and_exits_with_0(small_machine_file, err
 
 def test_the_command_exits_with_1_where_a_wrong_one_is_accepted(small_machine_file, errors_file, monkeypatch, capsys):
     monkeypatch.setattr(Judge, "component_reasons", lambda self, correction: [])
-    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines: [])
+    monkeypatch.setattr(Judge, "reasons", lambda self, grid, lines, left=None: [])
     words = ["crash-test", str(small_machine_file), str(errors_file), "--controller", "isg-csv"]
     assert run_command(cli, words) == 1
     assert "ACCEPTED although wrong" in capsys.readouterr().out
