@@ -316,6 +316,7 @@ _FLAGS = {
     "decimal": "--decimal",
     "zero_runs": "--zero-runs",
     "ignore": "--ignore",
+    "base_length_mm": "--base-length",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
 #: What each format leaves open to the user.
@@ -375,6 +376,10 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     )
     if chosen.sign not in (None, *TABLE_SIGNS) and "sign_of_squareness" not in str(item.understood):
         raise InputError(f"{chosen.sign} applies to squareness, and there is none", file=source, field="--sign")
+    base_mm = chosen.base_length_mm
+    if base_mm is not None and not (0 < base_mm < np.inf and "base_length_mm" in str(item.understood)):
+        text = f"{base_mm:g} mm does not apply: expected a length above zero, and a column of straightness in words"
+        raise InputError(f"{text} (Straightness Z [um/m]), or --map EZX=COLUMN", file=source, field="--base-length")
     if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
         check_largest(item.data.deviation_mm, item.data.origin)
     # refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant

@@ -20,6 +20,7 @@ from compgen.foreign.column_names import (
     NamedColumn,
     is_index,
     known_unit,
+    quantity_of,
     split_name,
     unaccented,
 )
@@ -131,6 +132,34 @@ def _finished(
     return ErrorTable(turned, constants, {"source": findings.table.grid.path.name})
 
 
+#: Positions of readings that are taken step by step differ from the length of the base by less, mm.
+_STEP_MM = 0.1
+
+
+def summed_steps(findings: TableFindings, steps: ErrorTable, base_mm: float) -> ErrorTable:
+    """Return the straightness from its differences over the base of a level or of an autocollimator's mirror, step by step.
+
+    The difference at a position is that from there to the position plus ``base_mm``; the first value is zero. The
+    uncertainties of the steps are independent.
+
+    Raises
+    ------
+    InputError
+        for positions that are not one base apart.
+    """
+    ((name, curve),) = steps.curves.items()
+    away = np.abs(np.diff(curve.position_mm) - base_mm)
+    if away.max(initial=0.0) > _STEP_MM:
+        at = curve.position_mm[int(np.argmax(away))]
+        text = f"the step from {at:g} mm on is not the base length of {base_mm:g} mm: a sum needs every step"
+        raise findings.table.grid.fail(text, findings.table.header_line)
+    findings.understood["base_length_mm"] = base_mm
+    findings.notes.append(f"{name} is the sum of its differences over {base_mm:g} mm, each from its position on")
+    at_mm = np.append(curve.position_mm, curve.position_mm[-1] + base_mm)
+    u = np.sqrt(np.cumsum(np.concatenate([[0.0], curve.u**2])))
+    return ErrorTable({name: Curve(at_mm, np.concatenate([[0.0], np.cumsum(curve.value)]), u)}, {})
+
+
 # Lists of squareness errors: a row for each, by its name in ISO 230-1 or by a pair of axes.
 
 
@@ -232,6 +261,8 @@ def squareness_in(grid: CellGrid, options: ImportOptions, form: str) -> Imported
             raise grid.fail(
                 f"the number beside {shown(row[0])} is not understood; expected one such as 12 or 12 urad", line
             )
+        if angles and quantity_of(split_name(row[0]).word) and reader.name_of(row, angles)[0] is None:
+            continue  # a temperature, or when it was measured
         if angles and not named and reader.name_of(row, angles)[0] is None:
             return None
         if angles:
@@ -281,8 +312,8 @@ class SquarenessRows:
         name, by_name = self.name_of(row, angles)
         if name is None:
             raise self.grid.fail(
-                f"{called} is not a pair of axes; expected EC0Y (Y to X), EB0Z (Z to X), EA0Z (Z to Y), or XY, XZ, YZ; a "
-                f"rotation of X, EC0X, is -EC0Y ({_PAGE})",
+                f"{called} is not a pair of axes; expected a row for each of EC0Y (Y to X), EB0Z (Z to X), EA0Z (Z to Y), or XY, "
+                f"XZ, YZ; a rotation of X, EC0X, is -EC0Y ({_PAGE})",
                 line,
             )
         if name in self.found:

@@ -77,6 +77,7 @@ class ImportOptions:
     zero_runs : treatment of laser runs that are zero at every target.
     dates : order of day, month and year if they are numbers.
     ignore : columns, or sheets of a workbook, to exclude although they contain numbers.
+    base_length_mm : straightness consists of differences over this length, step by step, which are summed.
     """
 
     kind: Kind | None = option(None, "What the file contains; default: recognised by its columns.")
@@ -122,6 +123,14 @@ class ImportOptions:
         (),
         "Column, or sheet of a workbook, to exclude although it contains numbers (may be given several times).",
         metavar="NAME",
+    )
+
+    base_length_mm: float | None = option(
+        None,
+        "Columns of straightness contain differences (or slopes, in um/m or arcsec) over the base of a level or mirror, mm, step "
+        "by step, each from its position on; they are summed.",
+        name="--base-length",
+        metavar="MM",
     )
 
     def given_unit(

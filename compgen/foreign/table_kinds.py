@@ -42,7 +42,7 @@ from compgen.foreign.column_names import (
     unaccented,
 )
 from compgen.foreign.covariates import RowData, directions_of, labels_of, metadata_of, row_data_of
-from compgen.foreign.error_tables import long_errors, si_values, wide_errors
+from compgen.foreign.error_tables import long_errors, si_values, summed_steps, wide_errors
 from compgen.foreign.findings import (
     USUAL_URAD,
     Data,
@@ -573,20 +573,25 @@ def _over_position(
 ) -> tuple[ErrorTable, ReversalCurves | None]:
     """Return one error over the positions from all of its columns, and its reversal."""
     rows = _wide(findings, columns)
-    unit, kind = split_name(rows.name).unit, "angle" if name[1] in "ABC" else "length"
-    if unit is not None and unit not in (RAD_PER_ANGLE if kind == "angle" else MM_PER_LENGTH):
-        text = f"is in {unit}, and {name} expected a unit of {kind}"
-        raise findings.table.grid.fail(text, findings.table.header_line, rows.name)
+    angular, unit = name[1] in "ABC", split_name(rows.name).unit
+    base_mm = None if angular or name[1] == name[2] else findings.options.base_length_mm
     target = findings.positions_mm("position", findings.numbers("position"))[rows.row]
-    value = si_values(findings, name, split_name(rows.name), rows.value, float(np.ptp(target)))
+    if base_mm is not None and unit in RAD_PER_ANGLE:  # the slope of each step
+        value = rows.value * RAD_PER_ANGLE[unit] * base_mm
+    elif unit is not None and unit not in (RAD_PER_ANGLE if angular else MM_PER_LENGTH):
+        text = f"is in {unit}, and {name} expected a unit of {'angle' if angular else 'length'}"
+        raise findings.table.grid.fail(text, findings.table.header_line, rows.name)
+    else:
+        value = si_values(findings, name, split_name(rows.name), rows.value, float(np.ptp(target)))
     one_way = rows.run
     if "run" in findings.fields and not one_way.any():
         one_way = _runs_in_cells(findings)[0][rows.row]
     direction, run = _directions(findings, target, one_way, rows.label, value)
     line = np.array(findings.table.lines, dtype=np.int64)[rows.row]
     runs = OneAxis(target, direction, run, -value if findings.options.sign == "correction" else value, line)
-    findings.notes += remarks(runs, name[2], angular=name[1] in "ABC")
-    return errors_of(runs, name, {})
+    findings.notes += remarks(runs, name[2], angular=angular)
+    found, reversal = errors_of(runs, name, {})
+    return (found, reversal) if base_mm is None else (summed_steps(findings, found, base_mm), None)
 
 
 # Tables of tracer lengths, and of measured positions, in space.
@@ -895,6 +900,13 @@ def _along_axes(findings: TableFindings) -> tuple[Data, ReversalCurves | None, K
         findings.doubts[:] = [text for text in findings.doubts if "--axis" not in text]
         table, reversal = errors_of(runs, error, metadata)
         return table, reversal, "errors"
+    above = findings.table.metadata
+    told = set(motions_in(" ".join([*findings.table.grid.notes[:1], path.stem, *above, *above.values()])))
+    if findings.options.kind is None and told & {"straightness", "yaw", "roll"}:
+        findings.doubts.append(
+            f"the lines above the table, or a name, mention {', '.join(sorted(told))}: give --error NAME (EYX: straightness of "
+            "X in Y, ECX: yaw), or --kind axis if these are positioning deviations"
+        )
     findings.understood["axes"] = {letter or "?": _described(runs, MM_PER_UM) for letter, runs in found.items()}
     return runs_of(found, str(path), metadata), None, "axis"
 

@@ -63,6 +63,8 @@ NAMED = {
     "ratio": ("Rechtwinkligkeit\nEC0Y;0,009/300\nEB0Z;-6 µm / 200 mm\n", {"EC0Y": (30, None), "EB0Z": (-30, None)}),
     "unit in the cell": ("Squareness (k = 2)\nEC0Y;12 ± 3 µrad\nEA0Z;-5 arcsec\n",
                          {"EC0Y": (12, 1.5), "EA0Z": (-5 * ARCSEC_URAD, None)}),
+    "certificate": ("Certificate no. 12\nDate;12.03.2025\nTemperature;20.1;C\nSquareness;Value [urad]\nEC0Y;12\n",
+                    {"EC0Y": (12, None)}),
     # the angle itself: +Y leans to -X where EC0Y > 0 (more than 90); +Z leans to +X where EB0Z > 0 (less than 90)
     "angles": ("Angle;deg\nEC0Y;90.001\nXZ;89.999\n", {"EC0Y": (17.4532925, None), "EB0Z": (17.4532925, None)}),
 }  # fmt: skip
@@ -322,3 +324,44 @@ def test_a_workbook_of_runs_angles_and_squareness_in_one_command(call, tmp_path,
     assert 1e6 * errors.curves["EBX"].at(400.0) == pytest.approx(8, abs=1e-6)
     assert 1e6 * errors.squareness["EC0Y"][0] == pytest.approx(25, abs=1e-3)
     assert 1e3 * errors.curves["EXX"].at(400.0) == pytest.approx(8, abs=1e-6)
+
+
+STEPS = {
+    # 10, 30, -20 um/m over 200 mm: 2, 6, -4 um
+    "slopes": "X axis\nPosition [mm];Straightness Z [um/m]\n0;10\n200;30\n400;-20\n",
+    "differences": "X-Achse\nPosition [mm];Geradheit vertikal [µm]\n0;2\n200;6\n400;-4\n",
+    # two runs, 1 um/m apart
+    "runs": "X axis\nPosition [mm];Straightness Z run 1 [um/m];Straightness Z run 2 [um/m]\n"
+    "0;9,5;10,5\n200;29,5;30,5\n400;-20,5;-19,5\n",
+}
+
+
+@pytest.mark.parametrize("case", STEPS)
+def test_readings_of_a_level_step_by_step_are_summed_if_the_user_says_so(tmp_path, case):
+    item = import_file(written(tmp_path, STEPS[case]), ImportOptions(sign="error", base_length_mm=200.0))
+    assert item.doubts == ()
+    curve = item.data.curves["EZX"]
+    assert curve.position_mm.tolist() == [0, 200, 400, 600]
+    assert curve.value == pytest.approx([0, 2e-3, 8e-3, 4e-3], abs=1e-15)
+    if case == "runs":
+        # variance of a reading 0.5 (um/m)^2, of the mean of two 0.25; times (0.2 m)^2; grows with the number of steps
+        assert curve.u == pytest.approx(1e-3 * np.sqrt(0.25 * 0.04 * np.arange(4)))
+
+
+def test_a_base_length_that_does_not_fit_is_refused(tmp_path):
+    path = written(tmp_path, STEPS["slopes"])
+    with pytest.raises(InputError, match="is in um/m, and EZX expected a unit of length"):
+        import_file(path, ImportOptions(sign="error"))
+    with pytest.raises(InputError, match="step from 0 mm on is not the base length of 100 mm"):
+        import_file(path, ImportOptions(sign="error", base_length_mm=100.0))
+    for text in (STEPS["slopes"].replace("Straightness Z", "Pitch"), "EC0Y;5 urad\nEB0Z;3 urad\n"):
+        with pytest.raises(InputError, match="200 mm does not apply"):
+            import_file(written(tmp_path, text), ImportOptions(sign="error", base_length_mm=200.0))
+
+
+def test_runs_under_a_title_of_straightness_are_not_taken_for_positioning(tmp_path):
+    text = "Geradheit X-Achse\nPosition [mm];Lauf 1 + [µm];Lauf 1 - [µm]\n0;0;1\n100;2;3\n200;1;1\n"
+    path = written(tmp_path, text)
+    assert "mention straightness: give --error NAME" in " ".join(import_file(path).doubts)
+    assert set(import_file(path, ImportOptions(error="EYX", sign="error")).data.curves) == {"EYX"}
+    assert import_file(path, ImportOptions(kind="axis", sign="error")).doubts == ()
