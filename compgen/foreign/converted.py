@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, join_axis_runs, read_axis_runs, read_diagonals
-from compgen.data.circles import read_circles
+from compgen.data.circles import Circles, read_circles
 from compgen.data.csv_files import CsvTable, read_csv
 from compgen.data.deviations import Deviations, join_deviations, read_artefacts, read_deviations, read_parts
 from compgen.data.error_table import Curve, ErrorTable, read_errors
@@ -108,6 +108,8 @@ def _measured(path: Path, kind: str | None, axis: str | None) -> Sequence[Plain 
     item = _settled(path, axis)
     if isinstance(item.data, Capture):
         raise InputError("contains a capture over time, from which no errors are identified", file=path)
+    if isinstance(item.data, Circles):
+        raise InputError("contains circles; write them with 'volcomp import --out DIR', and give that file", file=path)
     return [item.data] if item.other_errors is None else [item.data, item.other_errors]
 
 

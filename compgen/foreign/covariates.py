@@ -386,6 +386,7 @@ _MAIN: Mapping[str, tuple[str, ...]] = {
     "lengths": ("x", "y", "z", "length", "station", "point"),
     "deviations": ("x", "y", "z", "dx", "dy", "dz", "xa", "ya", "za"),
     "errors": ("error", "position", "value", "u_value"),
+    "circle": ("angle", "radius", "plane", "deviation", "actual", "direction", "run"),
 }
 _SPACE = (
     "time",
@@ -400,6 +401,7 @@ _PLACES: Mapping[Kind, tuple[str, ...]] = {
     "axis": ("time", "date"),
     "lengths": (*_SPACE, "u_value"),
     "deviations": _SPACE,
+    "circle": ("time", "date", "feed"),
 }
 
 

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
+from compgen.data.circles import PLANES, Circles, format_circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
@@ -37,24 +38,26 @@ from compgen.foreign.source import Order, parse_number, shown
 # The result of an import: the object, what was understood, and what is in doubt.
 
 
-Kind = Literal["axis", "lengths", "deviations", "errors", "capture"]
-KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture")
+Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle"]
+KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture", "circle")
 SUFFIXES = {
     "axis": ".axis.csv",
     "lengths": ".lengths.csv",
     "deviations": ".deviations.csv",
     "errors": ".errors.csv",
     "capture": ".capture.csv",
+    "circle": ".circle.csv",
 }
 #: Answers to ``--sign`` for all tables; the others are for squareness.
 TABLE_SIGNS = ("error", "correction")
-Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture
+Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
     Lengths: format_lengths,
     Deviations: format_deviations,
     ErrorTable: format_errors,
     Capture: format_capture,
+    Circles: format_circles,
 }
 
 
@@ -71,6 +74,7 @@ class ImportOptions:
     error : name of the error (EYX, ECX, ...) in the file, for straightness and angles.
     sign : "error" (measured minus commanded) or "correction" (what is to be added; the sign is reversed on import); of
         squareness by pairs of axes "angle-above-90", "angle-below-90" or "rotation" (as EC0Y, EB0Z, EA0Z).
+    plane, radius_mm : XY, YZ or ZX, and the nominal radius, of a circular test that does not state them.
     directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
     sheet : name of the sheet of a workbook.
     decimal : decimal mark of a table, if its numbers do not show it.
@@ -84,7 +88,8 @@ class ImportOptions:
     columns: Mapping[str, str] = option(
         factory=dict,
         text="FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, "
-        "point; dx, dy, dz, xa, ya, za; error, value, EBX (an error); temperature, temp_NAME, time, date, feed, load, tool_x, "
+        "point; dx, dy, dz, xa, ya, za; angle, radius, plane; "
+        "error, value, EBX (an error); temperature, temp_NAME, time, date, feed, load, tool_x, "
         "approach_x, repeat, line, block, setup, pose, u_value; run1+, run1-, run2 (a column of one run). May be given "
         "several times.",
         name="--map",
@@ -107,6 +112,8 @@ class ImportOptions:
         "squareness by pairs of axes, what a positive number means: angle-above-90, angle-below-90 (between the positive "
         "axes), rotation (EC0Y, EB0Z, EA0Z of ISO 230-1).",
     )
+    plane: str | None = option(None, "Plane of a circular test.", choices=tuple(PLANES))
+    radius_mm: float | None = option(None, "Nominal radius of a circular test, mm.")
     directions: Literal["labels", "motion", "alternate"] | None = option(
         None,
         "labels: as in the file; motion: from the order of the rows; alternate: odd runs up, even down.",

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.axis_runs import AxisRuns, check_single, join_axis_runs
+from compgen.data.circles import LARGEST_RADIUS_MM, PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves
@@ -33,6 +34,7 @@ from compgen.foreign.column_names import (
     error_columns,
     fields_of,
     is_deviation,
+    known_unit,
     motion_in,
     motions_in,
     run_columns,
@@ -40,6 +42,7 @@ from compgen.foreign.column_names import (
     split_name,
     statistic_in,
     unaccented,
+    way,
 )
 from compgen.foreign.covariates import RowData, directions_of, labels_of, metadata_of, row_data_of
 from compgen.foreign.error_tables import long_errors, si_values, summed_steps, wide_errors
@@ -786,6 +789,193 @@ def _measured(findings: TableFindings, key: str, position: FloatArray) -> FloatA
     return values * scale - position
 
 
+# Tables of circular tests (ballbar): radial deviations or radii over the angle, with a column or words for the direction.
+#
+# There is no public specification of the text exports of ballbar programs. What is read are names of columns and lines
+# above the table; that angles count from the first axis of the plane to the second one is inferred, and tested with both
+# directions: they have one centre.
+
+
+#: Words for both directions, letters only, longest first: "counterclockwise" contains "clockwise".
+_TURNS = {
+    "counterclockwise": 1, "anticlockwise": 1, "gegenuhrzeigersinn": 1, "antihoraire": 1, "antiorario": 1, "antihorario": 1,
+    "imuhrzeigersinn": -1, "uhrzeigersinn": -1, "clockwise": -1, "horaire": -1, "orario": -1, "horario": -1,
+    "ccw": 1, "acw": 1, "cw": -1, "\u9006\u65f6\u9488": 1, "\u987a\u65f6\u9488": -1,
+}  # fmt: skip
+#: What else the name of a column of one direction may say.
+_OF_A_TURN = re.compile(r"radial|deviation|dev|abweichung|reading|run|lauf|nr|no|test|data|um|mm|nm")
+#: The centres of both directions differ by more than this share of their distance from the centre in the other sense, and
+#: by more than this many um, where the angles of one direction count backwards.
+_MIRRORED, _MIRRORED_UM = 0.3, 2.0
+
+
+def _turn(text: str) -> tuple[int, int] | None:
+    """Direction and number (0: none) that a cell or the name of a column states; None if it states something else too."""
+    letters = re.sub(r"[^a-z\u4e00-\u9fff]", "", text.lower().replace("\u00b5", "u").replace("\u03bc", "u"))
+    word = next((word for word in _TURNS if word in letters), None)
+    if word is None or _OF_A_TURN.sub("", letters.replace(word, "", 1)):
+        return None
+    numbers = re.findall(r"\d+", text)
+    return (_TURNS[word], int(numbers[0]) if numbers else 0) if len(numbers) < 2 else None
+
+
+def circles_of(findings: TableFindings) -> Circles:
+    """Return the radial deviations of a circular test, from deviations or from radii."""
+    _need(findings, "angle")
+    row, direction, run, value_mm, radius_mm = _radial(findings)
+    angle = findings.numbers("angle")
+    unit = findings.unit("angle") or ("deg" if np.ptp(angle) > 7.0 else None)
+    if unit is None:
+        unit = "rad"
+        findings.doubts.append("the file states no unit of the angle; give --unit angle=rad or deg")
+    # XZ, ZY and YX are not among the names: their angles would count the other way
+    names = {**{name: k for k, name in enumerate(PLANES)}, "G17": 0, "G19": 1, "G18": 2}
+    stated = findings.options.plane or _above(findings, "plane")[0]
+    planes = (
+        [stated] if "plane" not in findings.fields or stated else findings.table.column(findings.fields["plane"].name)
+    )
+    plane = np.array([names.get(name.strip().upper(), -1) for name in planes], dtype=np.int64)
+    if (plane < 0).any():
+        findings.doubts.append(
+            "the file does not state the plane as XY, YZ or ZX; give --plane, if angles count from its first axis"
+        )
+        plane = np.zeros(1, dtype=np.int64)
+    findings.understood["plane"] = ", ".join(list(PLANES)[k] for k in np.unique(plane))
+    angle_rad = (angle * RAD_PER_ANGLE[unit])[row]
+    _check_sense(findings, angle_rad, direction, value_mm)
+    findings.understood |= {
+        "angle": f"{unit}, from the first axis of the plane to the second (inferred)",
+        "readings": len(row),
+        "directions": sorted(set(direction.tolist())),
+        "runs": len(np.unique(run)),
+    }
+    if findings.options.sign == "correction":
+        value_mm = -value_mm
+    findings.understood["sign"] = "corrections, sign reversed" if findings.options.sign == "correction" else (
+        "actual minus nominal radius"
+    )  # fmt: skip
+    row_data = row_data_of(findings, "circle", once=len(row) == len(angle))
+    covariates = {name: values[row] for name, values in row_data.covariates.items()}
+    origin = [(str(findings.table.grid.path), int(findings.table.lines[k])) for k in row]
+    check_largest(value_mm, origin)
+    return Circles(
+        plane=np.broadcast_to(plane, len(findings.table.lines))[row],
+        angle_rad=angle_rad,
+        radius_mm=np.full(len(row), radius_mm),
+        deviation_mm=value_mm,
+        direction=direction,
+        run=run,
+        setup=np.zeros(len(row), dtype=np.int64),
+        centre_mm=np.full((len(row), 3), np.nan),
+        u_mm=np.full(len(row), np.nan),
+        covariates=covariates,
+        metadata=metadata_of(findings, row_data),
+        origin=origin,
+    )
+
+
+def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, FloatArray, float]:
+    """Row, direction, run and radial deviation (mm) of each reading, and the nominal radius."""
+    fields, table = findings.fields, findings.table
+    taken = {column.name for column in fields.values()}
+    turns = {name: found for name in table.header if name not in taken and (found := _turn(name)) is not None}
+    if not turns and "deviation" not in fields and "actual" not in fields and "radius" in fields:
+        # a radius that changes is a measured one
+        findings.fields = {
+            **{key: column for key, column in fields.items() if key != "radius"},
+            "actual": fields["radius"],
+        }
+        fields = findings.fields
+    stated, unit = _above(findings, "radius")
+    number = parse_number(stated)
+    radius_mm = 100.0  # until the user gives it
+    if findings.options.radius_mm is not None:
+        radius_mm = findings.options.radius_mm
+    elif "radius" in fields and np.ptp(radii := findings.positions_mm("radius", findings.numbers("radius"))) == 0.0:
+        radius_mm = float(radii[0])
+    elif number is not None and unit in MM_PER_LENGTH:
+        radius_mm = number * MM_PER_LENGTH[str(unit)]
+    else:
+        findings.doubts.append("the file states no nominal radius with its unit; give --radius-mm")
+    if not 0.0 < radius_mm <= LARGEST_RADIUS_MM:
+        raise table.grid.fail(f"{radius_mm:g} mm is not a radius; expected above 0, up to {LARGEST_RADIUS_MM:g} mm")
+    findings.understood["radius_mm"] = radius_mm
+    usual_mm = usual_deviation_mm(2.0 * radius_mm)
+    rows = np.arange(len(table.lines))
+    if turns and "deviation" not in fields:
+        units = {split_name(name).unit for name in turns}
+        if len(units) > 1:
+            raise table.grid.fail(
+                "the columns of both directions have different units; write them alike", table.header_line
+            )
+        findings.fields = {**fields, "deviation": split_name(next(iter(turns)))}
+        findings.used |= set(turns)
+        whole = [np.array(table.numbers(name, empty=True)) for name in turns]
+        row = np.tile(rows, len(turns))
+        value, kept = np.concatenate(whole), np.isfinite(np.concatenate(whole))
+        direction, run = (np.repeat([found[k] for found in turns.values()], len(rows)) for k in (0, 1))
+        row, direction, run, value = row[kept], direction[kept], run[kept], value[kept]
+        return (
+            row,
+            direction,
+            run,
+            findings.values_si("deviation", "deviation", value, usual_mm, angular=False),
+            radius_mm,
+        )
+    if "direction" in fields:
+        cells = table.column(fields["direction"].name)
+        ways = []
+        for cell, line in zip(cells, table.lines, strict=True):
+            turned = _turn(cell)
+            ways.append(turned[0] if turned else way(cell))
+            if ways[-1] is None:
+                message = f"{shown(cell)} is not a direction; write CCW or CW, 1 or -1"
+                raise table.grid.fail(message, line, fields["direction"].name)
+        direction = np.array(ways, dtype=np.int64)
+    else:
+        direction = np.ones(len(rows), dtype=np.int64)
+        findings.doubts.append(
+            "no column states the direction (CCW, CW); give --map direction=COLUMN, or add such a column"
+        )
+    run = labels_of(findings, fields["run"]) if "run" in fields else np.zeros(len(rows), dtype=np.int64)
+    if "deviation" in fields:
+        findings.used.add(fields["deviation"].name)
+        values = findings.numbers("deviation")
+        value_mm = findings.values_si("deviation", fields["deviation"].name, values, usual_mm, angular=False)
+    else:
+        _need(findings, "actual")
+        findings.used.add(fields["actual"].name)
+        value_mm = findings.positions_mm("actual", findings.numbers("actual")) - radius_mm
+    return rows, direction, run, value_mm, radius_mm
+
+
+def _above(findings: TableFindings, key: str) -> tuple[str, str | None]:
+    """The value that a line above the table states for a field, and its unit; empty without such a line."""
+    for name, text in findings.table.metadata.items():
+        named, words = split_name(name), text.split()
+        if named.word in FIELDS[key] and words:
+            return words[0], named.unit or (known_unit(words[1]) if len(words) == 2 else None)
+    return "", None
+
+
+def _check_sense(findings: TableFindings, angle_rad: FloatArray, direction: IntArray, value_mm: FloatArray) -> None:
+    """Ask whether the angles of one direction count backwards, where the centres of both look mirrored."""
+    if len(np.unique(direction)) < 2 or findings.options.directions == "labels":
+        return
+    centres = []
+    for sense in (1, -1):
+        t = angle_rad[direction == sense]
+        design = np.column_stack([np.cos(t), np.sin(t), np.ones(len(t))])
+        centres.append(1e3 * np.linalg.lstsq(design, value_mm[direction == sense], rcond=1e-6)[0][:2])
+    apart = float(np.linalg.norm(centres[0] - centres[1]))
+    mirrored = float(np.linalg.norm(centres[0] - centres[1] * [1.0, -1.0]))
+    if apart > _MIRRORED_UM and mirrored < _MIRRORED * apart:
+        findings.doubts.append(
+            f"the centres of both directions are mirrored ({apart:.3g} um apart): angles of one direction seem to count the "
+            "other way; correct them, or give --directions labels if they are right"
+        )
+
+
 # The kind of measurement of a table, and the combination of the sheets of a workbook.
 
 
@@ -798,6 +988,9 @@ def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") ->
     table = find_table(grid, options.decimal)
     findings = TableFindings(table, fields_of(table.header, options.columns, options.ignore), options)
     findings.notes.extend(table.grid.notes)
+    if not {"position", "x", "y", "z"}.isdisjoint(findings.fields) and options.kind != "circle":  # then not of a circle
+        others = {"angle", "radius", "plane"} - set(options.columns)
+        findings.fields = {key: column for key, column in findings.fields.items() if key not in others}
     _along_one_axis(findings)
     kind = options.kind or _kind(findings)
     findings.understood["columns"] = {key: column.name for key, column in findings.fields.items()}
@@ -810,6 +1003,8 @@ def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") ->
         data = lengths_of(findings)
     elif kind == "deviations":
         data = deviations_of(findings)
+    elif kind == "circle":
+        data = circles_of(findings)
     elif kind == "errors" and options.error is None and (motions := motion_columns(findings)):
         data, reversal = error_motions(findings, motions)
     elif kind == "errors" and options.error is None:
@@ -867,6 +1062,8 @@ def _kind(findings: TableFindings) -> Kind:
         return "errors"
     if "position" in fields:
         return "axis"
+    if "angle" in fields:
+        return "circle"
     header = ", ".join(findings.table.header)
     raise findings.table.grid.fail(
         f"its columns are not recognised: {shown(header)}; assign them: --map position=COLUMN --map deviation=COLUMN (axis "
