@@ -105,6 +105,22 @@ class Circles(Displayed):
         )
 
 
+def arcs_of(angle_rad: FloatArray, rows: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the readings ``rows`` of one path in the order of their angles, an array for each arc.
+
+    A full circle is one arc that ends with its first reading; a gap of more than 3 degrees and 3 steps ends an arc.
+    """
+    angle = angle_rad[rows] % (2 * np.pi)
+    order = np.argsort(angle, kind="stable")
+    rows, angle = rows[order], angle[order]
+    gaps = np.diff(angle, append=angle[0] + 2 * np.pi)
+    ends = np.flatnonzero(gaps > max(3.0 * float(np.median(gaps)), np.radians(3.0))) + 1
+    if not len(ends):
+        return [np.append(rows, rows[0])]
+    first = int(ends[-1]) % len(rows)
+    return np.split(np.roll(rows, -first), ends[:-1] + len(rows) - int(ends[-1]))
+
+
 _CIRCLES = Schema(
     (
         Field("plane", ("plane",), one_of(PLANES, "a plane"), encode=lambda planes: [list(PLANES)[k] for k in planes]),

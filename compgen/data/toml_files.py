@@ -855,6 +855,16 @@ def numbers(value: Any) -> tuple[float, ...]:
     return tuple(number(item) for item in value)
 
 
+def one_or_more(check: Callable[[Any], float]) -> Callable[[Any], float | tuple[float, ...]]:
+    """A number that ``check`` accepts, or a list of them."""
+
+    @accepts({"anyOf": [accepted(check), array_schema(accepted(check))]})
+    def check_each(value: Any) -> float | tuple[float, ...]:
+        return tuple(check(item) for item in value) if isinstance(value, list) else check(value)
+
+    return check_each
+
+
 @accepts({**array_schema(accepted(number), 3), "maxItems": 3})
 def vector3(value: Any) -> tuple[float, float, float]:
     """Three finite numbers, for X, Y and Z."""

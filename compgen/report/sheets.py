@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from compgen.accuracy.positioning import EDITIONS
 from compgen.accuracy.sides import Side
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.charts import DASHED, Picture, Plot, legend, limits_of, page_assets, svg
-from compgen.data.circles import PLANES, Circles
+from compgen.data.circles import PLANES, Circles, arcs_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
@@ -258,7 +258,7 @@ def draw_circle(name: str, circles: Circles, own: NDArray[np.bool_]) -> Picture:
         plot.text(0.95 * x, 0.95 * y, text, anchor="middle", shift=(0.0, 3.0))
     for sign, role in ((1, "c0"), (-1, "c1")):
         for number in np.unique(run[direction == sign]).tolist():
-            for arc in _arcs(angle, np.flatnonzero((direction == sign) & (run == number))):
+            for arc in arcs_of(angle, np.flatnonzero((direction == sign) & (run == number))):
                 place = NOMINAL + radial[arc] * per_um
                 plot.line(place * np.cos(angle[arc]), place * np.sin(angle[arc]), role, width=1.3)
     for division in (-3, 0, 3):  # on top of the lines
@@ -270,15 +270,3 @@ def draw_circle(name: str, circles: Circles, own: NDArray[np.bool_]) -> Picture:
     scale = f"about the centre of least squares, {step:g} µm per division, magnification {magnification:.0f}"
     key, title = f"circle-{name.replace(' ', '-')}", f"Radial deviation {name}"
     return Picture(key, title, svg(key, f"{title}, {scale}", [plot], ROUND, more=names), note=scale)
-
-
-def _arcs(angle: FloatArray, rows: NDArray[np.int64]) -> Iterable[NDArray[np.int64]]:
-    """Yield the readings of one path in the order of their angles; a full circle is closed, gaps stay open."""
-    rows = rows[np.argsort(angle[rows] % (2 * np.pi))]
-    gaps = np.diff(angle[rows] % (2 * np.pi), append=angle[rows[0]] % (2 * np.pi) + 2 * np.pi)
-    ends = np.flatnonzero(gaps > max(3.0 * float(np.median(gaps)), math.radians(3.0)))
-    if not len(ends):
-        yield np.append(rows, rows[0])
-        return
-    rows = np.roll(rows, -(int(ends[-1]) + 1))
-    yield from np.split(rows, (ends + 1 - (int(ends[-1]) + 1)) % len(rows))[: len(ends) + 1]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, SECONDS_PER_MIN
-from compgen.data.toml_files import accepts, part_setting, setting
+from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.simulate.effects import LengthEffect, RunEffect, SimulatedEffect
 from compgen.simulate.trajectory import (
@@ -129,18 +128,6 @@ def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
 OVERRUN = 0.02
 
 
-@accepts(
-    {
-        "anyOf": [
-            toml_files.accepted(toml_files.positive),
-            toml_files.array_schema(toml_files.accepted(toml_files.positive)),
-        ]
-    }
-)
-def _dwells(value: Any) -> float | tuple[float, ...]:
-    return tuple(toml_files.positive(item) for item in value) if isinstance(value, list) else toml_files.positive(value)
-
-
 @dataclass(frozen=True)
 class AxisLaser:
     """Runs in both directions along axes, one after another.
@@ -163,7 +150,7 @@ class AxisLaser:
     cycles: int = setting(toml_files.whole(1, 1000), 5)
     noise_um: float = setting(toml_files.not_negative, 0.2)
     feed_mm_min: float = setting(toml_files.positive, 2000.0)
-    dwell_s: float | tuple[float, ...] = setting(_dwells, 4.0)
+    dwell_s: float | tuple[float, ...] = setting(toml_files.one_or_more(toml_files.positive), 4.0)
     at_mm: Vector3 | None = setting(toml_files.vector3, None)
 
     def stops(self, machine: Machine) -> tuple[Stops, NDArray[np.int64]]:

@@ -10,6 +10,8 @@ import browser as helper
 import numpy as np
 import pytest
 
+from compgen.data.circles import arcs_of
+
 GOLDEN_CSV = Path(__file__).resolve().parents[1] / "golden" / "accuracy" / "iso230_2_constructed_golden.csv"
 
 
@@ -172,6 +174,21 @@ def test_the_polar_diagram_shows_the_readings_at_its_scale(tmp_path, call, angle
         np.testing.assert_allclose(np.cos(turned - a[own]), 1.0, atol=1e-6)
         drawn = (np.linalg.norm(place, axis=1) - zero) / per_um
         np.testing.assert_allclose(drawn, radial[own], atol=0.02 * step + 0.02)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "arcs"),
+    [
+        ([90, 0, 30, 60], [[0, 30, 60, 90]]),
+        (range(0, 360, 90), [[0, 90, 180, 270, 0]]),
+        ([350, 355, 0, 5, 100, 105, 110], [[350, 355, 0, 5], [100, 105, 110]]),
+        ([310, 170, 180, 300, 190], [[170, 180, 190], [300, 310]]),
+    ],
+)
+def test_a_gap_ends_an_arc_and_a_full_circle_is_closed(degrees, arcs):
+    angle = np.radians(np.array(degrees, dtype=float))
+    found = arcs_of(angle, np.arange(len(angle)))
+    assert [np.rint(np.degrees(angle[rows])).astype(int).tolist() for rows in found] == arcs
 
 
 @pytest.mark.skipif(helper.program() is None, reason="chromium is not installed: the sheet is not printed")
