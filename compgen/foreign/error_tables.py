@@ -168,7 +168,7 @@ def summed_steps(findings: TableFindings, steps: ErrorTable, base_mm: float) -> 
 _PAIRS = {"XY": ("EC0Y", 1.0), "XZ": ("EB0Z", -1.0), "YZ": ("EA0Z", 1.0)}
 _ABOVE_90 = dict(_PAIRS.values())
 _AXIS_WORD = r"(?:[\s\-]?(?:AXIS|ACHSE|AXE|ASSE|EJE))?"
-_BETWEEN = r"(?:ZU|TO|\u00c0|A|VS|AND|UND|ET|E|GEGEN|(?<=\s)Y(?=\s))?"
+_BETWEEN = r"(?:WITH RESPECT TO|RELATIVE TO|ZU|TO|\u00c0|A|VS|AND|UND|ET|E|GEGEN|(?<=\s)Y(?=\s))?"
 _PAIR = re.compile(
     rf"(?<![A-Z])([XYZ]){_AXIS_WORD}[\s\-/\u2013_:\u22a5\u27c2]*{_BETWEEN}[\s\-/\u2013_]*([XYZ])(?![A-Z]){_AXIS_WORD}"
 )
@@ -176,6 +176,7 @@ _PAIR = re.compile(
 _ISO = re.compile(r"(?<![A-Z0-9])(?:E_?([CBA])_?[0O]|([CBA])_?0)_?([XYZ])(?![A-Z0-9])")
 #: What a column beside the value contains, by its name without accents: uncertainty, or the length of the deviation.
 _BESIDE = {
+    "k": re.compile(r"^k$"),
     "u": re.compile(r"(^|[^a-z])u([^a-z/]|$)|uncert|unsicher|incert"),
     "length": re.compile(r"length|lange|laenge|(^|\W)over(\W|$)|uber|ueber|longueur|lungh|longitud"),
 }
@@ -257,7 +258,9 @@ def squareness_in(grid: CellGrid, options: ImportOptions, form: str) -> Imported
         for n, cell in enumerate(row):
             if cell and not angles:
                 reader.above.setdefault(n, []).append(cell)
-        if not angles and reader.name_of(row, {})[0] and re.search(r"\d", _ISO.sub("", " ".join(row).upper())):
+        whole_name = any(pattern.fullmatch(cell.upper()) for cell in row for pattern in (_ISO, _PAIR))
+        digits = re.search(r"\d", _ISO.sub("", " ".join(row).upper())) is not None
+        if not angles and reader.name_of(row, {})[0] and (whole_name or digits):
             raise grid.fail(
                 f"the number beside {shown(row[0])} is not understood; expected one such as 12 or 12 urad", line
             )
@@ -301,9 +304,10 @@ class SquarenessRows:
         """Return the error that the words of a row name, and whether by its name in ISO 230-1; None if none or several."""
         label = " ".join(cell for n, cell in enumerate(row) if n not in angles).upper()
         iso = {f"E{a or b}0{c}" for a, b, c in _ISO.findall(label)}
-        pairs = {"".join(sorted(pair)) for pair in _PAIR.findall(label)} & set(_PAIRS)
+        pairs = {"".join(sorted(pair)) for pair in _PAIR.findall(_ISO.sub(" ", label))} & set(_PAIRS)
         if iso:
-            return (iso.pop() if len(iso) == 1 and iso <= set(SQUARENESS_NAMES) else None), True
+            agree = len(iso) == 1 and iso <= set(SQUARENESS_NAMES) and {_PAIRS[pair][0] for pair in pairs} <= iso
+            return (iso.pop() if agree else None), True
         return (_PAIRS[pairs.pop()][0] if len(pairs) == 1 else None), False
 
     def take(self, row: Sequence[str], line: int, angles: Mapping[int, Angle]) -> None:
@@ -350,7 +354,7 @@ class SquarenessRows:
         kinds: dict[str, int] = {}
         for n in angles:
             words = [cell for cell in self.above.get(n, []) if known_unit(cell.strip("[]() ")) is None]
-            name = words[-1] if words and len(angles) > 1 else ""
+            name = words[-1] if words else ""
             kind = next((key for key, pattern in _BESIDE.items() if pattern.search(unaccented(name))), "value")
             if is_index(name):
                 continue
@@ -392,9 +396,16 @@ class SquarenessRows:
         if not np.isfinite(expanded):
             return cell.value * scale, float("nan"), ""
         factor = _COVERAGE.search("\n".join([named, *row, *(word for words in self.above.values() for word in words)]))
-        if factor is None and not _STANDARD.search(named):
+        k = (
+            1.0
+            if factor is None and _STANDARD.search(named)
+            else float(parse_number(factor[1]) or 0.0)
+            if factor
+            else 0.0
+        )
+        k = angles[kinds["k"]].value if "k" in kinds else k
+        if k <= 0:
             return 0.0, float("nan"), "coverage factor k"
-        k = 1.0 if factor is None else float(parse_number(factor[1]) or 1.0)
         return cell.value * scale, abs(expanded) * scale / k, ""
 
     def unit(

@@ -7,8 +7,10 @@ import openpyxl
 import pytest
 
 from compgen.data.error_table import read_errors
+from compgen.data.machine import load_machine
 from compgen.errors import InputError
 from compgen.foreign import ImportOptions, import_file
+from compgen.kinematics import exact_error
 
 #: One second of arc, pi / 648000 rad.
 ARCSEC_URAD = 4.84813681109536
@@ -63,6 +65,9 @@ NAMED = {
     "ratio": ("Rechtwinkligkeit\nEC0Y;0,009/300\nEB0Z;-6 µm / 200 mm\n", {"EC0Y": (30, None), "EB0Z": (-30, None)}),
     "unit in the cell": ("Squareness (k = 2)\nEC0Y;12 ± 3 µrad\nEA0Z;-5 arcsec\n",
                          {"EC0Y": (12, 1.5), "EA0Z": (-5 * ARCSEC_URAD, None)}),
+    "columns": ("Name;Description;Value;Unit;U;k\nEC0Y;Y with respect to X;2;arcsec;1;2\n",
+                {"EC0Y": (2 * ARCSEC_URAD, ARCSEC_URAD / 2)}),
+    "units of U": ("Squareness;Value [arcsec];U (k=2) [urad]\nEC0Y;2;2\n", {"EC0Y": (2 * ARCSEC_URAD, 1)}),
     "certificate": ("Certificate no. 12\nDate;12.03.2025\nTemperature;20.1;C\nSquareness;Value [urad]\nEC0Y;12\n",
                     {"EC0Y": (12, None)}),
     # the angle itself: +Y leans to -X where EC0Y > 0 (more than 90); +Z leans to +X where EB0Z > 0 (less than 90)
@@ -111,6 +116,20 @@ def test_the_sign_of_pairs_of_axes_is_asked_for_and_answered(tmp_path, text, sig
     assert [found[name][0] for name in ("EC0Y", "EB0Z", "EA0Z")] == pytest.approx(expected_urad, abs=1e-9)
 
 
+@pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT", "WZFXYT", "WYFZXT"])
+@pytest.mark.parametrize(("sign", "side"), [("angle-above-90", 1.0), ("angle-below-90", -1.0)])
+def test_the_axes_of_the_machine_enclose_the_angle_that_was_stated(tmp_path, chain, sign, side):
+    file = tmp_path / "machine.toml"
+    file.write_text(MACHINE.format(chain=chain))
+    errors = import_file(written(tmp_path, PAIRS[0]), ImportOptions(sign=sign)).data
+    corners_mm = np.array([[0.0, 0.0, -200.0], [400.0, 0.0, -200.0], [0.0, 300.0, -200.0], [0.0, 0.0, 0.0]])
+    tip_mm = corners_mm + exact_error(load_machine(str(file)), errors, corners_mm)
+    along = [tip_mm[k] - tip_mm[0] for k in (1, 2, 3)]
+    for (a, b), stated_urad in {(0, 1): 10, (0, 2): 20, (1, 2): 30}.items():
+        cosine = along[a] @ along[b] / np.linalg.norm(along[a]) / np.linalg.norm(along[b])
+        assert 1e6 * (np.arccos(cosine) - np.pi / 2) == pytest.approx(side * stated_urad, abs=1e-2)
+
+
 def test_neither_error_nor_correction_says_which_angle_a_pair_means(tmp_path):
     for sign in ("error", "correction"):
         assert import_file(written(tmp_path, PAIRS[0]), ImportOptions(sign=sign)).doubts
@@ -124,6 +143,11 @@ WRONG = {
     "Squareness [urad]\nEC0Y;10\nEC0Y;12\n": ("line 3", "appears again"),
     "Squareness [urad]\nEC0Y;10\nX-Y;12\n": ("line 3", "appears again"),
     "Squareness [urad]\nEC0Y;10\nEB0Z;about 5\n": ("line 3", "the number beside 'EB0Z' is not understood"),
+    "Squareness;urad\nEC0Y;10\nEB0Z;\n": ("line 3", "the number beside 'EB0Z' is not understood"),
+    "Squareness;urad\nEC0Y;10\nXZ;inf\n": ("line 3", "the number beside 'XZ' is not understood"),
+    "Squareness;urad;u [urad]\nEC0Y;10;2\nEB0Z;;2\n": ("line 3", "contains no value"),
+    "Name;Pair;Squareness [urad]\nEC0Y;XZ;10\n": ("line 2", "'EC0Y' is not a pair of axes"),
+    "Squareness;urad;U (k=0)\nEC0Y;10;2\n": ("line 2", "states no coverage factor k"),
     "Squareness\nEC0Y;10\nEB0Z;5 urad\n": ("line 2", "states no unit of 'EC0Y'"),
     "Squareness;urad;U [urad]\nEC0Y;10;2\nEB0Z;5;2\n": ("line 2", "states no coverage factor k of 'EC0Y'"),
     "Squareness;urad;Limit [urad]\nEC0Y;10;50\nEB0Z;5;50\n": ("line 2", "contains several numbers"),
