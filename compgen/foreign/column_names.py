@@ -554,7 +554,10 @@ _MOTIONS = {
     "roll": re.compile(rf"(?<![a-z])(?:roll|wank|roulis|rollio|alabeo){_ENDING}"),
     "error": re.compile(r"(?<![a-z])e_?([xyzabc])_?([xyz])(?![a-z0-9])"),
 }
-_SIDES = {"H": re.compile(r"horiz[a-z]*|waag[a-z]*|orizz[a-z]*"), "V": re.compile(r"verti[a-z]*|senkr[a-z]*")}
+_SIDES = {
+    "H": re.compile(r"(?<![a-z])h(?![a-z0-9])|horiz[a-z]*|waag[a-z]*|orizz[a-z]*"),
+    "V": re.compile(r"(?<![a-z])v(?![a-z0-9])|verti[a-z]*|senkr[a-z]*"),
+}
 _LETTER = re.compile(r"(?<![a-z])([xyz])(?![a-z0-9])")
 #: Words of such names that say nothing more.
 _BESIDE_AXIS = re.compile(r"-?(?<![a-z])(?:axis|achse|axe|asse|eje|von|along|angle|winkel|level|libelle)(?![a-z/])")
@@ -620,7 +623,7 @@ def motion_in(name: str) -> MotionColumn | None:
     rest = _BESIDE_AXIS.sub(" ", _MOTIONS[motions[0]].sub(" ", re.sub(r"(?<=\w)\s+-\s+(?=[a-z])", " ", flat)))
     letters = [letter.upper() for letter in _LETTER.findall(rest)]
     rest = _LETTER.sub(" ", rest)
-    for side, pattern in _SIDES.items():
+    for side, pattern in _SIDES.items() if motions[0] == "straightness" else ():
         letters += [side] if pattern.search(rest) else []
         rest = pattern.sub(" ", rest)
     words = _read(rest)

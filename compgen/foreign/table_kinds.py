@@ -555,9 +555,16 @@ def error_motions(findings: TableFindings, columns: Sequence[MotionColumn]) -> t
     if "deviation" in findings.fields:
         found[f"E{letter}{letter}"] = [RunColumn(findings.fields["deviation"].name, 0, 0)]
     if read:
+        others = [
+            runs[0].name for runs in found.values() if not any(f"{shown(runs[0].name)} is" in text for text in read)
+        ]
+        also = f"; --sign applies to {', '.join(map(shown, others))} as well" if others else ""
         findings.doubts.append(
-            f"{', '.join(read)} (Z vertical; otherwise --map), but their sign is not stated; give {_MEANING}"
+            f"{', '.join(read)} (Z vertical; otherwise --map), but their sign is not stated; give {_MEANING}{also}"
         )
+    words = unaccented(" ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]))
+    if not read and findings.options.sign is None and any(word in words for word in _COUNTER):
+        findings.doubts.append("the file mentions corrections; give --sign error or correction")
     findings.used |= {findings.fields[key].name for key in ("axis", "direction", "run") if key in findings.fields}
     results = [_over_position(findings, name, runs) for name, runs in found.items()]
     metadata = metadata_of(findings, row_data_of(findings, "errors"))

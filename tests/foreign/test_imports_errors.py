@@ -288,6 +288,8 @@ def test_rows_of_runs_with_directions_are_averaged(tmp_path):
         ("Z", "Roll [urad]", "ECZ"),
         ("X", "Geradheit vertikal [um]", "EZX"),
         ("Y", "Straightness horizontal [um]", "EXY"),
+        ("X", "Straightness V (um)", "EZX"),
+        ("X", "Straightness H (um)", "EYX"),
         ("Z", "Straightness X [um]", "EXZ"),
         ("Y", "Geradheitsabweichung Z [um]", "EZY"),
     ],
@@ -327,6 +329,32 @@ def test_what_stands_beside_the_errors_is_never_left_out(tmp_path):
     assert any("'Pitch mean [urad]' is a statistic" in note for note in item.notes)
     path.write_text(path.read_text().replace("100;2;1;2;5", "100;2;1;9;5"))
     assert "states 9" in " ".join(import_file(path, ImportOptions(sign="error", ignore=["Nonsense"])).doubts)
+
+
+def test_named_errors_with_directions_state_their_sign_unless_corrections_are_mentioned(tmp_path):
+    text = "X axis\nPosition [mm];EYX + [um];EYX - [um]\n0;1;3\n100;2;4\n"
+    item = import_file(written(tmp_path, text))
+    assert item.doubts == ()
+    assert item.data.curves["EYX"].value == pytest.approx([2e-3, 3e-3])
+    path = written(tmp_path, "Korrekturwerte\n" + text)
+    assert "mentions corrections" in import_file(path).doubts[0]
+    assert import_file(path, ImportOptions(sign="correction")).data.curves["EYX"].value == pytest.approx([-2e-3, -3e-3])
+
+
+def test_the_question_lists_the_columns_whose_sign_is_known_but_would_be_reversed_too(tmp_path):
+    path = written(tmp_path, "X axis\nPosition [mm];Deviation [um];EYX [um];Pitch [urad]\n0;0;0;0\n100;1;2;3\n")
+    (doubt,) = import_file(path).doubts
+    assert doubt.endswith("--sign applies to 'EYX [um]', 'Deviation [um]' as well")
+    curves = import_file(path, ImportOptions(sign="error")).data.curves
+    found = {name: curve.value[1] for name, curve in curves.items()}
+    assert found == pytest.approx({"EXX": 1e-3, "EYX": 2e-3, "EBX": 3e-6})
+
+
+def test_two_rows_of_names_give_error_and_direction(tmp_path):
+    path = written(tmp_path, "Y axis\nPosition [mm];Pitch [urad];;Yaw [urad];\n;+;-;+;-\n0;0;2;2;4\n100;1;3;3;5\n")
+    curves = import_file(path, ImportOptions(sign="error")).data.curves
+    assert curves["EAY"].value == pytest.approx([1e-6, 2e-6])
+    assert curves["ECY"].value == pytest.approx([3e-6, 4e-6])
 
 
 def test_a_unit_of_length_is_no_angle(tmp_path):
