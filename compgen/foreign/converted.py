@@ -26,7 +26,7 @@ from compgen.data.names import error_named
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
 from compgen.foreign.detect import import_file
-from compgen.foreign.findings import Imported, ImportOptions
+from compgen.foreign.findings import SQUARENESS_APART, Imported, ImportOptions
 from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
@@ -160,15 +160,16 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
 
     They are brought to the gauge of every identification (positioning and angles zero at the reference point,
     straightness at both ends; squareness absorbs the lines), without smoothing; ``details`` says what that changed. Of
-    a table that is not the ``whole`` of what is known and contains no squareness, the lines are left out: how a
-    straightedge lay says nothing about the machine.
+    a table that is not the ``whole`` of what is known and contains no squareness, or whose squareness was measured apart,
+    the lines are left out: how a straightedge lay says nothing about the machine.
 
     Raises
     ------
     InputError
         for errors that do not match the machine's travel or chain.
     """
-    if not whole and not table.squareness:
+    apart = table.metadata.get("squareness") == SQUARENESS_APART
+    if apart or (not whole and not table.squareness):
         curves = dict(table.curves)
         for name, curve in table.curves.items():
             if error_named(name).is_straightness:

@@ -48,6 +48,8 @@ SUFFIXES = {
     "capture": ".capture.csv",
     "circle": ".circle.csv",
 }
+#: The comment ``# squareness = ...`` of errors whose squareness and straightness come from separate sheets.
+SQUARENESS_APART = "measured apart from straightness"
 #: Answers to ``--sign`` for all tables; the others are for squareness.
 TABLE_SIGNS = ("error", "correction")
 Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles

@@ -47,6 +47,7 @@ from compgen.foreign.column_names import (
 from compgen.foreign.covariates import RowData, directions_of, labels_of, metadata_of, row_data_of
 from compgen.foreign.error_tables import long_errors, si_values, summed_steps, wide_errors
 from compgen.foreign.findings import (
+    SQUARENESS_APART,
     USUAL_URAD,
     Data,
     Imported,
@@ -1205,4 +1206,6 @@ def _joined_errors(first: Imported, parts: Sequence[ErrorTable]) -> ErrorTable:
         raise InputError(f"{twice} is on two sheets; choose one with --sheet", file=first.path)
     curves = {name: curve for item in parts for name, curve in item.curves.items()}
     squareness = {name: value for item in parts for name, value in item.squareness.items()}
-    return ErrorTable(curves, squareness, parts[0].metadata)
+    together = any(item.curves and item.squareness for item in parts)
+    apart = {"squareness": SQUARENESS_APART} if curves and squareness and not together else {}
+    return ErrorTable(curves, squareness, {**parts[0].metadata, **apart})

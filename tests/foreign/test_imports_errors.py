@@ -417,3 +417,27 @@ def test_runs_under_a_title_of_straightness_are_not_taken_for_positioning(tmp_pa
     assert "mention straightness: give --error NAME" in " ".join(import_file(path).doubts)
     assert set(import_file(path, ImportOptions(error="EYX", sign="error")).data.curves) == {"EYX"}
     assert import_file(path, ImportOptions(kind="axis", sign="error")).doubts == ()
+
+
+def test_how_a_straightedge_lay_does_not_change_a_squareness_that_was_measured_apart(call, tmp_path):
+    machine = tmp_path / "machine.toml"
+    machine.write_text(MACHINE.format(chain="WFYXZT"))
+    # a line of 100 um/m, and 2 um of straightness in the middle
+    straight = [["X axis"], ["Position [mm]", "EYX [um]"], [0, 5], [200, 27], [400, 45]]
+    square = [["EC0Y", "25 urad"]]
+    for name, sheets in {
+        "with runs": {"X": axis_sheet("X", 20, 0, 400), "Geradheit": straight, "Rechtwinkligkeit": square},
+        "errors only": {"Geradheit": straight, "Rechtwinkligkeit": square},
+    }.items():
+        path = workbook(tmp_path, sheets, f"{name}.xlsx")
+        out = tmp_path / name
+        code, _, err = call("identify", machine, path, "--out", out / "direct")
+        assert code == 0, err
+        code, _, err = call("import", path, "--out", out)
+        assert code == 0, err
+        code, _, err = call("identify", machine, *sorted(out.glob("*.csv")), "--out", out / "imported")
+        assert code == 0, err
+        for folder in ("direct", "imported"):
+            errors = read_errors(out / folder / "identified.errors.csv")
+            assert 1e6 * errors.squareness["EC0Y"][0] == pytest.approx(25, abs=1e-3)
+            assert 1e3 * errors.curves["EYX"].at(200.0) == pytest.approx(2, abs=1e-6)
