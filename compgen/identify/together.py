@@ -125,8 +125,18 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
         dict(chain.from_iterable(result.errors.squareness.items() for result in known)),
         known[0].errors.metadata,
     )
-    u = errors.uncertainties()
+    u, rows = errors.uncertainties(), errors.rows()
     whole = bool(np.isfinite(u).all())
+    # the values of one result keep their joint covariance, those of different ones are independent
+    factors = [np.diag(u)]
+    for result in known:
+        if result.values_factor is not None and whole:
+            own = np.concatenate([np.arange(rows[name].start, rows[name].stop) for name in result.errors.names])
+            # as many columns as values, not as readings
+            square = np.transpose(np.linalg.qr(result.values_factor.T)[1])
+            factors[0][own] = 0.0
+            factors.append(np.zeros((len(u), square.shape[1])))
+            factors[-1][own] = square
     return replace(
         _common(parts, known),
         errors=errors,
@@ -136,7 +146,7 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
         unknowns=sum(result.unknowns for result in known),
         worst_u=worst_uncertainty(errors) if whole else {},
         layout=error_parameters(machine, errors.names),
-        values_factor=np.diag(u) if whole else None,
+        values_factor=np.hstack(factors) if whole else None,
         details={"parts": [part.summary() for part in parts]},
     )
 

@@ -11,8 +11,10 @@ from compgen.cli.common import run_command
 from compgen.data.circles import PLANES, Circles, format_circles, read_circles
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.foreign import open_measurement
 from compgen.identify.axis_tests import identify_circles
 from compgen.kinematics.exact_chain import tip_position
+from compgen.pipeline import identify_bare
 
 RADIUS_MM, NOISE_MM = 100.0, 2e-4
 SQUARENESS = {"EC0Y": 80e-6, "EB0Z": -60e-6, "EA0Z": 45e-6}
@@ -199,3 +201,38 @@ def test_files_say_what_is_wrong_with_them(tmp_path, machine):
         identify_circles(machine, readings(machine, errors_of(machine), "XY", known_centre=False))
     with pytest.raises(UndeterminedError, match="too short"):
         identify_circles(machine, readings(machine, errors_of(machine), "XY", arc=(0.0, 3.0), directions=(1,)))
+
+
+def one_arc_each_way(machine, errors):
+    """Planes XY and YZ, short arcs that differ in both directions: the reversal of Y is shared and hardly determined."""
+    names = ("plane", "angle_rad", "radius_mm", "deviation_mm", "direction", "run", "setup", "centre_mm", "u_mm")
+    arcs = {("XY", 1): (-100, -60), ("XY", -1): (60, 180), ("YZ", 1): (-60, -20), ("YZ", -1): (-80, 20)}
+    parts = [
+        readings(machine, errors, plane, arc=arc, directions=(way,), seed=seed)
+        for seed, ((plane, way), arc) in enumerate(arcs.items())
+    ]
+    return Circles(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+def test_planes_keep_their_joint_covariance_beside_other_measurements(tmp_path, machine):
+    """The squareness errors of two planes share the reversal of Y, and so the readings that show it."""
+    errors = errors_of(machine)
+    path = file_of(tmp_path, one_arc_each_way(machine, errors), "both")
+    alone = identify_circles(machine, read_circles(path)).values_factor
+    covariance = alone @ alone.T
+    runs = tmp_path / "x.axis.csv"
+    rows = [
+        f"X,{x},{way},{run},{20e-3 * x + 0.1 * run:.4f}"
+        for run in (1, 2, 3)
+        for way in (1, -1)
+        for x in range(-250, 251, 50)
+    ]
+    runs.write_text("axis,position_mm,direction,run,deviation_um\n" + "\n".join(rows) + "\n")
+    together = identify_bare(machine, open_measurement([path, runs]))
+    names, _ = together.errors.labels()
+    own = [names.index(name) for name in ("EC0Y", "EA0Z")]
+    factor = together.values_factor
+    np.testing.assert_allclose((factor @ factor.T)[np.ix_(own, own)], covariance, rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(factor, axis=1), together.errors.uncertainties(), rtol=1e-9)
+    assert not (factor @ factor.T)[own][:, names.index("EXX")].any()
+    assert abs(covariance[0, 1]) > 0.1 * np.sqrt(covariance[0, 0] * covariance[1, 1])
