@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import PART, Artefact, Deviations, aligned, setups_of
+from compgen.data.deviations import FAR_MM, PART, Artefact, Deviations, aligned, setups_of
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.determined import Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
@@ -442,6 +442,13 @@ def artefact_observations(
     position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
     check_travel(machine, position_mm, artefact.origin)
     expected_mm = layout.tips(around, position_mm, tool_mm) - tool_mm - position_mm
+    largest_mm = float(np.abs(expected_mm).max())
+    if largest_mm > FAR_MM:  # no machine: noise, enlarged by directions that the set-ups hardly determine
+        raise UndeterminedError(
+            f"the set-ups hardly separate the errors of the machine from the artefact (errors of {largest_mm:.3g} mm would fit): "
+            "measure the artefact turned by 180 degrees and shifted, too, or give the machine fewer nodes or errors",
+            [],
+        )
     found_mm = artefact.measured_mm + expected_mm
     lying = aligned(Deviations(artefact.nominal_mm, found_mm - artefact.nominal_mm, labels={"setup": artefact.setup}))
     poses = [lying.poses[setup] for setup in artefact.setup.tolist()]

@@ -6,11 +6,12 @@ import pytest
 import compgen
 from compgen.data.deviations import read_artefacts
 from compgen.data.error_table import Curve, ErrorTable
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.foreign import open_measurement
 from compgen.identify import IdentifyOptions, identify_measurement
 from compgen.kinematics.exact_chain import tip_position
 from compgen.pipeline import identify_bare
+from compgen.simulate import simulate_axis_runs
 
 EC0Y, SLOPES, NOISE_MM = 120e-6, (30e-6, -20e-6), 3e-4
 
@@ -147,3 +148,21 @@ def test_files_say_what_is_wrong_with_them(tmp_path, machine, errors):
     mirrored = [(name, x, y, z, -mx, my, setup) for name, x, y, z, mx, my, setup in rows]
     with pytest.raises(InputError, match="mirrored"):
         identify_measurement(machine, open_measurement([written(tmp_path / "b.artefact.csv", mirrored)]))
+
+
+def test_set_ups_that_hardly_separate_plate_and_machine_are_named_as_the_reason(tmp_path):
+    """A plate of 0.2 m on a machine of metres, turned by 90 degrees and shifted only: noise becomes millimetres."""
+    scenario = tmp_path / "s.toml"
+    poses = ["rotation_deg = [0, 0, 0]", "rotation_deg = [0, 0, 90]", "rotation_deg = [0, 0, 0]"]
+    lines = [
+        'name = "s"\nseed = 3\n[instrument]\ntype = "touch-probe"\ncomponents = "xy"\ncalibrated = false\nform_um = 20'
+    ]
+    for k, pose in enumerate(poses):
+        lines.append(f"[[instrument.poses]]\norigin_mm = [{-400 + 25 * k}, -400, -200]\n{pose}")
+    scenario.write_text("\n".join(lines))
+    machine = compgen.load_machine("zha-gantry")
+    plate = simulate_axis_runs(machine, compgen.read_scenario(scenario)).readings
+    with pytest.raises(
+        UndeterminedError, match="turned by 180 degrees and shifted, too, or give the machine fewer nodes"
+    ):
+        identify_measurement(machine, plate)
