@@ -21,7 +21,7 @@ from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
 from compgen.identify.adjust.robust import RobustFit, WeightedReadings, belonging, explain_rejected, fit_robustly
-from compgen.identify.adjust.solver import Factor, Rank, describe_rank, determined_factor, solve, unknown_names
+from compgen.identify.adjust.solver import NO_DATA, Factor, Rank, describe_rank, determined_factor, solve, unknown_names
 from compgen.identify.adjust.starts import (
     StationStart,
     affine_start,
@@ -327,13 +327,18 @@ ONE_PLACE_MM = 20.0
 SAME_LEVEL_MM = 0.5
 
 
-def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> list[str]:
-    """Return what makes the readings determine the errors, the most likely cause first; empty if nothing simple does."""
+def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions, *, empty_nodes: bool) -> list[str]:
+    """Return what makes the readings determine the errors, the most likely cause first; empty if nothing simple does.
+
+    Fewer nodes are tried only for nodes without any reading (``empty_nodes``): they do not help stations on a line.
+    """
     span_mm = np.ptp(lengths.position_mm, axis=0)
     found = [
         f"{AXES[k]} did not move (all readings at {lengths.position_mm[0, k]:g} mm): measure at several positions along it"
         for k in np.flatnonzero(span_mm < SAME_LEVEL_MM).tolist()
     ]
+    if found:
+        return found
     task = task_of(machine, lengths)
     place_mm = start_values(task)[0].stations_mm
     for first, second in itertools.combinations(range(len(place_mm)), 2):
@@ -343,7 +348,7 @@ def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> li
             found.append(
                 f"the stations {names} are in one place ({distance:.1f} mm apart), which counts once: measure from another place"
             )
-    if options.nodes == "machine" and not found:
+    if options.nodes == "machine" and empty_nodes and not found:
         fewer = next(
             (item for item in with_fewer_nodes(machine, lengths) if _quietly(item, lengths, options) is not None), None
         )
@@ -426,7 +431,8 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
         except ConvergenceError as error:
             raise ConvergenceError(f"{error}{_explained(machine, lengths, chosen)}") from error
         except UndeterminedError as error:
-            advice = "".join(f"{text}; " for text in remedies(machine, lengths, chosen))
+            empty = any(text.startswith(NO_DATA) for text in error.combinations)
+            advice = "".join(f"{text}; " for text in remedies(machine, lengths, chosen, empty_nodes=empty))
             raise UndeterminedError(f"{advice}{error}", error.combinations) from error
         return with_systematic(machine, lengths, _with_causes(machine, lengths, chosen, found), chosen.systematic)
 

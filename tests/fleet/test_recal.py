@@ -528,7 +528,7 @@ def test_the_size_of_all_files_of_a_measurement_is_limited_before_they_are_read(
         stream.truncate(1 << 40)  # holds nothing, would take a terabyte of memory
     said = "\n".join(plant.run().outcomes[0].messages)
     assert "2.deviations.csv: is too large: 0.4 MB, but only 0.2 MB are left" in said and "0.deviations" not in said
-    assert "sparse.deviations.csv: is too large: 1.1e+06 MB where 1 MB are left" in said
+    assert "sparse.deviations.csv: is too large: 1.1e+06 MB, but only 1 MB are left" in said
 
 
 @pytest.mark.parametrize(

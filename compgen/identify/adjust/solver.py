@@ -199,6 +199,10 @@ class Rank:
     combinations: tuple[str, ...]
 
 
+#: Begin of the text about unknowns that no reading depends on.
+NO_DATA = "no data at all for"
+
+
 def determined_factor(
     matrix: FloatArray, names: Callable[[], list[str]], what: str, suspicious: float = SUSPICIOUS_RCOND
 ) -> tuple[Factor, Rank | None]:
@@ -239,7 +243,7 @@ def describe_rank(matrix: FloatArray, names: list[str], zero: float = ZERO_EIGEN
     without = [names[k] for k in np.flatnonzero(empty)]
     if without:
         more = f" and {len(without) - MOST_NAMED} more" if len(without) > MOST_NAMED else ""
-        texts.append(f"no data at all for: {', '.join(without[:MOST_NAMED])}{more}")
+        texts.append(f"{NO_DATA}: {', '.join(without[:MOST_NAMED])}{more}")
     # each direction without data is described by the errors that take part in it, the leading one first
     others = vectors[:, null][:, np.sum(vectors[:, null][empty] ** 2, axis=0) < 0.5]
     for vector in _sparse_directions(others).T:
