@@ -110,7 +110,7 @@ class CircleCandidate:
     """An effect that may be named: its columns (n, k), a parameter each with the SI unit of its name.
 
     ``trials`` counts the places at which it was tried; ``settings`` are the ones found, ``slope`` the derivative of the
-    columns by the logarithm of the setting (n, k).
+    columns by the logarithm of the setting (n, k), ``make`` the same effect with another setting.
     """
 
     name: str
@@ -120,6 +120,7 @@ class CircleCandidate:
     trials: int = 1
     settings: Mapping[str, float] = field(default_factory=dict)
     slope: FloatArray | None = None
+    make: Callable[[float], CircleCandidate] | None = None
 
     @property
     def words(self) -> tuple[str, str]:
@@ -254,7 +255,7 @@ def sharpened(make: Callable[[float], CircleCandidate], space: CircleSpace, at: 
             low = first
         else:
             high = second
-    return make(math.exp(0.5 * (low + high)))
+    return replace(make(math.exp(0.5 * (low + high))), make=make)
 
 
 def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space: CircleSpace) -> list[CircleCandidate]:
@@ -537,6 +538,13 @@ def chosen_of(
         rest = [one for one in named if one is not item]
         if worth(item, beside(rest)) == 0.0:
             named = rest
+    # the settings were found before the other effects were known: once more beside these
+    for _ in range(2):
+        for k, item in enumerate(named):
+            if item.make is not None:
+                rest = [one for one in named if one is not item]
+                key, setting = next(iter(item.settings.items()))
+                named[k] = sharpened(item.make, beside(rest), setting, 1.01 if key == "pitch_mm" else 1.5)
     return named
 
 
@@ -548,7 +556,7 @@ def solved(
     chi2: Mapping[str, float],
 ) -> tuple[list[NamedCircleEffect], FloatArray]:
     """Values and uncertainties of the named effects in one adjustment, and the residuals without them (n,), mm."""
-    blocks = [item.columns for item in named]
+    blocks, names = [item.columns for item in named], {item.name for item in named}
     columns = np.hstack([base, *blocks])
     value = circles.deviation_mm
     found = np.linalg.lstsq(columns, value, rcond=1e-9)[0]
@@ -577,7 +585,7 @@ def solved(
         others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
         own = others.without(item.columns)
         alias = [
-            one.name for one in every if one not in named and _alike(own, others.without(one.columns), one.columns)
+            one.name for one in every if one.name not in names and _alike(own, others.without(one.columns), one.columns)
         ]
         visible = float(np.linalg.norm(own) / np.linalg.norm(item.columns))
         effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible))
