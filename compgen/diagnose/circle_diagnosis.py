@@ -167,6 +167,14 @@ class CircleSpace:
         found = np.linalg.lstsq(seen, self.left, rcond=1e-6)[0]
         return float(np.sum((seen @ found) ** 2))
 
+    def are_alike(self, first: FloatArray, second: FloatArray) -> bool:
+        """Whether two sets of columns (n, k) say the same outside the space; not if the second is hardly seen there."""
+        seen = self.without(second)
+        if np.linalg.norm(seen) < LEAST_VISIBLE * np.linalg.norm(second):
+            return False
+        a, b = np.linalg.qr(self.without(first))[0], np.linalg.qr(seen)[0]
+        return float(np.linalg.svd(a.T @ b, compute_uv=False).min()) > ALIKE
+
 
 def candidates_of(machine: Machine, circles: Circles, position_mm: FloatArray) -> list[CircleCandidate]:
     """All effects without settings, in the order in which one of two equal ones is preferred."""
@@ -584,20 +592,10 @@ def solved(
             values = {"tau_ms": (math.sqrt(square), u_square / (2.0 * math.sqrt(square)))}
         others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
         own = others.without(item.columns)
-        alias = [
-            one.name for one in every if one.name not in names and _alike(own, others.without(one.columns), one.columns)
-        ]
+        alias = [one.name for one in every if one.name not in names and others.are_alike(item.columns, one.columns)]
         visible = float(np.linalg.norm(own) / np.linalg.norm(item.columns))
         effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible))
     return effects, after
-
-
-def _alike(first: FloatArray, second: FloatArray, whole: FloatArray) -> bool:
-    """Whether two sets of columns, without the rest of the model, say the same; ``whole`` is the second one with it."""
-    if np.linalg.norm(second) < LEAST_VISIBLE * np.linalg.norm(whole):
-        return False
-    a, b = np.linalg.qr(first)[0], np.linalg.qr(second)[0]
-    return float(np.linalg.svd(a.T @ b, compute_uv=False).min()) > ALIKE
 
 
 def invisible_of(circles: Circles, start: CircleSpace, every: Sequence[CircleCandidate]) -> tuple[str, ...]:
