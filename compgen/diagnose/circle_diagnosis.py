@@ -72,7 +72,8 @@ SECTOR_DEG, FOLDS = 30.0, 4
 WORDS = {
     "squareness": (
         "the axes of {of} are out of square: an ellipse at 45 degrees, alike in both directions",
-        "export the squareness (volcomp run), or align the axes",
+        "export the squareness (volcomp run), or align the axes; it is that within the circle: where guides are bent, it differs "
+        "over the whole travel",
     ),
     "servo_mismatch": (
         "the axes of {of} follow their commands with different delays: an ellipse at 45 degrees that turns with the direction",

@@ -94,6 +94,8 @@ def identification_table(result: Identification) -> Group:
         for item in result.details.get("unknowns", ())
         if item["what"] in ("reversal", "scales", "servo mismatch")
     ]
+    if result.method == "circles" and result.errors.squareness:
+        lines.append("squareness within the circles: bent guides make it differ over the whole travel, beyond u")
     if result.method == "merged":
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
