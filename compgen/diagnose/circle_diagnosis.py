@@ -392,7 +392,7 @@ class CircleDiagnosis(DisplayedDiagnosis):
             },
             "advice": self._advice(),
             "reasons": [],
-            "notes": [f"heldout_lines: sectors of {SECTOR_DEG:g} degrees, a quarter of them left out at a time"],
+            "notes": [f"lines left out: sectors of {SECTOR_DEG:g} degrees, a quarter of them at a time"],
             "evidence": {"readings": len(self.circles), "planes": list(self.circles.planes)},
         }
 

@@ -173,6 +173,16 @@ def suspects_of(found: Diagnosis) -> list[tuple[str, float, float]]:
     return [(name, chi2, share) for name, (chi2, share) in ranked]
 
 
+#: Keys and grades of ``diagnosis.json`` in words.
+IN_WORDS = {
+    "train": "readings used",
+    "heldout_lines": "lines left out",
+    "heldout_stations": "stations left out",
+    "heldout_times": "times left out",
+    "beside_unknown": "confirmed, with an unknown effect",
+}
+
+
 # The page of a diagnosis: one self-contained HTML file with figures.
 
 
@@ -271,7 +281,7 @@ def _effects(data: dict[str, Any]) -> str:
             for name, entry in item["parameters"].items()
         )
         others = ", ".join(f"{o['name']} {o['weight']:.2f}" for o in item["alias_set"] if o["name"] != item["name"])
-        text = f"<b>{escape(item['name'])}</b> <span class=note>{escape(item['grade'].replace('_', ' '))}</span> "
+        text = f"<b>{escape(item['name'])}</b> <span class=note>{escape(IN_WORDS.get(item['grade'], item['grade']))}</span> "
         text += escape(values) + (f"; cannot be distinguished from {escape(others)}" if others else "")
         text += escape("".join(f"; {reason}" for reason in item.get("reasons", [])))
         if item.get("text"):
@@ -308,7 +318,7 @@ def _figures(data: dict[str, Any]) -> str:
 
 def _misfit(data: dict[str, Any]) -> str:
     rows = "".join(
-        f"<tr><td>{escape(key.replace('_', ' '))}</td><td>{pair['before_rms_um']:.3f}</td>"
+        f"<tr><td>{escape(IN_WORDS.get(key, key))}</td><td>{pair['before_rms_um']:.3f}</td>"
         f"<td>{pair['after_rms_um']:.3f}</td></tr>"
         for key, pair in data["gap"].items()
         if isinstance(pair, dict)
@@ -373,7 +383,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
             lines.append(f"  * resembles {item['resembles']}, but this is not certain")
     lines += [f"* possible secondary effect: {item['name']}" for item in data["secondary"]]
     misfit = [
-        (key.replace("_", " "), pair["before_rms_um"], pair["after_rms_um"])
+        (IN_WORDS[key], pair["before_rms_um"], pair["after_rms_um"])
         for key in ("train", "heldout_lines", "heldout_stations", "heldout_times")
         if (pair := data["gap"][key])
     ]
@@ -410,7 +420,7 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
 
 
 def _effect_lines(item: Mapping[str, Any], *, markdown: bool, several: bool) -> list[str]:
-    grade = item["grade"].replace("_", " ")
+    grade = IN_WORDS.get(item["grade"], item["grade"])
     name = f"**{item['name']}**" if markdown else item["name"]
     axis = f"{item['axis']}, " if several and "axis" in item else ""
     lines = [f"* {name} ({axis}{grade}, weight {item['confidence']:.2f})"]
