@@ -471,6 +471,16 @@ def read_settings(kind: type[T], section: Section, /, **given: Any) -> T:
     return result
 
 
+def read_each(kind: type[T], section: Section, key: str) -> tuple[T, ...]:
+    """Return a ``kind`` for each table of an array of tables; an error if there is none."""
+    found = tuple(read_settings(kind, entry) for entry in section.sections(key))
+    if not found:
+        needed = ", ".join(item.key for item, _ in declared_settings(kind) if item.required)
+        message = f"is missing; give at least one [[{section.name}.{key}]] with {needed}"
+        raise section.fail(key, message, kind="missing", instead=[example_of(section_schema(kind))])
+    return found
+
+
 def unless_stated(settings: T, section: Section, **usual: Any) -> T:
     """Return settings with the ``usual`` values, by field, for keys missing in the section (axis by axis)."""
     found = {}

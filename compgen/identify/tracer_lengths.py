@@ -423,7 +423,7 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     """
     chosen = options or IdentifyOptions()
     with one_thread():
-        if chosen.nodes == "from-data":
+        if chosen.nodes == "from-data":  # tried without warnings; those of the nodes that are taken come below
             fitting = (item for item in with_fewer_nodes(machine, lengths) if _quietly(item, lengths, chosen))
             machine = next(fitting, machine)
         try:

@@ -179,7 +179,7 @@ def draw_positioning(
     axis: str, runs: AxisRuns, own: NDArray[np.bool_], targets: Mapping[str, FloatArray], k: float
 ) -> Picture:
     """Return the picture of one axis: readings, means of both directions, mean +- k s, and where A, E, M, B, R come from."""
-    x, zeros = targets["position_mm"], np.zeros(len(targets["position_mm"]))
+    x = targets["position_mm"]
     means = {way: targets[f"mean_{way}_um"] for way in ("up", "down")}
     spread = {way: k * np.nan_to_num(targets[f"s_{way}_um"]) for way in means}
     reading = runs.deviation_mm[own] / MM_PER_UM
@@ -198,10 +198,11 @@ def draw_positioning(
                 plot.line(x, means[way] + sign * spread[way], role, width=0.7, dash=DASHED)
     ranges = Plot((0.0, 3.0), limits, (WIDE_BOX[2] + 6.0, WIDE_BOX[1], WIDE[0] - 4.0, WIDE_BOX[3]), bare=True)
     middle = targets["mean_um"]
-    repeated = np.isfinite([targets[f"s_{way}_um"] for way in means]).any()
-    shown = [("A", edges if repeated else []), ("E", list(means.values())), ("M", [middle])]
-    for place, (name, values) in enumerate(shown):
-        known = np.concatenate([*values, zeros[:0]])
+    shown = {"E": list(means.values()), "M": [middle]}
+    if np.isfinite([targets[f"s_{way}_um"] for way in means]).any():
+        shown = {"A": edges, **shown}
+    for place, (name, values) in enumerate(shown.items()):
+        known = np.concatenate(values)
         known = known[np.isfinite(known)]
         if not len(known):
             continue

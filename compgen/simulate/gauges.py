@@ -146,17 +146,8 @@ class Ballbar:
         count = len(stops)
         # the pivot is set up where the tip is with the machine at the centre
         centre_mm = np.tile(self.centre(machine), (count, 1))
-        still = Stops(
-            centre_mm,
-            stops.point,
-            stops.run,
-            stops.time_s,
-            0 * stops.approach,
-            None,
-            stops.covariates,
-            {},
-            0 * centre_mm,
-        )
+        at_rest = np.zeros_like(centre_mm)
+        still = replace(stops, position_mm=centre_mm, approach=at_rest, way_mm=at_rest)
         pivot_mm = tips(still)[0] + np.array(self.pivot_um) * MM_PER_UM
         length_mm = np.linalg.norm(tips(stops) - pivot_mm, axis=1) + self.zero_um * MM_PER_UM
         plane = marks["plane"].astype(np.int64)
@@ -269,10 +260,8 @@ class TouchProbe:
 
     def lying(self, pose: PlatePose, true_mm: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Places of the features in the workpiece frame, (n, 3): in the stated pose, a little off."""
-        off_mm, off_rad = (
-            self.misplaced_mm * rng.standard_normal(3),
-            1e-3 * self.misturned_mrad * rng.standard_normal(3),
-        )
+        off_mm = self.misplaced_mm * rng.standard_normal(3)
+        off_rad = 1e-3 * self.misturned_mrad * rng.standard_normal(3)
         if len(self.components) < 3:  # in the plane: what is not measured stays as stated
             off_mm[2], off_rad[:2] = 0.0, 0.0
         stated = np.broadcast_to(np.radians(pose.rotation_deg), true_mm.shape)
@@ -310,11 +299,7 @@ class TouchProbe:
 
 def read_touch_probe(section: toml_files.Section) -> TouchProbe:
     """The machine's own probe on an artefact in one or more poses: *.artefact.csv."""
-    poses = tuple(toml_files.read_settings(PlatePose, entry) for entry in section.sections("poses"))
-    if not poses:
-        one = toml_files.example_of(toml_files.section_schema(PlatePose))
-        message = "is missing; give at least one [[instrument.poses]] with origin_mm"
-        raise section.fail("poses", message, kind="missing", instead=[one])
+    poses = toml_files.read_each(PlatePose, section, "poses")
     probe = toml_files.read_settings(TouchProbe, section, poses=poses)
     turned = [np.radians(pose.rotation_deg)[:2] for pose in poses]
     if len(probe.components) < 3 and np.any(turned):

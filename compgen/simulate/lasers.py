@@ -110,11 +110,7 @@ class LaserTracer:
 
 def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
     """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
-    stations = tuple(toml_files.read_settings(Station, entry) for entry in section.sections("stations"))
-    if not stations:
-        one = toml_files.example_of(toml_files.section_schema(Station))
-        message = "is missing; give at least one [[instrument.stations]]"
-        raise section.fail("stations", message, kind="missing", instead=[one])
+    stations = toml_files.read_each(Station, section, "stations")
     names = [station.name for station in stations]
     if len(set(names)) != len(names):
         raise section.fail("stations", f"the names {', '.join(names)} must differ")
