@@ -14,7 +14,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from itertools import chain
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +126,9 @@ def parse_any(source: Path, content: str) -> CsvFile:
 FloatArray = NDArray[np.float64]
 _LARGEST_LABEL = 2.0**53
 _ROWS_AT_ONCE = 10_000
+#: Numbers below this size with at most so many decimals are written digit by digit, and rounded like any other: a
+#: product with 10**digits is right to less than ``_TIE``.
+_LARGEST_BY_DIGITS, _MOST_BY_DIGITS, _TIE = 9999.5, 8, 1e-3
 #: A spreadsheet interprets a cell with such a beginning as a formula, in a comment also after a comma.
 _FORMULA = re.compile(r"'*[=+\-@]")
 _IN_COMMENT = re.compile(r"(?<=[,;])(?=[=+\-@])")
@@ -423,40 +426,62 @@ def format_csv(
     spreadsheet would interpret as a formula gets an apostrophe before it, which :meth:`CsvTable.text` removes again.
     """
     digits = decimals or {}
-    parts = [_template(values, digits.get(name, 6)) for name, values in columns.items()]
-    rows = max((len(cells) for _, cells in parts), default=0)
-    if any(len(cells) != rows for _, cells in parts):
+    sizes = {len(values) for values in columns.values()}
+    if len(sizes) > 1:
         raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
+    rows = max(sizes, default=0)
     facts = {**(metadata or {}), "rows": rows}
     noted = [f"# {visible_line(key)} = {visible_line(value)}" for key, value in facts.items()]
     comments = [_IN_COMMENT.sub(" ", line) for line in noted]
-    row = ",".join(template for template, _ in parts) + "\n"
     text = ["\n".join([*comments, ",".join(columns)]), "\n"]
     for start in range(0, rows, _ROWS_AT_ONCE):
-        block = [cells[start : start + _ROWS_AT_ONCE] for _, cells in parts]
-        text.append(row * len(block[0]) % tuple(chain.from_iterable(zip(*block, strict=True))))
+        some = {name: values[start : start + _ROWS_AT_ONCE] for name, values in columns.items()}
+        pieces = [piece for name, values in some.items() for piece in (*_cells(values, digits.get(name, 6)), b",")]
+        # rows of bytes of one length: what a shorter cell does not need is zero, and taken out
+        widths = [len(piece) if isinstance(piece, bytes) else piece.itemsize for piece in pieces]
+        block = np.empty(min(_ROWS_AT_ONCE, rows - start), [(f"{k}", f"S{width}") for k, width in enumerate(widths)])
+        for k, piece in enumerate([*pieces[:-1], b"\n"]):
+            block[f"{k}"] = piece
+        text.append(block.tobytes().translate(None, b"\0").decode())
     return "".join(text)
 
 
-def _template(values: Sequence[str] | FloatArray, digits: int) -> tuple[str, Sequence[str] | Sequence[float]]:
-    """Conversion of a column for the ``%`` operator, and what it converts."""
+def _cells(values: Sequence[str] | FloatArray, digits: int) -> list[bytes | NDArray[np.bytes_]]:
+    """Return the cells of a column as UTF-8, in one piece or in several that follow each other, each (n,)."""
     if not isinstance(values, np.ndarray):
         texts = [str(value) for value in values]
         cells = {}
         for text in set(texts):  # a column has few different labels
             # one line, in quotes where it needs them, and never a formula for a spreadsheet
-            flat = " ".join(text.split())
+            flat = " ".join(text.replace("\0", " ").split())
             if _FORMULA.match(flat) and flat not in ("+", "-") and not _is_number(flat):
                 flat = f"'{flat}"
             cells[text] = '"' + flat.replace('"', '""') + '"' if any(char in flat for char in ',"#') else flat
-        return "%s", [cells[text] for text in texts]
-    numbers = np.array(values, dtype=np.float64)
-    if not np.isfinite(numbers).all():
-        return "%s", [fixed(value, digits) for value in numbers.tolist()]
-    for k in np.flatnonzero(np.signbit(numbers) & (numbers > -(10.0**-digits))):
-        if float(fixed(float(numbers[k]), digits)) == 0.0:
-            numbers[k] = 0.0  # no negative zero
-    return f"%.{digits}f", numbers.tolist()
+        return [np.array([cells[text].encode() for text in texts], dtype=np.bytes_)]
+    numbers = np.asarray(values, dtype=np.float64)
+    size = np.abs(numbers)
+    if digits > _MOST_BY_DIGITS or not (size < _LARGEST_BY_DIGITS).all():  # also if one is nan
+        return [np.array([fixed(value, digits).encode() for value in numbers.tolist()], dtype=np.bytes_)]
+    scaled = size * 10.0**digits
+    whole = np.rint(scaled)
+    # the product is rounded: where that could matter, the number itself decides
+    for k in np.flatnonzero(np.abs(np.abs(scaled - whole) - 0.5) < _TIE):
+        whole[k] = float(f"{size[k]:.{digits}f}".replace(".", ""))
+    left = np.floor(whole / 10.0**digits)
+    fraction, high_digits = whole - left * 10.0**digits, max(digits - 4, 0)
+    high = np.floor(fraction / 10_000.0)
+    minus = np.where((numbers < 0.0) & (whole > 0.0), b"-", b"\0")
+    parts: list[bytes | NDArray[np.bytes_]] = [minus, _digits(0)[left.astype(np.intp)]]
+    parts += [b"."] if digits else []
+    parts += [_digits(high_digits)[high.astype(np.intp)]] if high_digits else []
+    return [*parts, _digits(min(digits, 4))[(fraction - 10_000.0 * high).astype(np.intp)]] if digits else parts
+
+
+@cache
+def _digits(width: int) -> NDArray[np.bytes_]:
+    """Return 0 ... 9999 (or as many as there are) as ``width`` digits; for 0 without leading zeros, zero bytes before them."""
+    shown = [str(k).rjust(4, "\0") if width == 0 else str(k).zfill(width) for k in range(10 ** (width or 4))]
+    return np.array(shown, dtype=np.bytes_)
 
 
 def fixed(value: float, digits: int) -> str:

@@ -53,7 +53,9 @@ def test_a_wrong_cell_of_a_plain_file_is_pointed_at_with_its_line(tmp_path):
 
 @settings(max_examples=300, deadline=None)
 @given(
-    values=st.lists(st.floats(-1e9, 1e9) | st.floats(-1e-5, 1e-5) | st.just(float("nan")), min_size=1, max_size=20),
+    values=st.lists(st.floats(-1e9, 1e9) | st.floats(-1e-5, 1e-5) | st.just(float("nan")), min_size=1, max_size=20)
+    | st.lists(st.floats(-1e4, 1e4) | st.integers(-99_999, 99_999).map(lambda k: k / 16), min_size=1, max_size=20)
+    | st.lists(st.integers(-99_999, 99_999).map(lambda k: (k + 0.5) * 1e-4), min_size=1, max_size=20),
     digits=st.integers(0, 9),
 )
 @example(values=[-0.0, -5e-7, -4.9999999999e-7, -5.0000000001e-7, -1.5e-6, 0.0], digits=6)
