@@ -245,6 +245,7 @@ def identify_mixed(
     from compgen.identify.merging import merge
     from compgen.identify.six_dof import SixDofMeasurement
     from compgen.identify.together import Source, identify_together
+    from compgen.identify.tracer_lengths import MIN_STATIONS
 
     parts, plain = [], IdentifyOptions()
     unless_lengths = replace(
@@ -269,9 +270,12 @@ def identify_mixed(
             with warnings.catch_warnings():
                 if isinstance(part, AxisRuns | Artefact):  # they warn of what others may have measured
                     warnings.simplefilter("ignore", CompgenWarning)
-                alone = identify_measurement(machine, part, applicable)
+                if isinstance(part, Lengths) and len(part.stations) < MIN_STATIONS and applicable.stations is None:
+                    alone = None
+                else:
+                    alone = identify_measurement(machine, part, applicable)
         except UndeterminedError:
-            if not isinstance(part, Deviations | Artefact):
+            if not isinstance(part, Deviations | Artefact | Lengths):
                 raise
             alone = None
         parts.append(Source(name, part, alone))

@@ -18,7 +18,8 @@ from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify.adjust.unknowns import check_axis_travel, check_travel
+from compgen.identify.adjust.determined import Observations
+from compgen.identify.adjust.unknowns import ErrorParameters, check_axis_travel, check_travel
 from compgen.identify.identification import (
     Identification,
     metadata_of,
@@ -233,6 +234,36 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
         reversal_curves=ReversalCurves(reversal, {"machine": machine.name}) if reversal else None,
         method="circles",
         details={"unknowns": [_described(column, solution.value[k], solution.u[k]) for column, k in shown]},
+    )
+
+
+def circle_observations(
+    machine: Machine, layout: ErrorParameters, circles: Circles, found: Identification
+) -> Observations:
+    """Return the squareness errors ``found`` by circles as readings of the errors of a layout, with their joint covariance.
+
+    A circle shows the squareness within its diameter: guides that are bent there contribute to it. So a value reads the
+    curves, too, each with the same weights of the radial readings as the squareness itself.
+    """
+    names = [name for name in found.errors.names if name in layout.squareness]
+    rows = [found.errors.names.index(name) for name in names]
+    assert found.values_factor is not None
+    factor = found.values_factor[rows]
+    weights = factor / (found.u_length_um * MM_PER_UM)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)  # said when the circles were identified
+        position_mm = circle_positions(machine, circles)
+    errors = layout.design(c_matrix(machine, position_mm), layout.bases(position_mm))
+    # unit variances: independent combinations of the planes
+    size, direction = np.linalg.eigh(factor @ factor.T)
+    whiten = (direction / np.sqrt(size)).T
+    return Observations(
+        design=whiten @ weights @ np.einsum("nd,ndp->np", circles.radial(), errors),
+        others=np.zeros((len(names), 0)),
+        value=whiten @ found.errors.values()[rows],
+        sigma=np.ones(len(names)),
+        at_mm=np.full((len(names), 3), np.nan),
+        shows=np.zeros((len(names), len(layout.curves)), dtype=bool),
     )
 
 

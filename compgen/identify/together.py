@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import chain
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import Circles
@@ -21,18 +22,39 @@ from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import MM_PER_UM
+from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, UndeterminedError
-from compgen.identify.adjust.determined import Determined, Observations, determined_values, least_squares, stacked
+from compgen.identify.adjust.determined import (
+    SHOWS,
+    Determined,
+    Observations,
+    determined_values,
+    least_squares,
+    stacked,
+)
 from compgen.identify.adjust.residual_tests import misfit_of
+from compgen.identify.adjust.robust import Rejected, fit_accepted
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identify.axis_tests import circle_observations
 from compgen.identify.covariance import joint_covariance, values_with_factor
-from compgen.identify.identification import Identification, not_among, uncertainty_scale, worst_uncertainty
+from compgen.identify.identification import (
+    Identification,
+    not_among,
+    uncertainty_scale,
+    without_adjustment,
+    worst_uncertainty,
+)
 from compgen.identify.merging import FALSE_ALARM, MANY, projected
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import artefact_observations, position_observations
+from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import modelled_errors
+
+#: Lengths of few stations show many errors by second-order terms only: directions below this share of the largest, which
+#: such readings determine about a hundred times worse than themselves, count as not determined.
+FAINT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -43,14 +65,19 @@ class Source:
     measurement: object
     alone: Identification | None
 
+    @property
+    def new_lengths(self) -> int:
+        """Number of its lengths if these were not adjusted alone, else 0."""
+        return len(self.measurement) if isinstance(self.measurement, Lengths) and self.alone is None else 0
+
     def observed(
         self, machine: Machine, layout: ErrorParameters, options: IdentifyOptions, around: FloatArray | None
     ) -> Observations:
         """Return its readings of the errors of a layout; ``around`` are approximate errors (size,).
 
-        Positions enter reading by reading. Lengths and six-DOF readings enter as the errors that they determine, with
-        their joint covariance: stations, dead lengths and rejected readings are already settled. Axis runs and known
-        errors enter value by value.
+        Positions enter reading by reading, and lengths that alone do not determine the errors. Other lengths, six-DOF
+        readings and circles enter as the errors that they determine, with their joint covariance: stations, dead lengths and
+        rejected readings are already settled. Axis runs and known errors enter value by value.
         """
         if isinstance(self.measurement, Deviations):
             found = position_observations(machine, layout, self.measurement, options, around)
@@ -59,13 +86,18 @@ class Source:
             start = np.zeros(layout.size) if around is None else around
             found, _, _ = artefact_observations(machine, layout, self.measurement, options, start)
             return self._as_alone(found)
+        if isinstance(self.measurement, Lengths) and self.alone is None:
+            start = np.zeros(layout.size) if around is None else around
+            return length_observations(machine, layout, self.measurement, options, start)
         if self.alone is None:
             text = f"{self.name}: the readings do not determine the errors and the other unknowns of this measurement"
             raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
+        if isinstance(self.measurement, Circles):
+            return circle_observations(machine, layout, self.measurement, self.alone)
         if self.alone.method == "sixdof":
             names, positions, values, factor, _ = projected(machine, layout, self.alone)
             return Observations.of_values(layout, names, positions, values, factor @ factor.T)
-        if self.alone.has_covariance and self.alone.method not in ("deviations", "axis-runs", "circles", "given"):
+        if self.alone.has_covariance and self.alone.method not in ("deviations", "axis-runs", "given"):
             known = joint_covariance(self.alone)
             return Observations.of_values(
                 layout, known.error, known.position_mm, self.alone.errors.values(), known.errors_covariance
@@ -113,6 +145,10 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
         raise UndeterminedError("none of the measurements alone determines any of the machine's errors", [])
     listed = list(chain.from_iterable(result.errors.names for result in known))
     direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns | Circles) for part in parts)
+    if any(isinstance(part.measurement, Circles) for part in parts):  # guides that are bent change what circles show
+        direct = direct and not any(
+            name not in SQUARENESS_NAMES and error_named(name).is_straightness for name in listed
+        )
     if direct and len(listed) == len(set(listed)):
         return _joined(machine, parts, known)
     return _adjusted(machine, parts, options)
@@ -153,31 +189,107 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
 
 def _solved(
     machine: Machine, layout: ErrorParameters, parts: Sequence[Source], options: IdentifyOptions
-) -> tuple[list[Observations], Determined]:
-    """Return the readings of each part, and what all of them determine together.
+) -> tuple[list[Observations], Determined, NDArray[np.bool_]]:
+    """Return the readings of each part, what all of them determine together, and which of all readings fit.
 
-    Positions in a frame of unknown pose are linear around approximate errors only: those of a first solution.
+    Positions in a frame of unknown pose and lengths from unknown stations are linear around approximate errors only:
+    those of a first solution.
     """
-    around = None
-    for _ in range(2 if any(isinstance(part.measurement, Deviations | Artefact) for part in parts) else 1):
+    around, least = None, _least(parts)
+    posed = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
+    for _ in range(2 if posed else 1):
         found = [part.observed(machine, layout, options, around) for part in parts]
+        found = [
+            _with_known_curves(layout, found, k) if isinstance(part.measurement, Circles) else found[k]
+            for k, part in enumerate(parts)
+        ]
         everything = stacked(found)
-        solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool))
+        accepted = np.ones(len(everything), dtype=bool)
+        solution = least_squares(layout, everything, accepted, least)
         around = solution.on(layout)
-    return found, solution
+    # lengths that were not adjusted alone contain their gross errors
+    new = np.concatenate([np.arange(len(item)) < part.new_lengths for item, part in zip(found, parts, strict=True)])
+
+    def fit(fitting: NDArray[np.bool_], _: Determined | None) -> Determined:
+        accepted[new] = fitting
+        return least_squares(layout, everything, accepted, least)
+
+    if new.any():
+        solution, _ = fit_accepted(
+            fit,
+            lambda result: (result.residual / everything.sigma)[new],
+            int(np.count_nonzero(new)),
+            "lengths do not fit the model and the other measurements; check stations, axes, signs and units,",
+            reject=options.reject,
+        )
+    return found, solution, accepted
+
+
+def _least(parts: Sequence[Source]) -> float:
+    """Share of the largest direction below which one counts as not determined."""
+    return FAINT if any(part.new_lengths for part in parts) else SHOWS
+
+
+def _determined_errors(layout: ErrorParameters, observations: Observations, least: float) -> set[str]:
+    """Errors of which every value at the positions of the readings is determined."""
+    places = observations.positions(layout)
+    names = [name for name, position_mm in places.items() for _ in position_mm]
+    rows = layout.value_rows(names, np.concatenate(list(places.values())))
+    fixed = ~np.any(rows, axis=1)  # zero by definition
+    whole = determined_values(layout, observations, rows, least) | fixed
+    lost = {name for name, known in zip(names, whole.tolist(), strict=True) if not known}
+    return set(places) - lost
+
+
+def _with_known_curves(layout: ErrorParameters, found: Sequence[Observations], k: int) -> Observations:
+    """The readings of circles ``found[k]``: of the curves only those that the other parts determine wherever they show them.
+
+    Straightness that nothing else shows stays a part of the squareness within the circle.
+    """
+    others = stacked([item for j, item in enumerate(found) if j != k])
+    known = _determined_errors(layout, others, SHOWS)
+    design = found[k].design.copy()
+    for number, curve in enumerate(layout.curves):
+        name = curve.error.name
+        if name not in others.covered and not (name in known and others.shows[:, number].any()):
+            design[:, curve.columns] = 0.0
+    return replace(found[k], design=design)
 
 
 def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
     """One least-squares adjustment of everything, and how the parts agree."""
     layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
     layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
-    found, solution = _solved(machine, layout, parts, options)
-    agreement = _agreement(layout, parts, found)
+    found, solution, accepted = _solved(machine, layout, parts, options)
+    starts = np.cumsum([0, *(len(readings) for readings in found)])
+    fitting = [
+        readings.kept(accepted[start : start + len(readings)]) for readings, start in zip(found, starts, strict=False)
+    ]
+    agreement = _agreement(layout, parts, fitting, solution)
     freedom, sigma = solution.freedom, np.concatenate([readings.sigma for readings in found])
-    reduced = float(np.sum((solution.residual / sigma) ** 2)) / freedom if freedom > 0 else 1.0
+    reduced = float(np.sum((solution.residual / sigma)[accepted] ** 2)) / freedom if freedom > 0 else 1.0
     u_scale = uncertainty_scale(reduced, "stated")
     errors, factor = values_with_factor(solution.layout, solution.unknowns, u_scale * solution.factor)
     known = [part.alone for part in parts if part.alone is not None]
+    adjusted = []
+    for part, first in zip(parts, starts, strict=False):
+        rows = slice(first, first + part.new_lengths)
+        if isinstance(part.measurement, Lengths) and part.new_lengths:
+            part = replace(part, alone=_as_adjusted(machine, part.measurement, solution.residual[rows], accepted[rows]))
+        adjusted.append(part)
+    shown, hardly = errors, dict[str, str]()
+    if any(part.new_lengths for part in parts):
+        # lengths of few stations show a little of everything: what is known elsewhere stays, and what is determined
+        elsewhere = {name for result in known for name in result.errors.names}
+        determined = elsewhere | _determined_errors(layout, stacked(fitting), FAINT)
+        hardly = {
+            name: f"{name}: the readings do not separate it from the stations and other errors"
+            for name in errors.names
+            if name not in determined
+        }
+        values = errors.rows()
+        kept = [name for name in errors.names if name not in hardly]
+        factor, errors = np.vstack([factor[values[name]] for name in kept]), errors.only(*kept)
     beyond = {
         name: ", ".join(f"{error} ({value:.1f})" for error, value in numbers.items() if value > 1.0)
         for name, numbers in agreement.items()
@@ -190,7 +302,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     ]
     for text in texts:
         warnings.warn(text, CompgenWarning, stacklevel=4)
-    common = _common(parts, known)
+    common = _common(adjusted, known)
     return replace(
         common,
         objections=(*common.objections, *texts),
@@ -201,31 +313,62 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         u_scale=u_scale,
         misfit=misfit_of(reduced, freedom, u_scale, "stated") if freedom > 0 else None,
         unobservable=(
-            *not_among(errors, "no reading shows it"),
-            *(f"{name}: part of it cannot be separated from other unknowns" for name in solution.partly),
+            *not_among(shown, "no reading shows it"),
+            *hardly.values(),
+            *(
+                f"{name}: part of it cannot be separated from other unknowns"
+                for name in solution.partly
+                if name not in hardly
+            ),
         ),
         rank=solution.rank,
         unknowns=solution.rank,
         condition=solution.condition,
         worst_u=worst_uncertainty(errors),
-        layout=solution.layout,
+        layout=error_parameters(machine, errors.names) if hardly else solution.layout,
         adjustment=None,
         values_factor=factor,
         details={
-            "parts": [part.summary() for part in parts],
+            "parts": [part.summary() for part in adjusted],
             "en": agreement,
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
     )
 
 
+def _as_adjusted(
+    machine: Machine, lengths: Lengths, residual_mm: FloatArray, accepted: NDArray[np.bool_]
+) -> Identification:
+    """Lengths that were adjusted with other readings only: no errors of their own, residuals (n,) reading minus model."""
+    rejected = tuple(
+        Rejected(
+            row,
+            lengths.stations[lengths.station[row]],
+            str(lengths.point[row]),
+            float(residual_mm[row]) / MM_PER_UM,
+            f"differs from the model by {residual_mm[row] / MM_PER_UM:+.1f} um",
+            *(lengths.origin[row] if lengths.origin else ()),
+        )
+        for row in np.flatnonzero(~accepted).tolist()
+    )
+    plain = without_adjustment(machine, ErrorTable({}, {}, dict(lengths.metadata)), -residual_mm, "unknown", "")
+    return replace(plain, accepted=accepted, rejected=rejected, method="lengths with other readings")
+
+
 def _agreement(
-    layout: ErrorParameters, parts: Sequence[Source], found: Sequence[Observations]
+    layout: ErrorParameters, parts: Sequence[Source], found: Sequence[Observations], solution: Determined
 ) -> dict[str, dict[str, float]]:
     """Largest E_n number of each error between one part alone and all others, by name of the part.
 
-    The coverage factor is chosen to give the probability of a false alarm for all values of a part together.
+    The coverage factor is chosen to give the probability of a false alarm for all values of a part together. Circles are
+    compared in squareness, with the curves as the solution of everything has them.
     """
+    unknowns, found = solution.on(layout), list(found)
+    curves = np.arange(layout.size) < layout.size - len(layout.squareness)
+    for k, part in enumerate(parts):
+        if isinstance(part.measurement, Circles):
+            value = found[k].value - found[k].design[:, curves] @ unknowns[curves]
+            found[k] = replace(found[k], design=np.where(curves, 0.0, found[k].design), value=value)
     from scipy.special import stdtrit  # imported here: slow to load
 
     result: dict[str, dict[str, float]] = {}
@@ -235,12 +378,14 @@ def _agreement(
             one, other = (least_squares(layout, item, np.ones(len(item), dtype=bool)) for item in (found[k], others))
         except UndeterminedError:
             continue
-        differences = {}
-        for name, position_mm in found[k].positions(layout).items():
-            rows = layout.value_rows([name] * len(position_mm), position_mm)
-            both = determined_values(layout, found[k], rows) & determined_values(layout, others, rows)
-            (value, u), (against, u_against) = (side.curve(name, position_mm[both]) for side in (one, other))
+        differences, places = {}, found[k].positions(layout)
+        label = np.array([name for name, position_mm in places.items() for _ in position_mm])
+        rows = layout.value_rows(label.tolist(), np.concatenate(list(places.values())))
+        shared = determined_values(layout, found[k], rows) & determined_values(layout, others, rows)
+        for name, position_mm in places.items():
+            both = shared[label == name]
             if both.any():
+                (value, u), (against, u_against) = (side.curve(name, position_mm[both]) for side in (one, other))
                 differences[name] = (value - against, np.hypot(u, u_against))
         count = sum(len(u) for _, u in differences.values())
         factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(count, 1)))
@@ -267,7 +412,7 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
         accepted=accepted,
         counted=None,
         rms_um=float(np.sqrt(np.mean(residual[accepted] ** 2))) / MM_PER_UM if accepted.any() else 0.0,
-        rejected=tuple(chain.from_iterable(result.rejected for result in known)),
+        rejected=tuple(chain.from_iterable(part.alone.rejected for part in parts if part.alone is not None)),
         segments=tuple(chain.from_iterable(result.segments for result in known)),
         reversal=next((result.reversal for result in known if result.reversal is not None), None),
         reversal_curves=ReversalCurves(reversal, {"machine": known[0].layout.machine.name}) if reversal else None,

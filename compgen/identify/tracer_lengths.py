@@ -17,6 +17,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.identify.adjust.determined import Observations
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
@@ -57,7 +58,8 @@ from compgen.identify.options import (
     reading_noise,
     with_known_start,
 )
-from compgen.identify.reference_conditions import identify_at_reference
+from compgen.identify.reference_conditions import identify_at_reference, reading_conditions
+from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
 if TYPE_CHECKING:
@@ -599,3 +601,89 @@ def _fit(
         return replace(problem, known=task.problem.known)
 
     return fit_robustly(task.problem, start, readings, factor, rebuilt, disturbed=disturbed)
+
+
+# Lengths that alone do not determine the errors, as readings in an adjustment with other measurements.
+
+
+#: Steps that fit stations and dead lengths to given errors; each of them gains several digits.
+PLACING_STEPS = 5
+#: Targets whose thickness is below this share of their spread lie in a plane: either side of it explains their lengths.
+FLAT = 1e-3
+
+
+def length_observations(
+    machine: Machine, layout: ErrorParameters, lengths: Lengths, options: IdentifyOptions, around: FloatArray
+) -> Observations:
+    """Return the lengths of any number of stations as readings of the errors of a layout, then the known stations.
+
+    Stations and dead lengths are further unknowns. Linear about the errors ``around`` (size,) and the stations that fit
+    them best.
+
+    Raises
+    ------
+    InputError
+        for positions outside the travel, too few readings of a station.
+    UndeterminedError
+        if all targets of a station lie in a plane: the lengths do not show on which side of it the station is.
+    """
+    check_readings(machine, lengths, 1)
+    lengths, conditions = reading_conditions(machine, lengths, temperature=options.temperature)
+    task = task_of(machine, lengths)
+    start = robust_state(start_values(task)[0], lengths, task.target_mm, task.station, task.group)[0]
+    known = options.stations if isinstance(options.stations, KnownStations) else None
+    if known is not None:
+        start = with_known_start(start, known, lengths, task.target_mm, task.group)
+    for k, name in enumerate(lengths.stations):
+        targets_mm = task.target_mm[task.station == k]
+        spread = np.linalg.svd(targets_mm - targets_mm.mean(axis=0), compute_uv=False)
+        if spread[2] < FLAT * spread[0] and (known is None or name not in known.names):
+            raise UndeterminedError(
+                f"all targets of station {name!r} lie in a plane, so its lengths do not show on which side of it the station "
+                "is: measure at another height as well, or give the place of the station (--stations)",
+                [],
+            )
+    n, stations, rows = len(lengths), 3 * len(lengths.stations), np.arange(len(lengths))
+    tool_mm = np.broadcast_to(tool_of(machine, lengths.tool_mm), lengths.position_mm.shape)
+    tip_mm = layout.tips(around, lengths.position_mm, tool_mm)
+    state, still = replace(start, errors=around), np.zeros_like(tip_mm)
+    sigma_mm = reading_noise(lengths, options).sigma_mm(
+        np.linalg.norm(tip_mm - state.stations_mm[task.station], axis=1)
+    )
+    others = np.zeros((n, stations + len(state.dead_length_mm)))
+    others[rows, stations + task.group] = -1.0
+    behind = np.zeros((0, others.shape[1]))
+    pull, u_mm = np.zeros(0), np.zeros(0)
+    for _ in range(PLACING_STEPS):
+        sight = tip_mm - state.stations_mm[task.station]
+        distance = np.linalg.norm(sight, axis=1)
+        unit = sight / distance[:, None]
+        reading_mm = lengths.length_mm
+        if conditions.needs_geometry:
+            reading_mm = reading_mm + conditions.correction_mm(lengths, layout, state, task.group, still)
+        gap_mm = reading_mm - distance + state.dead_length_mm[task.group]
+        for axis in range(3):
+            others[rows, 3 * task.station + axis] = -unit[:, axis]
+        if known is not None:
+            index = known.indices(lengths.stations)
+            behind = np.eye(others.shape[1])[(3 * index[:, None] + np.arange(3)).ravel()]
+            pull = (known.position_mm - state.stations_mm[index]).ravel()
+            u_mm = np.repeat(known.u_mm, 3)
+        sigma = np.concatenate([sigma_mm, u_mm])
+        both, gaps = np.vstack([others, behind]), np.concatenate([gap_mm, pull])
+        placing = np.linalg.lstsq(both / sigma[:, None], gaps / sigma, rcond=1e-12)[0]
+        state = state.moved(np.concatenate([np.zeros(len(around)), placing]))
+    design = np.einsum(
+        "nd,ndp->np",
+        unit,
+        layout.design(c_matrix(machine, lengths.position_mm, tool_mm), layout.bases(lengths.position_mm)),
+    )
+    nothing = len(behind)
+    return Observations(
+        design=np.vstack([design, np.zeros((nothing, layout.size))]),
+        others=both,
+        value=gaps + np.concatenate([design @ around, np.zeros(nothing)]),
+        sigma=sigma,
+        at_mm=np.vstack([lengths.position_mm, np.full((nothing, 3), np.nan)]),
+        shows=np.repeat([[True], [False]], [n, nothing], axis=0) & np.ones(len(layout.curves), dtype=bool),
+    )

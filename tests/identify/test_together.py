@@ -1,6 +1,7 @@
 """Several measurements of one machine together: against its given errors, and against each measurement alone."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,18 @@ import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
+from compgen.data.circles import PLANES, Circles, format_circles
 from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.error_table import format_errors
+from compgen.data.lengths import format_lengths
 from compgen.data.names import error_named
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.foreign import open_measurement
-from compgen.identify import joint_covariance
+from compgen.foreign.converted import given_errors
+from compgen.identify import IdentifyOptions, joint_covariance
+from compgen.identify.any_measurement import MixedMeasurement
 from compgen.identify.options import StatedNumbers
+from compgen.identify.together import Source, identify_together
 from compgen.kinematics.exact_chain import tip_position
 from compgen.pipeline import identify_bare, with_reversal
 
@@ -298,3 +304,122 @@ def test_the_formula_of_the_granite_square_on_the_page_of_instruments(small_mach
         b = -drift(along_y, np.pi / 2 + lean + turned * own)  # plunger to +X: it grows to the right of the Y arm
         found.append(-b / length - a / length + turned * own)
     assert found == pytest.approx([truth, truth], abs=1e-8)
+
+
+def some_stations(small_lengths_file, *names):
+    """The readings of some stations of the small machine."""
+    lengths = compgen.read_lengths(small_lengths_file)
+    rows = np.flatnonzero(np.isin(lengths.station, [lengths.stations.index(name) for name in names]))
+    kept = lengths.part(rows)
+    number = {lengths.stations.index(name): k for k, name in enumerate(names)}
+    return replace(kept, stations=names, station=np.array([number[k] for k in kept.station.tolist()]))
+
+
+def test_two_stations_and_a_plane_give_what_neither_gives_alone(small_machine, small_lengths_file):
+    """Two stations determine no error alone; with measured positions at one height they add the errors along Z."""
+    truth = compgen.read_errors(small_lengths_file.parent / "truth.errors.csv")
+    plane = plane_of(small_machine, truth)
+    both = MixedMeasurement((("t", some_stations(small_lengths_file, "S1", "S3")), ("p", plane)))
+    found = identify_bare(small_machine, both)
+    assert found.objections == ()
+    assert 0.8 < found.reduced_chi_square < 1.2
+    assert len(found.residual_mm) == len(both.parts[0][1]) + 2 * len(plane)
+    assert {"EZZ", "EYZ"} <= set(found.errors.names)
+    alone = identify_bare(small_machine, plane)
+    assert "EZZ" not in alone.errors.names
+    for name in set(found.errors.names) - set(alone.errors.names):  # new ones are wholly determined
+        value, u, known = of(found, truth, name)
+        assert np.max(np.abs(value - known) / np.maximum(u, 1e-9)) < 4.0, name
+
+
+def of(found, truth, name):
+    """Value, uncertainty and truth of an error, each (m,)."""
+    if name in found.errors.squareness:
+        (value, u), (known, _) = found.errors.squareness[name], truth.squareness[name]
+        return np.array([value]), np.array([u]), np.array([known])
+    curve = found.errors.curves[name]
+    return curve.value, curve.u, truth.curves[name].at(curve.position_mm)
+
+
+def test_one_station_adds_nothing_alone_and_takes_nothing_away(tmp_path, small_machine, truth, small_lengths_file):
+    """A station beside a laser: the positioning of X stays, all that one station cannot separate is named."""
+    lengths = some_stations(small_lengths_file, "S2")
+    lengths.length_mm[5] += 0.5  # a reading that belongs to nothing
+    truth = compgen.read_errors(small_lengths_file.parent / "truth.errors.csv")
+    runs = runs_of(small_machine, truth, 0)
+    found = identify_bare(small_machine, MixedMeasurement((("t", lengths), ("x", runs))))
+    assert found.errors.names == ("EXX",)
+    value, u, known = of(found, truth, "EXX")
+    assert np.max(np.abs(value - known) / np.maximum(u, 1e-9)) < 4.0
+    assert u.max() < NOISE_MM  # as the runs alone, the zero at the reference point included
+    assert "EC0Y: the readings do not separate it from the stations and other errors" in found.unobservable
+    assert max(found.rejected, key=lambda item: abs(item.residual_um)).row == 5
+    assert len(found.rejected) < 0.01 * len(lengths)
+    paths = written(tmp_path, t_lengths_csv=format_lengths(lengths), x_axis_csv=format_axis_runs(runs))
+    command = ["identify", str(small_machine.source), *map(str, paths), "--out", str(tmp_path / "o")]
+    assert run_command(cli, command) == 0
+    assert run_command(cli, [*command[:2], str(paths[0]), "--out", str(tmp_path / "p")]) == 2  # a station alone
+
+
+def test_lengths_of_targets_in_one_plane_are_refused_with_the_reason(small_machine, small_lengths_file, truth):
+    lengths = some_stations(small_lengths_file, "S2")
+    flat = lengths.part(np.flatnonzero(lengths.position_mm[:, 2] == lengths.position_mm[0, 2]))
+    with pytest.raises(UndeterminedError, match="targets of station 'S2' lie in a plane"):
+        identify_bare(small_machine, MixedMeasurement((("t", flat), ("x", runs_of(small_machine, truth, 0)))))
+
+
+def circles_of(machine, errors, *, radius_mm=90.0, noise_mm=NOISE_MM, seed=6):
+    """Circles in three planes about the middle of the travel, both directions, by the exact model."""
+    rng, centre = np.random.default_rng(seed), np.array([np.mean(axis.range_mm) for axis in machine.axes])
+    tool = np.array(machine.tool_offset_mm)
+    angle = np.radians(np.arange(0.5, 360.0, 3.0))
+    parts = []
+    for plane, (first, second) in enumerate(PLANES.values()):
+        position = np.tile(centre, (len(angle), 1))
+        position[:, first] += radius_mm * np.cos(angle)
+        position[:, second] += radius_mm * np.sin(angle)
+        tip = tip_position(machine, errors.at(position), position, tool) - tool - centre
+        distance = np.linalg.norm(tip, axis=1) - radius_mm
+        for way in (1, -1):
+            parts.append((np.full(len(angle), plane), angle, distance + rng.normal(0.0, noise_mm, len(angle)), way))
+    plane, at, deviation = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    count, way = len(plane), np.repeat([part[3] for part in parts], len(angle))
+    return Circles(
+        plane, at, np.full(count, radius_mm), deviation, way, np.zeros(count, dtype=int), np.zeros(count, dtype=int),
+        np.tile(centre, (count, 1)), np.full(count, np.nan),
+    )  # fmt: skip
+
+
+def test_circles_enter_an_adjustment_with_their_joint_covariance(small_machine):
+    """A number for EC0Y improves the other planes, too, as far as their values are correlated: Gauss-Markov by hand."""
+    table = StatedNumbers(squareness={"EC0Y": "45", "EB0Z": "-30", "EA0Z": "25"}).errors(small_machine)
+    circles = circles_of(small_machine, table)
+    circles = circles.part(np.flatnonzero(circles.direction == 1))  # the reversals of the axes tie the planes
+    with pytest.warns(CompgenWarning, match="in one direction only"):
+        alone = identify_bare(small_machine, circles)
+    prior, weights = alone.values_factor @ alone.values_factor.T, np.array([1.0, 0.0, 0.0])
+    assert abs(prior[0, 1]) > 0.1 * prior[0, 0]
+    u_rad = float(np.sqrt(prior[0, 0]))
+    known = alone.errors.values()[0] + u_rad
+    numbers = StatedNumbers(squareness={"EC0Y": f"{1e6 * known}±{1e6 * u_rad}"}).errors(small_machine)
+    given = Source("number", None, given_errors(small_machine, numbers, whole=False))
+    found = identify_together(small_machine, [Source("c", circles, alone), given], IdentifyOptions())
+    gain = prior @ weights / (weights @ prior @ weights + u_rad**2)
+    assert found.errors.values() == pytest.approx(alone.errors.values() + gain * u_rad, abs=1e-10)
+    u = found.errors.uncertainties() / found.u_scale
+    assert u == pytest.approx(np.sqrt(np.diag(prior - np.outer(gain, weights @ prior))), rel=1e-6)
+
+
+def test_circles_and_straightness_together_give_the_squareness_over_the_travel(tmp_path, small_machine, truth):
+    """A circle shows the squareness within its diameter; the slopes of the bent guides there are known, and taken off."""
+    flat = truth.only(*(name for name in truth.names if error_named(name).kind != "angular"))
+    circles = circles_of(small_machine, flat)
+    alone = identify_bare(small_machine, circles)
+    assert abs(alone.errors.squareness["EC0Y"][0] - flat.squareness["EC0Y"][0]) > 10e-6
+    straight = flat.only(*(name for name in flat.curves if error_named(name).is_straightness)).replace(metadata={})
+    paths = written(tmp_path, c_circle_csv=format_circles(circles), s_errors_csv=format_errors(straight))
+    found = identify_bare(small_machine, open_measurement(paths))
+    for name in flat.squareness:
+        value, u = found.errors.squareness[name]
+        assert abs(value - flat.squareness[name][0]) < 4.0 * u + 1e-6, name
+        assert u < 5e-6

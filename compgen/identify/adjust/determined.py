@@ -195,7 +195,9 @@ class Determined:
         return rows @ self.unknowns, np.linalg.norm(rows @ self.factor, axis=1)
 
 
-def determined_values(layout: ErrorParameters, observations: Observations, rows: FloatArray) -> NDArray[np.bool_]:
+def determined_values(
+    layout: ErrorParameters, observations: Observations, rows: FloatArray, least: float = SHOWS
+) -> NDArray[np.bool_]:
     """Which error values, ``rows`` (m, size) times the unknowns, the readings separate from all other unknowns, (m,).
 
     At one height a positioning error cannot be separated from an angle about a horizontal axis: neither value is
@@ -208,15 +210,19 @@ def determined_values(layout: ErrorParameters, observations: Observations, rows:
     size = np.linalg.norm(rest, axis=0)
     scale = np.where(size > SHOWS * size.max(initial=1e-300), size, size.max(initial=1e-300))
     _, values, right = np.linalg.svd(rest / scale, full_matrices=False)
-    directions = right[values > SHOWS * values.max(initial=1e-300)].T
+    directions = right[values > least * values.max(initial=1e-300)].T
     scaled = rows * unit / scale
     outside = np.linalg.norm(scaled - scaled @ directions @ directions.T, axis=1)
     size = np.linalg.norm(scaled, axis=1)
     return np.asarray((size > 0) & (outside <= MOST_OUTSIDE * size))
 
 
-def least_squares(layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_]) -> Determined:
+def least_squares(
+    layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_], least: float = SHOWS
+) -> Determined:
     """Adjust the errors of a layout and the other unknowns to the accepted readings, (k,).
+
+    Directions of the errors that the readings show by a share of less than ``least`` count as not determined.
 
     Raises
     ------
@@ -226,7 +232,7 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
     names = [name for name, _ in layout.columns()]
     angular, unit = _kinds(layout)
     used = (accepted / observations.sigma)[:, None]
-    shown, _ = _seen_directions(observations.design * unit * used, observations.others * used, angular)
+    shown, _ = _seen_directions(observations.design * unit * used, observations.others * used, angular, least)
     seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
     kept = [name for name, columns in layout.columns() if seen[columns].max(initial=0.0) > SEEN]
     if not kept:
@@ -236,14 +242,15 @@ def least_squares(layout: ErrorParameters, observations: Observations, accepted:
     curves = [curve.error.name in kept for curve in layout.curves]
     observations = replace(observations, design=observations.design[:, columns], shows=observations.shows[:, curves])
     unreached, tied = _far_nodes(smaller, observations, accepted)
-    found = _optimum(smaller, observations, accepted, _ties(smaller, tied, {}))
+    found = _optimum(smaller, observations, accepted, _ties(smaller, tied, {}), least)
     if tied:  # repeat with the curvature of the curves where they are seen
-        found = _optimum(smaller, observations, accepted, _ties(smaller, tied, _bends(smaller, found.unknowns, tied)))
+        bends = _ties(smaller, tied, _bends(smaller, found.unknowns, tied))
+        found = _optimum(smaller, observations, accepted, bends, least)
     return replace(found, unreached=unreached, left_out=tuple(name for name in names if name not in kept))
 
 
 def _optimum(
-    layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_], bends: FloatArray
+    layout: ErrorParameters, observations: Observations, accepted: NDArray[np.bool_], bends: FloatArray, least: float
 ) -> Determined:
     """Least squares in the directions that the readings show; angles only explain what translations cannot.
 
@@ -255,7 +262,7 @@ def _optimum(
     errors, others = observations.design * unit, observations.others
     design = np.vstack([errors * used, bends * unit])
     frames = np.vstack([others * used, np.zeros((len(bends), others.shape[1]))])
-    shown, rank = _seen_directions(design, frames, angular)
+    shown, rank = _seen_directions(design, frames, angular, least)
     whole = np.hstack([design @ shown, frames])
     target = np.concatenate([observations.value * used[:, 0], np.zeros(len(bends))])
     scale = np.linalg.norm(whole, axis=0)
@@ -290,7 +297,9 @@ def _kinds(layout: ErrorParameters) -> tuple[NDArray[np.bool_], FloatArray]:
     return angular, unit
 
 
-def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_]) -> tuple[FloatArray, int]:
+def _seen_directions(
+    errors: FloatArray, frames: FloatArray, angular: NDArray[np.bool_], least: float
+) -> tuple[FloatArray, int]:
     """Orthonormal directions (size, r) of the unknown errors that the readings separate from the poses, and r.
 
     The angles get what neither poses nor translations explain. Directions without effect are omitted: their unknowns
@@ -307,7 +316,7 @@ def _seen_directions(errors: FloatArray, frames: FloatArray, angular: NDArray[np
         rest = own / lever
         rest = rest - explained @ (explained.T @ rest)
         left, values, right = np.linalg.svd(rest, full_matrices=False)
-        shows = values > SHOWS * max(1.0, float(values[0]))
+        shows = values > least * max(1.0, float(values[0]))
         good = right[shows]
         raw = np.zeros((len(angular), len(good)))
         raw[np.flatnonzero(group)] = good.T / lever[:, None]
