@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,7 @@ class VolumeGrid:
         x, y, z = (len(levels) for levels in self.levels_mm)
         return x, y, z
 
-    @property
+    @cached_property
     def position_mm(self) -> FloatArray:
         """All points, shape (n, 3)."""
         return full_grid(self.levels_mm).reshape(-1, 3)
@@ -377,6 +377,15 @@ def grid_tables(
 
 def motion_tables(errors: ErrorTable) -> AxisTables:
     """Return tables of the small motions: group 0 the translation in mm, group 1 the rotation vector in rad."""
+    numbers = ((name, curve.position_mm, curve.value) for name, curve in errors.curves.items())
+    return _motion_tables(*((name, *(np.asarray(k, np.float64).tobytes() for k in two)) for name, *two in numbers))
+
+
+@lru_cache(maxsize=8)
+def _motion_tables(*curves: tuple[str, bytes, bytes]) -> AxisTables:
+    """The tables of curves: names, nodes in mm, values. Many small calculations ask for those of the same errors."""
+    numbers = ((name, np.frombuffer(nodes), np.frombuffer(values)) for name, nodes, values in curves)
+    errors = ErrorTable({name: Curve(nodes_mm, value, value) for name, nodes_mm, value in numbers})
     tables = [AxisTable(index, np.zeros((len(index.nodes_mm), 2, 3))) for index in _indices(errors)]
     for error in ERRORS:
         if error.name in errors.curves:

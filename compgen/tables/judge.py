@@ -22,7 +22,7 @@ from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, factor, tool_of
 from compgen.kinematics.many_points import VolumeGrid, full_grid, volume_grid
-from compgen.tables.synthesis import Projector, best_values, error_at, kept, projector
+from compgen.tables.synthesis import Projector, best_values, error_at, kept, kept_field, projector
 
 # A field on a full grid, split into parts that depend on one axis, on a pair of axes, and on all three.
 #
@@ -269,7 +269,7 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
     nodes = _nodes(machine, errors, solver)
     grid = volume_grid(machine, nodes)
     line_mm = scan_lines(machine, nodes)
-    best_mm = solver.field(values, grid.position_mm)
+    best_mm = kept_field(machine, errors, grid.position_mm, solver, values)
     # the bent part: the field without its best-fit constant and slopes (squareness, pitch)
     columns = np.column_stack([np.ones(len(best_mm)), grid.position_mm - grid.position_mm.mean(axis=0)])
     bent_mm = best_mm - columns @ np.linalg.lstsq(columns, best_mm, rcond=None)[0]
@@ -283,7 +283,7 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
         grid=grid,
         best_mm=best_mm,
         line_mm=line_mm,
-        line_best_mm=solver.field(values, line_mm),
+        line_best_mm=kept_field(machine, errors, line_mm, solver, values),
         bent_mm=float(np.ptp(bent_mm, axis=0).max()),
         goal_mm=max(GOAL_MM, GOAL_SHARE * float(np.max(np.linalg.norm(bent_mm, axis=1)))),
         slack_mm=resolution_mm + np.minimum(grid_u_mm, COMPONENT_SHARE * np.std(best_mm, axis=0)),

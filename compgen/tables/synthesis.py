@@ -59,15 +59,18 @@ class _Call:
 
     @classmethod
     def of(cls, machine: Machine, errors: ErrorTable, position_mm: FloatArray, *more: Any) -> _Call:
-        """Take the digest of everything that the errors of the machine at points (n, 3) depend on, and of ``more``."""
+        """Take the digest of everything that the errors of the machine at points (n, 3) depend on, and of ``more``.
+
+        A :class:`Projector` among ``more`` has a digest of its own.
+        """
         model = (machine.chain.name, machine.squareness_reference, machine.tool_offset_mm, kernel_choice())
         sizes = [(name, len(curve.position_mm)) for name, curve in errors.curves.items()]
-        digest = hashlib.blake2b(repr((model, sizes, dict(errors.squareness), position_mm.shape)).encode())
+        digest = hashlib.sha256(repr((model, sizes, dict(errors.squareness), position_mm.shape)).encode())
         for curve in errors.curves.values():
             for part in (curve.position_mm, curve.value, curve.u):
-                digest.update(np.asarray(part, dtype=np.float64).tobytes())
-        digest.update(np.asarray(position_mm, dtype=np.float64).tobytes())
-        digest.update(pickle.dumps(more))
+                digest.update(np.ascontiguousarray(part, dtype=np.float64).data)
+        digest.update(np.ascontiguousarray(position_mm, dtype=np.float64).data)
+        digest.update(pickle.dumps([item.digest if isinstance(item, Projector) else item for item in more]))
         return cls(digest.digest(), machine, errors, position_mm, more)
 
 
@@ -239,7 +242,7 @@ class Projector:
     is ``tool_mm``. ``terms`` are the basis at the sample. ``freedom`` builds in the zeros at the reference point;
     ``offsets`` is 3 if a constant per axis is fitted together with the tables because the control cannot express it.
     ``factor`` (free + offsets, free + offsets) is the Cholesky factor of the normal matrix with
-    unit diagonal, ``scale`` what gave it that.
+    unit diagonal, ``scale`` what gave it that. Two with the same ``digest`` are equal but for the values in the basis.
     """
 
     basis: tuple[Term, ...]
@@ -252,6 +255,7 @@ class Projector:
     offsets: int
     factor: FloatArray
     scale: FloatArray
+    digest: bytes
 
     def project(self, required_mm: FloatArray, start: FloatArray | None = None) -> FloatArray:
         """Return all table values (parameters,) whose field is closest to ``required_mm`` (n, 3)."""
@@ -305,12 +309,37 @@ def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArr
     ``values`` are those of all terms in a row; several rows (k, parameters) give as many fields (k, n, 3).
     """
     rows = np.atleast_2d(values)
-    fields = np.zeros((len(rows), len(position_mm), 3))
+    fields = np.zeros((len(rows), 3, len(position_mm)))
+    places: dict[tuple[int, bytes], tuple[NDArray[np.int64], FloatArray]] = {}  # terms over an axis have the same nodes
     for term, place in placed_terms(basis):
-        carrier = term.carrier_field(position_mm, tool_mm)
-        for one, row in zip(fields, rows, strict=True):
-            one += carrier * term.curve(row[place], position_mm)[:, None]
+        nodes_mm, own = np.asarray(term.nodes_mm, dtype=np.float64), rows[:, place]
+        if term.axis is None or len(nodes_mm) == 1:
+            along = own
+        else:
+            # as np.interp, to the last bit, but the interval of a point is looked up once
+            nodes = term.axis, nodes_mm.tobytes()
+            if nodes not in places:
+                inside = np.clip(position_mm[:, term.axis], nodes_mm[0], nodes_mm[-1])
+                left = np.searchsorted(nodes_mm, inside, side="right") - 1
+                places[nodes] = left, inside - nodes_mm[left]
+            left, beyond_mm = places[nodes]
+            slope = np.diff(own) / np.diff(nodes_mm)
+            along = np.hstack([slope, np.zeros((len(own), 1))]).take(left, axis=1)
+            along *= beyond_mm
+            along += own.take(left, axis=1)
+        carriers = term.carriers(position_mm, tool_mm).items()
+        for output, carrier in carriers:
+            fields[:, output] += carrier * along
+    fields = np.ascontiguousarray(np.moveaxis(fields, 1, 2))
     return fields if values.ndim == 2 else np.asarray(fields[0])
+
+
+@kept
+def kept_field(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, solver: Projector, values: FloatArray
+) -> FloatArray:
+    """Return :meth:`Projector.field` of table values at points (n, 3): controls with the same tables share it."""
+    return solver.field(values, position_mm)
 
 
 def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArray:
@@ -423,7 +452,8 @@ def _factorised(problem: _Problem) -> Projector:
     if failed:
         raise LinAlgError("the normal matrix of the tables is not positive definite")
     sampled = (position_mm, weight, own_tool_mm, tool_mm, terms)
-    return Projector(basis, *sampled, freedom, offsets, factor, scale)
+    digest = hashlib.sha256(pickle.dumps(problem.key)).digest()
+    return Projector(basis, *sampled, freedom, offsets, factor, scale, digest)
 
 
 def synthesize(

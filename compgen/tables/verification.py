@@ -730,7 +730,7 @@ def verify(
         after_rigid_removed=rigid_removed[1],
         unrepresentable_um=float(np.max(np.linalg.norm(rest, axis=1))) / MM_PER_UM,
         uncorrected_um={
-            **_uncorrected(machine, errors, solver),
+            **_uncorrected(machine, errors, solver.position_mm, solver),
             **left_by_reversal(not_in_tables, corrected=False),
         },
         points=len(where),
@@ -821,12 +821,21 @@ def _useless_reasons(
     return []
 
 
-def _uncorrected(machine: Machine, errors: ErrorTable, solver: Projector) -> dict[str, float]:
-    """Return the largest displacement in um that the best table leaves of each single error (first order), if relevant."""
-    names = errors.names
-    required = np.stack([-volumetric_error(machine, errors.only(name), solver.position_mm) for name in names])
+@kept
+def _single_errors(machine: Machine, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
+    """Corrections of the single errors to first order at positions (n, 3): (errors, n, 3), mm."""
+    return np.stack([-volumetric_error(machine, errors.only(name), position_mm) for name in errors.names])
+
+
+@kept
+def _uncorrected(machine: Machine, errors: ErrorTable, position_mm: FloatArray, solver: Projector) -> dict[str, float]:
+    """Return the largest displacement in um that the best table leaves of each single error (first order), if relevant.
+
+    ``position_mm`` are the sample points of the ``solver``.
+    """
     found = {}
-    for name, rest in zip(names, solver.left_of(required), strict=True):
+    required = _single_errors(machine, errors, position_mm)
+    for name, rest in zip(errors.names, solver.left_of(required), strict=True):
         if solver.offsets:
             rest = rest - np.average(rest, axis=0, weights=solver.weight)
         x, y, z = rest.T

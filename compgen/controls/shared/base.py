@@ -82,11 +82,20 @@ class Term:
             return np.full(len(position_mm), values[0])
         return np.interp(position_mm[:, self.axis], self.nodes_mm, values)
 
+    def carriers(self, position_mm: FloatArray, tool_mm: FloatArray) -> dict[int, FloatArray | float]:
+        """Carrier by output axis, (m,) or constant, at commanded positions (m, 3) with tool offset (3,) or (m, 3)."""
+        found: dict[int, FloatArray | float] = {}
+        for part in self.carrier:
+            lever = 1.0 if part.lever is None else factor(part.lever, position_mm, tool_mm)
+            added = part.sign * (lever - part.origin_mm)
+            found[part.output] = found[part.output] + added if part.output in found else added
+        return found
+
     def carrier_field(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
         """Carrier at commanded positions (m, 3) with tool offset (3,) or (m, 3): shape (m, 3)."""
         field = np.zeros((len(position_mm), 3))
-        for part in self.carrier:
-            field[:, part.output] += part.sign * (factor(part.lever, position_mm, tool_mm) - part.origin_mm)
+        for output, carrier in self.carriers(position_mm, tool_mm).items():
+            field[:, output] = carrier
         return field
 
 
