@@ -35,6 +35,7 @@ from compgen.identify.any_measurement import (
 )
 from compgen.identify.options import StatedNumbers
 from compgen.identify.reversal_errors import SIGNIFICANT
+from compgen.resources import LANGUAGES
 
 if TYPE_CHECKING:
     from compgen.fit import FitOptions, FitResult
@@ -374,6 +375,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     stated: StatedNumbers | None = None,
     limits: SafetyLimits | None = None,
     allow_misfit: bool = False,
+    language: str = LANGUAGES[0],
     progress: Progress = lambda _: None,
 ) -> RunResult:
     """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
@@ -394,6 +396,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     limits : limits for the steps of the tables.
     allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation instead of a
         reason to refuse the tables.
+    language : of the preflight list and the page of the check program, ``"en"`` or ``"de"``.
     progress : called with the name of each step when it begins.
 
     Raises
@@ -452,6 +455,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
             allow_unverified=allow_unverified,
             provenance=provenance,
             reversal=reversal,
+            language=language,
         )
         verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
         # findings on the measurement; those that block are also reasons against the tables
@@ -464,7 +468,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         verification = replace(verification, objections=found, reasons=tuple(reasons))
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
-        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal)
+        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language)
         checked[sub_folder] = exported, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)

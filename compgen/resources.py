@@ -33,6 +33,9 @@ def cache_folder(kind: str) -> Path:
     return Path(base) / "compgen" / kind
 
 
+#: Languages of pages and of lists for the machine; the first one is that of the program.
+LANGUAGES = ("en", "de")
+
 #: The only place of the version: the metadata of the package and the documentation take it from here.
 VERSION = "0.1.0"
 

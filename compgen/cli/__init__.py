@@ -21,7 +21,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import load_for, output_options, plugin_option, run_command
-from compgen.resources import cache_folder
+from compgen.resources import LANGUAGES, cache_folder
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
 _COMMANDS = {
@@ -211,7 +211,7 @@ def _configured() -> dict[str, Any]:
     """Return the defaults of options that the configuration file states; paths are relative to it.
 
     It is ``config.toml`` in the user's folder for settings, or the file that ``COMPGEN_CONFIG`` names (empty: none). It may only
-    state where files are: nothing in it changes a number.
+    state where files are, and the language of pages: nothing in it changes a number.
     """
     named = os.environ.get("COMPGEN_CONFIG")
     path = Path(click.get_app_dir("compgen")) / "config.toml" if named is None else Path(named)
@@ -222,12 +222,15 @@ def _configured() -> dict[str, Any]:
     root = toml_files.read_toml(path)
     machines = root.take("machines", toml_files.texts_of_paths, ())
     certificate = root.take("certificate", toml_files.text_of_path, "")
+    language = root.take("language", toml_files.choice(*LANGUAGES), "")
     root.finish()
     found: dict[str, Any] = {}
     if machines:
         found["machines"] = [str(path.parent / Path(folder).expanduser()) for folder in machines]
     if certificate:
         found["certificate"] = str(path.parent / Path(certificate).expanduser())
+    if language:
+        found["language"] = language
     return found
 
 

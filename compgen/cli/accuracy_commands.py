@@ -21,7 +21,7 @@ from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
 from compgen.cli.common import NUMBER, PATH, Command, json_option, options_of, out_option
-from compgen.cli.shared_options import instrument_option, machine_argument
+from compgen.cli.shared_options import instrument_option, language_option, machine_argument
 from compgen.cli.terminal import answer, progress
 from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine
@@ -117,6 +117,7 @@ def _reader(axis: str | None, *paths: Path) -> Reader:
     help="Laboratory, customer, persons, instruments and conditions for the sheet (TOML; see docs/report.md).",
 )
 @out_option
+@language_option
 @json_option
 def accuracy_command(
     machine: Machine,
@@ -130,6 +131,7 @@ def accuracy_command(
     axis: str | None,
     budget: SetupBudget,
     out: Path,
+    language: str,
     as_json: bool,
 ) -> int:
     """Evaluate one measurement or error file by the standards, each figure with its uncertainty.
@@ -164,7 +166,7 @@ def accuracy_command(
     files = {"accuracy.txt": _plain(accuracy_table(found))}
     rows = rows_with_tolerance(found, dict(tolerances))
     if side.readings is not None or side.circles is not None:
-        files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory)
+        files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory, language)
     elif click.get_current_context().get_parameter_source("certificate") is ParameterSource.COMMANDLINE:
         raise InputError(
             "applies to the sheet of axis runs or circles, which this file does not contain", field="--certificate"

@@ -474,8 +474,9 @@ def show_drift(store: Store, job: Job, machine: str | None, report: Path | None,
 
     if machine is None:
         raise InputError("--drift and --report are for one machine; give its name")
-    found = drift_of_store(store, store.machine(machine), DriftSettings(job.machine(machine).tolerances))
-    paths = [] if report is None else [str(_write(report, found))]
+    settings = job.machine(machine)
+    found = drift_of_store(store, store.machine(machine), DriftSettings(settings.tolerances))
+    paths = [] if report is None else [str(_write(report, found, settings.language))]
     if as_json:
         print_json({"accepted": True, "paths": paths, "drift": found.summary()})
         return 0
@@ -498,10 +499,10 @@ def show_drift(store: Store, job: Job, machine: str | None, report: Path | None,
     return 0
 
 
-def _write(path: Path, drift: Drift) -> Path:
+def _write(path: Path, drift: Drift, language: str) -> Path:
     from compgen.fleet.history_page import write_history_report
 
-    return write_history_report(path, drift)
+    return write_history_report(path, drift, language)
 
 
 @recal_command.command("recheck")

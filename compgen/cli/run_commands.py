@@ -18,6 +18,7 @@ from compgen.cli.shared_options import (
     fitting_options,
     identify_options,
     instrument_option,
+    language_option,
     limits_option,
     machine_argument,
     measurements_argument,
@@ -62,8 +63,11 @@ if TYPE_CHECKING:
     type=PATH,
     help="Local copy of dcc.xsd (PTB): write dcc.xml only if it validates.",
 )
+@language_option
 @json_option
-def report_command(folder: Path, out: Path | None, certificate: Path | None, schema: Path | None, as_json: bool) -> int:
+def report_command(
+    folder: Path, out: Path | None, certificate: Path | None, schema: Path | None, language: str, as_json: bool
+) -> int:
     """Make the report of a folder that run, identify, verify or compare wrote, from the files in it.
 
     Writes report.html (one file, no network; print it to PDF from a browser), report.json (its numbers), dossier.md and
@@ -95,7 +99,7 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
             remark = f"dcc.xml: DCC {rules.version}, valid against {rules.path}"
     with progress(quiet=as_json) as show:
         show("drawing the report")
-        report, paths = write_report(folder, out, also)
+        report, paths = write_report(folder, out, also, language)
     if as_json:
         print_json({**report.data, "paths": [str(path) for path in paths.values()]})
         return 0
@@ -106,12 +110,12 @@ def report_command(folder: Path, out: Path | None, certificate: Path | None, sch
     return 0
 
 
-def report_written(folder: Path) -> Path | None:
+def report_written(folder: Path, language: str) -> Path | None:
     """Write the report of a finished command into its folder; if this fails, the result remains."""
     from compgen.report.html import write_report
 
     try:
-        return write_report(folder)[1]["report.html"]
+        return write_report(folder, language=language)[1]["report.html"]
     except InputError as error:
         warnings.warn(f"the report could not be made: {error}", CompgenWarning, stacklevel=2)
         return None
@@ -143,6 +147,7 @@ def report_written(folder: Path) -> Path | None:
 )
 @explain_option
 @click.option("--no-report", is_flag=True, help="Write neither report.html nor the files that belong to it.")
+@language_option
 @json_option
 def run_command(
     machine: Machine,
@@ -160,6 +165,7 @@ def run_command(
     allow_misfit: bool,
     explain: bool,
     no_report: bool,
+    language: str,
     as_json: bool,
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
@@ -185,13 +191,14 @@ def run_command(
             active=active,
             limits=limits,
             allow_misfit=allow_misfit,
+            language=language,
             progress=show,
             instrument=instrument,
             stated=stated,
         )
         if not no_report:
             show("drawing the report")
-        report = None if no_report else report_written(out)
+        report = None if no_report else report_written(out, language)
     if report is not None:  # a new report replaces it; otherwise the earlier one is kept as PREVIOUS-...
         for path in result.earlier_report:
             path.unlink(missing_ok=True)

@@ -18,6 +18,7 @@ from compgen.cli.shared_options import (
     emphasis_options,
     errors_argument,
     explain_option,
+    language_option,
     limits_option,
     machine_argument,
     points_option,
@@ -144,6 +145,7 @@ def options_command(
 @active_options()
 @explain_option
 @click.option("--no-verify", is_flag=True, help="Do not read the files back and verify them.")
+@language_option
 @json_option
 def export_command(
     machine: Machine,
@@ -156,6 +158,7 @@ def export_command(
     active: ActiveTables | None,
     explain: bool,
     no_verify: bool,
+    language: str,
     as_json: bool,
 ) -> int:
     """Export errors to the files of a control, with manifest.json and preflight.md.
@@ -186,8 +189,9 @@ def export_command(
         allow_unverified=allow_unverified,
         provenance=provenance_of(machine.source, errors, reversal, *(active.paths if active else ())),
         reversal=both,
+        language=language,
     )
-    extra_files |= check_files(machine, exported, table, templates, both)
+    extra_files |= check_files(machine, exported, table, templates, both, language)
     explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
     if explanation is not None:
         extra_files["explain.md"] = explanation_markdown(explanation)

@@ -14,15 +14,21 @@ from compgen.data.names import COVERAGE
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
 from compgen.report.html.pictures import describe_error
 from compgen.report.html.write import page_environment
+from compgen.resources import LANGUAGES
 
 
-def history_page(drift: Drift) -> str:
-    """Return the text of the page; it loads nothing from elsewhere and runs no script."""
-    environment = page_environment("history")
+def history_page(drift: Drift, language: str = LANGUAGES[0]) -> str:
+    """Return the text of the page in a language; it loads nothing from elsewhere and runs no script."""
+    environment = page_environment("history", language)
     environment.filters |= {"probability": probability, "moment": moment_of, "zip": zip}
     style, _, policy = page_assets()
+    pictures = draw_history(drift)
+    if language != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        pictures = [texts_of(language).picture(item) for item in pictures]
     return environment.get_template("history.html.j2").render(
-        drift=drift.summary(), pictures=draw_history(drift), style=style, policy=policy
+        drift=drift.summary(), pictures=pictures, style=style, policy=policy
     )
 
 
@@ -32,10 +38,10 @@ def probability(value: float, level: float) -> Markup:
     return Markup(f"<strong>{text}</strong>" if value < level else text)
 
 
-def write_history_report(path: Path, drift: Drift) -> Path:
+def write_history_report(path: Path, drift: Drift, language: str = LANGUAGES[0]) -> Path:
     """Write the page to a file, completely or not at all."""
     folder = OutputFolder(path.parent)
-    folder.add(path.name, history_page(drift))
+    folder.add(path.name, history_page(drift, language))
     return next(iter(folder.commit().values()))
 
 

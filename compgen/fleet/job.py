@@ -25,6 +25,7 @@ from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
 from compgen.data.toml_files import Section, accepted, accepts, part_setting, setting, table_setting, take_settings
 from compgen.errors import InputError
+from compgen.resources import LANGUAGES
 
 # --- schedules -----------------------------------------------------------------------------------------------------
 #
@@ -327,6 +328,11 @@ class MachineJob:
     allow_unverified: bool = setting(
         toml_files.flag, False, meaning="Export formats that no public document fully describes."
     )
+    language: Literal["en", "de"] = setting(
+        toml_files.choice(*LANGUAGES),
+        LANGUAGES[0],
+        meaning="Language of preflight lists and of the report of the history.",
+    )
     notify: tuple[str, ...] = setting(
         command_words, (), meaning="Command, as a list of words, that is notified of decisions and failures."
     )
@@ -376,6 +382,8 @@ class MachineJob:
         rules = {"policy": asdict(self.policy), "unverified": self.allow_unverified, "templates": str(self.templates)}
         if self.max_minutes != MachineJob.max_minutes:  # with more time, what took too long is tried again
             rules["max_minutes"] = self.max_minutes
+        if self.language != LANGUAGES[0]:
+            rules["language"] = self.language
         found = sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
         if known and found not in known:
             load_machine(self.machine)

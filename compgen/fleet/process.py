@@ -546,6 +546,7 @@ def process(
             active=None if was_active is None else ActiveTables(was_active),
             instrument=job.instrument,
             limits=SafetyLimits(job.policy.max_step_um),
+            language=job.language,
             allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
         )
         judgement = _judged(case, outcome)

@@ -24,6 +24,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 from compgen.report.dcc.laboratory import Certificate, Condition
 from compgen.report.html.write import page_environment
+from compgen.resources import LANGUAGES
 
 #: Targets that a page has room for; more are in ``accuracy.json`` only.
 MOST_TARGETS = 24
@@ -78,6 +79,7 @@ def sheet_page(
     rows: Mapping[str, list[SheetRow]],
     edition: int,
     certificate: Certificate | None = None,
+    language: str = LANGUAGES[0],
 ) -> str:
     """Return the text of ``sheet.html``: one printed page for each axis of axis runs, or each circle.
 
@@ -89,6 +91,7 @@ def sheet_page(
     rows : the figures of each page with their tolerances (:func:`rows_with_tolerance`).
     edition : of ISO 230-2.
     certificate : laboratory, customer, persons and conditions, if known.
+    language : of the page.
     """
     sheets = []
     for name, group in rows.items():
@@ -109,10 +112,14 @@ def sheet_page(
             sheet["title"] = f"Circular test {name}, radius {side.circles.radius_mm[own][0]:g} mm, ISO 230-4"
             sheet["picture"] = draw_circle(name, side.circles, own)
             measured = side.circles
+        if language != LANGUAGES[0]:
+            from compgen.data.language import texts_of
+
+            sheet["picture"] = texts_of(language).picture(sheet["picture"])
         sheet["facts"] = [*facts_of(machine, certificate), *conditions_of(measured, own, certificate)]
         sheets.append(sheet)
     style, _, policy = page_assets()
-    return page_environment("sheet").get_template("sheet.html.j2").render(
+    return page_environment("sheet", language).get_template("sheet.html.j2").render(
         sheets=sheets, title=f"{machine.name}: {side.path.name}", file=side.path.name, statements=found.statements,
         certificate=certificate, style=style, policy=policy,
     )  # fmt: skip

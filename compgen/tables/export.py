@@ -19,7 +19,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenWarning, InputError
-from compgen.resources import program_version
+from compgen.resources import LANGUAGES, program_version
 from compgen.tables.render import Format, companion_files, errors_context, load_format, render, render_files
 from compgen.tables.synthesis import Projector, best_values, projector
 
@@ -219,6 +219,7 @@ def export(
     allow_unverified: bool = False,
     provenance: Provenance | None = None,
     reversal: ReversalCurves | None = None,
+    language: str = LANGUAGES[0],
 ) -> Export:
     """Turn errors into the files of one control; nothing is written yet.
 
@@ -232,6 +233,7 @@ def export(
     provenance : the input files, for the manifest and the headers.
     reversal : what each axis does differently in its two directions; in tables of one direction where the control has
         them, else as a parameter or a warning in the preflight list.
+    language : of the preflight list, ``"en"`` or ``"de"``; files for the control and the manifest stay in English.
 
     Raises
     ------
@@ -272,7 +274,7 @@ def export(
     own = {**own, "warnings": [*own["warnings"], *unread]}
     described = _described(files)
     violations = control.violations(tables)
-    preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates)
+    preflight = render(card, "preflight.md.j2", {**common, **own, "files": described}, templates, language)
     copy = machine.file if machine.file and machine.file.is_file() else None
     manifest = {
         "program": f"compgen {common['version']}",

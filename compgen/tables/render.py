@@ -32,7 +32,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import one_line
 from compgen.data.names import AXES, ERRORS
 from compgen.errors import InputError
-from compgen.resources import cache_folder, data_folder
+from compgen.resources import LANGUAGES, cache_folder, data_folder
 
 # Controller files through Jinja2: strict about missing values, sandboxed; text of a user is never executed.
 
@@ -241,7 +241,7 @@ class KeptTemplates(FileSystemBytecodeCache):
 
 
 @lru_cache(maxsize=32)
-def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
+def _environment(folders: tuple[Path, ...], language: str = LANGUAGES[0]) -> ImmutableSandboxedEnvironment:
     """Return the environment of some folders; it is cached with its compiled templates, and changed ones are read again."""
     environment = _Bounded(
         loader=ChoiceLoader([FileSystemLoader(folder) for folder in folders]),
@@ -251,12 +251,17 @@ def _environment(folders: tuple[Path, ...]) -> ImmutableSandboxedEnvironment:
         trim_blocks=True,
         lstrip_blocks=True,
         optimized=False,
-        bytecode_cache=KeptTemplates("tables")
+        bytecode_cache=KeptTemplates("tables" if language == LANGUAGES[0] else f"tables-{language}")
         if folders == (data_folder("templates"),)
         else None,  # not those of users
     )
     environment.filters["fixed"] = lambda value, digits: fixed(float(value), digits)
     environment.filters["plain"] = lambda value: one_line(value)
+    environment.filters["word"] = str
+    if language != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        texts_of(language).translate(environment, html=False)
     return environment
 
 
@@ -271,7 +276,13 @@ def _inert(value: Any) -> Any:
     return value
 
 
-def render(card: Format, template: str, context: Mapping[str, Any], folder: Path | None = None) -> str:
+def render(
+    card: Format,
+    template: str,
+    context: Mapping[str, Any],
+    folder: Path | None = None,
+    language: str = LANGUAGES[0],
+) -> str:
     """Render one template of a format.
 
     Parameters
@@ -280,10 +291,11 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
     template : file name below the format's folder.
     context : values; texts are flattened to one line of printable ASCII before they reach the template.
     folder : a user's templates folder, searched before the shipped one.
+    language : of a list for the reader; files for a control are never translated.
     """
     folders = template_folders(card.name, folder)
     try:
-        page = _environment(tuple(folders)).get_template(f"{card.name}/{template}")
+        page = _environment(tuple(folders), language).get_template(f"{card.name}/{template}")
         with _ended_after(LONGEST_S):
             # An endless template is stopped as soon as its output is too long.
             parts = page.generate({**{key: _inert(value) for key, value in context.items()}, "format": card})
@@ -293,11 +305,16 @@ def render(card: Format, template: str, context: Mapping[str, Any], folder: Path
                 size += len(part)
                 if size > MOST_CHARACTERS:
                     raise EndlessTemplateError(f"it writes more than {MOST_CHARACTERS} characters: does a loop end?")
-            return "".join(kept)
+            text = "".join(kept)
     except _TEMPLATE_FAULTS as error:
         file, line = _place(error, folders)
         message = f"the template cannot be rendered: {one_line(error)}"
         raise InputError(message, file=file or f"templates/{card.name}/{template}", line=line) from error
+    if language != LANGUAGES[0]:
+        from compgen.data.language import wrapped
+
+        text = wrapped(text)
+    return text
 
 
 @contextmanager

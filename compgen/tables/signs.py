@@ -21,6 +21,7 @@ from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import full_grid
+from compgen.resources import LANGUAGES
 from compgen.tables import Export, export
 from compgen.tables.entries import entry_check, numbers_of, with_number
 from compgen.tables.judge import COMPONENT_FLOOR_MM, Judge, judge_of
@@ -427,6 +428,7 @@ def check_files(
     errors: ErrorTable,
     templates: Path | None = None,
     reversal: ReversalCurves | None = None,
+    language: str = LANGUAGES[0],
 ) -> dict[str, str]:
     """Return ``check/check-program.md`` and, for controls with a documented motion in machine coordinates, the program.
 
@@ -436,6 +438,7 @@ def check_files(
     exported : the files; the readings are those of their text.
     templates : a user's templates folder, searched first.
     reversal : as in :func:`check_program`.
+    language : of the page; the program stays in English.
     """
     control = controller_named(exported.controller)(machine)
     sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
@@ -446,7 +449,7 @@ def check_files(
     folders = template_folders(card.name, templates)
     has_program = any((folder / card.name / "check-program.nc.j2").is_file() for folder in folders)
     context = {**_context(machine, exported, program), "has_program": has_program}
-    files = {PAGE_NAME: render(replace(card, name="_common"), "check-program.md.j2", context, templates)}
+    files = {PAGE_NAME: render(replace(card, name="_common"), "check-program.md.j2", context, templates, language)}
     if has_program:
         files[PROGRAM_NAME] = render(card, "check-program.nc.j2", context, templates)
     return files

@@ -39,7 +39,7 @@ from compgen.report.html.pictures import (
     grid_of,
     thousands,
 )
-from compgen.resources import data_folder
+from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
 from compgen.tables.verification import coverage_of
@@ -466,6 +466,7 @@ def render_page(
     data: Mapping[str, Any],
     pictures: Mapping[str, Sequence[Picture]],
     seconds: float | None = None,
+    language: str = LANGUAGES[0],
 ) -> str:
     """Return the text of ``report.html``.
 
@@ -476,16 +477,22 @@ def render_page(
     pictures : by group: ``curves``, ``squareness``, ``measurement``, and ``space-K``, ``slices-K``, ``tables-K`` for
         control K.
     seconds : how long the drawing took; None omits it.
+    language : of the page; what users wrote, and what is in files for a control, stays as it is.
     """
-    environment = page_environment("report")
+    environment = page_environment("report", language)
     style, script, policy = page_assets("charts.js", "script.js")
+    has_named = any(item["series"][-1]["name"].startswith("table ") for item in (p.data for p in pictures["curves"]))
+    if language != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        pictures = {group: [texts_of(language).picture(item) for item in items] for group, items in pictures.items()}
     drawn = [picture for group in pictures.values() for picture in group]
     return environment.get_template("page.html.j2").render(
         data=data,
         controls=list(zip(data["controls"], source.controls, strict=True)),
         pictures=pictures,
         has_fit=source.fitted is not None,
-        has_named=any(item["series"][-1]["name"].startswith("table ") for item in (p.data for p in pictures["curves"])),
+        has_named=has_named,
         figures=FIGURES,
         policy=policy,
         style=style,
@@ -495,8 +502,8 @@ def render_page(
     )
 
 
-def page_environment(kind: str) -> Environment:
-    """Return the templates of pages: every text is escaped; compiled templates are kept for each ``kind``."""
+def page_environment(kind: str, language: str = LANGUAGES[0]) -> Environment:
+    """Return the templates of pages in a language: every text is escaped; compiled templates are kept for each ``kind``."""
     environment = Environment(
         loader=FileSystemLoader(data_folder("templates") / "_report"),
         autoescape=True,
@@ -504,7 +511,7 @@ def page_environment(kind: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         optimized=False,
-        bytecode_cache=KeptTemplates(kind),
+        bytecode_cache=KeptTemplates(kind if language == LANGUAGES[0] else f"{kind}-{language}"),
     )
     environment.filters |= {
         "um": um,
@@ -513,7 +520,12 @@ def page_environment(kind: str) -> Environment:
         "markdown": markdown,
         "unit": lambda name: LABEL.get(name, name),
         "thousands": thousands,
+        "word": str,
     }
+    if language != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        texts_of(language).translate(environment, html=True)
     return environment
 
 
@@ -792,8 +804,8 @@ class Report:
     data: Mapping[str, Any]
 
 
-def build_report(folder: str | Path) -> Report:
-    """Read the results in ``folder`` and make their report; nothing is written.
+def build_report(folder: str | Path, language: str = LANGUAGES[0]) -> Report:
+    """Read the results in ``folder`` and make their report, the page in a language; nothing is written.
 
     Raises
     ------
@@ -802,7 +814,7 @@ def build_report(folder: str | Path) -> Report:
     """
     source = read_folder(folder)
     data = json_values(content(source))
-    page = render_page(source, data, draw(source, data))
+    page = render_page(source, data, draw(source, data), language=language)
     record = calibration_record(data)
     dossier = dossier_data(data)
     return Report(
@@ -818,14 +830,17 @@ def build_report(folder: str | Path) -> Report:
 
 
 def write_report(
-    folder: str | Path, out: str | Path | None = None, also: Further | None = None
+    folder: str | Path,
+    out: str | Path | None = None,
+    also: Further | None = None,
+    language: str = LANGUAGES[0],
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
-    ``also`` makes additional files, by name, from the numbers of the report.
+    ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page.
     """
     target = OutputFolder(out if out is not None else folder)
-    report = build_report(folder)
+    report = build_report(folder, language)
     documents = also(report.data) if also is not None else {}
     for name, text in report.files.items():
         target.add(name, text)

@@ -1,0 +1,301 @@
+"""Texts of pages and lists in another language than English: its catalogue, sentences with values in them, templates.
+
+Programs and files speak English; results are kept in English, too (every JSON file). Another language is needed only where
+something is shown: a template is translated when it is loaded, and every text that is filled into it when it is filled
+in. The catalogue is that of gettext. Nothing in this module is used, or imported, for English.
+
+A message of the catalogue is a whole sentence with named places, ``"set {number} is incomplete"``, or a whole part of a
+template (:func:`parts`), whose German form contains the same expressions.
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from gettext import GNUTranslations
+from html import escape, unescape
+from typing import TYPE_CHECKING, Any
+
+from compgen.data.messages import nearest
+from compgen.errors import InputError
+from compgen.resources import LANGUAGES, data_folder
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jinja2 import BaseLoader, Environment
+
+    from compgen.data.charts import Picture
+
+#: Context of single words in the catalogue. They are translated only where a page shows them as a word, because a word in a
+#: text may be a key or a value that has to be typed as it is (``sign = "error"``).
+WORD = "word"
+
+_PLACE = re.compile(r"\{(\w+)\}")
+_TOKEN = re.compile(
+    r"(\{#.*?#\}|\{%.*?%\}|\{\{.*?\}\}|<!.*?>|<style.*?</style>|<script.*?</script>|</?[a-zA-Z][^>]*>)", re.DOTALL
+)
+_INLINE = re.compile(r"</?(strong|em|b|i|code|span|br|small|sub|sup)\b")
+_BRANCH = re.compile(r"\{%-?\s*(if|elif|else|endif)\b")
+_ONLY_STATEMENTS = re.compile(r"\s*(\{%.*?%\}\s*|\{#.*?#\}\s*)+$")
+_MARKER = re.compile(r"\s*(#+ |\d+\. |[-*] (\[ \] )?|)")
+#: What is the same in every language: code, units, names of standards.
+_CODE = re.compile(r"`[^`]*`|<code>.*?</code>")
+_UNREAD = re.compile(r"\b(mm|um|µm|ISO|SHA|En|rms)\b")
+_WORDS = re.compile(r"[^\W\d_]{2,}")
+#: Lists are wrapped at this column; rows of tables and headings are not.
+_COLUMN = 120
+
+
+def checked_language(name: str) -> str:
+    """Return the name of a language, e.g. ``"de"``; ValueError for one that has no catalogue.
+
+    >>> checked_language("de")
+    'de'
+    """
+    if name not in LANGUAGES:
+        raise ValueError(f"is not a language of the pages; {nearest(name, LANGUAGES)}")
+    return name
+
+
+@lru_cache(maxsize=4)
+def texts_of(language: str) -> Texts:
+    """Return the texts of a language; InputError for one that has no catalogue."""
+    try:
+        path = data_folder("templates") / "_language" / f"{checked_language(language)}.mo"
+    except ValueError as error:
+        raise InputError(f"{language!r} {error}", field="language") from error
+    with path.open("rb") as file:
+        return Texts(vars(GNUTranslations(file))["_catalog"], language)
+
+
+class Texts:
+    """The catalogue of one language, from English messages to their translation.
+
+    >>> german = Texts({"{count} points of {name}": "{count} Punkte von {name}", "the first axis": "die erste Achse"})
+    >>> german.text("12 points of the first axis")
+    '12 Punkte von die erste Achse'
+    >>> german.text("a text without a translation")
+    'a text without a translation'
+    """
+
+    def __init__(self, messages: dict[str, str], language: str = "de") -> None:
+        self.language = language
+        self.messages = {english: text for english, text in messages.items() if english and text}
+        found = []
+        for english in self.messages:
+            literals = _PLACE.split(english)[::2]
+            if len(literals) > 1 and "{{" not in english and "{%" not in english and any(map(str.isalpha, english)):
+                pattern = re.escape(english).replace(r"\{", "{").replace(r"\}", "}")
+                places = re.compile(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", pattern), re.DOTALL)
+                found.append((sum(map(len, literals)), max(literals, key=len), places, english))
+        # the more of a text is in the message itself, the surer is the message
+        self._patterns = sorted(found, key=lambda item: -item[0])
+        self._known: dict[str, str] = {}
+
+    def text(self, english: str) -> str:
+        """Return a text in this language, as it is if the catalogue does not contain it.
+
+        Values within it are translated in the same way; a text of several sentences, or of several parts between
+        semicolons, is translated part by part.
+        """
+        if english not in self._known:
+            if len(self._known) > 20_000:
+                self._known.clear()
+            self._known[english] = self._of(english)
+        return self._known[english]
+
+    def _of(self, english: str) -> str:
+        core = english.strip()
+        known = self.messages.get(core)
+        if known is None and " " in core:
+            known = self._matched(core) or self._by_parts(core)
+        if known is None:
+            return english
+        before, _, after = english.partition(core)
+        return before + known + after
+
+    def label(self, english: str) -> str:
+        """Return a text that may be a single word, e.g. of a picture or a verdict."""
+        core = english.strip()
+        known = self.messages.get(f"{WORD}\x04{core}")
+        return self.text(english) if known is None else english.replace(core, known)
+
+    def _matched(self, english: str) -> str | None:
+        for _, longest, pattern, message in self._patterns:
+            if longest in english and (found := pattern.fullmatch(english)):
+                values = {name: self.label(value) for name, value in found.groupdict().items()}
+                return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
+        return None
+
+    def _by_parts(self, english: str) -> str | None:
+        for end in (r"(?<=[.!?]) (?=\S)", r"(?<=;) (?=\S)", r"(?<=:) (?=\S)"):
+            parts = re.split(end, english)
+            if len(parts) > 1:
+                found = [self._part(part) for part in parts]
+                if found != parts:
+                    return " ".join(found)
+        return None
+
+    def _part(self, english: str) -> str:
+        """Return one of several parts; its full stop or semicolon may not belong to the message."""
+        found = self.text(english)
+        if found == english and english[-1] in ".;:":
+            return self.text(english[:-1]) + english[-1]
+        return found
+
+    def picture(self, picture: Picture) -> Picture:
+        """Return a picture with heading, note and texts in this language; names of series are for the script of its page."""
+        from markupsafe import Markup
+
+        data = dict(picture.data)
+        if "series" in data:
+            data["series"] = [{**item, "name": self.label(item["name"])} for item in data["series"]]
+        said = {"title": self.label(picture.title), "note": self.label(picture.note)}
+        return replace(picture, **said, svg=Markup(self.drawn(picture.svg)), data=data)
+
+    def drawn(self, svg: str) -> str:
+        """Return a picture (SVG) with its texts in this language."""
+        found = re.sub(r"(?<=>)[^<>]+(?=</(?:text|title|desc|tspan)>)", self._escaped, svg)
+        return re.sub(r'(?<=aria-label=")[^"]+', self._escaped, found)
+
+    def _escaped(self, found: re.Match[str]) -> str:
+        return escape(self.label(unescape(found[0])))
+
+    def page(self, html: str) -> str:
+        """Return a finished page whose texts are all messages, each between two tags, in this language."""
+        kept = re.split(r"(<style.*?</style>|<script.*?</script>|<code>.*?</code>)", html, flags=re.DOTALL)
+        kept[::2] = [re.sub(r"(?<=>)[^<>]+(?=<)", self._escaped, part) for part in kept[::2]]
+        return self.drawn("".join(kept))
+
+    def template(self, source: str, *, html: bool) -> str:
+        """Return the source of a template in this language; parts that the catalogue does not contain stay in English."""
+        found, end = [], 0
+        for first, last in parts(source, html=html):
+            message = " ".join(source[first:last].split())
+            found += [source[end:first], self.messages.get(message, source[first:last])]
+            end = last
+        text = "".join([*found, source[end:]])
+        if html:
+            text = re.sub(r'(?<=aria-label=")[^"{]+', lambda found: self.label(found[0]), text)
+        return text.replace('<html lang="en">', f'<html lang="{self.language}">')
+
+    def translate(self, environment: Environment, *, html: bool) -> Environment:
+        """Let a Jinja environment load templates in this language, and translate what is filled into them."""
+        assert environment.loader is not None
+        environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
+        environment.finalize = self.filled
+        environment.filters["word"] = self.label
+        environment.globals["language"] = self.language
+        return environment
+
+    def filled(self, value: Any) -> Any:
+        """Return a value that is filled into a template: a text in this language, anything else as it is."""
+        return self.text(value) if type(value) is str else value
+
+
+def _loader(loader: BaseLoader, translate: Callable[[str], str]) -> BaseLoader:
+    """Return a loader of the same templates after their translation."""
+    from jinja2 import BaseLoader
+
+    class Translated(BaseLoader):
+        def get_source(self, environment: Environment, template: str) -> Any:
+            source, name, current = loader.get_source(environment, template)
+            return translate(source), name, current
+
+    return Translated()
+
+
+def parts(source: str, *, html: bool) -> Iterator[tuple[int, int]]:
+    r"""Yield where the translatable parts of a template begin and end.
+
+    In HTML they are the texts between two tags of blocks, in Markdown headings, paragraphs, items and rows of tables. A part
+    contains all expressions, tags and branches within it, so that a translation can put them in another order.
+
+    >>> text = "{% if a %}\n<p>With <b>{{ name }}</b>{% if b %} and more{% endif %}</p>\n{% endif %}"
+    >>> [text[first:last] for first, last in parts(text, html=True)]
+    ['With <b>{{ name }}</b>{% if b %} and more{% endif %}']
+    """
+    for first, last in _between_blocks(source) if html else _paragraphs(source):
+        text = source[first:last]
+        first += len(text) - len(text.lstrip())
+        last -= len(text) - len(text.rstrip())
+        if _WORDS.search(_UNREAD.sub(" ", _TOKEN.sub(" ", _CODE.sub(" ", source[first:last])))):
+            yield first, last
+
+
+def _between_blocks(source: str) -> Iterator[tuple[int, int]]:
+    tokens: list[re.Match[str]] = []
+    end = 0
+    for found in _TOKEN.finditer(source):
+        token = found[0]
+        inline = token.startswith("{{") or _INLINE.match(token) or _BRANCH.match(token)
+        if not inline:
+            yield from _balanced(source, end, found.start(), tokens)
+            tokens, end = [], found.end()
+        elif _BRANCH.match(token):
+            tokens.append(found)
+    yield from _balanced(source, end, len(source), tokens)
+
+
+def _balanced(source: str, first: int, last: int, branches: list[re.Match[str]]) -> Iterator[tuple[int, int]]:
+    """Split a part at branches that do not begin and end within it."""
+    open_ones: list[list[re.Match[str]]] = []
+    cuts: list[re.Match[str]] = []
+    for found in branches:
+        kind = _BRANCH.match(found[0])[1]  # type: ignore[index]
+        if kind == "if":
+            open_ones.append([found])
+        elif not open_ones:
+            cuts.append(found)
+        elif kind == "endif":
+            open_ones.pop()
+        else:
+            open_ones[-1].append(found)
+    for found in sorted([*cuts, *(item for group in open_ones for item in group)], key=lambda item: item.start()):
+        yield first, found.start()
+        first = found.end()
+    yield first, last
+
+
+def _paragraphs(source: str) -> Iterator[tuple[int, int]]:
+    place, first, fenced, before = 0, None, False, ""
+    for line in source.splitlines(keepends=True):
+        marker = _MARKER.match(line)
+        assert marker is not None
+        row = line.startswith("|")
+        fenced ^= line.lstrip().startswith("```")
+        code = fenced or line.lstrip().startswith("```") or (line.startswith("    ") and not before.strip())
+        alone = row or code or not line.strip() or _ONLY_STATEMENTS.match(line) is not None
+        if first is not None and (alone or marker[1]):
+            yield first, place
+            first = None
+        if row:
+            yield place, place + len(line)
+        elif not alone and first is None:
+            first = place + marker.end()
+        place += len(line)
+        before = "" if code else line
+        if first is not None and marker[1].startswith("#"):
+            yield first, place
+            first = None
+    if first is not None:
+        yield first, place
+
+
+def wrapped(markdown: str) -> str:
+    """Return Markdown whose long paragraphs and items are wrapped, as those of the English templates are."""
+    lines = []
+    for line in markdown.split("\n"):
+        if len(line) <= _COLUMN or line.startswith(("|", "#")):
+            lines.append(line)
+            continue
+        marker = _MARKER.match(line)
+        assert marker is not None
+        lines += textwrap.wrap(
+            line, _COLUMN, subsequent_indent=" " * marker.end(), break_long_words=False, break_on_hyphens=False
+        )
+    return "\n".join(lines)
