@@ -848,6 +848,10 @@ def _uncorrected(machine: Machine, errors: ErrorTable, position_mm: FloatArray, 
 # The files of a verification: its figures, and the points behind them.
 
 
+#: Decimals of ``volume.csv``: of positions in mm, and of errors in um.
+POSITION_DECIMALS, ERROR_DECIMALS = 6, 4
+
+
 def verification_files(result: Verification) -> dict[str, str]:
     """Return the texts of ``result.json`` and ``volume.csv``."""
     return {"result.json": json.dumps(result.summary(), indent=2) + "\n", "volume.csv": format_volume(result)}
@@ -859,7 +863,7 @@ def format_volume(result: Verification) -> str:
     If a reversal is known, every point is listed twice, reached in positive and in negative direction.
     """
     columns: dict[str, FloatArray] = {f"{axis}_mm": result.position_mm[:, k] for k, axis in enumerate("xyz")}
-    digits = dict.fromkeys(columns, 6)
+    digits = dict.fromkeys(columns, POSITION_DECIMALS)
     for prefix, values in (("before", result.error_before_mm), ("after", result.error_after_mm)):
         columns |= {f"{prefix}_{axis}_um": values[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
-    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, 4), **digits})
+    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, ERROR_DECIMALS), **digits})

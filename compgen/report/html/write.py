@@ -26,7 +26,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError
-from compgen.report.html.folder import ControlFolder, ResultFolder, TableCurve, read_folder, table_curves
+from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
     describe_error,
     draw_curve,
@@ -804,15 +804,17 @@ class Report:
     data: Mapping[str, Any]
 
 
-def build_report(folder: str | Path, language: str = LANGUAGES[0]) -> Report:
+def build_report(folder: str | Path, language: str = LANGUAGES[0], known: KnownTables | None = None) -> Report:
     """Read the results in ``folder`` and make their report, the page in a language; nothing is written.
+
+    ``known`` is what the run which wrote the folder still has, see :func:`compgen.report.html.folder.read_folder`.
 
     Raises
     ------
     InputError
         if the folder contains no results, or one of its files cannot be read.
     """
-    source = read_folder(folder)
+    source = read_folder(folder, known)
     data = json_values(content(source))
     page = render_page(source, data, draw(source, data), language=language)
     record = calibration_record(data)
@@ -834,13 +836,15 @@ def write_report(
     out: str | Path | None = None,
     also: Further | None = None,
     language: str = LANGUAGES[0],
+    known: KnownTables | None = None,
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
-    ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page.
+    ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page;
+    ``known``: see :func:`build_report`.
     """
     target = OutputFolder(out if out is not None else folder)
-    report = build_report(folder, language)
+    report = build_report(folder, language, known)
     documents = also(report.data) if also is not None else {}
     for name, text in report.files.items():
         target.add(name, text)
