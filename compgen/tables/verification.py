@@ -179,7 +179,11 @@ def figure_uncertainty(
     most = max(50, min(UNCERTAINTY_POINTS, MOST_NUMBERS // (3 * max(len(known.error), 1))))
     places = np.unique(np.linspace(0, len(position_mm) - 1, most).astype(int))
     chosen = position_mm[places]
-    spread = error_design(machine, known, chosen) @ known.errors_factor
+    design, factor = error_design(machine, known, chosen), known.errors_factor
+    spread = np.empty((len(chosen), 3, factor.shape[1]))
+    for output in range(3):  # most errors move one axis
+        used = design[:, output].any(axis=0)
+        spread[:, output] = design[:, output, used] @ factor[used]
     flat = spread.reshape(3 * len(chosen), -1)
     found: list[float] = []
     for factor in (flat, small_motion(chosen + tool_of(machine, None)).taken_out(flat)):
