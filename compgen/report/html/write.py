@@ -7,9 +7,10 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -43,6 +44,9 @@ from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
 from compgen.tables.verification import coverage_of
+
+if TYPE_CHECKING:
+    from markdown_it import MarkdownIt
 
 # Figures of ISO 230 in the report: those in the folder, otherwise those of the identified errors.
 
@@ -541,11 +545,16 @@ def script_data(value: Any) -> Markup:
 
 def markdown(text: str) -> Markup:
     """Return the HTML of Markdown without raw HTML, links and pictures; the check boxes of lists become marks."""
-    from markdown_it import MarkdownIt
-
-    html = MarkdownIt("commonmark", {"html": False}).enable("table").disable(list(_OFF)).render(text)
+    html = _markdown_renderer().render(text)
     html = re.sub(r"<(/?)h([1-3])>", lambda found: f"<{found.group(1)}h{int(found.group(2)) + 3}>", html)
     return Markup(html.replace("<li>[ ] ", "<li class='check'>"))
+
+
+@cache
+def _markdown_renderer() -> MarkdownIt:
+    from markdown_it import MarkdownIt
+
+    return MarkdownIt("commonmark", {"html": False}).enable("table").disable(list(_OFF))
 
 
 # The documentation of a compensation in the spirit of ISO/TR 16907, clause 12: what was done, with what, and its limits.
