@@ -72,6 +72,16 @@ sign = "error"
 mult_mode = "S1"
 [controllers.pmac]
 counts_per_mm = { X = 1000.0, Y = 2000.0, Z = -1500.0 }
+[controllers.ucnc]
+build = "xy-only"
+[controllers.ecmc]
+version = "11.0.8"
+[controllers.weihong]
+sign = "error"
+[controllers.mach4]
+sign = "correction"
+[controllers.fagor-8055]
+sign = "error"
 """
 
 SMALL_SCENARIO = """\

@@ -73,6 +73,18 @@ CONTROLLERS = Controls(
         "linuxcnc-volumetric": "linuxcnc_volumetric.LinuxcncVolumetric",
         "twincat-lists": "twincat_lists.TwincatLists",
         "pmac": "pmac.Pmac",
+        "klipper": "firmware_skew.Klipper",
+        "marlin": "firmware_skew.Marlin",
+        "reprapfirmware": "firmware_skew.RepRapFirmware",
+        "ucnc": "firmware_skew.Ucnc",
+        "smoothieware": "screw_maps.Smoothieware",
+        "ecmc": "screw_maps.Ecmc",
+        "aerotech": "screw_maps.Aerotech",
+        "aerotech-2d": "planar_grids.Aerotech2d",
+        "kmotion": "planar_grids.Kmotion",
+        "weihong": "screw_maps.Weihong",
+        "mach4": "screw_maps.Mach4",
+        "fagor-8055": "screw_maps.Fagor8055",
         "neutral": "neutral.Neutral",
     }
 )

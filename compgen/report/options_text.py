@@ -11,7 +11,7 @@ from rich.text import Text
 
 from compgen.data.comparison import Residuals
 from compgen.data.messages import um_text
-from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
+from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation, LevelResult
 
 # What the options of a control would gain: tables for the terminal, and ``options.md``.
 
@@ -167,6 +167,7 @@ def options_markdown(result: Capability) -> str:
 LEAST_HELP = 0.9
 #: What a control of each level corrects, in words.
 CORRECTS = {
+    "skew": "squareness alone",
     "pitch": "positioning along each axis",
     "squareness": "positioning, straightness and squareness",
     "products": "positioning, straightness, squareness, and angles as products of tables",
@@ -194,8 +195,8 @@ def explanation_markdown(item: Explanation) -> str:
     table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
     notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
     other = ""
-    if item.level != "volumetric":
-        results = zip(item.options.tools_mm, item.options.level(item.level).by_tool, strict=True)
+    if item.level not in ("volumetric", "skew"):
+        results = zip(item.options.tools_mm, _level(item).by_tool, strict=True)
         tools = [
             f"{um_text(left.after.max_um)} um at {tool_name(tool) if any(tool) else 'no offset'}"
             for tool, (left, _) in results
@@ -208,8 +209,13 @@ def explanation_markdown(item: Explanation) -> str:
     return "\n".join([*parts, _next(item), _nodes(item), _limits(item)])
 
 
+def _level(item: Explanation) -> LevelResult:
+    """The level that the control reaches; skew factors are on the way to none of them."""
+    return item.options.level("nothing" if item.level == "skew" else item.level)
+
+
 def _next(item: Explanation) -> str:
-    current = item.options.level(item.level)
+    current = _level(item)
     following, result = [], item.options.after(current.key)
     while result is not None:
         if not (result.key == "directional" and item.own is not None and item.own.directional):

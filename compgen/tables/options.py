@@ -45,6 +45,7 @@ LABELS = {
     "products": "+ angles, as products of tables",
     "volumetric": "full volumetric",
     "directional": "+ direction-dependent",
+    "skew": "squareness alone",  # of some controls; no level of its own
 }
 #: The bases get additional nodes between the nodes of the curves, as long as an axis has no more than this many:
 #:
@@ -196,6 +197,8 @@ def level_key(basis: Sequence[Term]) -> str:
     """Return the level that a control's tables belong to, from its basis."""
     if any(term.name in ERROR_NAMES for term in basis):
         return "volumetric"
+    if all(term.axis is None for term in basis):
+        return "skew"
     if any(part.lever is not None for term in basis for part in term.carrier):
         return "products"
     if any(part.output != term.axis for term in basis for part in term.carrier):
@@ -212,11 +215,19 @@ def level_key(basis: Sequence[Term]) -> str:
 TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
 #: Options of a control that are evaluated in addition to the machine file: their description and settings.
 VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
-    "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True}))
+    "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True})),
+    "ucnc": (("compiled for XY only", {"build": "xy-only"}), ("compiled for three", {"build": "three"})),
 }
 #: Settings that the machine file must state for an export, and what a comparison may assume: in every mode the products
-#: leave the same residual; of two systems of values the one that leaves less.
-ASSUMED: Mapping[str, Mapping[str, Any]] = {"siemens-cec": {"mult_mode": "S1"}, "mitsubishi": {"mode": "incremental"}}
+#: leave the same residual, with either sign, too; of two systems of values the one that leaves less.
+ASSUMED: Mapping[str, Mapping[str, Any]] = {
+    "siemens-cec": {"mult_mode": "S1"},
+    "mitsubishi": {"mode": "incremental"},
+    "ecmc": {"version": "10.0.0"},
+    "weihong": {"sign": "error"},
+    "mach4": {"sign": "correction"},
+    "fagor-8055": {"sign": "error"},
+}
 
 
 @dataclass(frozen=True)
@@ -600,6 +611,8 @@ def explain(
 def _why(name: str, level: str) -> str:
     """Return why a control of this level leaves an error."""
     error = error_named(name)
+    if level == "skew":
+        return "skew factors hold squareness alone, as far as the control has them"
     if level in ("products", "volumetric"):
         return "the nodes of the tables do not follow it closely"
     if error.kind == "angular":

@@ -37,8 +37,6 @@ RIDGE = 1e-11
 LEAST_SHARE = 0.5
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
-#: Fields that move the tip by less than this are rounding.
-NOTHING_MM = 1e-12
 #: Results at more points are not kept.
 MOST_KEPT = 50_000
 #: Up to so many fields are summed one by one, more by a matrix product unless the matrix has more entries than that.
@@ -193,38 +191,28 @@ class SampledTerm:
         outputs = tuple(sorted({part.output for part in term.carrier}))
         return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, term.carrier_field(position_mm, tool_mm))
 
-    def gather(self, fields_mm: FloatArray, moved: Any, hats: _Hats) -> FloatArray:
-        """Products of the values' fields with k fields (3, k, n), (values, k); ``moved`` (3, k): where these are not zero."""
-        size = self.place.stop - self.place.start
-        products = np.zeros((size, fields_mm.shape[1]))
-        some = _places(np.any(moved[list(self.outputs)], axis=0))
+    def gather(self, fields_mm: FloatArray, hats: _Hats) -> FloatArray:
+        """Products of the values' fields with k fields (3, k, n), (values, k)."""
         # copies of columns are contiguous, so that products of k fields take a third of the time
         first, *others = self.outputs
-        along = self.carrier[:, first].copy() * fields_mm[first, some]
+        along = self.carrier[:, first].copy() * fields_mm[first]
         for output in others:
-            along += self.carrier[:, output].copy() * fields_mm[output, some]
+            along += self.carrier[:, output].copy() * fields_mm[output]
         hat = hats.of(self, len(along))
         if hat is not None:
-            products[:, some] = hat @ along.T
-        else:
-            for k, one in zip(np.arange(len(moved.T))[some], along, strict=True):
-                products[:, k] = np.bincount(self.node.ravel(), (self.share * one).ravel(), size)
-        return products
+            return np.asarray(hat @ along.T)
+        size = self.place.stop - self.place.start
+        return np.stack([np.bincount(self.node.ravel(), (self.share * one).ravel(), size) for one in along], axis=1)
 
     def take(self, values: FloatArray, fields_mm: FloatArray, hats: _Hats) -> None:
-        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n), if they are not rounding only."""
-        some = _places(np.abs(values).max(axis=0) * np.abs(self.carrier).max() > NOTHING_MM)
-        own = values.T[some]
-        hat = hats.of(self, len(own))
-        left, right = self.share
-        along = left * own[:, self.node[0]] + right * own[:, self.node[1]] if hat is None else own @ hat
+        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n)."""
+        hat = hats.of(self, values.shape[1])
+        if hat is not None:
+            along = values.T @ hat
+        else:
+            along = (self.share[0] * values.T[:, self.node[0]]) + (self.share[1] * values.T[:, self.node[1]])
         for output in self.outputs:
-            fields_mm[output, some] -= self.carrier[:, output].copy() * along
-
-
-def _places(chosen: Any) -> slice | NDArray[np.intp]:
-    """Indices of what is chosen; a slice, of which numpy makes no copy, for all."""
-    return slice(None) if chosen.all() else np.flatnonzero(chosen)
+            fields_mm[output] -= self.carrier[:, output].copy() * along
 
 
 class _Hats:
@@ -252,7 +240,8 @@ class Projector:
 
     ``position_mm`` (n, 3) with ``weight`` (n,) and ``sample_tool_mm`` (3,) or (n, 3) are the sample; elsewhere the tool
     is ``tool_mm``. ``terms`` are the basis at the sample. ``freedom`` builds in the zeros at the reference point;
-    ``offsets`` is 3 if a constant per axis is fitted together with the tables because the control cannot express it.
+    ``offsets`` is 3 if a constant per axis is fitted together with the tables because the control cannot express it, 6 if
+    a rotation of the whole volume is, too: for tables of shears alone, which must not take a rotation for a squareness.
     ``factor`` (free + offsets, free + offsets) is the Cholesky factor of the normal matrix with
     unit diagonal, ``scale`` what gave it that. Two with the same ``digest`` are equal but for the values in the basis.
     """
@@ -289,10 +278,13 @@ class Projector:
 
     def _solved(self, required_mm: FloatArray, hats: _Hats) -> FloatArray:
         """All table values (parameters, k) for k required fields (3, k, n)."""
-        counting, moved = required_mm * self.weight, np.any(required_mm, axis=2)
-        right = self.freedom.gather(np.concatenate([term.gather(counting, moved, hats) for term in self.terms]))
+        counting = required_mm * self.weight
+        right = self.freedom.gather(np.concatenate([term.gather(counting, hats) for term in self.terms]))
         if self.offsets:
             right = np.concatenate([right, counting.sum(axis=2)])
+        if self.offsets > 3:
+            turned = rigid_fields(self.position_mm)[3:]
+            right = np.concatenate([right, np.einsum("jon,okn->jk", turned, counting)])
         solution = self.scale[:, None] * lapack().dpotrs(self.factor, right * self.scale[:, None], lower=1)[0]
         return self.freedom.expand(solution[: len(self.freedom.free)])
 
@@ -352,6 +344,13 @@ def kept_field(
 ) -> FloatArray:
     """Return :meth:`Projector.field` of table values at points (n, 3): controls with the same tables share it."""
     return solver.field(values, position_mm)
+
+
+def rigid_fields(position_mm: FloatArray) -> FloatArray:
+    """Return the displacements of points (n, 3) by 1 mm along X, Y, Z and by 1 rad about them, shape (6, 3, n), mm."""
+    moved = np.repeat(np.eye(3)[:, :, None], len(position_mm), axis=2)
+    turned = np.cross(np.eye(3)[:, None], position_mm[None]).swapaxes(1, 2)
+    return np.concatenate([moved, turned])
 
 
 def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArray:
@@ -436,14 +435,16 @@ def _factorised(problem: _Problem) -> Projector:
         position_mm, weight = np.tile(position_mm, (len(tools_mm), 1)), np.tile(weight, len(tools_mm))
     terms = tuple(SampledTerm.of(term, place, position_mm, tool_mm) for term, place in placed_terms(basis))
     freedom = FreeValues.of(machine, basis)
-    free, offsets = len(freedom.free), 3 if problem.anchored else 0
+    shears = all(term.axis is None and term.carrier[0].lever is not None for term in basis)
+    free, offsets = len(freedom.free), (6 if shears else 3) if problem.anchored else 0
     normal = np.zeros((free + offsets, free + offsets))
     normal[:free, :free] = freedom.gather(freedom.gather(_normal_matrix(terms, weight)).T)
     if offsets:
-        constant, moved = weight * np.eye(3)[:, :, None], np.eye(3, dtype=np.bool_)
-        across = freedom.gather(np.concatenate([term.gather(constant, moved, _Hats()) for term in terms]))
+        moved = rigid_fields(position_mm)[:offsets]
+        across = freedom.gather(np.concatenate([term.gather(weight * moved.swapaxes(0, 1), _Hats()) for term in terms]))
         normal[:free, free:], normal[free:, :free] = across, across.T
-        normal[free:, free:] = weight.sum() * np.eye(3)
+        normal[free:, free:] = np.einsum("ion,n,jon->ij", moved, weight, moved) if offsets > 3 else 0.0
+        normal[free : free + 3, free : free + 3] = weight.sum() * np.eye(3)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     # rows whose product with the values gives them at the positions keep_mm of every term
     blocks = []

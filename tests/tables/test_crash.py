@@ -16,6 +16,8 @@ from compgen.tables.judge import Judge
 from compgen.tables.signs import crash_test, exported_tables, permutation_name, signed_permutations
 
 ALL = sorted(CONTROLLERS)
+#: Signs that change nothing: most of these do not move Z; uCNC (compiled for XY) moves X as a function of Y alone.
+UNSEEN = {"aerotech-2d": 1, "klipper": 1, "marlin": 1, "reprapfirmware": 1, "ucnc": 9}
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,8 @@ def test_every_wrong_table_of_every_control_is_rejected(name, crashed):
     kinds = [trial.kind for trial in result.trials]
     assert (kinds.count("output"), kinds.count("frame"), kinds.count("unit")) == (47, 47, 2)
     assert all(trial.reason for trial in result.trials if trial.outcome == "rejected")
-    assert result.count("rejected") >= len(result.trials) - 1  # at most one slip of angles that hardly acts
+    # at most one slip of angles that hardly acts, and the signs of axes that the control does not move or look at
+    assert result.count("rejected") >= len(result.trials) - 1 - UNSEEN.get(name, 0)
 
 
 @pytest.mark.parametrize("name", ["isg-csv", "siemens-cec"])

@@ -432,7 +432,7 @@ def test_every_wrong_permutation_shows_at_one_of_the_positions(name, programs):
     corrected = np.any(moved, axis=0)  # the sign of an axis without any table shows nowhere
     wrong = [np.any(matrix[:, corrected] != np.eye(3)[:, corrected]) for matrix in signed_permutations()[1:]]
     assert seen[wrong].min() > 3 * MICROMETRE
-    assert np.count_nonzero(wrong) >= 46
+    assert np.count_nonzero(wrong) >= (40 if name == "ucnc" else 46)  # which moves X alone
 
 
 def test_a_wrong_sign_reads_what_the_page_says(small_machine, small_errors, programs):

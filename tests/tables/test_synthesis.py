@@ -122,6 +122,10 @@ def dense_columns(basis, position_mm, tool_mm):
     return np.column_stack(columns)
 
 
+#: Controls that hold squareness alone, as shears about machine zero.
+SHEARS = ("klipper", "marlin", "reprapfirmware", "ucnc")
+
+
 @pytest.mark.parametrize("name", sorted(CONTROLLERS))
 def test_the_tables_are_the_least_squares_optimum(name, small_machine, make_errors):
     errors = make_errors(small_machine, squareness_rad=(EXAMPLE_SQUARENESS_RAD, -60e-6, 23e-6))
@@ -131,6 +135,9 @@ def test_the_tables_are_the_least_squares_optimum(name, small_machine, make_erro
     wanted = wanted_correction(small_machine, errors, solver.position_mm)
     dense = dense_columns(basis, solver.position_mm, small_machine.tool_offset_mm)
     offsets = np.tile(np.eye(3), (len(wanted), 1)) if anchored else np.zeros((wanted.size, 0))
+    if name in SHEARS:  # nor may they take a rotation for a squareness
+        turned = [np.cross(axis, solver.position_mm).ravel() / 1e3 for axis in np.eye(3)]
+        offsets = np.hstack([offsets, np.array(turned).T])
     full = np.hstack([dense / np.maximum(np.linalg.norm(dense, axis=0), 1e-300), offsets])
     root = np.repeat(np.sqrt(solver.weight), 3)
     solution = np.linalg.lstsq(full * root[:, None], wanted.ravel() * root, rcond=1e-13)[0]
@@ -178,6 +185,8 @@ def test_anchored_tables_are_exactly_zero_at_the_reference_point(name, small_mac
         zero = reference.copy()
         if term.zero_at_mm is not None:  # a control may anchor its tables elsewhere
             zero[0, term.axis] = term.zero_at_mm
+        if term.axis is None:  # a shear is anchored at machine zero
+            zero[:] = 0.0
         added = term.carrier_field(zero, tool) * term.curve(values[term.name], zero)[:, None]
         at_node = term.zero_at_mm is None or np.any(term.nodes_mm == term.zero_at_mm)
         assert np.max(np.abs(added)) <= (0.0 if at_node else 1e-15)  # else interpolated between two nodes

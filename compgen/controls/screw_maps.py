@@ -1,0 +1,718 @@
+"""Positioning tables of small controls: ``smoothieware``, ``ecmc``, ``aerotech``, ``weihong``, ``mach4``, ``fagor-8055``."""
+
+from __future__ import annotations
+
+import math
+import re
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from compgen.controls.shared.base import (
+    Controller,
+    SourceFile,
+    Term,
+    Usage,
+    by_travel,
+    coverage_violations,
+    nodes_by_axis,
+    parameter_row,
+    travel_of,
+)
+from compgen.controls.shared.grids import equidistant_grid, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.scanner import check_complete, check_size, content_lines, fixed_point, floating
+from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.data import toml_files
+from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
+from compgen.data.lengths import Points
+from compgen.data.names import AXES
+from compgen.data.toml_files import accepts, axis_setting, choice, setting, whole
+from compgen.errors import InputError
+
+_MOST_CHARACTERS = 5_000_000
+#: Decimals of a position, mm.
+POSITION_DIGITS = 6
+#: Longest table of a control without a limit in its documents.
+MOST_POINTS = 1000
+#: How often the correction at the corrected position is looked up again: a slope of 1e-3 leaves 1e-3 of it each time.
+_STEPS = 12
+
+Settings = TypeVar("Settings")
+
+
+@dataclass(frozen=True)
+class ScrewMap:
+    """Table of one axis with the numbers of its file: positions (n,) mm, values in both directions (n,)."""
+
+    position_mm: FloatArray
+    positive: FloatArray
+    negative: FloatArray
+
+    def with_values(self, positive: FloatArray, negative: FloatArray, digits: int) -> ScrewMap:
+        """Return the table with other values, rounded as written."""
+        return ScrewMap(self.position_mm, *(rounded(column, digits) for column in (positive, negative)))
+
+
+@dataclass(frozen=True)
+class ScrewMaps:
+    """Tables by axis 0..2."""
+
+    maps: Mapping[int, ScrewMap]
+
+
+class ScrewMapControl(Controller[Settings, ScrewMaps]):
+    """What these controls have in common: one polyline over each axis, perhaps one for each direction.
+
+    All are zero at the reference point: a constant would only move the axis when the table is switched on.
+    """
+
+    anchored = True
+    #: True if the positions must be evenly spaced; how many there may be and must be; decimals of a value.
+    even, most, least, digits = False, MOST_POINTS, 2, 6
+    #: The number that this control needs where 1 mm must be added to the command.
+    sign = 1.0
+    #: Name of the table in messages; how many points of the file one node makes.
+    table_name, points_per_node = "table", 1
+
+    @property
+    def most_points(self) -> int:
+        """Return the largest number of points of one axis."""
+        return self.points_per_node * int(getattr(self.settings, "most_points", self.most))
+
+    @abstractmethod
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Return position (mm) and the values in both directions of each row, by axis."""
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return X(x), Y(y), Z(z)."""
+        nodes = [self.nodes_mm(errors, axis) for axis in range(3)]
+        pairs = [(axis, axis) for axis in range(3)]
+        return one_dimensional_terms(self.machine, errors, nodes, pairs, anchored=self.anchored)
+
+    def nodes_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
+        """Return the positions of a table: where the curves need them, evenly spaced where the control wants it."""
+        loss_mm, most = getattr(self.settings, "loss_mm", 0.0), self.most_points // self.points_per_node
+        if self.even:
+            grid = equidistant_grid(self.machine, errors, axis, most=most, loss_mm=loss_mm, anchor=self.anchored)
+            return grid.nodes_mm
+        nodes = rounded(uneven_nodes_mm(self.machine, errors, axis, loss_mm=loss_mm, most=most), POSITION_DIGITS)
+        if len(nodes) < self.least:
+            nodes = np.union1d(nodes, rounded(np.linspace(nodes[0], nodes[-1], self.least), POSITION_DIGITS))
+        return nodes
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
+        """Return the values, rounded as written, the same in both directions."""
+        maps = {}
+        for axis, term in enumerate(basis):
+            column = self.sign * np.asarray(values[one_dimensional_name(axis, axis)])
+            maps[axis] = ScrewMap(term.nodes_mm, column, column).with_values(column, column, self.digits)
+        return ScrewMaps(maps)
+
+    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
+        """Return the reversal of each axis along itself, if the control has a table for each direction."""
+        own = {key: part for key, part in reversal.curves.items() if key[0] == key[1]}
+        return replace(reversal, curves=own if self.bidirectional else {})
+
+    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
+        """Return the tables with half of the reversal less after positive travel and half more after negative travel."""
+        found = dict(tables.maps)
+        for (axis, _), curve in reversal.curves.items():
+            if np.max(np.abs(curve.value)) >= WORTH_MM:
+                half = 0.5 * self.sign * curve.at(found[axis].position_mm)
+                found[axis] = found[axis].with_values(
+                    found[axis].positive - half, found[axis].negative + half, self.digits
+                )
+        return ScrewMaps(found)
+
+    def context(self, tables: ScrewMaps) -> dict[str, Any]:
+        """Return the rows by axis, and the sign with a worked number."""
+        shown = [
+            {
+                "letter": AXES[axis],
+                "rows": list(
+                    zip(*(column.tolist() for column in (t.position_mm, t.positive, t.negative)), strict=True)
+                ),
+            }
+            for axis, t in sorted(tables.maps.items())
+        ]
+        return {
+            "sign_statement": self._sign_statement(tables),
+            "parameters": self.parameters(tables),
+            "warnings": [],
+            "tables": shown,
+            "records": sum(len(table.position_mm) for table in tables.maps.values()),
+            "digits": self.digits,
+            "settings": self.settings,
+        }
+
+    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+        """Return what must be set on the control besides the tables."""
+        return []
+
+    def parse(self, files: Sequence[SourceFile]) -> ScrewMaps:
+        """Read the tables strictly; positions must rise."""
+        maps: dict[int, ScrewMap] = {}
+        for source in files:
+            check_size(source, _MOST_CHARACTERS)
+            for axis, rows in self.read_file(source).items():
+                if axis in maps:
+                    raise source.fail(f"is a second {self.table_name} of {AXES[axis]}", 1)
+                columns = np.array(rows, dtype=np.float64).reshape(-1, 3).T
+                if np.any(np.diff(columns[0]) <= 0.0):
+                    k = int(np.argmax(np.diff(columns[0]) <= 0.0))
+                    message = (
+                        f"the position {columns[0, k + 1]:g} of {AXES[axis]} is not above {columns[0, k]:g} before it"
+                    )
+                    raise source.fail(message, 1)
+                if len(rows) < self.least:
+                    message = f"the {self.table_name} of {AXES[axis]} has {len(rows)} points; at least {self.least} are needed"
+                    raise source.fail(message, 1)
+                maps[axis] = ScrewMap(*columns)
+        if not maps:
+            raise files[0].fail("contains no table", 1) if files else InputError("no file was given")
+        return ScrewMaps(maps)
+
+    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+        """Return what the polylines add, end values outside, by the direction of the last travel if it matters."""
+        added = np.zeros((len(points), 3))
+        for axis, table in tables.maps.items():
+            position = points.position_mm[:, axis]
+            columns = (np.interp(position, table.position_mm, part) for part in (table.positive, table.negative))
+            positive, negative = columns if self.bidirectional else (next(columns),) * 2
+            added[:, axis] = by_travel(travel_of(points, axis), positive, negative) / self.sign
+        return added
+
+    def violations(self, tables: ScrewMaps) -> list[str]:
+        """Return axes without a table, travel that a table does not cover, too many points, uneven spacing."""
+        found = [f"there is no {self.table_name} for {AXES[axis]}" for axis in range(3) if axis not in tables.maps]
+        for axis, table in sorted(tables.maps.items()):
+            position, what = table.position_mm, f"the {self.table_name}"
+            found += coverage_violations(self.machine, axis, position[0], position[-1], what)
+            if len(position) > self.most_points:
+                found.append(
+                    f"{what} of {AXES[axis]} has {len(position)} points; at most {self.most_points} are possible"
+                )
+            steps = np.diff(position)
+            if self.even and np.ptp(steps) > 2.0 * 10.0**-POSITION_DIGITS:
+                found.append(
+                    f"the positions of {AXES[axis]} are not evenly spaced: {steps.min():g} ... {steps.max():g} mm"
+                )
+        return found
+
+    def table_nodes_mm(self, tables: ScrewMaps) -> tuple[FloatArray, ...]:
+        """Return the positions of each axis."""
+        return nodes_by_axis((axis, table.position_mm) for axis, table in tables.maps.items())
+
+    def usage(self, tables: ScrewMaps) -> list[Usage]:
+        """Return the points of each axis against the limit."""
+        return [
+            Usage(f"points of {AXES[axis]}", len(table.position_mm), self.most_points, "points")
+            for axis, table in sorted(tables.maps.items())
+        ]
+
+    def resolution_mm(self) -> float:
+        """Half of the last decimal of a value."""
+        return 0.5 * 10.0**-self.digits
+
+    def sign_words(self) -> str:
+        """Return what a value is, in words."""
+        return ""
+
+    def _sign_statement(self, tables: ScrewMaps) -> str:
+        axis, table = max(tables.maps.items(), key=lambda item: float(np.max(np.abs(item[1].positive))))
+        k = int(np.argmax(np.abs(table.positive)))
+        position = np.tile(0.5 * (self.machine.lower_mm + self.machine.upper_mm), (1, 1))
+        position[0, axis] = np.clip(table.position_mm[k], *self.machine.axes[axis].range_mm)
+        added = float(self.emulate(tables, Points(position, approach=np.ones_like(position)))[0, axis])
+        return (
+            f"{self.sign_words()} Example: at {AXES[axis]} {table.position_mm[k]:.6f} mm the file has "
+            f"{fixed(float(table.positive[k]), self.digits)}; for the command {AXES[axis]} {position[0, axis]:.4f} mm in "
+            f"positive travel the axis goes to {fixed(float(position[0, axis]) + added, 5)} mm."
+        )
+
+
+def rounded(values: FloatArray, digits: int) -> FloatArray:
+    """Return numbers as read back from a text with so many decimals."""
+    return np.array([float(fixed(value, digits)) for value in np.asarray(values).tolist()])
+
+
+def axis_named(source: SourceFile, line: int, word: str) -> int:
+    """Return the number of the axis with this letter; InputError for anything else."""
+    if word.upper() not in AXES or len(word) != 1:
+        raise source.fail(f"{word[:40]!r} is not an axis; expected X, Y or Z", line)
+    return AXES.index(word.upper())
+
+
+def sign_setting(values: str) -> Any:
+    """Declare ``sign``, which the user must state: no document of the vendor settles it."""
+    return setting(
+        choice("error", "correction"),
+        meaning=f'what the {values} are: "error", actual minus nominal, which the control subtracts, or "correction", '
+        "which it adds; check it at the machine",
+    )
+
+
+class StatedSign(ScrewMapControl[Settings]):
+    """A control whose sign the machine file must state, with a table for each direction of travel."""
+
+    bidirectional = True
+    digits = 4
+
+    def __init__(self, machine: Any, settings: Settings | None = None) -> None:
+        super().__init__(machine, settings)
+        self.sign = -1.0 if getattr(self.settings, "sign") == "error" else 1.0  # noqa: B009
+
+    def reservations(self, tables: ScrewMaps) -> list[str]:
+        """Say that the sign comes from the machine file."""
+        return [
+            f'the sign of the values is the one that the machine file states ("{getattr(self.settings, "sign")}"); '  # noqa: B009
+            "no document of the vendor settles it: do the check in preflight.md first"
+        ]
+
+    def sign_words(self) -> str:
+        """Return what the machine file says."""
+        if self.sign < 0.0:
+            return 'sign = "error": the values are actual minus nominal; the control SUBTRACTS them from the command.'
+        return 'sign = "correction": the values are nominal minus actual; the control ADDS them to the command.'
+
+
+class SheetControl(StatedSign[Settings]):
+    """A control whose values are typed in: the file is a sheet of them, CSV."""
+
+    HEADER = "axis,position_mm,positive_mm,negative_mm"
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read the sheet; a comment declares how many rows it has."""
+        found: dict[int, list[tuple[float, float, float]]] = {}
+        lines = content_lines(source, "#")
+        if lines[0][1] != self.HEADER:
+            raise source.fail(f"expected the header {self.HEADER}", lines[0][0])
+        for line, text in lines[1:]:
+            cells = [cell.strip() for cell in text.split(",")]
+            if len(cells) != 4:
+                raise source.fail(f"expected 4 columns separated by commas, got {len(cells)}", line)
+            position, positive, negative = (
+                float(fixed_point(source, line, cell, "a value in mm")) for cell in cells[1:]
+            )
+            found.setdefault(axis_named(source, line, cells[0]), []).append((position, positive, negative))
+        check_complete(source, len(lines) - 1)
+        return found
+
+
+@dataclass(frozen=True)
+class WeihongSettings:
+    """Settings ``[controllers.weihong]``."""
+
+    sign: str = sign_setting("numbers of axeserr.dat")
+    loss_mm: float = loss_setting()
+
+
+class Weihong(StatedSign[WeihongSettings]):
+    """``weihong``: the screw error file axeserr.dat of NcStudio."""
+
+    name = "weihong"
+    settings_class = WeihongSettings
+    table_name = "section"
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read ``unit = mm``, then a section per axis with rows of nominal position, forward and backward value."""
+        found: dict[int, list[tuple[float, float, float]]] = {}
+        rows: list[tuple[float, float, float]] | None = None
+        unit = False
+        for line, text in content_lines(source, ";"):
+            if re.fullmatch(r"unit\s*=\s*mm", text, re.IGNORECASE):
+                unit = True
+            elif head := re.fullmatch(r"\[\s*(\w{1,9})\s*\]", text):
+                axis = axis_named(source, line, head.group(1))
+                if axis in found:
+                    raise source.fail(f"the section [{AXES[axis]}] is given a second time", line)
+                rows = found[axis] = []
+            elif not unit:
+                raise source.fail(f"expected 'unit = mm' before the first row, got {text[:40]!r}", line)
+            elif rows is None:
+                raise source.fail(f"expected a section [X], [Y] or [Z], got {text[:40]!r}", line)
+            else:
+                cells = [cell.strip() for cell in text.split(",")]
+                if len(cells) != 3:
+                    message = f"expected nominal position, forward and backward value, got {len(cells)} columns"
+                    raise source.fail(message, line)
+                position, positive, negative = (
+                    float(fixed_point(source, line, cell, "a value in mm")) for cell in cells
+                )
+                if rows and position <= rows[-1][0]:
+                    raise source.fail(f"the position {position:g} is not above {rows[-1][0]:g} before it", line)
+                rows.append((position, positive, negative))
+        return found
+
+
+@dataclass(frozen=True)
+class Mach4Settings:
+    """Settings ``[controllers.mach4]``."""
+
+    sign: str = sign_setting("values that are typed in")
+    both_directions: bool = setting(
+        toml_files.flag, False, meaning="the build has a map for each direction (after 4780 of 2021-11-29)"
+    )
+    most_points: int = setting(whole(2, 1000), 60, meaning="most points of one axis that you are willing to type in")
+    loss_mm: float = loss_setting()
+
+
+class Mach4(SheetControl[Mach4Settings]):
+    """``mach4``: the values of the plug-in Machine Calibration, Linear Compensation."""
+
+    name = "mach4"
+    settings_class = Mach4Settings
+    even, table_name = True, "screw map"
+
+    def __init__(self, machine: Any, settings: Mach4Settings | None = None) -> None:
+        super().__init__(machine, settings)
+        self.bidirectional = self.settings.both_directions
+
+    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+        """Return start, length and number of points of each axis."""
+        return [
+            parameter_row(
+                f"{AXES[axis]}: start, length, points",
+                f"{table.position_mm[0]:.4f}, {table.position_mm[-1] - table.position_mm[0]:.4f}, {len(table.position_mm)}",
+                "mm; the points are evenly spaced and include both ends",
+            )
+            for axis, table in sorted(tables.maps.items())
+        ]
+
+
+@dataclass(frozen=True)
+class FagorSettings:
+    """Settings ``[controllers.fagor-8055]``."""
+
+    sign: str = sign_setting("errors of the table")
+    most_points: int = setting(whole(2, 1000), 1000, meaning="axis parameter NPOINTS (P16)")
+    loss_mm: float = loss_setting()
+
+
+class Fagor8055(SheetControl[FagorSettings]):
+    """``fagor-8055``: the leadscrew tables of the CNC 8055 and 8055i."""
+
+    name = "fagor-8055"
+    settings_class = FagorSettings
+    table_name = "leadscrew table"
+
+    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
+        """Return the tables with the reversal; a negative column of zeros alone would mean: as in positive travel."""
+        found = {}
+        for axis, table in super().with_reversal(tables, reversal).maps.items():
+            if np.any(table.positive) and not np.any(table.negative):
+                negative = table.negative.copy()
+                negative[0] = 10.0**-self.digits
+                table = replace(table, negative=negative)
+            found[axis] = table
+        return ScrewMaps(found)
+
+    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+        """Return what the tables add; a negative column of zeros means that the positive one holds for both directions."""
+        maps = {
+            axis: table if np.any(table.negative) else replace(table, negative=table.positive)
+            for axis, table in tables.maps.items()
+        }
+        return super().emulate(ScrewMaps(maps), points)
+
+    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+        """Return the axis parameters that switch a table on."""
+        return [
+            row
+            for axis, table in sorted(tables.maps.items())
+            for row in (
+                parameter_row(f"{AXES[axis]}: NPOINTS (P16)", str(len(table.position_mm)), "points of the table"),
+                parameter_row(f"{AXES[axis]}: LSCRWCOM (P15)", "ON", "switches the table on"),
+            )
+        ]
+
+
+@accepts({"type": "string", "pattern": r"^[0-9]+(\.[0-9]+){0,3}$"})
+def _version(value: Any) -> str:
+    if not isinstance(value, str) or not re.fullmatch(r"[0-9]{1,4}(\.[0-9]{1,4}){0,3}", value):
+        raise ValueError('expected a version such as "10.0.0" or "9.6.8", in quotes')
+    return value
+
+
+@dataclass(frozen=True)
+class EcmcSettings:
+    """Settings ``[controllers.ecmc]``."""
+
+    version: str = setting(
+        _version,
+        meaning="release of ecmc that runs: up to 9.6.8 the table is added to the encoder, from 10.0.0 on subtracted",
+    )
+    loss_mm: float = loss_setting()
+
+
+class Ecmc(ScrewMapControl[EcmcSettings]):
+    """``ecmc``: lookup tables of the encoders, one file per axis."""
+
+    name = "ecmc"
+    settings_class = EcmcSettings
+    at_axes = True
+    least, digits = 3, 9
+    table_name = "lookup table"
+    #: First release that subtracts the table.
+    SUBTRACTS_FROM = 10
+
+    def __init__(self, machine: Any, settings: EcmcSettings | None = None) -> None:
+        super().__init__(machine, settings)
+        # the axis stands where encoder - table = command, so the control adds the table to the command
+        self.sign = 1.0 if self.subtracts else -1.0
+
+    @property
+    def subtracts(self) -> bool:
+        """Whether this release subtracts the table from the encoder."""
+        return int(self.settings.version.partition(".")[0]) >= self.SUBTRACTS_FROM
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read rows of position and value, separated by blanks or commas, with ``PREC=n`` and comments in column one."""
+        named = re.findall(r"(?<![a-z])([xyz])(?![a-z])", source.path.stem, re.IGNORECASE)
+        if not named:
+            raise source.fail("the file name does not say which axis it is for; expected a name such as ecmc-x.lut", 1)
+        rows: list[tuple[float, float, float]] = []
+        for line, text in content_lines(source, "#"):
+            if re.fullmatch(r"PREC=[0-9]{1,3}", text):
+                continue
+            words = text.replace(",", " ").split()
+            if len(words) != 2:
+                raise source.fail(f"expected a position and a value, got {len(words)} columns", line)
+            position, value = (floating(source, line, word, "a number in mm") for word in words)
+            if rows and position <= rows[-1][0]:
+                raise source.fail(f"the position {position:g} is not above {rows[-1][0]:g} before it", line)
+            rows.append((position, value, value))
+        return {AXES.index(named[-1].upper()): rows}
+
+    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+        """Return encoder minus command where the corrected encoder shows the command."""
+        added = np.zeros((len(points), 3))
+        for _ in range(_STEPS):
+            added = super().emulate(tables, Points(points.position_mm + added))
+        return added
+
+    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+        """Return the commands that load the tables."""
+        return [
+            parameter_row("ecmc", self.settings.version, "release for which the sign was chosen"),
+            parameter_row("Cfg.SetAxisEncLookupTableScale", "1", "another scale multiplies the table, -1 reverses it"),
+            parameter_row("Cfg.SetAxisEncLookupTableRange", "0", "with a range the table repeats"),
+        ]
+
+    def sign_words(self) -> str:
+        """Return what this release does with a value."""
+        if self.subtracts:
+            return f"ecmc {self.settings.version} SUBTRACTS the value from the encoder position: value = encoder minus true."
+        return f"ecmc {self.settings.version} ADDS the value to the encoder position: value = true minus encoder."
+
+
+@dataclass(frozen=True)
+class AerotechSettings:
+    """Settings ``[controllers.aerotech]``."""
+
+    axis_numbers: tuple[int, int, int] = axis_setting(
+        whole(1, 32),
+        (1, 2, 3),
+        differ="the three axis numbers must differ, got {}",
+        meaning="numbers of the axes in the file, from 1",
+    )
+    reversed_axes: tuple[bool, bool, bool] = axis_setting(
+        toml_files.flag, (False, False, False), meaning="ReverseMotionDirection of the axis: tables follow the encoder"
+    )
+    loss_mm: float = loss_setting()
+
+
+class Aerotech(ScrewMapControl[AerotechSettings]):
+    """``aerotech``: one-dimensional axis calibration of A3200 and Automation1."""
+
+    name = "aerotech"
+    settings_class = AerotechSettings
+    even, table_name = True, "calibration table"
+
+    def context(self, tables: ScrewMaps) -> dict[str, Any]:
+        """Return the tables as in the file: in the direction of the encoder, six values a line."""
+        shown = []
+        for axis, table in sorted(tables.maps.items()):
+            way = self.way(axis)
+            step = (table.position_mm[-1] - table.position_mm[0]) / (len(table.position_mm) - 1)
+            values = [way * value for value in table.positive.tolist()]
+            shown.append(
+                {
+                    "letter": AXES[axis],
+                    "number": self.settings.axis_numbers[axis],
+                    "sample_mm": way * step,
+                    "offset_mm": -way * float(table.position_mm[0]),
+                    "lines": [values[k : k + 6] for k in range(0, len(values), 6)],
+                }
+            )
+        return {**super().context(tables), "tables": shown}
+
+    def way(self, axis: int) -> float:
+        """Return +1, or -1 where the encoder counts against the axis."""
+        return -1.0 if self.settings.reversed_axes[axis] else 1.0
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read all tables ``:START`` ... ``:END``."""
+        found: dict[int, list[tuple[float, float, float]]] = {}
+        keys: dict[str, float] = {}
+        values: list[float] = []
+        axis: int | None = None
+        begun = 0
+        for line, text in content_lines(source, "'"):
+            words = text.split()
+            if words[0].upper() == ":START":
+                if values:
+                    raise source.fail(":START within the values; is :END missing?", line)
+                begun = line
+                for word in words[1:]:
+                    key, _, number = word.upper().partition("=")
+                    if not number and axis is None and key.isdigit():
+                        if len(key) > 2 or int(key) not in self.settings.axis_numbers:
+                            raise source.fail(f"axis {key[:9]} is none of {self.settings.axis_numbers}", line)
+                        axis = self.settings.axis_numbers.index(int(key))
+                    elif (key, number) in (("POSUNIT", "PRIMARY"), ("CORUNIT", "PRIMARY")):
+                        keys.setdefault("unit", 1.0)
+                    elif (key, number) == ("CORUNIT", "PRIMARY/1000"):
+                        keys["unit"] = 1e-3
+                    elif key in ("SAMPLEDIST", "OFFSET") and key not in keys:
+                        keys[key] = float(fixed_point(source, line, number, key))
+                    else:
+                        raise source.fail(
+                            f"{word[:40]!r} is not understood or given twice; it may change the table", line
+                        )
+            elif words == [":END"]:
+                if axis is None or "SAMPLEDIST" not in keys or "OFFSET" not in keys:
+                    raise source.fail("the table needs an axis number, SAMPLEDIST and OFFSET", line)
+                if axis in found:
+                    raise source.fail(f"is a second table of axis {self.settings.axis_numbers[axis]}", line)
+                way = self.way(axis)
+                step, first = way * keys["SAMPLEDIST"], -way * keys["OFFSET"]
+                if step <= 0.0:
+                    raise source.fail(
+                        f"SAMPLEDIST {keys['SAMPLEDIST']:g} does not fit reversed_axes of {AXES[axis]}", line
+                    )
+                found[axis] = [
+                    (round(first + k * step, 9), way * keys["unit"] * value, way * keys["unit"] * value)
+                    for k, value in enumerate(values)
+                ]
+                keys, values, axis, begun = {}, [], None, 0
+            elif begun:
+                values += [float(fixed_point(source, line, word, "a correction value")) for word in words]
+            else:
+                raise source.fail(f"expected :START, got {text[:40]!r}", line)
+        if begun:
+            raise source.fail("the table that begins here has no :END; is the file truncated?", begun)
+        return found
+
+    def sign_words(self) -> str:
+        """Return what a value is, as far as public writers of such files show it."""
+        return "A value is the correction, minus the measured error, in mm; the control ADDS it (inferred, see below)."
+
+
+@dataclass(frozen=True)
+class SmoothiewareSettings:
+    """Settings ``[controllers.smoothieware]``."""
+
+    most_points: int = setting(
+        whole(2, 400), 40, meaning="largest number of nodes of one axis; each is written as two points"
+    )
+    loss_mm: float = loss_setting()
+
+
+class Smoothieware(ScrewMapControl[SmoothiewareSettings]):
+    """``smoothieware``: pitch_compensation.dat of Carvera and Smoothieware, multipliers of the position."""
+
+    name = "smoothieware"
+    settings_class = SmoothiewareSettings
+    digits, table_name, points_per_node = 9, "list of points", 2
+    #: Half the distance of the two points that make a bend, mm: the polyline is rounded over it.
+    BEND_MM = 0.05
+
+    def basis(self, errors: ErrorTable) -> list[Term]:
+        """Return X(x), Y(y), Z(z), zero at machine zero, which is a node of each."""
+        return [replace(term, zero_at_mm=0.0, start=term.start - np.interp(0.0, term.nodes_mm, term.start))
+                for term in super().basis(errors)]  # fmt: skip
+
+    def nodes_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
+        """Add machine zero, from which the control integrates, and keep nodes far enough apart for their bends."""
+        nodes = super().nodes_mm(errors, axis)
+        if not nodes[0] <= 0.0 <= nodes[-1]:
+            nodes = np.union1d(nodes, [0.0])
+        apart = np.concatenate([[True], np.diff(nodes) > 4.0 * self.BEND_MM])
+        apart[-1] = True
+        return nodes[apart]
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
+        """Return the multipliers: constant between two nodes, changing linearly over a bend at each node between.
+
+        The integral of the multipliers then passes through every node but for the rounding of its bend.
+        """
+        maps = {}
+        for axis, term in enumerate(basis):
+            nodes, added = term.nodes_mm, np.asarray(values[one_dimensional_name(axis, axis)])
+            slopes = 1.0 + np.diff(added) / np.diff(nodes)
+            bends = [position for node in nodes[1:-1] for position in (node - self.BEND_MM, node + self.BEND_MM)]
+            positions = np.array([nodes[0], *bends, nodes[-1]])
+            column = rounded(np.repeat(slopes, 2), self.digits)
+            maps[axis] = ScrewMap(rounded(positions, POSITION_DIGITS), column, column)
+        return ScrewMaps(maps)
+
+    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+        """Return the integral of the multipliers minus the position: ``integrate`` of PitchCompensation.cpp, in float32."""
+        added = np.zeros((len(points), 3))
+        for axis, table in tables.maps.items():
+            position = table.position_mm.astype(np.float32)
+            multiplier = table.positive.astype(np.float32)
+            dx = np.diff(position).astype(np.float64)
+            mean = (multiplier[1:] + multiplier[:-1]).astype(np.float64) / 2.0
+            integral = np.concatenate([[0.0], np.cumsum(dx * mean)])
+            where = np.append(points.position_mm[:, axis], 0.0)
+            k = np.clip(np.searchsorted(position.astype(np.float64), where, side="right") - 1, 0, len(dx) - 1)
+            beyond = np.clip(where, float(position[0]), float(position[-1]))
+            along = beyond - position[k].astype(np.float64)
+            bend = (multiplier[k + 1] - multiplier[k]).astype(np.float64) / dx[k]
+            total = integral[k] + multiplier[k].astype(np.float64) * along + 0.5 * bend * along**2
+            ends = np.where(where < position[0], multiplier[0], multiplier[-1]).astype(np.float64)
+            total += ends * (where - beyond)
+            added[:, axis] = total[:-1] - total[-1] - where[:-1]
+        return added
+
+    def violations(self, tables: ScrewMaps) -> list[str]:
+        """Return also multipliers that the control skips."""
+        found = super().violations(tables)
+        for axis, table in sorted(tables.maps.items()):
+            if np.any(np.abs(table.positive - 1.0) > 0.5):
+                found.append(f"{AXES[axis]} has a multiplier outside 0.5 ... 1.5, which the control skips")
+        return found
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read lines such as ``X 10.5 1.00034``."""
+        found: dict[int, list[tuple[float, float, float]]] = {}
+        for line, text in content_lines(source, "#"):
+            words = text.split()
+            if len(words) != 3:
+                raise source.fail(f"expected axis, position and multiplier, got {len(words)} columns", line)
+            rows = found.setdefault(axis_named(source, line, words[0]), [])
+            position, multiplier = (floating(source, line, word, "a number") for word in words[1:])
+            if rows and position <= rows[-1][0]:
+                raise source.fail(f"the position {position:g} is not above {rows[-1][0]:g} before it", line)
+            rows.append((position, multiplier, multiplier))
+        return found
+
+    def anchor_mm(self) -> FloatArray:
+        """Return machine zero, from which the control integrates."""
+        return np.zeros(3)
+
+    def resolution_mm(self) -> float:
+        """Half a step of float32 near 1 over the travel, and the rounding of a bend."""
+        reach = float(np.abs([self.machine.lower_mm, self.machine.upper_mm]).max())
+        step = math.ulp(1.0) * 2.0**29  # of float32 between 1 and 2
+        return 0.5 * step * reach + 1e-5
+
+    def sign_words(self) -> str:
+        """Return what a number is."""
+        return "A number is a multiplier of the distance from machine zero: above 1 the axis is sent further out."
