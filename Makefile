@@ -1,6 +1,7 @@
 # make demo   sets up and runs the main job on the example
 # make test   sets up, checks style and types, runs the tests
 # make extras installs what recal, serve, --cluster, dcc.xml and the compiled kernels need in addition
+# make texts  writes the catalogues of texts again (CONTRIBUTING.md), and lists what has no translation
 # make pins   writes the pinned dependencies again (CONTRIBUTING.md)
 # make bench  prints the ratios against named peers
 # make coverage    runs the tests and prints their branch coverage
@@ -24,7 +25,7 @@ SPREAD := -n 3 --dist loadfile --no-loadscope-reorder
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo extras test lint system bench coverage docs docs-links pins clean
+.PHONY: demo extras test lint system bench coverage docs docs-links texts pins clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
@@ -96,6 +97,9 @@ bench: .venv/ready-dev
 	for name in identify evaluate fit interval_coverage; do $(BIN)/python benchmarks/$$name.py || exit 1; done
 	$(BIN)/python benchmarks/diagnosis.py --sets 2
 	$(BIN)/python benchmarks/endtoend.py
+
+texts: .venv/ready-dev
+	$(BIN)/python tests/texts/extraction.py
 
 # pins stay as they are unless UPGRADE names a package: make pins UPGRADE="--upgrade-package numpy"
 pins:

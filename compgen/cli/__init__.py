@@ -264,8 +264,9 @@ def cli(context: click.Context) -> None:
         load_for(context, installed=True)
     configured = _configured()
     if configured:
+        context.default_map = {name: configured for lines in _COMMANDS.values() for name in lines}
         # `report` takes a certificate by --dcc, for another purpose
-        context.default_map = {name: configured for lines in _COMMANDS.values() for name in lines if name != "report"}
+        context.default_map["report"] = {key: value for key, value in configured.items() if key != "certificate"}
 
 
 def main() -> None:

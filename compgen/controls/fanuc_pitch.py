@@ -503,7 +503,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
         for axis, block in present:
             number, name = settings.axis_numbers[axis], f"{AXES[axis]} (A{settings.axis_numbers[axis]})"
             values = self._values_of(block).items()
-            found.append(f"Parameters of {name}: " + ", ".join(_change(sample, p, number, text) for p, text in values))
+            changes = ", ".join(_change(sample, p, number, text) for p, text in values)
+            found.append(f"Parameters of {name}: {changes}")
             spans = [(block.first, block.last)]
             if block.negative:
                 spans.append((block.negative_first, block.negative_last))
@@ -514,7 +515,8 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             old = {key: sample.values[key] for key, _ in block.points() if key in sample.values}
             changed = sum(1 for key, value in block.points() if key in old and old[key] != value)
             remark = f"; {changed} of them differ from the sample" if old else ""
-            found.append(f"Points of {name}: {' and '.join(texts)}{remark}")
+            both = f"{texts[0]} and {texts[1]}" if block.negative else texts[0]
+            found.append(f"Points of {name}: {both}{remark}")
         return found
 
     def _preflight_parameters(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:

@@ -784,7 +784,7 @@ def _notes(style: FanucStyle, points: Sequence[Record], others: Sequence[Record]
     else:
         found.append("the sample contains no parameter 3624: the form of lengths is NOT confirmed")
     order = "points before parameters" if style.points_first else "parameters before points"
-    found.append(f"{order}, {style.containers} pair{'s' if style.containers > 1 else ''} of %")
+    found.append(f"{order}, {style.containers} pairs of %" if style.containers > 1 else f"{order}, 1 pair of %")
     axes = "all axes of a parameter in one record" if style.axes_together else "one record per axis"
     found.append(axes + (", value word before axis word" if style.value_first else ""))
     found += [f"comment {text}" for text in (*style.header, *style.footer)]

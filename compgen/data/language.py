@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 #: Context of single words in the catalogue. They are translated only where a page shows them as a word, because a word in a
 #: text may be a key or a value that has to be typed as it is (``sign = "error"``).
 WORD = "word"
+#: Context of parts of templates: they are no values.
+PART = "part"
 
 _PLACE = re.compile(r"\{(\w+)\}")
 _TOKEN = re.compile(
@@ -46,6 +48,13 @@ _MARKER = re.compile(r"\s*(#+ |\d+\. |[-*] (\[ \] )?|)")
 _CODE = re.compile(r"`[^`]*`|<code>.*?</code>")
 _UNREAD = re.compile(r"\b(mm|um|µm|ISO|SHA|En|rms)\b")
 _WORDS = re.compile(r"[^\W\d_]{2,}")
+_COUNTED = re.compile(r"([\d.]+ )?(.*)", re.DOTALL)
+#: A message with fewer characters of its own is looked for only in texts that are shorter than this.
+_SURE, _SHORT = 12, 120
+_SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?]) (?=\S)"), re.compile(r"(?<=;) (?=\S)")
+_AFTER_COLON = re.compile(r"(?<=:) (?=\S)")
+#: Several words in small letters, as only sentences have them.
+_PROSE = re.compile(r"\b[a-z]{2,},? [a-z]{2,}\b")
 #: Lists are wrapped at this column; rows of tables and headings are not.
 _COLUMN = 120
 
@@ -88,64 +97,87 @@ class Texts:
         found = []
         for english in self.messages:
             literals = _PLACE.split(english)[::2]
-            if len(literals) > 1 and "{{" not in english and "{%" not in english and any(map(str.isalpha, english)):
-                pattern = re.escape(english).replace(r"\{", "{").replace(r"\}", "}")
-                places = re.compile(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", pattern), re.DOTALL)
-                found.append((sum(map(len, literals)), max(literals, key=len), places, english))
+            if len(literals) > 1 and "\x04" not in english and any(map(str.isalpha, english)):
+                found.append((sum(map(len, literals)), max(literals, key=len), _patterns(english), english))
         # the more of a text is in the message itself, the surer is the message
         self._patterns = sorted(found, key=lambda item: -item[0])
-        self._known: dict[str, str] = {}
+        self._known: dict[str, str | None] = {}
 
     def text(self, english: str) -> str:
-        """Return a text in this language, as it is if the catalogue does not contain it.
+        """Return a text in this language; sentences that the catalogue does not contain stay in English.
 
-        Values within it are translated in the same way; a text of several sentences, or of several parts between
-        semicolons, is translated part by part.
+        Values within a sentence are translated in the same way, and those that are sentences must be known, too: a
+        sentence is never a mixture of two languages.
         """
+        found = self._complete(english)
+        if found is None:
+            pieces = _SENTENCES.split(english)
+            found = " ".join(self._part(piece) or piece for piece in pieces)
+        return found
+
+    def label(self, english: str) -> str:
+        """Return a text that may be a single word, e.g. of a picture or a verdict, or a number with one."""
+        return self._word(english) or self.text(english)
+
+    def _word(self, english: str) -> str | None:
+        number, word = _COUNTED.fullmatch(english).groups()  # type: ignore[union-attr]
+        known = self.messages.get(f"{WORD}\x04{word.strip()}")
+        return None if known is None else (number or "") + word.replace(word.strip(), known)
+
+    def _complete(self, english: str) -> str | None:
+        """Return a text in this language, as it is if it contains no sentence; None if a sentence has no translation."""
         if english not in self._known:
             if len(self._known) > 20_000:
                 self._known.clear()
-            self._known[english] = self._of(english)
+            core = english.strip()
+            found = self._whole(core) or self._by_parts(core) or (None if _PROSE.search(core) else core)
+            self._known[english] = None if found is None else english.replace(core, found) if core else english
         return self._known[english]
 
-    def _of(self, english: str) -> str:
-        core = english.strip()
-        known = self.messages.get(core)
-        if known is None and " " in core:
-            known = self._matched(core) or self._by_parts(core)
-        if known is None:
-            return english
-        before, _, after = english.partition(core)
-        return before + known + after
-
-    def label(self, english: str) -> str:
-        """Return a text that may be a single word, e.g. of a picture or a verdict."""
-        core = english.strip()
-        known = self.messages.get(f"{WORD}\x04{core}")
-        return self.text(english) if known is None else english.replace(core, known)
+    def _whole(self, english: str) -> str | None:
+        known = self.messages.get(english)
+        return self._matched(english) if known is None and " " in english else known
 
     def _matched(self, english: str) -> str | None:
-        for _, longest, pattern, message in self._patterns:
-            if longest in english and (found := pattern.fullmatch(english)):
-                values = {name: self.label(value) for name, value in found.groupdict().items()}
-                return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
+        for size, longest, patterns, message in self._patterns:
+            if longest not in english or (size < _SURE and len(english) > _SHORT):
+                continue
+            for pattern in patterns:
+                if match := pattern.fullmatch(english):
+                    values = {
+                        name: self._word(text) or self._complete(text) for name, text in match.groupdict().items()
+                    }
+                    if None not in values.values():
+                        return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
         return None
 
     def _by_parts(self, english: str) -> str | None:
-        for end in (r"(?<=[.!?]) (?=\S)", r"(?<=;) (?=\S)", r"(?<=:) (?=\S)"):
-            parts = re.split(end, english)
-            if len(parts) > 1:
-                found = [self._part(part) for part in parts]
-                if found != parts:
-                    return " ".join(found)
+        """Translate a name and what follows its colon, several sentences, or parts between semicolons."""
+        name, _, rest = english.partition(": ")
+        known = self._whole(rest)
+        if known is not None and not _PROSE.search(name):
+            return f"{self._word(name) or name}: {known}"
+        for end in (_SENTENCES, _CLAUSES, _AFTER_COLON):
+            pieces = end.split(english)
+            found: list[str | None] = []
+            first = 0
+            while first < len(pieces) > 1 and None not in found:
+                last = len(pieces) - (first == 0)
+                while last > first + 1 and self._whole(" ".join(pieces[first:last])) is None:
+                    last -= 1  # a message may have several sentences itself
+                found.append(self._part(" ".join(pieces[first:last])))
+                first = last
+            if found and None not in found:
+                return " ".join(found)  # type: ignore[arg-type]
         return None
 
-    def _part(self, english: str) -> str:
+    def _part(self, english: str) -> str | None:
         """Return one of several parts; its full stop or semicolon may not belong to the message."""
-        found = self.text(english)
-        if found == english and english[-1] in ".;:":
-            return self.text(english[:-1]) + english[-1]
-        return found
+        found = self._word(english) or self._whole(english)
+        if found is None and english[-1:] in (".", ";", ":"):
+            shorter = self._word(english[:-1]) or self._complete(english[:-1])
+            return None if shorter is None else shorter + english[-1]
+        return found or self._complete(english)
 
     def picture(self, picture: Picture) -> Picture:
         """Return a picture with heading, note and texts in this language; names of series are for the script of its page."""
@@ -176,7 +208,7 @@ class Texts:
         found, end = [], 0
         for first, last in parts(source, html=html):
             message = " ".join(source[first:last].split())
-            found += [source[end:first], self.messages.get(message, source[first:last])]
+            found += [source[end:first], self.messages.get(f"{PART}\x04{message}", source[first:last])]
             end = last
         text = "".join([*found, source[end:]])
         if html:
@@ -188,13 +220,23 @@ class Texts:
         assert environment.loader is not None
         environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
         environment.finalize = self.filled
-        environment.filters["word"] = self.label
+        environment.filters["word"] = lambda value: self.label(str(value))
         environment.globals["language"] = self.language
         return environment
 
     def filled(self, value: Any) -> Any:
-        """Return a value that is filled into a template: a text in this language, anything else as it is."""
-        return self.text(value) if type(value) is str else value
+        """Return a value that is filled into a template: a text in this language, lines of a file and all else as they are."""
+        return self.text(value) if type(value) is str and "\n" not in value else value
+
+
+def _patterns(message: str) -> list[re.Pattern[str]]:
+    """Return what texts of a message look like; of two values side by side the first one has no blank, if possible."""
+    literals = re.escape(message).replace(r"\{", "{").replace(r"\}", "}")
+    found = [_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", literals)]
+    if "}{" in message:
+        close = re.sub(r"\{(\w+)\}(?=\{)", lambda place: f"(?P<{place[1]}>[\\w.+-]*)", literals)
+        found.append(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", close))
+    return [re.compile(pattern, re.DOTALL) for pattern in found]
 
 
 def _loader(loader: BaseLoader, translate: Callable[[str], str]) -> BaseLoader:

@@ -108,8 +108,12 @@ class Coverage:
     def text(self) -> str:
         """Return in words what was measured."""
         kinds = list(dict.fromkeys(_kind(name) for name in self.determined))
-        only = f"{' and '.join(kinds)} only, " if 0 < len(kinds) <= 2 else ""
-        return f"{only}{len(self.determined)} of {len(self.observable)} errors measured"
+        known, observable = len(self.determined), len(self.observable)
+        if len(kinds) == 1:
+            return f"{kinds[0]} only, {known} of {observable} errors measured"
+        if len(kinds) == 2:
+            return f"{kinds[0]} and {kinds[1]} only, {known} of {observable} errors measured"
+        return f"{known} of {observable} errors measured"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``measured`` of ``result.json``."""

@@ -12,16 +12,17 @@ import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
-from compgen.data.language import WORD, parts
+from compgen.data.language import PART, WORD, parts
 
 ROOT = Path(__file__).parents[2]
 CATALOGUES = ROOT / "templates" / "_language"
 
 #: Modules whose sentences are shown on a page or in a preflight list.
 MODULES = (
-    "accuracy/*.py", "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py", "fleet/history_page.py",
-    "identify/adjust/residual_tests.py", "identify/adjust/robust.py", "report/html/*.py", "report/sheets.py",
-    "tables/active.py", "tables/entries.py", "tables/export.py", "tables/judge.py", "tables/signs.py", "tables/verification.py",
+    "accuracy/*.py", "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py",
+    "fleet/history_page.py", "identify/identification.py", "identify/adjust/residual_tests.py",
+    "identify/adjust/robust.py", "report/html/*.py", "report/sheets.py", "tables/active.py", "tables/entries.py",
+    "tables/export.py", "tables/judge.py", "tables/signs.py", "tables/verification.py",
 )  # fmt: skip
 #: Readers of controls' files: their texts are messages of the terminal.
 READERS = ("heidenhain_text.py", "siemens_text.py")
@@ -35,7 +36,14 @@ NOT_SHOWN_IN = re.compile(
     r"^(overview|panels|summary|parse|remarks|_?read_|usage$|short_text|dossier|calibration|_verification$)"
 )
 #: Single words that pages show: no rule tells them from keys.
-WORDS = ()
+WORDS = (
+    "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted",
+    "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness", "Temperature",
+    "The", "Volume", "accepted", "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day",
+    "days", "exceeded", "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning",
+    "positive", "readings", "rejected", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
+    "within", "without", "worse",
+)  # fmt: skip
 
 
 def place_name(node):
@@ -61,7 +69,10 @@ def place_name(node):
 def sentence(node):
     """Return a string of Python as a message, with named places for what is filled in; None for anything else."""
     if isinstance(node, ast.Constant):
-        return node.value if isinstance(node.value, str) else None
+        if not isinstance(node.value, str):
+            return None
+        pieces = node.value.split("{}")  # of str.format
+        return "".join(f"{piece}{{value{k or ''}}}" for k, piece in enumerate(pieces[:-1])) + pieces[-1]
     if not isinstance(node, ast.JoinedStr):
         return None
     found, taken = [], {}
@@ -119,9 +130,9 @@ def of_module(source):
 
 
 def of_template(source, *, html):
-    """Yield the messages of a template: its parts, and the texts of expressions that are filled in."""
+    """Yield the messages of a template with their context: its parts, and the texts of expressions that are filled in."""
     for first, last in parts(source, html=html):
-        yield " ".join(source[first:last].split())
+        yield PART, " ".join(source[first:last].split())
     rest, end = [], 0
     for first, last in parts(source, html=html):
         rest.append(source[end:first])
@@ -129,7 +140,9 @@ def of_template(source, *, html):
     for expression in re.findall(r"\{\{.*?\}\}", "".join([*rest, source[end:]]), re.DOTALL):
         for text in re.findall(r'"([^"]*)"', expression):
             if is_sentence(text) and "%" not in text and ":" not in text:
-                yield text
+                yield None, text
+    for text in re.findall(r'aria-label="([^"{]* [^"{]*)"', source):
+        yield None, text
 
 
 def of_card(data):
@@ -144,7 +157,9 @@ def messages():
 
     def add(path, texts, context=None):
         for text in texts:
-            found.setdefault((context, text), dict.fromkeys([]))[str(path.relative_to(ROOT))] = None
+            found.setdefault(text if isinstance(text, tuple) else (context, text), {})[str(path.relative_to(ROOT))] = (
+                None
+            )
 
     templates = ROOT / "templates"
     for path in sorted(templates.glob("_report/*.html.j2")):

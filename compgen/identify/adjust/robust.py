@@ -483,8 +483,8 @@ def explain_rejected(
     exchanged = _exchanges(lengths, expected, [row for row in rows if row not in broken], residual_mm)
     found = []
     for row in rows:
-        size = f"differs from the model by {-residual_mm[row] * 1000.0:+.1f} um, "
-        size += f"{abs(residual_mm[row]) / sigma_mm[row]:.0f} standard deviations"
+        many = abs(residual_mm[row]) / sigma_mm[row]
+        size = f"differs from the model by {-residual_mm[row] * 1000.0:+.1f} um, {many:.0f} standard deviations"
         # the length of another station at this point?
         predicted = expected.distance_mm[expected.pose[row], expected.station_of] - expected.dead_mm
         off = np.abs(predicted - lengths.length_mm[row])

@@ -401,16 +401,18 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     best = min(loadable, key=lambda item: item["after"].get("rms_um", math.inf))
     before, after = best["before"], best["after"]
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
-    change = f"goes from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms"
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
     bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is unknown)"
     if not best["volumetric"]:
         return (
-            f"{name} effect of the measured errors alone {change} {bounds}, as read back from the files. The error "
-            "over the volume is unknown: the other errors were not measured."
+            f"{name} effect of the measured errors alone goes from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} "
+            f"µm rms {bounds}, as read back from the files. The error over the volume is unknown: the other errors were not "
+            "measured."
         )
-    text = f"{name} error of the tool tip over the volume {change} {bounds}, with the reference point fixed, as read back from "
-    text += "the files."
+    text = (
+        f"{name} error of the tool tip over the volume goes from {um(before.get('rms_um'))} to {um(after.get('rms_um'))} "
+        f"µm rms {bounds}, with the reference point fixed, as read back from the files."
+    )
     if best["state"] == "better_after_new_setup":
         rigid = f"{um(best['before_rigid'].get('rms_um'))} to {um(best['after_rigid'].get('rms_um'))} µm rms"
         text += f" With the best-fit rigid motion of the workpiece removed it goes from {rigid}."

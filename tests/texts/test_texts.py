@@ -1,0 +1,281 @@
+"""German pages and lists: every text has a translation with the same numbers, and nothing that a control reads is touched."""
+
+import html
+import json
+import re
+import subprocess
+import sys
+from collections import Counter
+from gettext import GNUTranslations
+
+import pytest
+from babel.messages.pofile import read_po
+from texts import extraction
+
+import compgen
+from compgen.controls import CONTROLLERS
+from compgen.data.language import Texts, parts, texts_of, wrapped
+from compgen.errors import InputError
+from compgen.report.html import build_report
+from compgen.tables import check_files
+from compgen.tables.render import load_format
+
+ERRORS = "examples/zha-gantry.truth.errors.csv"
+HOW_TO = "write their German texts into templates/_language/de.po and run `make texts` (CONTRIBUTING.md, Texts)"
+#: Words that only an English sentence has; names and keys are taken out before.
+ENGLISH = re.compile(
+    r"\b(the|of|and|with|are|which|this|these|must|has|have|only|from|to|is|not|by|for|before|after)\b"
+)
+
+
+@pytest.fixture(scope="module")
+def german():
+    return texts_of("de")
+
+
+@pytest.fixture(scope="module")
+def catalogue():
+    with (extraction.CATALOGUES / "de.po").open("rb") as file:
+        return {(item.context, item.id): item.string for item in read_po(file) if item.id}
+
+
+@pytest.fixture(scope="module")
+def machine():
+    return compgen.load_machine("zha-gantry")
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory, machine):
+    folder = tmp_path_factory.mktemp("run")
+    names = ["siemens-cec", "fanuc-pitch"]
+    compgen.run(machine, ["examples/zha-gantry.lengths.csv"], names, folder, language="de")
+    return folder
+
+
+def test_every_text_has_a_translation(catalogue):
+    missing = [text for (context, text) in extraction.messages() if not catalogue.get((context, text))]
+    assert not missing, f"{len(missing)} texts have no German translation; {HOW_TO}:\n" + "\n".join(missing)
+
+
+def test_the_catalogue_contains_nothing_else_and_is_compiled(catalogue):
+    unused = set(catalogue) - set(extraction.messages())
+    assert not unused, f"texts that no page shows any more; run `make texts`: {unused}"
+    with (extraction.CATALOGUES / "de.mo").open("rb") as file:
+        compiled = vars(GNUTranslations(file))["_catalog"]
+    known = {
+        text if context is None else f"{context}\x04{text}": german for (context, text), german in catalogue.items()
+    }
+    assert {key: value for key, value in compiled.items() if key} == known, "run `make texts`"
+
+
+def inner(text):
+    """Expressions of a template; what they show in words is translated, so it is left out."""
+    found = re.findall(r"\{\{.*?\}\}|\{%.*?%\}", text)
+    return Counter(re.sub(r'"([^"]*)"', lambda text: '""' if " " in text[1] else text[0], item) for item in found)
+
+
+def outer(text):
+    return re.sub(r"\{\{.*?\}\}|\{%.*?%\}", " ", text)
+
+
+@pytest.mark.parametrize(
+    ("what", "of"),
+    [
+        ("expressions of the template", inner),
+        ("places for values", lambda text: Counter(re.findall(r"\{\w+\}", outer(text)))),
+        ("code", lambda text: Counter(re.findall(r"`[^`]*`|<code>.*?</code>", text))),
+        ("tags", lambda text: Counter(re.findall(r"</?\w[^>]*>", outer(text)))),
+        ("numbers and their signs", lambda text: Counter(numbers(re.sub(r"\{\w+\}", " ", outer(text))))),
+        ("keys", lambda text: Counter(re.findall(r"--[a-z-]+|\b[a-z]+_[a-z_]+\b|\b[EC][A-Z0]{2}\b", outer(text)))),
+        ("values to set", lambda text: Counter(re.findall(r'= ?"[^"]*"', outer(text)))),
+    ],
+)
+def test_a_translation_has_the_same(what, of, catalogue):
+    wrong = [f"{text}\n  {german}" for (_, text), german in catalogue.items() if of(text) != of(german)]
+    assert not wrong, f"other {what}:\n" + "\n".join(wrong)
+
+
+def test_a_translation_has_the_same_units(catalogue):
+    """In German "um" is a word, so there the unit is µm."""
+    wrong = []
+    for (_, text), german in catalogue.items():
+        before, after = (re.sub(r"\{\w+\}", "0", outer(item)) for item in (text, german))
+        before = re.sub(r"(?<!\w)u(?=m\b|rad\b)", "µ", before)
+        units = [Counter(re.findall(r"(?<!\w)(?:mm|µm|µrad|rad|K)(?!\w)|%", item)) for item in (before, after)]
+        if units[0] != units[1]:
+            wrong.append(f"{text}\n  {german}")
+    assert not wrong, "other units:\n" + "\n".join(wrong)
+
+
+def numbers(text):
+    """All numbers with their signs; a hyphen between letters or digits is none."""
+    return re.findall(r"(?<![\w.])[-+−]?\d+(?:\.\d+)*|(?<=[^\W\d])\d+(?:\.\d+)*", text)
+
+
+def lists(machine, name, language):
+    errors = compgen.read_errors(ERRORS)
+    made = compgen.export(machine, errors, name, allow_unverified=True, language=language)
+    page = check_files(machine, made, errors, language=language)["check/check-program.md"]
+    return made, made.preflight, page
+
+
+@pytest.mark.parametrize("name", [name for name in CONTROLLERS])
+def test_the_preflight_list_says_the_same_in_german(name, machine, german):
+    english, *said = lists(machine, name, "en")
+    translated, *told = lists(machine, name, "de")
+    assert translated.files == english.files and translated.manifest == english.manifest
+    card = load_format(name)
+    for before, after in zip(said, told, strict=True):
+        assert Counter(numbers(after)) == Counter(numbers(before))
+        assert Counter(re.findall(r"`[^`]*`", " ".join(after.split()))) == Counter(
+            german.label(code) if code in ("`3605, interpolated type`", "`linear axis error compensation`") else code
+            for code in re.findall(r"`[^`]*`", " ".join(before.split()))
+        ) or any(german.text(code[1:-1]) != code[1:-1] for code in re.findall(r"`[^`]*`", before))
+        assert left_in_english(after, card.sources) == []
+
+
+def left_in_english(text, sources):
+    """Return the lines of a list or page that contain English words; titles of sources are names."""
+    for source in sources:
+        text = (
+            " ".join(text.split()).replace(source, "") if "\n" not in text else text.replace(wrapped(f"- {source}"), "")
+        )
+    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    found = []
+    for piece in re.split(r"\n(?=\s*$|- |\d+\. |\||#)", text):
+        plain = re.sub(
+            r'`[^`]*`|"[^"]*"|„[^“]*“|\([a-z -]+\)|\S*[_/\[\]=.-]\S*\w|\bkw\.\S+', " ", " ".join(piece.split())
+        )
+        if ENGLISH.search(plain):
+            found.append(piece)
+    return found
+
+
+def shown(page):
+    """Return the texts of a page, without code and files."""
+    body = re.sub(r"<style.*?</style>|<script.*?</script>|<code>.*?</code>|<pre.*?</pre>", "", page, flags=re.DOTALL)
+    found = re.findall(r">([^<>]+)<", body) + re.findall(r'(?:title|aria-label)="([^"]*)"', body)
+    return [" ".join(html.unescape(text).split()) for text in found if text.strip()]
+
+
+def test_a_german_report_is_german(ran):
+    page = build_report(ran, "de").files["report.html"]
+    assert '<html lang="de">' in page
+    texts = shown(page)
+    sources = [source for name in ("siemens-cec", "fanuc-pitch") for source in load_format(name).sources]
+    assert [text for text in texts if text not in sources and left_in_english(text, ())] == []
+    for text in (
+        "Bericht der Kompensation",
+        "Rechtwinkligkeitsabweichungen in µrad mit erweiterter Unsicherheit",
+        "Geradheit von Y in X",
+        "Zahlen sind mit Dezimalpunkt geschrieben, wie in den Dateien für die Steuerung.",
+    ):
+        assert text in texts
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
+    assert data["curve-EXX"]["series"][0]["name"] == "identifiziert"
+
+
+def test_only_the_page_has_a_language(ran):
+    english, translated = build_report(ran), build_report(ran, "de")
+    assert {name for name in english.files if english.files[name] != translated.files[name]} == {"report.html"}
+    assert english.data == translated.data
+    assert '<html lang="en">' in english.files["report.html"]
+
+
+def test_texts_of_users_are_escaped_and_stay_as_they_are(ran, tmp_path):
+    for path in ran.rglob("*"):
+        if path.is_file():
+            target = tmp_path / path.relative_to(ran)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    result = tmp_path / "siemens-cec" / "result.json"
+    data = json.loads(result.read_text())
+    data["notes"] = ["<script>alert('the tables cover the travel')</script>"]
+    result.write_text(json.dumps(data))
+    page = build_report(tmp_path, "de").files["report.html"]
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert(&#39;the tables cover the travel&#39;)&lt;/script&gt;" in page
+
+
+def test_what_has_to_be_typed_is_never_translated(machine, german):
+    _, preflight, _ = lists(machine, "siemens-cec", "de")
+    assert '`sign = "error"`' in preflight and "`$AN_CEC_MULT_BY_TABLE[" in preflight
+    assert german.text("error") == "error" and german.text("accepted") == "accepted"
+    assert german.label("accepted") == "angenommen" and german.label("7 weeks") == "7 Wochen"
+
+
+def test_a_sentence_is_never_a_mixture():
+    texts = Texts({"the table {name} is {state}": "die Tabelle {name} ist {state}", "not used": "unbenutzt"})
+    assert texts.text("the table X.TAB is not used") == "die Tabelle X.TAB ist unbenutzt"
+    assert texts.text("the table X.TAB is far too large") == "the table X.TAB is far too large"
+    assert (
+        texts.text("the table A is not used; the table B is not used.")
+        == "die Tabelle A ist unbenutzt; die Tabelle B ist unbenutzt."
+    )
+    assert texts.text("the table A is not used. A new sentence.") == "die Tabelle A ist unbenutzt. A new sentence."
+    assert texts.text("siemens-cec: the table A is not used") == "siemens-cec: die Tabelle A ist unbenutzt"
+
+
+def test_lines_of_a_file_are_not_texts(german):
+    assert german.filled("not known") == "nicht bekannt"
+    assert german.filled("not known\n1.0 not known") == "not known\n1.0 not known"
+    assert german.filled(3.5) == 3.5
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("{% if a %}\none\ntwo {{ b }}\n{% else %}\n- three\n  four\n{% endif %}\n", ["one\ntwo {{ b }}", "three\n  four"]),
+        ("1. {% if a %}yes{% else %}no{% endif %}, then\n2. `only code`\n\n```\nnever this\n```\n# Head\n",
+         ["{% if a %}yes{% else %}no{% endif %}, then", "Head"]),
+        ("| a word | mm |\n|---|---|\n| {{ x }} | mm |\n", ["| a word | mm |"]),
+    ],
+)  # fmt: skip
+def test_parts_of_a_list(source, found):
+    assert [source[first:last] for first, last in parts(source, html=False)] == found
+
+
+def test_parts_of_a_page():
+    source = "<p>{% if a %}Text <b>{{ b }}</b>{% endif %}</p>{% for x in y %}<td>{{ x }}</td>{% endfor %}"
+    source += "<i>one</i> {% if c %}<p>two</p>{% endif %}"
+    assert [source[first:last] for first, last in parts(source, html=True)] == [
+        "{% if a %}Text <b>{{ b }}</b>{% endif %}", "<i>one</i>", "two"
+    ]  # fmt: skip
+
+
+def test_long_paragraphs_are_wrapped_and_tables_are_not():
+    row = "| " + "word " * 40 + "|"
+    text = wrapped("- " + "word " * 40 + "\n" + row)
+    assert max(map(len, text.split("\n")[:-1])) <= 120 and text.split("\n")[1].startswith("  word")
+    assert text.endswith(row)
+
+
+def test_a_language_without_a_catalogue_is_refused(machine):
+    with pytest.raises(InputError, match="'fr' is not a language of the pages"):
+        texts_of("fr")
+
+
+def test_english_needs_no_catalogue(ran, tmp_path):
+    code = f"""
+import sys
+from compgen.cli import cli
+from compgen.cli.common import run_command
+assert run_command(cli, ["report", {str(ran)!r}, "--out", {str(tmp_path)!r}]) == 0
+assert "compgen.data.language" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=120)
+
+
+def test_one_language_for_all_commands_in_the_configuration(ran, tmp_path, monkeypatch, capsys):
+    from compgen.cli import cli
+    from compgen.cli.common import run_command
+
+    (tmp_path / "config.toml").write_text('language = "de"\n')
+    monkeypatch.setenv("COMPGEN_CONFIG", str(tmp_path / "config.toml"))
+    assert run_command(cli, ["report", str(ran), "--out", str(tmp_path / "a")]) == 0
+    assert '<html lang="de">' in (tmp_path / "a" / "report.html").read_text("utf-8")
+    assert run_command(cli, ["report", str(ran), "--out", str(tmp_path / "b"), "--language", "en"]) == 0
+    assert '<html lang="en">' in (tmp_path / "b" / "report.html").read_text("utf-8")
+    (tmp_path / "config.toml").write_text('language = "fr"\n')
+    assert run_command(cli, ["report", str(ran)]) == 2
+    assert "language" in capsys.readouterr().err
