@@ -40,7 +40,7 @@ from compgen.resources import LANGUAGES
 if TYPE_CHECKING:
     from compgen.fit import FitOptions, FitResult
     from compgen.identify.monte_carlo import SelfCheck
-    from compgen.tables import Export, SafetyLimits, Verification
+    from compgen.tables import Export, ReadTables, SafetyLimits, Verification
     from compgen.tables.active import ActiveTables
 
 Progress = Callable[[str], None]
@@ -48,11 +48,15 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class ControllerResult:
-    """Outcome for one control: what was exported, what the round trip on the written files says, and where they are."""
+    """Outcome for one control: what was exported, what the round trip on the written files says, and where they are.
+
+    ``read`` are the tables as read back from the files.
+    """
 
     export: Export
     verification: Verification
     paths: tuple[Path, ...]
+    read: ReadTables | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -242,9 +246,9 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
         provenance=provenance,
         reversal=reversal,
     )
-    verification = verified_export(machine, exported, identified, reversal, limits)
-    extra_files = tables.check_files(machine, exported, identified, templates, reversal)
-    return _write_results(OutputFolder(folder), {"": (exported, verification, extra_files)})[0][0]
+    read, verification = verified_export(machine, exported, identified, reversal, limits)
+    extra_files = tables.check_files(machine, exported, identified, templates, reversal, read=read)
+    return _write_results(OutputFolder(folder), {"": (exported, read, verification, extra_files)})[0][0]
 
 
 def verified_export(
@@ -254,8 +258,8 @@ def verified_export(
     reversal: ReversalCurves | None = None,
     limits: SafetyLimits | None = None,
     known: covariance.Covariance | None = None,
-) -> Verification:
-    """Verify what the written files contain; InputError if they cannot be read.
+) -> tuple[ReadTables, Verification]:
+    """Read the written files back and verify what they contain; InputError if they cannot be read.
 
     What the export itself could not express (an active limit) is a reason, too.
     """
@@ -270,7 +274,7 @@ def verified_export(
             message = f"the rendered file cannot be read back, so its template is wrong: {error.message}"
             raise InputError(message, file=name, line=error.line) from error
         result = tables.verify(machine, parsed, identified, reversal=reversal, limits=limits, covariance=known)
-        return replace(result, reasons=tuple(dict.fromkeys([*result.reasons, *exported.violations])))
+        return parsed, replace(result, reasons=tuple(dict.fromkeys([*result.reasons, *exported.violations])))
 
 
 def identify_bare(
@@ -316,7 +320,7 @@ def with_reversal(result: Identification, stated: ReversalCurves | None) -> Iden
 
 
 def _write_results(
-    output: OutputFolder, checked: Mapping[str, tuple[Export, Verification, Mapping[str, str]]]
+    output: OutputFolder, checked: Mapping[str, tuple[Export, ReadTables, Verification, Mapping[str, str]]]
 ) -> tuple[list[ControllerResult], tuple[Path, ...]]:
     """Write what is in ``output`` and the tables of all controls, by sub-folder, together: all files or none.
 
@@ -326,7 +330,7 @@ def _write_results(
         the result of each control, and the path to which the report of the earlier tables was moved.
     """
     results = []
-    for sub_folder, (exported, verification, extra_files) in checked.items():
+    for sub_folder, (exported, read, verification, extra_files) in checked.items():
         prefix = "" if verification.accepted else tables.REJECTED_PREFIX
         verification = replace(
             verification, files=tuple((prefix + name, digest) for name, digest in verification.files)
@@ -334,7 +338,7 @@ def _write_results(
         files = {**extra_files, **tables.verification_files(verification)}
         names = exported.add_to(output, sub_folder, accepted=verification.accepted, beside=files)
         paths = tuple(output.folder / name for name in names)
-        results.append(ControllerResult(exported, verification, paths))
+        results.append(ControllerResult(exported, verification, paths, read))
     earlier_report = tables.set_aside_superseded(output, list(checked))
     output.commit()
     return results, tuple(earlier_report)
@@ -444,7 +448,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     source = str(machine.source or machine.name)  # for the command that searches for the missing effect
     words = ["diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
     diagnosis = shlex.join(["volcomp", *words])
-    checked: dict[str, tuple[Export, Verification, Mapping[str, str]]] = {}
+    checked: dict[str, tuple[Export, ReadTables, Verification, Mapping[str, str]]] = {}
     for name, sub_folder in sub_folders.items():
         progress(f"exporting, reading back and verifying: {name}")
         exported = tables.export(
@@ -457,7 +461,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
             reversal=reversal,
             language=language,
         )
-        verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
+        read, verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
         # findings on the measurement; those that block are also reasons against the tables
         before, after = verification.before_rigid_removed, verification.after_rigid_removed
         taken = (
@@ -468,8 +472,8 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         verification = replace(verification, objections=found, reasons=tuple(reasons))
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
-        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language)
-        checked[sub_folder] = exported, verification, extra_files
+        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language, read)
+        checked[sub_folder] = exported, read, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
     add_identification(output, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})

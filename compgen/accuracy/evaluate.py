@@ -183,18 +183,18 @@ def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figur
 
 def axis_figures(source: ErrorSource) -> dict[str, Figure]:
     """Return for each axis the range of its positioning error along the line through the reference point (``M_X`` ...)."""
-    machine = source.machine
-    found = {}
-    for k, axis in enumerate(AXES):
+    found, lines = {}, []
+    for k in range(3):
         levels = levels_of(source, k)
-        points = np.tile(np.array(machine.reference_point_mm), (len(levels), 1))
+        points = np.tile(np.array(source.machine.reference_point_mm), (len(levels), 1))
         points[:, k] = levels
-        field = source.field(points)
-        along = field.error_mm[:, k]
-        weight = np.zeros_like(field.error_mm)
+        lines.append(points)
+    for k, (axis, part) in enumerate(zip(AXES, source.fields(lines), strict=True)):
+        along = part.error_mm[:, k]
+        weight = np.zeros_like(part.error_mm)
         weight[:, k] = range_weight(along)
         meaning = f"mean bidirectional positioning error M of {axis} on the line through the reference point; ISO 230-2"
-        found[f"M_{axis}"] = Figure.of_mm(np.ptp(along), field.spread(weight), meaning)
+        found[f"M_{axis}"] = Figure.of_mm(np.ptp(along), part.spread(weight), meaning)
     return found
 
 
@@ -215,13 +215,12 @@ def diagonal_figures(source: ErrorSource) -> dict[str, Figure]:
     """
     machine = source.machine
     found = {}
-    for name, signs in BODY_DIAGONALS.items():
-        points = diagonal_points(machine, signs)
+    diagonals = [diagonal_points(machine, signs) for signs in BODY_DIAGONALS.values()]
+    for name, points, part in zip(BODY_DIAGONALS, diagonals, source.fields(diagonals), strict=True):
         along = points[-1] - points[0]
         unit = along / np.linalg.norm(along)
-        field = source.field(points)
-        deviation = diagonal_deviation(machine, field.error_mm, points)
-        u_mm = field.spread(range_weight(deviation)[:, None] * unit)
+        deviation = diagonal_deviation(machine, part.error_mm, points)
+        u_mm = part.spread(range_weight(deviation)[:, None] * unit)
         found[name] = Figure.of_mm(np.ptp(deviation), u_mm, f"systematic error E of the diagonal {name}; ISO 230-6")
     worst = max(found, key=lambda name: found[name].value)
     return {

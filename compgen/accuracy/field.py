@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -438,15 +438,20 @@ class ErrorSource:
 
     def field(self, position_mm: FloatArray) -> ErrorField:
         """Return the errors of the tip at positions (n, 3) with the machine's tool; uncertainties to first order."""
-        points = Points(position_mm)
-        tool = tool_of(self.machine, None)
+        return self.fields([position_mm])[0]
+
+    def fields(self, lines_mm: Sequence[FloatArray]) -> list[ErrorField]:
+        """Return the fields at several sets of positions, each (n, 3), evaluated together."""
+        position_mm, tool = np.concatenate(lines_mm), tool_of(self.machine, None)
         if self.correction is None:
             model = exact_error if self.exact else volumetric_error
             error = model(self.machine, self.errors, position_mm)
         else:  # looked up at the commanded position, as controls do
-            added = self.correction(points)
+            added = self.correction(Points(position_mm))
             error = exact_error(self.machine, self.errors, position_mm + added) + added
-        return ErrorField(position_mm, position_mm + tool, error, self._spread(position_mm))
+        parts = np.split(error, np.cumsum([len(line) for line in lines_mm])[:-1])
+        lines = zip(lines_mm, parts, strict=True)
+        return [ErrorField(line, line + tool, part, self._spread(line)) for line, part in lines]
 
     def _spread(self, position_mm: FloatArray) -> Spread:
         if self.factor is None:

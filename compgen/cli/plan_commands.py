@@ -41,8 +41,9 @@ from compgen.plan import (
     regions_of,
     suggest,
 )
+from compgen.plan.gauges import plan_gauges, plan_page
 from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
-from compgen.report.terminal import plan_table, suggestion_table, trajectory_table, visibility_table
+from compgen.report.terminal import gauge_plan_table, plan_table, suggestion_table, trajectory_table, visibility_table
 from compgen.simulate import (
     AxisLaser,
     Ballbar,
@@ -60,6 +61,7 @@ from compgen.simulate import (
     simulate_sixdof,
     write_simulation,
 )
+from compgen.simulate.gauges import circle_from_text, pose_from_text, read_gauge
 from compgen.tables import residuals
 
 # ``volcomp plan``.
@@ -70,9 +72,31 @@ Progress = Callable[[str], None]
 
 @click.command("plan")
 @machine_argument
-@click.option("--stations", required=True, type=PATH, help="CSV: station, x_mm, y_mm, z_mm.")
+@click.option("--stations", type=PATH, help="Laser tracer: CSV with station, x_mm, y_mm, z_mm.")
 @click.option("--points", type=PATH, help="*.points.csv (mm); a point listed twice is measured twice.")
 @click.option("--grid", is_flag=True, help="Use all nodes of the machine as points, instead of --points.")
+@click.option(
+    "--artefact",
+    multiple=True,
+    type=PATH,
+    help="Plate or other artefact under the machine's probe: TOML; docs/files.md.",
+)
+@click.option(
+    "--pose",
+    "--poses",
+    multiple=True,
+    metavar="X,Y,Z[,ANGLE]",
+    help="Set-up of the artefact: its middle in machine coordinates, mm, and degrees about Z; several with ; between them.",
+)
+@click.option(
+    "--circle",
+    multiple=True,
+    metavar="PLANE:RADIUS[:X,Y,Z]",
+    help="Circular test: plane, radius and centre in mm (XY:150; the middle of the travel), or a TOML file.",
+)
+@click.option(
+    "--errors", type=PATH, help="Known errors (um, urad), whose effect on artefact and circles plan.html shows."
+)
 @options_of(IdentifyOptions, "readings", only=("u_length_um", "u_length_um_per_m"))
 @click.option("--suggest", "search", is_flag=True, help="Search for better station positions.")
 @click.option(
@@ -97,9 +121,13 @@ Progress = Callable[[str], None]
 @json_option
 def plan_command(
     machine: Machine,
-    stations: Path,
+    stations: Path | None,
     points: Path | None,
     grid: bool,
+    artefact: tuple[Path, ...],
+    pose: tuple[str, ...],
+    circle: tuple[str, ...],
+    errors: Path | None,
     readings: IdentifyOptions,
     search: bool,
     box: tuple[str, ...],
@@ -113,16 +141,34 @@ def plan_command(
 ) -> int:
     """Plan a measurement: what it will determine, and how well, before anything is measured.
 
+    With --stations: a laser tracer. With --artefact, --circle or both: gauges of the workshop, alone or with a tracer in
+    one adjustment; plan.html then shows deviation arrows and the polar diagram for --errors, with a slider for each error.
+
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
     suggested.stations.csv, with --target-um proposed.points.csv (mm). Lists the effects other than the geometric errors
     that the plan cannot show (volcomp effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15
-    um/m is assumed. Exit code 1 if an unknown is undetermined, or no trajectory reaches the target.
+    um/m is assumed. Exit code 1 if an unknown is undetermined, or no trajectory reaches the target; with gauges only if no
+    error at all is determined.
+
+    For gauges: volcomp plan zha-gantry --artefact plate.toml --pose -400,-500,-200 --circle XY:150 --out plan/
 
     \b
     Example:
       volcomp plan zha-gantry --stations identified/stations.csv --grid --out plan/
     """
     OutputFolder(out)
+    if artefact or circle:
+        if search or target_um is not None:
+            raise InputError(
+                "--suggest and --target-um are for a laser tracer alone; leave out --artefact and --circle"
+            )
+        return _plan_gauges(
+            machine, artefact, pose, circle, errors, stations, points, readings, out, grid=grid, as_json=as_json
+        )
+    if pose or errors:
+        raise InputError(f"{'--pose' if pose else '--errors'} belongs to --artefact or --circle, and neither is given")
+    if stations is None:
+        raise InputError("give --stations FILE (laser tracer), --artefact FILE or --circle PLANE:RADIUS")
     noise = planned_noise(readings)
     given, where = read_stations(stations), _points(machine, points, grid=grid)
     if (box or boxes) and not search:
@@ -154,6 +200,46 @@ def plan_command(
     answer(as_json, summary, *shown, visibility_table(visible))
     reached = judged is None or judged[1] is not None
     return 0 if result.determined and reached else 1
+
+
+def _plan_gauges(
+    machine: Machine,
+    artefact: tuple[Path, ...],
+    pose: tuple[str, ...],
+    circle: tuple[str, ...],
+    errors: Path | None,
+    stations: Path | None,
+    points: Path | None,
+    readings: IdentifyOptions,
+    out: Path,
+    *,
+    grid: bool,
+    as_json: bool,
+) -> int:
+    """Plan artefacts and circles, with planned tracer lengths if there are stations."""
+    if pose and not artefact:
+        raise InputError("--pose is the set-up of an artefact; give --artefact FILE as well")
+    if stations is None and (points or grid):
+        raise InputError("--points and --grid are where a laser tracer reads; give --stations FILE as well")
+    poses = tuple(pose_from_text(text) for item in pose for text in item.split(";"))
+    gauges = [read_gauge(path, "touch-probe", poses) for path in artefact]
+    gauges += [read_gauge(item, "ballbar") if item.endswith(".toml") else circle_from_text(item) for item in circle]
+    known = None if errors is None else open_errors(errors)
+    lengths = None
+    if stations is not None:
+        tracer = read_stations(stations)
+        lengths = planned(machine, tracer, _points(machine, points, grid=grid), planned_noise(readings)).lengths
+    with progress(quiet=as_json) as show:
+        show("predicting")
+        found = plan_gauges(machine, gauges, lengths, readings)
+        page = plan_page(found, known)
+    folder = OutputFolder(out)
+    folder.add("plan.errors.csv", format_errors(found.errors))
+    folder.add("plan.html", page)
+    folder.add("plan.json", json.dumps(found.summary(), indent=2) + "\n")
+    folder.commit()
+    answer(as_json, found.summary(), gauge_plan_table(found))
+    return 0 if found.errors.names else 1
 
 
 Judged = tuple[list[TrajectoryCandidate], TrajectoryCandidate | None]

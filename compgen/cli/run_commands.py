@@ -39,6 +39,7 @@ from compgen.report.terminal import identification_table, verification_table
 from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
+    from compgen.report.html.folder import KnownTables
     from compgen.report.html.write import Further
     from compgen.tables.active import ActiveTables
 
@@ -110,12 +111,12 @@ def report_command(
     return 0
 
 
-def report_written(folder: Path, language: str) -> Path | None:
+def report_written(folder: Path, language: str, known: KnownTables | None = None) -> Path | None:
     """Write the report of a finished command into its folder; if this fails, the result remains."""
     from compgen.report.html import write_report
 
     try:
-        return write_report(folder, language=language)[1]["report.html"]
+        return write_report(folder, language=language, known=known)[1]["report.html"]
     except InputError as error:
         warnings.warn(f"the report could not be made: {error}", CompgenWarning, stacklevel=2)
         return None
@@ -198,7 +199,8 @@ def run_command(
         )
         if not no_report:
             show("drawing the report")
-        report = None if no_report else report_written(out, language)
+        known = {item.export.controller: (item.read, item.verification) for item in result.results if item.read}
+        report = None if no_report else report_written(out, language, known)
     if report is not None:  # a new report replaces it; otherwise the earlier one is kept as PREVIOUS-...
         for path in result.earlier_report:
             path.unlink(missing_ok=True)

@@ -197,7 +197,7 @@ def export_command(
         extra_files["explain.md"] = explanation_markdown(explanation)
     reasons: tuple[str, ...] = tuple(exported.violations)
     if not no_verify:
-        verification = verified_export(machine, exported, table, both)
+        _, verification = verified_export(machine, exported, table, both)
         reasons = verification.reasons
         prefix = REJECTED_PREFIX if reasons else ""
         named = tuple((prefix + name, digest) for name, digest in verification.files)

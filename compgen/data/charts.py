@@ -15,6 +15,7 @@ import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -141,10 +142,9 @@ class Plot:
         if px.ndim == 1:
             whole = np.isfinite(px + py)
             runs = np.split(np.arange(len(px)), np.flatnonzero(~whole))
-            pieces = [run[whole[run]] for run in runs]
+            path = "".join(_path(px[run], py[run]) for run in (run[whole[run]] for run in runs) if len(run) > 1)
         else:
-            pieces = list(np.arange(px.size).reshape(px.shape))
-        path = "".join(_path(px.flat[piece], py.flat[piece]) for piece in pieces if len(piece) > 1)
+            path = _path(px, py)
         self._stroke(path, role, width, f";stroke-dasharray:{dash}" if dash else "")
 
     def dots(self, x: ArrayLike, y: ArrayLike, role: str, *, size: float = 4.0, square: bool = False) -> None:
@@ -188,19 +188,8 @@ class Plot:
     def heat(self, x: tuple[float, float], y: tuple[float, float], shares: Values, colours: Sequence[str]) -> None:
         """Fill a rectangle with cells; ``shares`` (rows from ``y[0]`` up, columns) are 0 for the first colour, 1 the last."""
         (left, right), (bottom, top) = self._px(x, y)
-        # a picture (rows, columns, 3) as PNG in base64 (ISO/IEC 15948: 8 bits, true colour, no filter)
         rgb = _colours(shares[::-1], colours)
-        rows = b"".join(b"\0" + row.tobytes() for row in rgb)
-        chunks = (
-            (b"IHDR", struct.pack(">IIBBBBB", rgb.shape[1], rgb.shape[0], 8, 2, 0, 0, 0)),
-            (b"IDAT", zlib.compress(rows, 9)),
-            (b"IEND", b""),
-        )
-        body = b"".join(
-            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-            for name, data in chunks
-        )
-        png = base64.b64encode(b"\x89PNG\r\n\x1a\n" + body).decode()
+        png = _png(rgb.tobytes(), rgb.shape[1])
         self.drawn.append(
             f'<image x="{left:.2f}" y="{top:.2f}" width="{right - left:.2f}" height="{bottom - top:.2f}" '
             f'preserveAspectRatio="none" style="image-rendering:pixelated" '
@@ -361,8 +350,25 @@ def _labelled(
 
 
 def _path(x: Values, y: Values) -> str:
-    flat = np.column_stack([x, y]).ravel().tolist()
-    return ("M" + " ".join(["%.2f %.2f"] * len(x))) % tuple(flat)
+    """The path of a line through points (n,), or of lines (m, n)."""
+    line = "M" + " ".join(["%.2f %.2f"] * x.shape[-1])
+    count = int(x.size // x.shape[-1])
+    return line * count % tuple(np.stack([x, y], axis=-1).ravel().tolist())
+
+
+@lru_cache(maxsize=32)  # the pictures of many controls have a part in common
+def _png(rgb: bytes, columns: int) -> str:
+    """Return a picture as PNG in base64 (ISO/IEC 15948: 8 bits, true colour, no filter)."""
+    rows = [rgb[start : start + 3 * columns] for start in range(0, len(rgb), 3 * columns)]
+    chunks = (
+        (b"IHDR", struct.pack(">IIBBBBB", columns, len(rows), 8, 2, 0, 0, 0)),
+        (b"IDAT", zlib.compress(b"".join(b"\0" + row for row in rows), 9)),
+        (b"IEND", b""),
+    )
+    body = b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
+    return base64.b64encode(b"\x89PNG\r\n\x1a\n" + body).decode()
 
 
 def _text(x: float, y: float, text: str, anchor: str, more: str = "") -> str:

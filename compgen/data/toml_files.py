@@ -476,7 +476,7 @@ def read_each(kind: type[T], section: Section, key: str) -> tuple[T, ...]:
     found = tuple(read_settings(kind, entry) for entry in section.sections(key))
     if not found:
         needed = ", ".join(item.key for item, _ in declared_settings(kind) if item.required)
-        message = f"is missing; give at least one [[{section.name}.{key}]] with {needed}"
+        message = f"is missing; give at least one [[{f'{section.name}.{key}'.lstrip('.')}]] with {needed}"
         raise section.fail(key, message, kind="missing", instead=[example_of(section_schema(kind))])
     return found
 

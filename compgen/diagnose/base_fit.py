@@ -17,7 +17,7 @@ from compgen.diagnose.observed import Observed
 from compgen.effects import Effect, Readings
 from compgen.errors import InputError
 from compgen.identify.adjust.unknowns import DistinctPoses
-from compgen.kinematics.exact_chain import exact_columns
+from compgen.kinematics.exact_chain import exact_columns, tip_position
 from compgen.kinematics.first_order import modelled_errors
 from compgen.kinematics.kernel_switch import lapack
 
@@ -199,11 +199,14 @@ STEPS = 12
 LEAST_SINGULAR = 1e-9
 #: A step that changes the readings by less than this, mm, ends the iteration.
 SMALL_MM = 1e-8
+#: After a step that changes the readings by more than this, mm, or by more than this share of the step before, the
+#: derivative is calculated again; otherwise it has changed by less than 1e-6.
+NEAR_MM, SHRINKING = 1e-3, 1e-2
 #: Curves are assumed to be about this small, mm and rad, and readings accurate to ``READING_MM``: too loose to matter
 #: where the data are informative, but what the data hardly determine stays near zero instead of diverging.
 LIKELY, READING_MM = 0.1, 1e-3
 LIKELY_RAD = 1e-4
-#: Columns of a panel of :func:`tall_qr`.
+#: Columns of a panel of :class:`TallQR`.
 PANEL = 32
 
 
@@ -250,43 +253,59 @@ class _Linearised:
     readings: Readings
 
 
-def tall_qr(columns: FloatArray) -> tuple[FloatArray, Callable[[FloatArray], FloatArray]]:
-    """Factor R (r, p) of columns (n, p), r = min(n, p), and a function that multiplies Q (n, r) by a matrix (r, k).
+class TallQR:
+    """QR of columns (n, p): ``factor`` R (r, p), r = min(n, p), and products with Q (n, r), which is never formed.
 
     LAPACK's recursive panels: numpy's QR of a matrix with many more rows than columns takes three times as long.
+    ``overwrite``: the columns, in Fortran order, may be destroyed.
     """
-    count, rank = len(columns), min(columns.shape)
-    compact, blocks, _ = lapack().dgeqrt(min(PANEL, rank), columns)
 
-    def of_basis(small: FloatArray) -> FloatArray:
-        padded = np.zeros((count, small.shape[1]), order="F")
-        padded[:rank] = small
-        return np.ascontiguousarray(lapack().dgemqrt(compact, blocks, padded, overwrite_c=1)[0])
+    def __init__(self, columns: FloatArray, *, overwrite: bool = False) -> None:
+        self._count, self._rank = len(columns), min(columns.shape)
+        panel = min(PANEL, self._rank)
+        self._compact, self._blocks, _ = lapack().dgeqrt(panel, columns, overwrite_a=int(overwrite))
+        self.factor = np.triu(self._compact[: self._rank])
 
-    return np.triu(compact[:rank]), of_basis
+    def of_basis(self, small: FloatArray) -> FloatArray:
+        """Q times a matrix (r, k)."""
+        padded = np.zeros((self._count, small.shape[1]), order="F")
+        padded[: self._rank] = small
+        return np.ascontiguousarray(lapack().dgemqrt(self._compact, self._blocks, padded, overwrite_c=1)[0])
+
+    def on_basis(self, target: FloatArray) -> FloatArray:
+        """Q' times a vector (n,)."""
+        turned = lapack().dgemqrt(self._compact, self._blocks, target[:, None].copy(), trans="T", overwrite_c=1)[0]
+        return np.asarray(turned[: self._rank, 0])
+
+
+def _scaled(columns: FloatArray, scale: FloatArray) -> FloatArray:
+    """Columns over their scale, in the order of LAPACK."""
+    return np.divide(columns, scale, out=np.empty(columns.shape, order="F"))
 
 
 def orthonormal(columns: FloatArray, least: float = 1e-9) -> FloatArray:
     """Orthonormal basis of the span of columns (n, p)."""
-    norm = np.linalg.norm(columns, axis=0)
+    norm = np.sqrt(np.einsum("nk,nk->k", columns, columns))
     kept = norm > 0
-    r, of_basis = tall_qr(columns[:, kept] / norm[kept])
-    u, singular, _ = np.linalg.svd(r, full_matrices=False)
-    return of_basis(u[:, singular > least * singular[0]])
+    qr = TallQR(_scaled(columns if kept.all() else columns[:, kept], norm[kept]), overwrite=True)
+    u, singular, _ = np.linalg.svd(qr.factor, full_matrices=False)
+    return qr.of_basis(u[:, singular > least * singular[0]])
+
+
+def least_norm_of(design: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the function from a target (n,) to the solution of :func:`least_norm`; ``design`` is factorised once."""
+    scale = np.sqrt(np.einsum("nk,nk->k", design, design))
+    scale[scale == 0.0] = 1.0
+    qr = TallQR(_scaled(design, scale), overwrite=True)
+    u, singular, vt = np.linalg.svd(qr.factor, full_matrices=False)
+    kept = singular > LEAST_SINGULAR * singular[0]
+    u, weighted = u[:, kept], vt[kept].T / singular[kept]
+    return lambda target: np.asarray(weighted @ (u.T @ qr.on_basis(target)) / scale)
 
 
 def least_norm(design: FloatArray, target: FloatArray) -> FloatArray:
     """Least-squares solution with scaled columns; directions without information get zero."""
-    scale = np.linalg.norm(design, axis=0)
-    scale[scale == 0.0] = 1.0
-    count = design.shape[1]
-    scaled = np.empty((len(design), count + 1), order="F")
-    np.divide(design, scale, out=scaled[:, :count])
-    scaled[:, count] = target
-    both = tall_qr(scaled)[0]  # its last column is Q' target
-    u, singular, vt = np.linalg.svd(both[:count, :count], full_matrices=False)
-    kept = singular > LEAST_SINGULAR * singular[0]
-    return np.asarray((vt[kept].T @ ((u[:, kept].T @ both[:count, count]) / singular[kept])) / scale)
+    return least_norm_of(design)(target)
 
 
 def fit_base(
@@ -316,19 +335,28 @@ def fit_base(
     unknowns = np.concatenate([unknowns, np.zeros(sum(counts))])
     # weight that keeps each curve coefficient near zero: accuracy of a reading over the likely size of the coefficient
     likely = [LIKELY if error_named(name).kind == "linear" else LIKELY_RAD for name in names_of(parts)]
-    hold = READING_MM / np.array(likely)
+    hold = READING_MM / np.array(likely) if whiten is None else 1.0 / np.array(likely)
+    solve: Callable[[FloatArray], FloatArray] | None = None
+    model, last = now.model, np.inf
     for _ in range(steps):
-        residual = observed.value_mm - now.model
-        design, target = now.jacobian, residual
-        if whiten is not None:
-            both = whiten(np.column_stack([design, target]))
-            design, target = both[:, :-1], both[:, -1]
-        step = _step(design, target, unknowns, hold if whiten is None else hold / READING_MM)
+        if solve is None:  # one factorisation serves all steps from nearly the same point
+            held = np.zeros((len(hold), now.jacobian.shape[1]))
+            held[:, : len(hold)] = np.diag(hold)
+            solve = least_norm_of(np.vstack([now.jacobian if whiten is None else whiten(now.jacobian), held]))
+        target = observed.value_mm - model
+        target = target if whiten is None else whiten(target)
+        step = solve(np.concatenate([target, -hold * unknowns[: len(hold)]]))
         unknowns = unknowns + step
-        change = now.jacobian @ step
-        now = _linearise(observed, parts, unknowns, effects, counts)
-        if float(np.sqrt(np.mean(change**2))) < SMALL_MM:
+        change = float(np.sqrt(np.mean((now.jacobian @ step) ** 2)))
+        if change < SMALL_MM:
             break
+        if change > min(NEAR_MM, SHRINKING * last):
+            now, solve = _linearise(observed, parts, unknowns, effects, counts), None
+            model = now.model
+        else:
+            model = _model(observed, parts, unknowns, effects)
+        last = change
+    now = _linearise(observed, parts, unknowns, effects, counts)
     names = [*names_of(parts), *observed.placement_names]
     names += [f"{e.card.name} {k}" for e, count in zip(effects, counts, strict=True) for k in range(count)]
     taken = tuple(zip(effects, counts, strict=True))
@@ -336,11 +364,17 @@ def fit_base(
     return BaseFit(observed, basis, unknowns, residual, now.jacobian, tuple(names), now.readings, taken)
 
 
-def _step(design: FloatArray, target: FloatArray, unknowns: FloatArray, hold: FloatArray) -> FloatArray:
-    """Least-squares step with the first unknowns kept near zero by weights ``hold`` (k,)."""
-    damping = np.zeros((len(hold), design.shape[1]))
-    damping[:, : len(hold)] = np.diag(hold)
-    return least_norm(np.vstack([design, damping]), np.concatenate([target, -hold * unknowns[: len(hold)]]))
+def _model(observed: Observed, parts: Sequence[Part], unknowns: FloatArray, effects: Sequence[Effect]) -> FloatArray:
+    """Readings (n,) that the model predicts at ``unknowns``."""
+    poses, size = observed.poses, size_of(parts)
+    errors = values_of(parts, unknowns, len(poses.position_mm))
+    tip = tip_position(observed.machine, errors, poses.position_mm, poses.tool_mm)
+    placement, of_effects = np.split(unknowns[size:], [len(observed.placement_names)])
+    model = observed.placed(tip, placement)[0]
+    if not effects:
+        return model
+    readings = observed.readings(tip, placement)
+    return np.asarray(model + np.hstack([_columns(effect, readings) for effect in effects]) @ of_effects)
 
 
 def _linearise(

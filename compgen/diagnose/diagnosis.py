@@ -188,7 +188,8 @@ def misfit_before_after(
     weight = 1.0 / noise.scale
     everything = _Problem(columns, _hstack(added, count), fit.residual_mm, weight)
     before, after = everything.fitted(False), everything.fitted(True)
-    some = _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
+    same = len(predicting) == len(added)
+    some = everything if same else _Problem(columns, _hstack(predicting, count), fit.residual_mm, weight)
     layout = fit.observed.layout
     # whole conditions: both repeats of a line are left out together
     kinds, lines = int(layout.condition.max()) + 1, None
@@ -267,25 +268,25 @@ class _Problem:
         before, after = np.empty_like(self.residual), np.empty_like(self.residual)
         for k in np.unique(fold):
             rows = np.flatnonzero(fold == k)
-            before[rows], after[rows] = self._predicted(rows, False), self._predicted(rows, True)
+            own, columns = self._weighted[rows], self.columns[rows]
+            square, right = own.T @ own, own.T @ self._target[rows]
+            for left, added in ((before, False), (after, True)):
+                size = self._sizes(added)
+                left[rows] = self._predicted(rows, columns[:, :size], square[:size, :size], right[:size])
         return _rms_pair(before, after)
 
-    def _predicted(self, rows: IntArray, added: bool) -> FloatArray:
-        k = self._sizes(added)
-        own = self._weighted[rows][:, :k]
-        square = own.T @ own
-        normal = self.normal[:k, :k] - square
-        right = self.right[:k] - own.T @ self._target[rows]
+    def _predicted(self, rows: IntArray, columns: FloatArray, square: FloatArray, seen: FloatArray) -> FloatArray:
+        """Residuals of ``rows``, with ``columns`` (m, k), after a fit to the others; what these rows add to the normals."""
+        k = columns.shape[1]
+        normal, right = self.normal[:k, :k] - square, self.right[:k] - seen
         unseen = np.diag(normal) < 1e-9 * np.maximum(np.diag(self.normal)[:k], 1e-300)
         known = ~unseen
         solution = np.zeros(k)
         solution[known] = _solve(normal[np.ix_(known, known)], right[known])
-        left = self.residual[rows] - self.columns[rows][:, :k] @ solution
+        left = self.residual[rows] - columns @ solution
         if unseen.any():
-            part = own[:, unseen]
-            left = left - self.columns[rows][:, :k][:, unseen] @ _solve(
-                part.T @ part, part.T @ (left * self.weight[rows])
-            )
+            part = columns[:, unseen] * self.weight[rows][:, None]
+            left = left - columns[:, unseen] @ _solve(part.T @ part, part.T @ (left * self.weight[rows]))
         return np.asarray(left)
 
 

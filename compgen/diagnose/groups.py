@@ -516,16 +516,16 @@ def _gain(fit: BaseFit, base: FloatArray, extra: FloatArray) -> tuple[float, int
 
     ``base`` is an orthonormal basis of its Jacobian.
     """
-    extra = extra / np.maximum(np.linalg.norm(extra, axis=0), 1e-300)
-    left = extra - base @ (base.T @ extra)
-    left -= base @ (base.T @ left)
-    square, vectors = np.linalg.eigh(left.T @ left)
+    norm = np.sqrt(np.maximum(np.einsum("nk,nk->k", extra, extra), 1e-300))
+    seen = base.T @ extra / norm
+    square, vectors = np.linalg.eigh(extra.T @ extra / np.outer(norm, norm) - seen.T @ seen)
     kept = square > LEAST_SQUARE
-    new = left @ (vectors[:, kept] / np.sqrt(square[kept]))
-    explained = float(np.sum((new.T @ fit.residual_mm) ** 2))
-    freedom = len(fit.observed) - fit.jacobian.shape[1] - new.shape[1]
+    score = (fit.residual_mm @ extra) / norm - (fit.residual_mm @ base) @ seen
+    explained = float(np.sum((vectors[:, kept].T @ score) ** 2 / square[kept]))
+    count = int(kept.sum())
+    freedom = len(fit.observed) - fit.jacobian.shape[1] - count
     left_over = float(np.sum(fit.residual_mm**2)) - explained
-    return explained / max(left_over / max(freedom, 1), 1e-300), new.shape[1]
+    return explained / max(left_over / max(freedom, 1), 1e-300), count
 
 
 def _extended(fit: BaseFit, wider: CurveBasis) -> FloatArray:

@@ -525,7 +525,7 @@ def _pairs(layout: MeasurementLayout, stop: IntArray) -> tuple[IntArray, IntArra
 
 
 #: Stops per piece.
-PIECE = 64
+PIECE = 40
 
 
 @dataclass(frozen=True)
@@ -545,6 +545,11 @@ class Piece:
     known: FloatArray
     kept: FloatArray
     learnt: FloatArray
+
+    @cached_property
+    def whole(self) -> FloatArray:
+        """Whitened stops per unit of each stop, then of each state, (b, b + J)."""
+        return np.hstack([self.inverse, -self.known])
 
 
 def pieces_of(
@@ -589,32 +594,45 @@ class Whitener:
     scale: FloatArray
     pieces: tuple[tuple[tuple[Piece, ...], tuple[Piece, ...]], ...]
 
-    def __call__(self, columns: FloatArray, *, centred: bool = False) -> FloatArray:
-        """Whiten columns (n, k) or one column (n,); ``centred``: less their mean on each channel."""
+    @cached_property
+    def averages(self) -> FloatArray:
+        """Weights (n, channels) of the mean of the readings of each channel."""
+        member = self.layout.channel[:, None] == np.arange(int(self.layout.channel.max()) + 1)
+        return np.asarray(member / np.maximum(member.sum(axis=0), 1))
+
+    def __call__(
+        self, columns: FloatArray, *, less: FloatArray | None = None, out: FloatArray | None = None
+    ) -> FloatArray:
+        """Whiten columns (n, k) or one column (n,).
+
+        ``less`` (channels, k): what is subtracted from the readings of each channel; ``out`` (n, k): where to put them.
+        """
         wide = columns.reshape(len(columns), -1)
-        result, at = np.empty(wide.shape), 0
-        owner = self.layout.channel
-        if centred:
-            summed = csr_array((np.ones(len(owner)), owner, np.arange(len(owner) + 1))).T @ wide
-            average = np.asarray(summed) / np.bincount(owner)[:, None]
+        result, at = np.empty(wide.shape) if out is None else out, 0
+        width, scaled = wide.shape[1], bool(np.any(self.scale != 1.0))
         for block, both in zip(self.layout.blocks, self.pieces, strict=True):
-            turn = rotation(block.channels)
-            states = np.zeros((block.channels, len(both[0][0].kept), wide.shape[1]))
-            size = len(block.stop)
-            whitened = result[at : at + size * block.channels].reshape(block.channels, size, -1)
+            count, size = block.channels, len(block.stop)
+            turn = rotation(count)
+            whitened = result[at : at + size * count].reshape(count, size, width)
+            work = np.zeros((count, PIECE + len(both[0][0].kept), width))
             for mean, contrast in zip(*both, strict=True):
-                rows = block.rows[mean.first : mean.last]
+                rows, here = block.rows[mean.first : mean.last], mean.last - mean.first
                 # (c, b, k): the channels of the piece, rotated to their mean and contrasts
                 picked = wide[rows.T]
-                if centred:
-                    picked -= average[owner[rows[0]]][:, None]
-                picked /= self.scale[rows.T][:, :, None]
-                turned = (turn @ picked.reshape(block.channels, -1)).reshape(picked.shape)
+                if less is not None:
+                    picked -= less[self.layout.channel[rows[0]]][:, None]
+                if scaled:
+                    picked /= self.scale[rows.T][:, :, None]
+                if here < PIECE:  # the states follow the stops
+                    work[:, here : here + work.shape[1] - PIECE] = work[:, PIECE:].copy()
+                held = work[:, : here + work.shape[1] - PIECE]
+                np.matmul(turn, picked.reshape(count, -1), out=work.reshape(count, -1)[:, : here * width])
                 for piece, own in ((mean, slice(0, 1)), (contrast, slice(1, None))):
-                    white = np.matmul(piece.inverse, turned[own], out=whitened[own, piece.first : piece.last])
-                    white -= piece.known @ states[own]
-                    states[own] = piece.kept[:, None] * states[own] + piece.learnt @ white
-            at += size * block.channels
+                    white = np.matmul(piece.whole, held[own], out=whitened[own, piece.first : piece.last])
+                    states = held[own, here:]
+                    states *= piece.kept[:, None]
+                    states += piece.learnt @ white
+            at += size * count
         return result.reshape(columns.shape)
 
     def transposed(self, whitened: FloatArray) -> FloatArray:

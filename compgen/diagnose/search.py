@@ -118,7 +118,8 @@ class Design:
         """Coordinates of the given groups as whitened columns, (N, r)."""
         if not members:
             return np.zeros((self.count, 0))
-        left = self.projected(np.hstack([self.groups[g].columns for g in members]), centred=True)
+        columns = np.hstack([self.groups[g].columns for g in members])
+        left = self.projected(columns, less=self.whiten.averages.T @ columns)
         ends = np.cumsum([0, *(len(self.maps[g]) for g in members)])
         return np.hstack([left[:, ends[k] : ends[k + 1]] @ self.maps[g] for k, g in enumerate(members)])
 
@@ -177,47 +178,67 @@ class Design:
         parts = [np.arange(self.start[g], self.start[g + 1]) for g in members]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
-    def projected(self, columns: FloatArray, *, centred: bool = False) -> FloatArray:
+    def projected(self, columns: FloatArray, *, less: FloatArray | None = None) -> FloatArray:
         """Whiten columns (n, k) and project out the base model.
 
-        ``centred``: less their mean on each channel, which a dead length would absorb.
+        ``less`` (channels, k): what is first subtracted on each channel, e.g. the mean, which a dead length would absorb.
         """
-        white = self.whiten(columns, centred=centred)
+        white = self.whiten(columns, less=less)
         return np.asarray(white - self.base @ (self.base.T @ white))
 
 
 def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design:
-    """Whiten, project and reduce all groups, a few sources of columns at a time."""
+    """Whiten, project and reduce all groups, a few sources of columns at a time.
+
+    Products with the base model and the residual are formed with these mapped back through the whitening, because raw
+    columns are short or sparse; whitened columns are needed for the products within a group only.
+    """
     base = orthonormal(whiten(fit.jacobian))
     white = whiten(fit.residual_mm)
     residual = white - base @ (base.T @ white)
+    size = base.shape[1]
+    vectors = np.hstack([whiten.transposed(np.column_stack([base, residual])), whiten.averages])
+    constants = vectors[:, : size + 1].T @ (whiten.averages > 0.0)
     owners: dict[int, list[int]] = {}
     for g, group in enumerate(groups):
         owners.setdefault(id(group.source), []).append(g)
+    chunks: list[list[list[int]]] = [[]]
+    widths = [0]
+    for own in owners.values():
+        width = groups[own[0]].source.width
+        if chunks[-1] and widths[-1] + width > CHUNK:
+            chunks.append([])
+            widths.append(0)
+        chunks[-1].append(own)
+        widths[-1] += width
     reduced: dict[int, tuple[FloatArray, FloatArray, float]] = {}
-    chunk: list[list[int]] = []
-    for own in [*owners.values(), []]:
-        width = sum(groups[of[0]].source.width for of in (*chunk, own) if of)
-        if chunk and (not own or width > CHUNK):
-            # less the mean on each channel, which a dead length would absorb
-            tall = whiten(np.hstack([groups[of[0]].source.columns() for of in chunk]), centred=True)
-            seen, score, at = base.T @ tall, residual @ tall, 0
-            whole = np.einsum("nk,nk->k", tall, tall)
-            left = np.maximum(whole - np.einsum("pk,pk->k", seen, seen), 0.0)
-            shares = np.sqrt(left / np.where(whole > 0.0, whole, np.inf))
-            for of in chunk:
-                for g in of:
-                    where = range(at, at + groups[g].source.width)[groups[g].place or slice(None)]
-                    mine = slice(where.start, where.stop)
-                    if len(where) == 1:
-                        share = float(shares[where[0]])
-                        mapping = np.full((1, int(share > LEAST_VISIBLE)), 1.0) / np.sqrt(left[mine])
-                    else:
-                        mapping, share = _reduced(tall[:, mine], seen[:, mine], base)
-                    reduced[g] = mapping, mapping.T @ score[mine], share
-                at += groups[of[0]].source.width
-            chunk = []
-        chunk.append(own)
+    summed: dict[int, FloatArray] = {}
+    space = np.empty(len(residual) * max(widths))
+    for chunk, width in zip(chunks, widths, strict=True):
+        if not chunk:
+            continue
+        sources = [groups[of[0]].source for of in chunk]
+        products = np.vstack([source.products(vectors, summed) for source in sources])
+        # less the mean on each channel, which a dead length would absorb
+        mean = products[:, size + 1 :].T
+        seen = products[:, : size + 1].T - constants @ mean
+        seen, score, at = seen[:-1], seen[-1], 0
+        out = space[: len(residual) * width].reshape(-1, width)
+        tall = whiten(np.hstack([source.columns() for source in sources]), less=mean, out=out)
+        whole = np.einsum("nk,nk->k", tall, tall)
+        left = np.maximum(whole - np.einsum("pk,pk->k", seen, seen), 0.0)
+        shares = np.sqrt(left / np.where(whole > 0.0, whole, np.inf))
+        for of in chunk:
+            for g in of:
+                where = range(at, at + groups[g].source.width)[groups[g].place or slice(None)]
+                mine = slice(where.start, where.stop)
+                if len(where) == 1:
+                    share = float(shares[where[0]])
+                    mapping = np.full((1, int(share > LEAST_VISIBLE)), 1.0) / np.sqrt(left[mine])
+                else:
+                    mapping, share = _reduced(tall[:, mine], seen[:, mine], base)
+                reduced[g] = mapping, mapping.T @ score[mine], share
+            at += groups[of[0]].source.width
     maps, scores, visible = zip(*(reduced[g] for g in range(len(groups))), strict=True) if groups else ((), (), ())
     start = np.cumsum([0, *(mapping.shape[1] for mapping in maps)]).astype(np.int64)
     stacked = np.concatenate(scores) if scores else np.zeros(0)

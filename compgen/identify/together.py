@@ -187,13 +187,13 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
     )
 
 
-def _solved(
+def solve_together(
     machine: Machine, layout: ErrorParameters, parts: Sequence[Source], options: IdentifyOptions
 ) -> tuple[list[Observations], Determined, NDArray[np.bool_]]:
     """Return the readings of each part, what all of them determine together, and which of all readings fit.
 
-    Positions in a frame of unknown pose and lengths from unknown stations are linear around approximate errors only:
-    those of a first solution.
+    Raises UndeterminedError if no error is determined. Positions in a frame of unknown pose and lengths from unknown
+    stations are linear around approximate errors only: those of a first solution.
     """
     around, least = None, _least(parts)
     posed = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
@@ -246,9 +246,12 @@ def _with_known_curves(layout: ErrorParameters, found: Sequence[Observations], k
 
     Straightness that nothing else shows stays a part of the squareness within the circle.
     """
+    design = found[k].design.copy()
+    if len(found) == 1:
+        design[:, : layout.size - len(layout.squareness)] = 0.0
+        return replace(found[k], design=design)
     others = stacked([item for j, item in enumerate(found) if j != k])
     known = _determined_errors(layout, others, SHOWS)
-    design = found[k].design.copy()
     for number, curve in enumerate(layout.curves):
         name = curve.error.name
         if name not in others.covered and not (name in known and others.shows[:, number].any()):
@@ -260,7 +263,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     """One least-squares adjustment of everything, and how the parts agree."""
     layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
     layout = max(layouts, key=lambda item: item.size, default=error_parameters(machine, modelled_errors(machine)))
-    found, solution, accepted = _solved(machine, layout, parts, options)
+    found, solution, accepted = solve_together(machine, layout, parts, options)
     starts = np.cumsum([0, *(len(readings) for readings in found)])
     fitting = [
         readings.kept(accepted[start : start + len(readings)]) for readings, start in zip(found, starts, strict=False)

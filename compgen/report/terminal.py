@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from compgen.fit import FitResult
     from compgen.identify import Identification
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
+    from compgen.plan.gauges import GaugePlan
     from compgen.tables import Residuals, Verification
     from compgen.tables.active import MergeReport
     from compgen.tables.diff import TableDifference
@@ -448,6 +449,34 @@ def plan_table(plan: Plan) -> Group:
             where = f"{curve.position_mm[int(np.argmax(curve.u))]:g}" if np.isfinite(worst) else ""
             table.add_row(name, number_text(worst, missing="not determined"), where, error.unit)
     return Group(Text("\n".join(lines)), *notes, table)
+
+
+def gauge_plan_table(plan: GaugePlan) -> Group:
+    """Return what a plan with artefacts and circles determines, what it leaves out, and what to add."""
+    summary = plan.summary()
+    lines = [*summary["gauges"], f"{plan.readings} readings, {summary['degrees_of_freedom']} degrees of freedom"]
+    table = Table("error", "u (k = 1) where read", "over the travel", "at (mm)", "unit", "", box=box.SIMPLE)
+    for name, item in summary["u"].items():
+        where = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
+        numbers = (number_text(item["u_max_where_read"], missing="-"), number_text(item["u_max"]))
+        table.add_row(name, *numbers, where, item["unit"], "partly" if name in plan.partly else "")
+    notes = [Text("no error is determined", "red")] if not plan.errors.names else []
+    if plan.left_out:
+        notes.append(Text(f"not determined, taken as zero: {', '.join(plan.left_out)}", "yellow"))
+    if plan.partly:
+        notes.append(
+            Text("partly: not separable from poses, the artefact or other errors in every direction", "yellow")
+        )
+    empty = {axis: nodes for name, nodes in summary["nodes_without_data"].items() if (axis := name[2])}
+    notes += [
+        Text(
+            f"no reading near {axis} {', '.join(f'{value:g}' for value in nodes)} mm: values there are extrapolated",
+            "yellow",
+        )
+        for axis, nodes in sorted(empty.items())
+    ]
+    notes += [Text(f"to add: {item.text}: {item.effect} ({item.option})") for item in plan.additions]
+    return Group(Text("\n".join(lines)), *([table] if plan.errors.names else []), *notes)
 
 
 def volume_line(title: str, plan: Plan) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,10 @@ Tips = Callable[[Stops], FloatArray]
 MS_PER_S = 1e3
 #: The tip is brought this close to a feature, mm, in at most so many steps; each gains three digits or more.
 CLOSE_MM, MOST_STEPS = 1e-9, 20
+
+
+#: Standard deviation of a ballbar's reading where only plane and radius are stated, um.
+CIRCLE_NOISE_UM = 0.5
 
 
 def _moving_only(effects: Sequence[SimulatedEffect], what: str) -> None:
@@ -297,11 +302,69 @@ class TouchProbe:
         return stops.position_mm
 
 
-def read_touch_probe(section: toml_files.Section) -> TouchProbe:
-    """The machine's own probe on an artefact in one or more poses: *.artefact.csv."""
-    poses = toml_files.read_each(PlatePose, section, "poses")
+def read_touch_probe(section: toml_files.Section, poses: tuple[PlatePose, ...] = ()) -> TouchProbe:
+    """The machine's own probe on an artefact in one or more poses: *.artefact.csv.
+
+    ``poses`` come after those of the section, which needs none then.
+    """
+    stated = toml_files.read_each(PlatePose, section, "poses") if "poses" in section or not poses else ()
+    poses = (*stated, *poses)
     probe = toml_files.read_settings(TouchProbe, section, poses=poses)
     turned = [np.radians(pose.rotation_deg)[:2] for pose in poses]
     if len(probe.components) < 3 and np.any(turned):
         raise section.fail("components", "'xy' is for an artefact that lies flat; rotation_deg has to be [0, 0, angle]")
     return probe
+
+
+def read_gauge(path: str | Path, kind: str, poses: tuple[PlatePose, ...] = ()) -> TouchProbe | Ballbar:
+    """Read a ballbar or a touch probe with its artefact from a TOML file: its keys alone, or [instrument] of a scenario.
+
+    Raises
+    ------
+    InputError
+        for an instrument of another ``kind`` ("touch-probe", "ballbar"), no pose, an unknown key.
+    """
+    root = toml_files.read_toml(path)
+    section = root.section("instrument") if "instrument" in root else root
+    stated = section.take("type", toml_files.choice("touch-probe", "ballbar"), kind)
+    if stated != kind:
+        raise section.fail("type", f"{stated!r} is not expected here; this file must describe a {kind}")
+    return read_touch_probe(section, poses) if kind == "touch-probe" else read_ballbar(section)
+
+
+def pose_from_text(text: str) -> PlatePose:
+    """Return a pose from ``X,Y,Z`` (mm), ``X,Y,Z,A`` (turned by A degrees about Z) or six numbers (rotation vector).
+
+    >>> pose_from_text("0,50,-300,90").rotation_deg
+    (0.0, 0.0, 90.0)
+    """
+    try:
+        values = tuple(float(word) for word in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) not in (3, 4, 6) or not np.isfinite(values).all():
+        message = (
+            f"{text!r} is not X,Y,Z in mm, X,Y,Z,ANGLE with degrees about Z, or X,Y,Z and a rotation vector in degrees"
+        )
+        raise InputError(message, field="--pose")
+    a, b, c = values[3:] if len(values) == 6 else (0.0, 0.0, *values[3:], 0.0)[:3]
+    return PlatePose((values[0], values[1], values[2]), (a, b, c))
+
+
+def circle_from_text(text: str) -> Ballbar:
+    """Return a ballbar from ``PLANE:RADIUS`` or ``PLANE:RADIUS:X,Y,Z`` (mm), one circle in each direction.
+
+    >>> circle_from_text("YZ:150").radius_mm
+    150.0
+    """
+    try:
+        plane, radius, *centre = text.split(":")
+        place = [float(word) for word in centre[0].split(",")] if centre else [0.0] * 3
+        number, (x, y, z) = list(PLANES).index(plane.upper()), place
+        radius_mm = toml_files.positive(float(radius))
+    except (ValueError, IndexError):
+        message = (
+            f"{text!r} is not PLANE:RADIUS or PLANE:RADIUS:X,Y,Z in mm, such as XY:150; planes are {', '.join(PLANES)}"
+        )
+        raise InputError(message, field="--circle") from None
+    return Ballbar((number,), radius_mm, (x, y, z) if centre else None, noise_um=CIRCLE_NOISE_UM)

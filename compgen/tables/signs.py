@@ -429,6 +429,7 @@ def check_files(
     templates: Path | None = None,
     reversal: ReversalCurves | None = None,
     language: str = LANGUAGES[0],
+    read: ReadTables | None = None,
 ) -> dict[str, str]:
     """Return ``check/check-program.md`` and, for controls with a documented motion in machine coordinates, the program.
 
@@ -439,12 +440,14 @@ def check_files(
     templates : a user's templates folder, searched first.
     reversal : as in :func:`check_program`.
     language : of the page; the program stays in English.
+    read : the files as read back, if they have been.
     """
-    control = controller_named(exported.controller)(machine)
-    sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
-    tables = ReadTables(control, control.parse(sources), ())
+    if read is None:
+        control = controller_named(exported.controller)(machine)
+        sources = [SourceFile(Path(name), text) for name, text in exported.files.items()]
+        read = ReadTables(control, control.parse(sources), ())
     card = load_format(exported.controller, templates)
-    program = check_program(machine, tables, errors, reversal)
+    program = check_program(machine, read, errors, reversal)
     # If the control's folder has no program, only the page is written.
     folders = template_folders(card.name, templates)
     has_program = any((folder / card.name / "check-program.nc.j2").is_file() for folder in folders)

@@ -37,6 +37,8 @@ RIDGE = 1e-11
 LEAST_SHARE = 0.5
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
+#: Fields that move the tip by less than this are rounding.
+NOTHING_MM = 1e-12
 #: Results at more points are not kept.
 MOST_KEPT = 50_000
 #: Up to so many fields are summed one by one, more by a matrix product unless the matrix has more entries than that.
@@ -191,28 +193,38 @@ class SampledTerm:
         outputs = tuple(sorted({part.output for part in term.carrier}))
         return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, term.carrier_field(position_mm, tool_mm))
 
-    def gather(self, fields_mm: FloatArray, hats: _Hats) -> FloatArray:
-        """Products of the values' fields with k fields (3, k, n), (values, k)."""
+    def gather(self, fields_mm: FloatArray, moved: Any, hats: _Hats) -> FloatArray:
+        """Products of the values' fields with k fields (3, k, n), (values, k); ``moved`` (3, k): where these are not zero."""
+        size = self.place.stop - self.place.start
+        products = np.zeros((size, fields_mm.shape[1]))
+        some = _places(np.any(moved[list(self.outputs)], axis=0))
         # copies of columns are contiguous, so that products of k fields take a third of the time
         first, *others = self.outputs
-        along = self.carrier[:, first].copy() * fields_mm[first]
+        along = self.carrier[:, first].copy() * fields_mm[first, some]
         for output in others:
-            along += self.carrier[:, output].copy() * fields_mm[output]
+            along += self.carrier[:, output].copy() * fields_mm[output, some]
         hat = hats.of(self, len(along))
         if hat is not None:
-            return np.asarray(hat @ along.T)
-        size = self.place.stop - self.place.start
-        return np.stack([np.bincount(self.node.ravel(), (self.share * one).ravel(), size) for one in along], axis=1)
+            products[:, some] = hat @ along.T
+        else:
+            for k, one in zip(np.arange(len(moved.T))[some], along, strict=True):
+                products[:, k] = np.bincount(self.node.ravel(), (self.share * one).ravel(), size)
+        return products
 
     def take(self, values: FloatArray, fields_mm: FloatArray, hats: _Hats) -> None:
-        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n)."""
-        hat = hats.of(self, values.shape[1])
-        if hat is not None:
-            along = values.T @ hat
-        else:
-            along = (self.share[0] * values.T[:, self.node[0]]) + (self.share[1] * values.T[:, self.node[1]])
+        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n), if they are not rounding only."""
+        some = _places(np.abs(values).max(axis=0) * np.abs(self.carrier).max() > NOTHING_MM)
+        own = values.T[some]
+        hat = hats.of(self, len(own))
+        left, right = self.share
+        along = left * own[:, self.node[0]] + right * own[:, self.node[1]] if hat is None else own @ hat
         for output in self.outputs:
-            fields_mm[output] -= self.carrier[:, output].copy() * along
+            fields_mm[output, some] -= self.carrier[:, output].copy() * along
+
+
+def _places(chosen: Any) -> slice | NDArray[np.intp]:
+    """Indices of what is chosen; a slice, of which numpy makes no copy, for all."""
+    return slice(None) if chosen.all() else np.flatnonzero(chosen)
 
 
 class _Hats:
@@ -278,8 +290,8 @@ class Projector:
 
     def _solved(self, required_mm: FloatArray, hats: _Hats) -> FloatArray:
         """All table values (parameters, k) for k required fields (3, k, n)."""
-        counting = required_mm * self.weight
-        right = self.freedom.gather(np.concatenate([term.gather(counting, hats) for term in self.terms]))
+        counting, moved = required_mm * self.weight, np.any(required_mm, axis=2)
+        right = self.freedom.gather(np.concatenate([term.gather(counting, moved, hats) for term in self.terms]))
         if self.offsets:
             right = np.concatenate([right, counting.sum(axis=2)])
         if self.offsets > 3:
@@ -440,10 +452,12 @@ def _factorised(problem: _Problem) -> Projector:
     normal = np.zeros((free + offsets, free + offsets))
     normal[:free, :free] = freedom.gather(freedom.gather(_normal_matrix(terms, weight)).T)
     if offsets:
-        moved = rigid_fields(position_mm)[:offsets]
-        across = freedom.gather(np.concatenate([term.gather(weight * moved.swapaxes(0, 1), _Hats()) for term in terms]))
+        rigid = rigid_fields(position_mm)[:offsets]
+        fields = weight * rigid.swapaxes(0, 1)
+        moved = np.any(fields, axis=2)
+        across = freedom.gather(np.concatenate([term.gather(fields, moved, _Hats()) for term in terms]))
         normal[:free, free:], normal[free:, :free] = across, across.T
-        normal[free:, free:] = np.einsum("ion,n,jon->ij", moved, weight, moved) if offsets > 3 else 0.0
+        normal[free:, free:] = np.einsum("ion,n,jon->ij", rigid, weight, rigid) if offsets > 3 else 0.0
         normal[free : free + 3, free : free + 3] = weight.sum() * np.eye(3)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-30 + 1e-14 * normal.diagonal().max()))
     # rows whose product with the values gives them at the positions keep_mm of every term

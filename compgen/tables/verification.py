@@ -183,7 +183,11 @@ def figure_uncertainty(
     most = max(50, min(UNCERTAINTY_POINTS, MOST_NUMBERS // (3 * max(len(known.error), 1))))
     places = np.unique(np.linspace(0, len(position_mm) - 1, most).astype(int))
     chosen = position_mm[places]
-    spread = error_design(machine, known, chosen) @ known.errors_factor
+    design, factor = error_design(machine, known, chosen), known.errors_factor
+    spread = np.empty((len(chosen), 3, factor.shape[1]))
+    for output in range(3):  # most errors move one axis
+        used = design[:, output].any(axis=0)
+        spread[:, output] = design[:, output, used] @ factor[used]
     flat = spread.reshape(3 * len(chosen), -1)
     found: list[float] = []
     for factor in (flat, small_motion(chosen + tool_of(machine, None)).taken_out(flat)):
@@ -852,6 +856,10 @@ def _uncorrected(machine: Machine, errors: ErrorTable, position_mm: FloatArray, 
 # The files of a verification: its figures, and the points behind them.
 
 
+#: Decimals of ``volume.csv``: of positions in mm, and of errors in um.
+POSITION_DECIMALS, ERROR_DECIMALS = 6, 4
+
+
 def verification_files(result: Verification) -> dict[str, str]:
     """Return the texts of ``result.json`` and ``volume.csv``."""
     return {"result.json": json.dumps(result.summary(), indent=2) + "\n", "volume.csv": format_volume(result)}
@@ -863,7 +871,7 @@ def format_volume(result: Verification) -> str:
     If a reversal is known, every point is listed twice, reached in positive and in negative direction.
     """
     columns: dict[str, FloatArray] = {f"{axis}_mm": result.position_mm[:, k] for k, axis in enumerate("xyz")}
-    digits = dict.fromkeys(columns, 6)
+    digits = dict.fromkeys(columns, POSITION_DECIMALS)
     for prefix, values in (("before", result.error_before_mm), ("after", result.error_after_mm)):
         columns |= {f"{prefix}_{axis}_um": values[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
-    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, 4), **digits})
+    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, ERROR_DECIMALS), **digits})

@@ -393,8 +393,9 @@ def test_grid_takes_the_mean_of_both_directions_and_refuses_scattered_points(ran
     )
     assert grid_of(twice).before_mm == pytest.approx(grid.before_mm - 0.001)
     places = [level[[0, 1]].mean(keepdims=True) for level in grid.levels_mm]
-    corners = grid.before_mm[:2, :2, :2].reshape(8, 3)  # the middle of a cell: linear interpolation is their mean
-    assert resampled(grid, grid.before_mm, places).ravel() == pytest.approx(corners.mean(axis=0))
+    for found, field_mm in zip(resampled(grid, places), (grid.before_mm, grid.after_mm), strict=True):
+        corners = field_mm[:2, :2, :2].reshape(8, 3)  # the middle of a cell: linear interpolation is their mean
+        assert found.ravel() == pytest.approx(corners.mean(axis=0))
     scattered = type(volume)(volume.position_mm[:-1], volume.before_mm[:-1], volume.after_mm[:-1])
     assert grid_of(scattered) is None
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.controls import CONTROLLERS
+from compgen.controls import CONTROLLERS, controller_named
 from compgen.controls.shared.base import Term
 from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import ErrorTable, read_errors
@@ -20,11 +20,12 @@ from compgen.data.files import read_bytes, read_text, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, read_machine
 from compgen.data.messages import one_line
-from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.identify.any_measurement import MEASURED_WITH
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector
+from compgen.tables.verification import ERROR_DECIMALS, POSITION_DECIMALS, Verification
 
 # The contents of a folder that ``run``, ``identify``, ``verify`` or ``compare`` wrote, read back for the report.
 
@@ -124,8 +125,14 @@ class ResultFolder:
     notes: tuple[str, ...] = ()
 
 
-def read_folder(folder: str | Path) -> ResultFolder:
+#: Tables as a run has read them back, and their verification, by control.
+KnownTables = Mapping[str, tuple[ReadTables, Verification]]
+
+
+def read_folder(folder: str | Path, known: KnownTables | None = None) -> ResultFolder:
     """Read the results in ``folder``; nothing outside it is read.
+
+    ``known`` are tables and volumes that the run which wrote the folder still has: they are not read once more.
 
     Raises
     ------
@@ -156,7 +163,7 @@ def read_folder(folder: str | Path) -> ResultFolder:
         residuals=_residuals(base / "residuals.csv"),
         controls=tuple(
             sorted(
-                (_control(path, machine) for path in control_folders),
+                (_control(path, machine, known or {}) for path in control_folders),
                 key=lambda c: (not c.result.get("accepted"), bool(c.result.get("partial")), c.name),
             )
         ),
@@ -239,12 +246,19 @@ def _volume(path: Path) -> Volume | None:
     return Volume(position_mm, values_mm[:, :3], values_mm[:, 3:])
 
 
-def _control(folder: Path, machine: Machine | None) -> ControlFolder:
+def _as_written(result: Verification) -> Volume:
+    """The numbers of ``volume.csv``."""
+    before_um, after_um = (part / MM_PER_UM for part in (result.error_before_mm, result.error_after_mm))
+    before_mm, after_mm = (np.round(part, ERROR_DECIMALS) * 1e-3 for part in (before_um, after_um))
+    return Volume(np.round(result.position_mm, POSITION_DECIMALS), before_mm, after_mm)
+
+
+def _control(folder: Path, machine: Machine | None, known: KnownTables) -> ControlFolder:
     result, manifest = _json(folder / "result.json"), _json(folder / "manifest.json")
     preflight = folder / "preflight.md"
     text = read_text(preflight) if preflight.is_file() else ""
-    files, volume = tuple(_files(folder, result)), _volume(folder / "volume.csv")
-    name = str(result.get("controller", folder.name))
+    files, name = tuple(_files(folder, result)), str(result.get("controller", folder.name))
+    volume = _as_written(known[name][1]) if name in known else _volume(folder / "volume.csv")
     found = ControlFolder(name, folder, result, manifest, text, files, volume)
     if machine is None or not files or name not in CONTROLLERS:
         return found
@@ -252,7 +266,10 @@ def _control(folder: Path, machine: Machine | None) -> ControlFolder:
     try:
         for key, value in (settings if isinstance(settings, dict) else {}).items():
             machine = machine.with_setting(name, key, value)
-        tables = read_tables(machine, [item.path for item in files], name)
+        if name in known:
+            tables = replace(known[name][0], controller=controller_named(name)(machine))
+        else:
+            tables = read_tables(machine, [item.path for item in files], name)
     except UNFIT:
         return found
     return replace(found, machine=machine, tables=tables)

@@ -23,7 +23,7 @@ from compgen.data.charts import (
     svg,
 )
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable
+from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.messages import um_text
 from compgen.data.names import AXES, COVERAGE, error_named
 from compgen.kinematics.many_points import full_grid
@@ -191,13 +191,14 @@ def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
     return VolumeOnGrid((levels[0], levels[1], levels[2]), before, after)
 
 
-def resampled(grid: VolumeOnGrid, field_mm: FloatArray, places_mm: Sequence[FloatArray]) -> FloatArray:
-    """Interpolate a field (nx, ny, nz, 3) linearly to another grid, given by its positions along X, Y and Z."""
-    found = field_mm
-    for axis, (level, places) in enumerate(zip(grid.levels_mm, places_mm, strict=True)):
-        weights = np.array([np.interp(places, level, row) for row in np.eye(len(level))])
-        found = np.moveaxis(np.tensordot(weights, found, axes=(0, axis)), 0, axis)
-    return found
+def resampled(grid: VolumeOnGrid, places_mm: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """Interpolate both errors (nx, ny, nz, 3) linearly to another grid, given by its positions along X, Y and Z."""
+    found = np.concatenate([grid.before_mm, grid.after_mm], axis=-1)
+    shrinking = sorted(range(3), key=lambda axis: len(places_mm[axis]) / len(grid.levels_mm[axis]))
+    for axis in shrinking:  # the numbers of points that are left are the smallest in this order
+        weights = hat_matrix(grid.levels_mm[axis], places_mm[axis])
+        found = np.moveaxis(np.tensordot(weights, found, axes=(1, axis)), 0, axis)
+    return found[..., :3], found[..., 3:]
 
 
 def projected(position_mm: FloatArray) -> FloatArray:
@@ -240,9 +241,7 @@ def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
         places = [
             np.linspace(level[0], level[-1], ALONG if k == axis else LINES) for k, level in enumerate(grid.levels_mm)
         ]
-        at = full_grid(places)
-        for found, field_mm in ((straight, None), (before, grid.before_mm), (after, grid.after_mm)):
-            lines = at if field_mm is None else resampled(grid, field_mm, places)
+        for found, lines in zip((straight, before, after), (full_grid(places), *resampled(grid, places)), strict=True):
             found.append(np.moveaxis(lines, axis, 2).reshape(-1, ALONG, 3))
     commanded, moved_before, moved_after = (np.concatenate(part) for part in (straight, before, after))
     layers = (
@@ -290,8 +289,9 @@ def _space(points: Sequence[FloatArray]) -> Plot:
 def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
     """Return |error| on the three middle planes before and after, all before and all after on one scale of colours."""
     pictures = []
-    for when, field_mm in (("before", grid.before_mm), ("after", grid.after_mm)):
-        planes = [(axis, *_plane(grid, field_mm, axis)) for axis in (2, 1, 0)]
+    cut = [(axis, *_plane(grid, axis)) for axis in (2, 1, 0)]
+    for side, when in enumerate(("before", "after")):
+        planes = [(axis, edges, both_um[side]) for axis, edges, both_um in cut]
         top_um = max(float(np.linalg.norm(errors_um, axis=-1).max()) for *_, errors_um in planes) or 1.0
         for axis, edges, errors_um in planes:
             across, up = (k for k in range(3) if k != axis)
@@ -315,11 +315,11 @@ def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
     return pictures
 
 
-def _plane(grid: VolumeOnGrid, field_mm: FloatArray, axis: int) -> tuple[list[FloatArray], FloatArray]:
-    """Return the middle plane across ``axis``: edges of its cells along each axis, mm, and errors (up, across, 3), um."""
+def _plane(grid: VolumeOnGrid, axis: int) -> tuple[list[FloatArray], list[FloatArray]]:
+    """Return the middle plane across ``axis``: edges of its cells along each axis, mm, and both errors (up, across, 3), um."""
     edges = [np.linspace(level[0], level[-1], 2 if k == axis else CELLS + 1) for k, level in enumerate(grid.levels_mm)]
     centres = [0.5 * (part[:-1] + part[1:]) for part in edges]
-    return edges, resampled(grid, field_mm, centres).squeeze(axis).swapaxes(0, 1) * 1e3
+    return edges, [part.squeeze(axis).swapaxes(0, 1) * 1e3 for part in resampled(grid, centres)]
 
 
 # Pictures of the measurement: residuals, and stations with their rays.

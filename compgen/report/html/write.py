@@ -7,9 +7,10 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -26,7 +27,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError
-from compgen.report.html.folder import ControlFolder, ResultFolder, TableCurve, read_folder, table_curves
+from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
     describe_error,
     draw_curve,
@@ -43,6 +44,9 @@ from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
 from compgen.tables.verification import coverage_of
+
+if TYPE_CHECKING:
+    from markdown_it import MarkdownIt
 
 # Figures of ISO 230 in the report: those in the folder, otherwise those of the identified errors.
 
@@ -543,11 +547,16 @@ def script_data(value: Any) -> Markup:
 
 def markdown(text: str) -> Markup:
     """Return the HTML of Markdown without raw HTML, links and pictures; the check boxes of lists become marks."""
-    from markdown_it import MarkdownIt
-
-    html = MarkdownIt("commonmark", {"html": False}).enable("table").disable(list(_OFF)).render(text)
+    html = _markdown_renderer().render(text)
     html = re.sub(r"<(/?)h([1-3])>", lambda found: f"<{found.group(1)}h{int(found.group(2)) + 3}>", html)
     return Markup(html.replace("<li>[ ] ", "<li class='check'>"))
+
+
+@cache
+def _markdown_renderer() -> MarkdownIt:
+    from markdown_it import MarkdownIt
+
+    return MarkdownIt("commonmark", {"html": False}).enable("table").disable(list(_OFF))
 
 
 # The documentation of a compensation in the spirit of ISO/TR 16907, clause 12: what was done, with what, and its limits.
@@ -806,15 +815,17 @@ class Report:
     data: Mapping[str, Any]
 
 
-def build_report(folder: str | Path, language: str = LANGUAGES[0]) -> Report:
+def build_report(folder: str | Path, language: str = LANGUAGES[0], known: KnownTables | None = None) -> Report:
     """Read the results in ``folder`` and make their report, the page in a language; nothing is written.
+
+    ``known`` is what the run which wrote the folder still has, see :func:`compgen.report.html.folder.read_folder`.
 
     Raises
     ------
     InputError
         if the folder contains no results, or one of its files cannot be read.
     """
-    source = read_folder(folder)
+    source = read_folder(folder, known)
     data = json_values(content(source))
     page = render_page(source, data, draw(source, data), language=language)
     record = calibration_record(data)
@@ -836,13 +847,15 @@ def write_report(
     out: str | Path | None = None,
     also: Further | None = None,
     language: str = LANGUAGES[0],
+    known: KnownTables | None = None,
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
-    ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page.
+    ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page;
+    ``known``: see :func:`build_report`.
     """
     target = OutputFolder(out if out is not None else folder)
-    report = build_report(folder, language)
+    report = build_report(folder, language, known)
     documents = also(report.data) if also is not None else {}
     for name, text in report.files.items():
         target.add(name, text)
