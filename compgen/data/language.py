@@ -42,7 +42,7 @@ _TOKEN = re.compile(
 )
 _INLINE = re.compile(r"</?(strong|em|b|i|code|span|br|small|sub|sup)\b")
 _BRANCH = re.compile(r"\{%-?\s*(if|elif|else|endif)\b")
-_ONLY_STATEMENTS = re.compile(r"\s*(\{%.*?%\}\s*|\{#.*?#\}\s*)+$")
+_ONLY_STATEMENTS = re.compile(r"\s*(\{%((?!%\}).)*%\}\s*|\{#.*?#\}\s*)+$")
 _MARKER = re.compile(r"\s*(#+ |\d+\. |[-*] (\[ \] )?|)")
 #: What is the same in every language: code, units, names of standards.
 _CODE = re.compile(r"`[^`]*`|<code>.*?</code>")

@@ -71,7 +71,7 @@ def sentence(node):
     if isinstance(node, ast.Constant):
         if not isinstance(node.value, str):
             return None
-        pieces = node.value.split("{}")  # of str.format
+        pieces = re.split(r"\{\d?\}", node.value)  # of str.format
         return "".join(f"{piece}{{value{k or ''}}}" for k, piece in enumerate(pieces[:-1])) + pieces[-1]
     if not isinstance(node, ast.JoinedStr):
         return None
