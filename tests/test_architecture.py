@@ -25,6 +25,7 @@ ORDER = (
     ("pipeline", "plugins"),
     ("report",),
     ("fleet",),
+    ("app",),
     ("cli",),
     ("controllers", "core"),  # former homes of the plug-in interface, for one minor version
     ("__main__",),

@@ -68,6 +68,9 @@ _COMMANDS = {
         "instruments": "List the instruments that compgen simulates.",
         "import": "Show what a file of another program contains, and convert it to the native format.",
     },
+    "app_commands": {
+        "app": "Open the workbench in the browser: from files to checked tables without a command line.",
+    },
     "fleet_commands": {
         "recal": "Scheduled recalibration: new measurements become proposed tables.",
         "serve": "Show the fleet in a browser: history, drift, before and after of proposed tables.",

@@ -1,0 +1,604 @@
+"""What the pages show: a measurement and what it leaves open, the chain of a machine, settings of controls, results."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from compgen.app.project import Project, ProjectState, Step, command_line
+from compgen.controls import CONTROLLERS
+from compgen.data import toml_files
+from compgen.data.axis_runs import AxisRuns
+from compgen.data.charts import CYCLE, Picture, Plot, limits_of, svg
+from compgen.data.circles import PLANES, Circles
+from compgen.data.csv_files import FloatArray
+from compgen.data.deviations import Deviations
+from compgen.data.error_table import ErrorTable, read_errors
+from compgen.data.files import read_text
+from compgen.data.machine import CHAINS, Chain, machine_files
+from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.new_machine import in_words
+from compgen.errors import CompgenError, InputError
+from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.report.html.pictures import draw_curve
+from compgen.tables import load_format
+
+#: Files larger than this are not drawn, bytes; so many pictures of one file at most.
+LARGEST_DRAWN, MOST_PICTURES = 40_000_000, 12
+
+# Measurements: pictures, and questions with what each answer would mean.
+
+
+def pictures_of(data: object, key: str) -> list[Picture]:
+    """Return pictures of what a measurement file contains; ``key`` is unique on the page."""
+    if isinstance(data, AxisRuns):
+        return [_runs_picture(data, axis, f"{key}-{AXES[axis]}") for axis in data.axes]
+    if isinstance(data, Circles):
+        return [_circle_picture(data, plane, f"{key}-{plane}") for plane in data.planes]
+    if isinstance(data, ErrorTable):
+        names = list(data.curves)[:MOST_PICTURES]
+        return [replace(draw_curve(name, data, None, {}), key=f"{key}-{name}") for name in names]
+    position_mm = getattr(data, "position_mm", None)
+    if position_mm is None or np.ndim(position_mm) != 2:
+        return []
+    if isinstance(data, Deviations):
+        return _deviation_pictures(data, key)
+    pictures = []
+    for first, second in ((0, 1), (0, 2)):
+        x, y = position_mm[:, first], position_mm[:, second]
+        plot = Plot(limits_of(x), limits_of(y), x_label=f"{AXES[first]} (mm)", y_label=f"{AXES[second]} (mm)")
+        shown = np.unique(np.column_stack([x, y]), axis=0)
+        plot.dots(shown[:, 0], shown[:, 1], "line", size=3.0)
+        name = f"{key}-{AXES[first]}{AXES[second]}"
+        title = f"Measured points in {AXES[first]} and {AXES[second]}"
+        pictures.append(Picture(name, f"Points {AXES[first]}{AXES[second]}", svg(name, title, [plot])))
+    return pictures
+
+
+def _runs_picture(data: AxisRuns, axis: int, key: str) -> Picture:
+    """Deviations over targets: each run, and the mean of each direction."""
+    rows = data.axis == axis
+    x, y = data.position_mm[rows], 1e3 * data.deviation_mm[rows]
+    direction, run = data.direction[rows], data.run[rows]
+    plot = Plot(limits_of(x, margin=0.02), limits_of(y, zero=True), x_label=f"{AXES[axis]} (mm)", y_label="µm")
+    plot.across(0.0)
+    for role, sign in (("c0", 1), ("c1", -1)):
+        chosen = direction == sign
+        for number in np.unique(run[chosen]):
+            part = chosen & (run == number)
+            order = np.argsort(x[part], kind="stable")
+            plot.line(x[part][order], y[part][order], role, width=0.6)
+        targets = np.unique(x[chosen])
+        plot.line(targets, [y[chosen & (x == target)].mean() for target in targets], role, width=2.0)
+    title = f"{AXES[axis]}: deviation over target; blue upwards, orange downwards; thick: means"
+    return Picture(key, f"Runs along {AXES[axis]}", svg(key, title, [plot]), note="blue: upwards, orange: downwards")
+
+
+def _circle_picture(data: Circles, plane: str, key: str) -> Picture:
+    """A polar diagram; the deviations are enlarged until the largest takes a third of the radius."""
+    part = data.part(np.flatnonzero(data.plane == list(PLANES).index(plane)))
+    deviation_um = 1e3 * (part.deviation_mm - part.deviation_mm.mean())
+    largest = float(np.abs(deviation_um).max()) or 1.0
+    plot = Plot((-1.5, 1.5), (-1.5, 1.5), (55.0, 5.0, 195.0, 145.0), bare=True)
+    turn = np.linspace(0.0, 2.0 * np.pi, 181)
+    for radius, role in ((1.0, "muted"), (1.0 + 1 / 3, "grid"), (1.0 - 1 / 3, "grid")):
+        plot.line(radius * np.cos(turn), radius * np.sin(turn), role, width=0.8)
+    for role, sign in (("c0", 1), ("c1", -1)):
+        for number in np.unique(part.run[part.direction == sign]):
+            rows = np.flatnonzero((part.direction == sign) & (part.run == number))
+            rows = rows[np.argsort(part.angle_rad[rows], kind="stable")]
+            radius = 1.0 + deviation_um[rows] / (3.0 * largest)
+            angle = part.angle_rad[rows]
+            plot.line(radius * np.cos(angle), radius * np.sin(angle), role)
+    note = f"outer and inner circle: ±{largest:.3g} µm; blue counter-clockwise"
+    return Picture(key, f"Circle {plane}", svg(key, f"Circle in {plane}, radial deviation", [plot]), note=note)
+
+
+def _deviation_pictures(data: Deviations, key: str) -> list[Picture]:
+    """Each measured component over the axis along which the points extend farthest."""
+    axis = int(np.argmax(np.ptp(data.position_mm, axis=0)))
+    pictures = []
+    for component in range(3):
+        y = 1e3 * data.deviation_mm[:, component]
+        if not np.isfinite(y).any():
+            continue
+        name, letter = f"{key}-d{AXES[component]}", AXES[component].lower()
+        x = data.position_mm[:, axis]
+        plot = Plot(limits_of(x, margin=0.02), limits_of(y, zero=True), x_label=f"{AXES[axis]} (mm)", y_label="µm")
+        plot.across(0.0)
+        plot.dots(x, y, CYCLE[component], size=3.0)
+        title = f"Deviation d{letter} over {AXES[axis]}"
+        pictures.append(Picture(name, f"d{letter}", svg(name, title, [plot]), note=f"over {AXES[axis]}"))
+    return pictures
+
+
+@lru_cache(maxsize=64)
+def _drawn(path: Path, _stamp: tuple[int, int], answers: tuple[str, ...], key: str) -> tuple[Picture, ...]:
+    kind = native_format(path)
+    data = describe_native(path, kind)[1] if kind else import_file(path, options_from(answers)).data
+    return tuple(pictures_of(data, key))
+
+
+def measurement_pictures(path: Path, answers: Sequence[str], key: str) -> Sequence[Picture]:
+    """Return pictures of a measurement file; none for one that is too large or cannot be read."""
+    try:
+        stat = path.stat()
+        if stat.st_size > LARGEST_DRAWN:
+            return ()
+        return _drawn(path, (stat.st_mtime_ns, stat.st_size), tuple(answers), key)
+    except (OSError, CompgenError):
+        return ()
+
+
+def options_from(answers: Sequence[str]) -> ImportOptions:
+    """Return import options from words such as ``--axis=X`` and ``--unit=deviation=um``."""
+    given: dict[str, Any] = {}
+    named = {item.metadata["name"] or f"--{item.name.replace('_', '-')}": item.name for item in fields(ImportOptions)}
+    for word in answers:
+        option, _, value = word.partition("=")
+        name = named[option]
+        if name in ("units", "columns"):
+            key, equals, right = value.partition("=")
+            given.setdefault(name, {})[key if equals else "value"] = right if equals else key
+        elif name == "ignore":
+            given[name] = (*given.get(name, ()), value)
+        else:
+            given[name] = float(value) if name in ("radius_mm", "base_length_mm") else value
+    return ImportOptions(**given)
+
+
+@dataclass(frozen=True)
+class AnswerChoice:
+    """One answer: the word that the command takes, how it is called, and the picture of what it would mean."""
+
+    word: str
+    label: str
+    pictures: Sequence[Picture]
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a file leaves open: its words, the option that answers it, and choices; without choices one types it."""
+
+    text: str
+    option: str
+    choices: Sequence[AnswerChoice]
+
+
+_OPTION = re.compile(
+    r"--(axis|unit|sign|error|dates|directions|decimal|zero-runs|plane|radius-mm|map|ignore|sheet|base-length|kind)\b"
+)
+_FIXED = {
+    "axis": AXES,
+    "dates": ("dmy", "mdy", "ymd"),
+    "decimal": ("comma", "point"),
+    "zero-runs": ("drop", "keep"),
+    "plane": tuple(PLANES),
+    "directions": ("labels", "motion", "alternate"),
+}
+_SIGNS = ("error", "correction", "angle-above-90", "angle-below-90", "rotation")
+_WORDS = {
+    "error": "error: measured minus commanded",
+    "correction": "correction: what has to be added",
+    "dmy": "day, month, year",
+    "mdy": "month, day, year",
+    "ymd": "year, month, day",
+    "drop": "not measured: leave these runs out",
+    "keep": "measured: zero is the result",
+    "labels": "as the file labels them",
+    "motion": "from the order of the rows",
+    "alternate": "odd runs upwards, even runs downwards",
+}
+
+
+def questions_of(path: Path, doubts: Sequence[str], answers: Sequence[str], key: str) -> list[Question]:
+    """Return what a file leaves open as questions, each with the picture that every answer would give."""
+    found: dict[str, Question] = {}
+    for number, doubt in enumerate(doubts):
+        match = _OPTION.search(doubt)
+        if match is None:
+            continue
+        option, words = match[1], list(_answers(match[1], doubt))
+        choices = [
+            AnswerChoice(
+                f"--{option}={word}",
+                _WORDS.get(word, word.partition("=")[2] or word),
+                measurement_pictures(path, (*answers, f"--{option}={word}"), f"{key}-{number}-{k}"),
+            )
+            for k, word in enumerate(words)
+        ]
+        found.setdefault(f"{option} {match.end()}" if option in ("map", "ignore") else option, Question(
+            doubt[: match.start()].rstrip(" ;,").removesuffix("give").rstrip(" ;,") or doubt, option, choices
+        ))  # fmt: skip
+    return list(found.values())
+
+
+def _answers(option: str, doubt: str) -> Sequence[str]:
+    """Return the answers that a question allows, none for free text."""
+    if option in _FIXED:
+        said = [word for word in _FIXED[option] if re.search(rf"\b{word}\b", doubt.partition("--")[2])]
+        return said or _FIXED[option]
+    if option == "sign":
+        return [word for word in _SIGNS if word in doubt.partition("--")[2]] or _SIGNS[:2]
+    if option == "unit":
+        field = re.search(r"--unit (\w+)=", doubt)
+        angular = re.search(r"\b(urad|mrad|arcsec|deg)\b", doubt) is not None
+        units = ("urad", "arcsec", "mrad") if angular else ("um", "mm", "in")
+        return [f"{field[1]}={unit}" if field else unit for unit in units]
+    if option == "error":
+        angular = "EA" in doubt
+        return [name for name in CURVE_NAMES if (error_named(name).kind == "angular") == angular]
+    return ()
+
+
+# The machine: its chain as a drawing, the settings of its controls, and its file with some values changed.
+
+
+def _box(corner: tuple[float, float, float], size: tuple[float, float, float], kind: str) -> str:
+    """Three faces of a block in an oblique view: X to the right, Y to the back, Z up."""
+    (x, y, z), (w, d, h) = corner, size
+
+    def at(*point: float) -> str:
+        return "{:.1f},{:.1f}".format(*_view(*point))
+
+    front = [at(x, y, z), at(x + w, y, z), at(x + w, y, z + h), at(x, y, z + h)]
+    top = [at(x, y, z + h), at(x + w, y, z + h), at(x + w, y + d, z + h), at(x, y + d, z + h)]
+    side = [at(x + w, y, z), at(x + w, y + d, z), at(x + w, y + d, z + h), at(x + w, y, z + h)]
+    faces = zip(("front", "top", "side"), (front, top, side), strict=True)
+    return "".join(f'<polygon class="{kind} {face}" points="{" ".join(points)}"/>' for face, points in faces)
+
+
+def _view(x: float, y: float, z: float) -> tuple[float, float]:
+    return 20.0 + x + 0.55 * y, 262.0 - z - 0.4 * y
+
+
+#: Half the arrow of each axis in the view, units of the picture.
+_ARROWS = ((30.0, 0.0), (16.0, -11.6), (0.0, -26.0))
+
+
+def _arrow(x: float, y: float, axis: int) -> str:
+    """An arrow with two heads along an axis, with its letter."""
+    dx, dy = _ARROWS[axis]
+    letter = f'<text x="{x + dx + 5:.1f}" y="{y + dy + 5:.1f}">{AXES[axis]}</text>'
+    return f'<path class="arrow" d="M{x - dx:.1f} {y - dy:.1f}L{x + dx:.1f} {y + dy:.1f}"/>{letter}'
+
+
+def chain_picture(chain: Chain) -> Markup:
+    """Draw which body carries which: the table side in front, the tool side on the column, an arrow for each axis."""
+    bodies, arrows = [_box((0, 0, 0), (270, 130, 16), "bed"), _box((110, 96, 16), (56, 30, 172), "bed")], []
+    x, y, z, w, h = 104.0, 96.0, 112.0, 68.0, 60.0
+    for axis in chain.tool_side:
+        y -= 22.0
+        bodies.append(_box((x, y, z), (w, 22, h), f"axis{axis}"))
+        px, py = _view(x + 0.5 * w, y, z + 0.5 * h)
+        arrows.append(_arrow(px + (34.0, 62.0, 0.0)[axis], py + (26.0, 8.0, 0.0)[axis], axis))
+        x, w, h = x + 6.0, w - 12.0, h - 8.0
+    px, py = _view(x + 0.5 * w, y, z)
+    bodies.append(f'<path class="tool" d="M{px - 6:.1f} {py:.1f}v14h12v-14zM{px - 2:.1f} {py + 14:.1f}v18h4v-18z"/>')
+    left, front, z, width, depth = 24.0, 6.0, 16.0, 216.0, 66.0
+    for axis in chain.workpiece_side:
+        height = 30.0 if axis == 2 else 17.0
+        bodies.append(_box((left, front, z), (width, depth, height), f"axis{axis}"))
+        px, py = _view(left, front, z + 0.5 * height)
+        arrows.append(_arrow(px + (44.0, width - 20.0, 100.0)[axis], py, axis))
+        left, front, width, depth, z = left + 14.0, front + 5.0, width - 28.0, depth - 10.0, z + height
+    bodies.append(_box((left + 0.5 * width - 24.0, front + 6.0, z), (48, max(18.0, depth - 14.0), 16), "work"))
+    title = f"{chain.name}: {in_words(chain)}"
+    marker = (
+        '<defs><marker id="head" viewBox="0 0 8 8" refX="6" refY="4" markerWidth="7" markerHeight="7" '
+        'orient="auto-start-reverse"><path class="head" d="M0 0L8 4L0 8z"/></marker></defs>'
+    )
+    drawn = f"{marker}{''.join([*bodies, *arrows])}"
+    return Markup(f'<svg class="chain" viewBox="0 0 380 280" role="img" aria-label="{escape(title)}">{drawn}</svg>')
+
+
+@dataclass(frozen=True)
+class SettingField:
+    """A key of a control as a field of a form: how it is given, its choices, meaning, present value and default."""
+
+    key: str
+    choices: Sequence[str]
+    meaning: str
+    value: str
+    default: str
+    kind: str
+
+
+def settings_of(text: str, control: str) -> list[SettingField]:
+    """Return the settings that a control declares, with the values of a machine file."""
+    present = tomllib.loads(text).get("controllers", {}).get(control, {})
+    declared = toml_files.section_schema(getattr(CONTROLLERS[control], "settings_class", object)).get("properties", {})
+    found = []
+    for key, about in declared.items():
+        kind, choices = str(about.get("type", "")), [str(item) for item in about.get("enum", ())]
+        if kind == "boolean":
+            choices = ["true", "false"]
+        value = "" if key not in present else toml_value(present[key], plain=True)
+        default = "" if about.get("default") is None else toml_value(about["default"], plain=True)
+        shown = "text" if all(isinstance(item, str) for item in about.get("enum", ("",))) and (
+            choices or kind == "string"
+        ) and kind != "boolean" else "toml"  # fmt: skip
+        found.append(SettingField(key, choices, str(about.get("description", "")), value, default, shown))
+    return found
+
+
+def toml_value(value: Any, *, plain: bool = False) -> str:
+    """Return a value as TOML writes it; with ``plain`` a text without its quotation marks."""
+    if isinstance(value, str):
+        return value if plain else json.dumps(value, ensure_ascii=False)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_value(item) for item in value) + "]"
+    return json.dumps(value)
+
+
+_HEADER = re.compile(r"\s*(#\s*)?\[([\w.-]+)\]\s*(#.*)?$")
+
+
+def with_value(text: str, section: str, key: str, value: str) -> str:
+    r"""Return the text of a machine file with one key changed and its comments kept; an empty ``value`` unsets the key.
+
+    >>> print(with_value("# [a]\n# k = 1 # meaning", "a", "k", "2"), end="")
+    [a]
+    k = 2                                     # meaning
+    """
+    lines = text.splitlines()
+    heads = [(k, match) for k, line in enumerate(lines) if (match := _HEADER.match(line))]
+    start, end = 0, len(lines)
+    if section:
+        place = next((k for k, (_, match) in enumerate(heads) if match[2] == section), None)
+        if place is None:
+            lines += ["", f"[{section}]"]
+            start = end = len(lines)
+        else:
+            start = heads[place][0] + 1
+            end = heads[place + 1][0] if place + 1 < len(heads) else len(lines)
+            if value:
+                lines[start - 1] = f"[{section}]"
+    elif heads:
+        end = heads[0][0]
+    for k in range(start, end):
+        found = re.match(rf"\s*(?:#\s*)?{re.escape(key)}\s*=\s*(.*)$", lines[k])
+        if found:
+            old, remark = _parted(found[1])
+            given = f"{key} = {value}" if value else f"# {key} = {old}"
+            lines[k] = f"{given:<41} {remark}".rstrip()
+            break
+    else:
+        if value:
+            while end > start and not lines[end - 1].strip():
+                end -= 1
+            lines.insert(end, f"{key} = {value}")
+    return "\n".join(lines) + "\n"
+
+
+def _parted(text: str) -> tuple[str, str]:
+    """Split a line of TOML after the equals sign into value and comment."""
+    quote = ""
+    for k, char in enumerate(text):
+        if char in "\"'" and quote in ("", char):
+            quote = "" if quote else char
+        elif char == "#" and not quote:
+            return text[:k].strip(), text[k:]
+    return text.strip(), ""
+
+
+def open_points(control: str) -> Sequence[str]:
+    """Return what no public document of the vendor settles about a control."""
+    return [" ".join(text.split()) for text in load_format(control).unverified]
+
+
+# Results.
+
+
+def error_pictures(path: Path, fitted: Path | None = None) -> list[Picture]:
+    """Return a picture of each identified error with its uncertainty, and smoothed if there is such a file."""
+    errors = read_errors(path)
+    smooth = None if fitted is None else read_errors(fitted)
+    return [draw_curve(name, errors, smooth, {}) for name in errors.curves]
+
+
+def squareness_rows(path: Path) -> list[tuple[str, float, float]]:
+    """Return name, value and standard uncertainty (urad, nan if unknown) of the squareness errors of a file."""
+    return [(name, 1e6 * value, 1e6 * u) for name, (value, u) in read_errors(path).squareness.items()]
+
+
+def shrink_picture(rows: Sequence[tuple[str, FloatArray | Sequence[float]]]) -> Markup:
+    """Draw bars of the residual before and after, one pair for each name; um rms."""
+    top = max((max(values) for _, values in rows), default=1.0) or 1.0
+    drawn = []
+    for k, (name, (before, after)) in enumerate(rows):
+        y = 8 + 44 * k
+        drawn.append(f'<text x="0" y="{y + 18}">{escape(name)}</text>')
+        for shift, value, role in ((0, before, "before"), (18, after, "after")):
+            width = 240.0 * value / top
+            drawn.append(f'<rect class="{role}" x="150" y="{y + shift}" width="{width:.1f}" height="14"/>')
+            drawn.append(f'<text x="{156 + width:.1f}" y="{y + shift + 12}">{value:.3g} µm</text>')
+    return Markup(
+        f'<svg class="shrink" viewBox="0 0 480 {16 + 44 * len(rows)}" role="img" aria-label="Residual before and after">'
+        f"{''.join(drawn)}</svg>"
+    )
+
+
+def machine_problem(path: Path) -> str:
+    """Return why a machine file cannot be read, "" if it can."""
+    try:
+        tomllib.loads(read_text(path))
+    except (InputError, tomllib.TOMLDecodeError) as error:
+        return str(error)
+    return ""
+
+
+def is_answer(word: str) -> bool:
+    """Whether a word is an option of ``volcomp import`` with a value that a file's question may have."""
+    return re.fullmatch(rf"{_OPTION.pattern}=[^\x00-\x1f]{{1,100}}", word) is not None
+
+
+def gap_picture(diagnosis: Mapping[str, Any]) -> Markup:
+    """Draw how much of the residual a named effect explains, on the readings used and on those left out."""
+    names = {"train": "readings used", "heldout_lines": "lines left out", "heldout_stations": "stations left out",
+             "heldout_times": "times left out"}  # fmt: skip
+    rows = [
+        (words, (float(part["before_rms_um"]), float(part["after_rms_um"])))
+        for name, words in names.items()
+        if isinstance(part := (diagnosis.get("gap") or {}).get(name), Mapping)
+        and all(isinstance(part.get(key), int | float) for key in ("before_rms_um", "after_rms_um"))
+    ]
+    return shrink_picture(rows) if rows else Markup("")
+
+
+# What each page of a project shows.
+
+
+def machine_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the machine, its settings with what is open, and the machines to choose from."""
+    machine, text, problem = state.machine, "", ""
+    path = machine_file(project, state)
+    if path is not None:
+        text, problem = read_text(path), machine_problem(path)
+    parsed = {} if problem or not text else tomllib.loads(text)
+    chain = str(parsed.get("chain", ""))
+    controls = [name for name in parsed.get("controllers", {}) if name in CONTROLLERS]
+    return {
+        "machine": machine, "text": text, "parsed": parsed,
+        "chain": Chain(chain) if chain in CHAINS else None, "in_words": in_words, "picture": chain_picture,
+        "shipped": sorted(machine_files(())), "chains": [Chain(name) for name in CHAINS],
+        "cards": [load_format(name) for name in sorted(CONTROLLERS)],
+        "controls": [(load_format(name), settings_of(text, name), open_points(name))
+                     for name in controls],
+        "checked": state.last("machine"),
+    }  # fmt: skip
+
+
+def machine_file(project: Project, state: ProjectState) -> Path | None:
+    """Return the file of the machine of a project."""
+    machine = state.machine
+    if machine is None:
+        return None
+    return project.path(machine) if machine.endswith(".toml") else machine_files(()).get(machine)
+
+
+def measurement_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the measurements of before the correction."""
+    return {"items": shown_measurements(project, state, after=False), "names": SQUARENESS_NAMES, "axes": AXES}
+
+
+def shown_measurements(project: Project, state: ProjectState, *, after: bool) -> list[dict[str, Any]]:
+    """Return each measurement with its pictures and questions."""
+    shown = []
+    for item in state.measurements:
+        if item.after != after:
+            continue
+        path, key, answers = project.path(item.file), f"m{item.number}", item.step.data["answers"]
+        shown.append(
+            {
+                "item": item,
+                "summary": item.step.data["summary"],
+                "pictures": () if item.questions else measurement_pictures(path, answers, key),
+                "questions": questions_of(path, item.questions, answers, f"q{item.number}"),
+            }
+        )
+    return shown
+
+
+def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return what was identified and diagnosed last, and whether it is up to date."""
+    step = state.last("identify")
+    files = {} if step is None else project.files_of(step)
+    errors = files.get("identified.errors.csv")
+    before = [
+        other for other in state.steps if other.kind == "identify" and step is not None and other.number < step.number
+    ]
+    found, diagnosis = state.last("diagnose"), {}
+    if found is not None:
+        diagnosis = project.facts(found, "diagnosis.json")
+    applied = found is not None and state.machine == f"{found.folder}/extended.toml"
+    earlier = project.facts(before[-1], "identify.json") if before and applied else {}
+    return {
+        "step": step, "facts": project.facts(step, "identify.json"), "errors": errors, "earlier": earlier,
+        "pictures": (drawn := error_pictures(errors) if errors else []),
+        "values": {picture.key: picture.data for picture in drawn},
+        "squareness": squareness_rows(errors) if errors else [],
+        "current": state.current("identify") is not None, "views": views(project, step),
+        "found": found, "diagnosis": diagnosis, "diagnosed_views": views(project, found),
+        "gap": gap_picture(diagnosis), "applied": applied,
+        "may_add": found is not None and "extended.toml" in project.files_of(found) and not applied,
+        "current_diagnosis": state.current("diagnose") is not None,
+    }  # fmt: skip
+
+
+def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the tables that were made, the controls side by side, and verified backups."""
+    path = machine_file(project, state)
+    parsed = {} if path is None or machine_problem(path) else tomllib.loads(read_text(path))
+    runs = [step for step in state.steps if step.kind == "run"]
+    results = [
+        {
+            "step": step, "result": project.facts(step, "result.json"), "files": project.files_of(step),
+            "current": not any(
+                other.number > step.number and other.kind in ("machine", "numbers", "removed", "measurement")
+                and not other.data.get("after") for other in state.steps
+            ),
+            "views": views(project, step), "control": step.data["control"],
+        }
+        for step in reversed(runs)
+    ]  # fmt: skip
+    verified = [
+        {"step": step, "result": project.facts(step, "result.json"), "control": step.data["control"]}
+        for step in reversed(state.steps)
+        if step.kind == "verify"
+    ]
+    step = state.last("options")
+    return {
+        "options": project.facts(step, "options.json"), "options_step": step, "results": results, "verified": verified,
+        "options_current": state.current("options") is not None,
+        "controls": list(parsed.get("controllers", {})), "identified": state.current("identify"),
+        "cards": [load_format(name) for name in sorted(CONTROLLERS)],
+    }  # fmt: skip
+
+
+def after_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the measurements of after the correction, and the last comparison."""
+    step = state.last("compare")
+    return {
+        "items": shown_measurements(project, state, after=True), "step": step,
+        "before": [item for item in state.measurements if not item.after and item.used],
+        "facts": project.facts(step, "compare.json"), "views": views(project, step),
+    }  # fmt: skip
+
+
+def project_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return all steps with their commands and files, and what belongs to none."""
+    recorded = {step.folder for step in state.steps}
+    left = [item.name for item in sorted(project.folder.iterdir()) if re.match(r"\d+-", item.name)]
+    path = machine_file(project, state)
+    parsed = {} if path is None or machine_problem(path) else tomllib.loads(read_text(path))
+    return {
+        "steps": [(step, [command_line(words) for words in step.commands]) for step in reversed(state.steps)],
+        "files": {step.number: list(project.files_of(step)) for step in state.steps},
+        "left": [name for name in left if name not in recorded], "script": project.script(),
+        "controls": list(parsed.get("controllers", {})), "handed": state.last("recal"),
+    }  # fmt: skip
+
+
+#: What each page of a project shows, by its name.
+SHOWN: dict[str, Callable[[Project, ProjectState], dict[str, Any]]] = {
+    "machine": machine_page, "measurement": measurement_page, "result": result_page, "tables": tables_page,
+    "after": after_page, "project": project_page,
+}  # fmt: skip
+
+
+def views(project: Project, step: Step | None) -> list[str]:
+    """Return the names of the pages that a step wrote, the main one first."""
+    names = [] if step is None else [name for name in project.files_of(step) if name.endswith(".html")]
+    return sorted(names, key=lambda name: (name not in ("report.html", "index.html"), name))

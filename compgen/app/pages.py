@@ -1,0 +1,961 @@
+"""The pages of the workbench: what each shows, what each button starts, and the checks of every request.
+
+A request is checked before any page sees it: host name, method, session, and for whatever changes something origin, token of
+the form and revision of the project. Projects and steps are numbers in the address; a file of a step is looked up in its
+list, so no part of an address is used as a path.
+"""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import math
+import re
+import secrets
+import signal
+import sys
+import threading
+import time
+import traceback
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from flask import Blueprint, Flask, Response, abort, current_app, g, redirect, render_template, request, send_file
+from jinja2 import StrictUndefined
+from markupsafe import Markup
+from werkzeug.exceptions import Forbidden, HTTPException
+from werkzeug.routing import IntegerConverter
+from werkzeug.wrappers import Response as BaseResponse
+
+from compgen.app import contents
+from compgen.app.project import (
+    PROJECT,
+    Progress,
+    Project,
+    ProjectState,
+    Runner,
+    Step,
+    StepTask,
+    command_line,
+    file_name,
+)
+from compgen.controls import CONTROLLERS
+from compgen.data.charts import LABEL
+from compgen.data.files import json_text, read_text, write_file
+from compgen.data.machine import load_machine, machine_files
+from compgen.data.names import AXES, SQUARENESS_NAMES
+from compgen.data.new_machine import chains_of, in_words
+from compgen.errors import CompgenError, InputError
+from compgen.fleet.dashboard.guard import HEADERS, check_host, check_method, check_origin, cookie_name, same, set_cookie
+from compgen.fleet.dashboard.settings import DashboardSettings
+from compgen.foreign import native_format
+from compgen.identify.options import StatedNumbers
+from compgen.report.html.write import markdown
+from compgen.resources import cache_folder, data_folder
+
+#: Largest request (files that are dropped together), largest part of a form that is not a file, bytes; parts of a form.
+LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 500_000_000, 2_000_000, 400
+#: A page that has not been heard of for this long is closed; background windows are slowed to one call a minute, s.
+SILENT_S = 200.0
+#: The program ends this long after the last page was closed, s.
+GRACE_S = 6.0
+#: A button answers with the result if it is ready within this time, otherwise with the progress, s.
+A_MOMENT_S = 0.8
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; style-src-attr 'unsafe-inline'; img-src 'self' data:; "
+    "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+#: Pages of a project, in the order of the work.
+PAGES = {
+    "machine": "Machine", "measurement": "Measurement", "result": "Result", "tables": "Tables",
+    "after": "Before and after", "project": "Project",
+}  # fmt: skip
+_NUMBER = "number(max=99999)"
+pages = Blueprint("pages", __name__)
+
+
+class StepNumber(IntegerConverter):
+    """A whole number in ASCII digits without leading zeros."""
+
+    regex = "0|[1-9][0-9]{0,4}"
+
+
+@dataclass
+class OpenPages:
+    """Which pages are open in browsers: the program ends when the last one is closed."""
+
+    seen: dict[str, float] = field(default_factory=dict)
+    last: float | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def alive(self, page: str) -> None:
+        """Note that a page is open."""
+        with self.lock:
+            if len(self.seen) < 1000 or page in self.seen:
+                self.seen[page] = self.last = time.monotonic()
+
+    def left(self, page: str) -> None:
+        """Note that a page was closed or follows a link."""
+        with self.lock:
+            if self.seen.pop(page, None) is not None:
+                self.last = time.monotonic()
+
+    def over(self) -> bool:
+        """Whether the last page was closed a while ago; False if there never was one."""
+        now = time.monotonic()
+        with self.lock:
+            for page in [page for page, at in self.seen.items() if now - at > SILENT_S]:
+                del self.seen[page]
+            return self.last is not None and not self.seen and now - self.last > GRACE_S
+
+
+@dataclass
+class Workbench:
+    """Everything that exists as long as the program runs; ``ticket`` is the token of the first address, used once."""
+
+    settings: DashboardSettings
+    projects: list[Runner] = field(default_factory=list)
+    ticket: str | None = field(default_factory=lambda: secrets.token_urlsafe(32))
+    session: str = field(default_factory=lambda: secrets.token_urlsafe(32))
+    csrf: str = field(default_factory=lambda: secrets.token_urlsafe(32))
+    open_pages: OpenPages = field(default_factory=OpenPages)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def open(self, folder: str | Path) -> int:
+        """Open a project and return its number; one that is open keeps its number."""
+        project = Project.open(folder)
+        with self.lock:
+            for number, runner in enumerate(self.projects, start=1):
+                if runner.project.folder == project.folder:
+                    return number
+            self.projects.append(Runner(project))
+            _remember(project.folder)
+            return len(self.projects)
+
+    def close(self) -> None:
+        """Stop what runs."""
+        for runner in self.projects:
+            runner.stop()
+
+
+def _recent_file() -> Path:
+    return cache_folder("app") / "recent.json"
+
+
+def recent_projects() -> list[Path]:
+    """Return the folders of projects that were opened last and still exist."""
+    try:
+        found = json.loads(_recent_file().read_text(encoding="utf-8"))
+        return [Path(item) for item in found if (Path(item) / PROJECT).is_file()][:10]
+    except (OSError, ValueError, TypeError):
+        return []
+
+
+def _remember(folder: Path) -> None:
+    known = [folder, *(item for item in recent_projects() if item != folder)]
+    try:
+        write_file(_recent_file(), json_text([str(item) for item in known[:10]]))
+    except InputError:  # a folder that nobody may write to
+        return
+
+
+def the_workbench() -> Workbench:
+    """Return what the pages share."""
+    found: Workbench = current_app.extensions["compgen"]
+    return found
+
+
+def the_runner(number: int) -> Runner:
+    """Return the commands of an open project or answer 404."""
+    known = the_workbench().projects
+    return known[number - 1] if 1 <= number <= len(known) else abort(404, "No such project is open.")
+
+
+# What each page shows.
+
+
+def _page(number: int, name: str, code: int = 200, **more: Any) -> tuple[str, int]:
+    """Render a page of a project; ``more`` overrides what it shows, e.g. ``problem``."""
+    runner = the_runner(number)
+    state = runner.project.state()
+    shown: dict[str, Any] = {
+        "problem": "", "number": number, "project": runner.project, "state": state, "page": name, "job": runner.job,
+        "done": {"machine": state.machine is not None, "measurement": bool(state.used_files()),
+                 "result": state.current("identify") is not None, "tables": state.current("run") is not None,
+                 "after": state.last("compare") is not None, "project": False},
+    }  # fmt: skip
+    shown |= contents.SHOWN[name](runner.project, state)
+    return render_template(f"{name}.html", **(shown | more)), code
+
+
+# Pages without a project, and what all of them need.
+
+
+@pages.get("/start")
+def start() -> BaseResponse:
+    """Exchange the token of the first address for a session; it is valid once."""
+    workbench = the_workbench()
+    with workbench.lock:
+        given, known = request.args.get("token", ""), workbench.ticket
+        if known is None or not same(given, known):
+            abort(403, "This address is valid once. Close this page and start `volcomp app` again.")
+        workbench.ticket = None
+    response = redirect("/projects/1/" if workbench.projects else "/", code=303)
+    set_cookie(response, workbench.settings, "app", workbench.session)
+    return response
+
+
+@pages.get("/")
+def home() -> str:
+    """Show the projects that were opened last, and where a new one would be."""
+    return _home("")
+
+
+def _home(problem: str, folder: str = "") -> str:
+    proposed = Path.home() / "volcomp" / time.strftime("%Y-%m-%d")
+    return render_template(
+        "start.html", problem=problem, recent=recent_projects(), folder=folder or str(proposed), number=0
+    )
+
+
+@pages.post("/open")
+def open_project() -> BaseResponse | tuple[str, int]:
+    """Open the folder of a project, or begin one."""
+    folder = request.form.get("folder", "").strip()
+    try:
+        if not folder or len(folder) > 1000:
+            raise InputError("give the folder of the project")
+        number = the_workbench().open(folder)
+        state = the_runner(number).project.state()
+    except InputError as error:
+        return _home(str(error), folder), 409
+    return redirect(f"/projects/{number}/{'result' if state.used_files() else 'machine'}", code=303)
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/")
+def first_page(number: int) -> BaseResponse:
+    """Go to the first page with something to do."""
+    state = the_runner(number).project.state()
+    name = "machine" if state.machine is None else "result" if state.used_files() else "measurement"
+    return redirect(f"/projects/{number}/{name}", code=303)
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/<any({', '.join(PAGES)}):name>")
+def project_page(number: int, name: str) -> tuple[str, int]:
+    """Show one page of a project."""
+    return _page(number, name)
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/status")
+def status(number: int) -> dict[str, Any]:
+    """Report what runs and the revision; the pages ask for it about twice a second while something runs."""
+    runner = the_runner(number)
+    job = runner.job or Progress("", "")
+    return {
+        "revision": runner.project.state().revision, "busy": runner.busy, "title": job.title, "line": job.line,
+        "seconds": round(job.seconds, 1),
+    }  # fmt: skip
+
+
+@pages.post("/alive")
+def alive() -> tuple[str, int]:
+    """Note that a page is open, or that it was left."""
+    page, here = request.form.get("page", "")[:40], the_workbench().open_pages
+    (here.left if request.form.get("left") else here.alive)(page)
+    return "", 204
+
+
+_ASSETS = {
+    "app.css": ("_app", "text/css"), "app.js": ("_app", "text/javascript"), "charts.js": ("_report", "text/javascript")
+}  # fmt: skip
+
+
+@pages.get("/<any('app.css', 'app.js', 'charts.js'):name>")
+def asset(name: str) -> Response:
+    """Send the style sheet or a script."""
+    folder, kind = _ASSETS[name]
+    return Response((data_folder("templates") / folder / name).read_text(encoding="utf-8"), mimetype=kind)
+
+
+@pages.get("/chain.svg")
+def chain_drawing() -> Response | tuple[str, int]:
+    """Draw the chain that words mean, while they are typed; 204 without any."""
+    try:
+        fits = chains_of(request.args.get("words", "")[:200])
+    except InputError:
+        return "", 204
+    if not fits:
+        return "", 204
+    words = "; ".join(f"{chain.name}: {in_words(chain)}" for chain in fits[:3])
+    response = Response(contents.chain_picture(fits[0]), mimetype="image/svg+xml")
+    response.headers["X-Meaning"] = words.encode("ascii", "replace").decode()
+    return response
+
+
+# What the buttons do.
+
+
+def action(name: str, path: str) -> Callable[[Callable[..., str | None]], Callable[..., Any]]:
+    """Make a view of a function that changes a project: it checks the revision, and shows the page again with a problem."""
+
+    def decorate(change: Callable[..., str | None]) -> Callable[..., Any]:
+        @pages.post(f"/projects/<{_NUMBER}:number>/{path}")
+        @functools.wraps(change)
+        def view(number: int, **arguments: int) -> BaseResponse | tuple[str, int]:
+            runner = the_runner(number)
+            try:
+                text = request.form.get("revision", "")
+                state = runner.project.check(int(text) if re.fullmatch(r"[0-9]{1,9}", text) else -1)
+                target = change(runner, state, **arguments)
+            except CompgenError as error:
+                return _page(number, name, 409, problem=str(error))
+            runner.wait(A_MOMENT_S)
+            return redirect(f"/projects/{number}/{target or name}", code=303)
+
+        return view
+
+    return decorate
+
+
+def _field(name: str, most: int = 300) -> str:
+    text = request.form.get(name, "").strip()
+    if len(text) > most or any(ord(char) < 32 for char in text):
+        raise InputError(f"expected one line of at most {most} characters", field=name)
+    return text
+
+
+def _machine_of(state: ProjectState) -> str:
+    if state.machine is None:
+        raise InputError("choose or describe the machine first")
+    return state.machine
+
+
+@action("machine", "machine/choose")
+def choose_machine(runner: Runner, state: ProjectState) -> None:
+    """Take a shipped machine; its file is copied into the project, where its settings can be changed."""
+    name = _field("machine")
+    path = machine_files(()).get(name)
+    if path is None:
+        raise InputError(f"{name!r} is not one of the machines in the list")
+    _store_machine(runner, read_text(path), f"{name}.toml", f"Machine {name}", by_hand="a copy of the shipped file")
+
+
+@action("machine", "machine/upload")
+def upload_machine(runner: Runner, state: ProjectState) -> None:
+    """Take a machine file."""
+    file = next((item for item in request.files.getlist("files") if item.filename), None)
+    if file is None:
+        raise InputError("choose a machine file (*.toml)")
+    name, content = file_name(file.filename or ""), file.stream.read(LARGEST_FORM)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError("is not UTF-8 text; expected a machine file (*.toml)", file=name) from error
+    _store_machine(
+        runner, text, name if name.endswith(".toml") else f"{name}.toml", f"Machine file {name}", by_hand="uploaded"
+    )
+
+
+@action("machine", "machine/describe")
+def describe_machine(runner: Runner, state: ProjectState) -> None:
+    """Write a machine file from the form, as ``volcomp init`` does."""
+    name, chain = _field("name", 60), _field("chain", 200)
+    if not re.fullmatch(r"\w[\w. -]*", name):
+        raise InputError(
+            "a name has letters, digits, blanks, dots and hyphens, and begins with a letter or a digit", field="name"
+        )
+    if not chain:
+        raise InputError("say which body carries which axis", field="chain")
+    words = ["init", name, f"--chain={chain}"]
+    for letter in AXES:
+        low, high = _number(f"{letter}-low"), _number(f"{letter}-high")
+        words.append(f"--travel={letter}={low:g}..{high:g}")
+    words += [f"--control={control}" for control in request.form.getlist("control") if control in CONTROLLERS]
+    values = {}
+    for key in ("reference_point_mm", "tool_offset_mm"):
+        given = [_field(f"{key}-{letter}") for letter in AXES]
+        if any(given):
+            numbers = [_number(f"{key}-{letter}") if part else 0.0 for letter, part in zip(AXES, given, strict=True)]
+            values[key] = contents.toml_value(numbers)
+    folder = runner.project.new_folder("machine")
+    words += [f"--out={folder}", "--json"]
+
+    def finish(step: Step, output: str) -> Step:
+        summary = json.loads(output)
+        path = runner.project.path(summary["file"])
+        text = read_text(path)
+        for key, value in values.items():
+            text = contents.with_value(text, "", key, value)
+        write_file(path, text)
+        load_machine(str(path))
+        by_hand = [f"# in {summary['file']}: {key} = {value}" for key, value in values.items()]
+        data = {"machine": summary["file"], "meaning": summary["meaning"], "by_hand": by_hand}
+        return Step(**{**step.__dict__, "data": data})
+
+    runner.start(
+        "writing the machine file",
+        "machine",
+        [StepTask(Step(0, "machine", f"Machine {name}", [words], folder), finish)],
+    )
+
+
+def _number(name: str) -> float:
+    text = _field(name, 30).replace(",", ".")
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 1e7:
+        raise InputError(f"{text!r} is not a number in mm", field=name)
+    return value
+
+
+@action("machine", "machine/text")
+def edit_machine(runner: Runner, state: ProjectState) -> None:
+    """Take the edited text of the machine file."""
+    text = request.form.get("text", "").replace("\r\n", "\n")
+    name = Path(_machine_of(state)).name
+    _store_machine(
+        runner, text, name if name.endswith(".toml") else f"{name}.toml", "Machine file edited", by_hand="edited"
+    )
+
+
+@action("machine", "machine/settings")
+def change_settings(runner: Runner, state: ProjectState) -> None:
+    """Change settings of a control in the machine file; its comments stay."""
+    path, control = contents.machine_file(runner.project, state), _field("control")
+    if path is None or control not in CONTROLLERS:
+        raise InputError("choose a machine and a control first")
+    text, name = read_text(path), Path(_machine_of(state)).name
+    if f"[controllers.{control}]" not in text:
+        text = f"{text.rstrip()}\n\n[controllers.{control}]\n"
+    changed = []
+    for setting in contents.settings_of(text, control):
+        given = _field(setting.key, 1000)
+        if given == setting.value:
+            continue
+        value = json.dumps(given, ensure_ascii=False) if given and setting.kind == "text" else given
+        text = contents.with_value(text, f"controllers.{control}", setting.key, value)
+        changed.append(f"{setting.key} = {value or 'default'}")
+    target = name if name.endswith(".toml") else f"{name}.toml"
+    _store_machine(
+        runner, text, target, f"Settings of {control}", by_hand=f"[controllers.{control}] {'; '.join(changed)}"
+    )
+
+
+def _store_machine(runner: Runner, text: str, name: str, title: str, by_hand: str) -> None:
+    """Keep a machine file if ``volcomp check`` finds no problem; otherwise it is refused with all of them."""
+    folder = runner.project.new_folder("machine")
+    path = f"{folder}/{name}"
+    write_file(runner.project.path(path), text)
+
+    def finish(step: Step, output: str) -> Step:
+        listed = json.loads(output)["files"][0]
+        if listed["problems"]:
+            raise InputError("\n".join(problem["text"] for problem in listed["problems"]))
+        data = {"machine": path, "by_hand": [f"# {path}: {by_hand}"], "remarks": listed["warnings"]}
+        return Step(**{**step.__dict__, "data": data})
+
+    words = ["check", path, "--kind", "machine", "--json"]
+    runner.start(
+        "checking the machine file", "machine", [StepTask(Step(0, "machine", title, [words], folder), finish, (0, 2))]
+    )
+
+
+@action("measurement", "measurement/add")
+def add_measurements(runner: Runner, state: ProjectState) -> str | None:
+    """Store the dropped files and show what they contain."""
+    after = bool(request.form.get("after"))
+    files = [item for item in request.files.getlist("files") if item.filename]
+    if not files:
+        raise InputError("choose one or more files")
+    if runner.busy:
+        raise InputError("another calculation is running; wait for it or stop it")
+    tasks = []
+    for file in files[:30]:
+        folder = runner.project.new_folder("measurement")
+        path = f"{folder}/{file_name(file.filename or '')}"
+        file.save(runner.project.path(path))
+        tasks.append(_import_task(runner.project, state, path, folder, (), {"after": after}))
+    runner.start("reading the files", "after" if after else "measurement", tasks)
+    return "after" if after else None
+
+
+def _import_task(
+    project: Project, state: ProjectState, path: str, folder: str, answers: Sequence[str], data: dict[str, Any]
+) -> StepTask:
+    """Return the task that shows a file and converts it if nothing is open; a file in the native form is used as it is."""
+    words = ["import", path, *answers, "--json"]
+    try:
+        foreign = native_format(project.path(path)) is None
+    except InputError:
+        foreign = False  # the command says what is wrong
+    if foreign:
+        words += ["--out", f"{folder}/read"]
+    if state.machine is not None:
+        words += ["--machine", state.machine]
+
+    def finish(step: Step, output: str) -> Step:
+        summary = json.loads(output or "{}")
+        if "understood" not in summary:
+            raise InputError(str(summary.get("error") or "the file could not be read"))
+        written = [Path(name).as_posix() for name in summary["files"]]
+        used = written or ([] if foreign else [path])
+        facts = {"file": path, "used": used, "summary": summary, "answers": list(answers), **data}
+        return Step(**{**step.__dict__, "data": facts})
+
+    title = Path(path).name if not answers else f"{Path(path).name}: {' '.join(answers)}"
+    return StepTask(Step(0, "measurement", title, [words], folder), finish, (0, 2))
+
+
+@action("measurement", f"measurement/<{_NUMBER}:item>/answer")
+def answer_questions(runner: Runner, state: ProjectState, item: int) -> str | None:
+    """Read a file again with the answers to what it leaves open."""
+    found = _measurement(state, item)
+    given = [_field(name) for name in request.form if name.startswith("answer-")]
+    typed = [
+        f"--{name.removeprefix('typed-')}={_field(name)}"
+        for name in request.form
+        if name.startswith("typed-") and _field(name)
+    ]
+    answers = [*found.step.data["answers"], *(word for word in given if word), *typed]
+    if not all(contents.is_answer(word) for word in answers):
+        raise InputError("choose one of the answers")
+    folder = runner.project.new_folder("measurement")
+    data = {"after": found.after, "answers_to": found.number}
+    task = _import_task(runner.project, state, found.file, folder, list(dict.fromkeys(answers)), data)
+    runner.start("reading the file again", "after" if found.after else "measurement", [task])
+    return "after" if found.after else None
+
+
+def _measurement(state: ProjectState, number: int) -> Any:
+    found = next((item for item in state.measurements if item.number == number), None)
+    if found is None:
+        raise InputError("this measurement is not in the project any more")
+    return found
+
+
+@action("measurement", f"measurement/<{_NUMBER}:item>/remove")
+def remove_measurement(runner: Runner, state: ProjectState, item: int) -> str | None:
+    """Leave a measurement out; its file stays in the folder."""
+    found = _measurement(state, item)
+    step = Step(0, "removed", f"Without {found.name}", data={"measurement": item, "after": found.after})
+    runner.project.add(step, state.revision)
+    return "after" if found.after else None
+
+
+@action("measurement", "numbers")
+def state_numbers(runner: Runner, state: ProjectState) -> None:
+    """Take numbers that are known without a file, with unit and uncertainty as one types them."""
+    numbers: dict[str, list[str]] = {}
+    for option, names in (("squareness", SQUARENESS_NAMES), ("backlash", AXES), ("scale", AXES)):
+        for name in names:
+            value = _field(f"{option}-{name}", 60)
+            if value:
+                numbers.setdefault(option, []).append(f"{name}={value}")
+    stated = StatedNumbers(**{key: dict(word.split("=", 1) for word in words) for key, words in numbers.items()})
+    stated.reversal()
+    path = contents.machine_file(runner.project, state)
+    if path is None:
+        raise InputError("choose or describe the machine first")
+    stated.errors(load_machine(str(path)))
+    runner.project.add(Step(0, "numbers", "Numbers known without a file", data={"numbers": numbers}), state.revision)
+
+
+def _inputs(state: ProjectState) -> list[str]:
+    """Return machine, measurements and numbers as a command takes them."""
+    machine = _machine_of(state)
+    open_files = [item.name for item in state.measurements if not item.after and not item.used]
+    if open_files:
+        raise InputError(
+            f"{', '.join(open_files)}: not usable yet; page Measurement says what is open. Answer it, or remove the file"
+        )
+    files = state.used_files()
+    numbers = [f"--{option}={word}" for option, words in state.numbers.items() for word in words]
+    if not files and not numbers:
+        raise InputError("add a measurement first")
+    return [machine, *files, *numbers]
+
+
+@action("result", "identify")
+def identify(runner: Runner, state: ProjectState) -> None:
+    """Identify the errors, and write the report."""
+    words = _inputs(state)
+    runner.start("identifying the errors", "result", [_identify_task(runner.project, words)])
+
+
+def _identify_task(project: Project, words: Sequence[str]) -> StepTask:
+    folder = project.new_folder("identify")
+    commands = [["identify", *words, "--out", folder], ["report", folder]]
+    return StepTask(Step(0, "identify", "Errors identified", commands, folder))
+
+
+@action("result", "diagnose")
+def diagnose(runner: Runner, state: ProjectState) -> None:
+    """Look for the effect that explains where model and measurement disagree."""
+    machine, files = _machine_of(state), state.used_files()
+    if not files:
+        raise InputError("add a measurement first: numbers alone have no residuals")
+    folder = runner.project.new_folder("diagnose")
+    words = ["diagnose", machine, *files, "--out", folder]
+    runner.start("looking for missing effects", "result", [StepTask(Step(0, "diagnose", "Diagnosis", [words], folder))])
+
+
+@action("result", "apply")
+def apply_diagnosis(runner: Runner, state: ProjectState) -> None:
+    """Take the machine with the effects that were found, and identify again."""
+    found = state.current("diagnose")
+    if found is None or "extended.toml" not in runner.project.files_of(found):
+        raise InputError("there is no diagnosis of the present measurement that named an effect")
+    machine = f"{found.folder}/extended.toml"
+    state = runner.project.add(
+        Step(0, "machine", "Machine with the effects that were found", data={"machine": machine}), state.revision
+    )
+    runner.start("identifying with the effect", "result", [_identify_task(runner.project, _inputs(state))])
+
+
+@action("tables", "options")
+def options(runner: Runner, state: ProjectState) -> None:
+    """Show side by side what each control would gain."""
+    step = _identified(state)
+    folder = runner.project.new_folder("options")
+    words = ["options", _machine_of(state), f"{step.folder}/identified.errors.csv", "--out", folder]
+    runner.start(
+        "exporting for every control",
+        "tables",
+        [StepTask(Step(0, "options", "Controls side by side", [words], folder))],
+    )
+
+
+def _identified(state: ProjectState) -> Step:
+    step = state.current("identify")
+    if step is None:
+        raise InputError("calculate the result of the present measurement first (page Result)")
+    return step
+
+
+@action("tables", "run")
+def make_tables(runner: Runner, state: ProjectState) -> None:
+    """Make, read back and verify the tables of a control."""
+    words, control = _inputs(state), _control()
+    folder = runner.project.new_folder("tables")
+    words = ["run", *words, "--controller", control, "--out", folder]
+    words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
+    step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control})
+    runner.start(f"tables for {control}", "tables", [StepTask(step)])
+
+
+def _control() -> str:
+    control = _field("control")
+    if control not in CONTROLLERS:
+        raise InputError("choose a control")
+    return control
+
+
+@action("tables", "verify")
+def verify_backup(runner: Runner, state: ProjectState) -> None:
+    """Verify what the control holds: a backup of it against the identified errors."""
+    step, control = _identified(state), _control()
+    files = [item for item in request.files.getlist("files") if item.filename]
+    if not files:
+        raise InputError("choose the backup of the control")
+    if runner.busy:
+        raise InputError("another calculation is running; wait for it or stop it")
+    folder = runner.project.new_folder("verify")
+    (runner.project.path(folder) / "backup").mkdir()
+    paths = [f"{folder}/backup/{k}-{file_name(item.filename or '')}" for k, item in enumerate(files[:50], start=1)]
+    for item, path in zip(files, paths, strict=False):
+        item.save(runner.project.path(path))
+    errors = f"{step.folder}/identified.errors.csv"
+    words = ["verify", _machine_of(state), *paths, "--controller", control, "--errors", errors, "--out", folder]
+    verified = Step(0, "verify", f"Backup of {control} verified", [words], folder, data={"control": control})
+    runner.start("verifying the backup", "tables", [StepTask(verified)])
+
+
+@action("after", "compare")
+def compare(runner: Runner, state: ProjectState) -> None:
+    """Compare a measurement after the correction with one before it."""
+    pair = []
+    for name, what in (("before", "a measurement before"), ("after", "a measurement after")):
+        text = _field(name)
+        item = next((item for item in state.measurements if str(item.number) == text and item.used), None)
+        if item is None:
+            raise InputError(f"choose {what} the correction")
+        pair.append(item)
+    folder = runner.project.new_folder("compare")
+    before, after = (item.used[0] for item in pair)
+    commands = [["compare", _machine_of(state), before, after, "--out", folder], ["report", folder]]
+    step = Step(0, "compare", f"{pair[0].name} against {pair[1].name}", commands, folder)
+    runner.start("comparing before and after", "after", [StepTask(step)])
+
+
+@action("project", "recal")
+def hand_over(runner: Runner, state: ProjectState) -> None:
+    """Write the job file of scheduled recalibration."""
+    name, control, measured = _field("name", 60), _control(), _field("measured")
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise InputError(
+            "a name has letters, digits, dots and hyphens, and begins with a letter or a digit", field="name"
+        )
+    if measured not in ("bare", "active"):
+        raise InputError("say whether the compensation is on while the machine is measured", field="measured")
+    words = ["recal", "add", name, "--machine", _machine_of(state), "--inbox", "inbox", "--controller", control]
+    words += ["--out", "recalibration", "--measured-with", measured, "--job", "recal.toml"]
+    runner.start("writing the job file", "project", [StepTask(Step(0, "recal", f"Recalibration of {name}", [words]))])
+
+
+@action("project", "undo")
+def undo(runner: Runner, state: ProjectState) -> None:
+    """Take back the last step."""
+    if runner.busy:
+        raise InputError("a calculation is running; wait for it or stop it")
+    runner.project.undo(state.revision)
+
+
+@pages.post(f"/projects/<{_NUMBER}:number>/stop")
+def stop(number: int) -> BaseResponse:
+    """Stop what runs; nothing of it is kept."""
+    runner = the_runner(number)
+    page = runner.job.page if runner.job is not None else "project"
+    runner.stop()
+    runner.wait(10.0)
+    return redirect(f"/projects/{number}/{page}", code=303)
+
+
+# Files.
+
+
+def _step(number: int, step: int) -> tuple[Project, Step]:
+    project = the_runner(number).project
+    found = next((item for item in project.state().steps if item.number == step), None)
+    return project, found if found is not None else abort(404, "The project has no such step.")
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/files/<{_NUMBER}:position>")
+def download(number: int, step: int, position: int) -> Response:
+    """Send one file of a step as a download."""
+    project, found = _step(number, step)
+    files = project.files_of(found)
+    if not 1 <= position <= len(files):
+        abort(404, "There is no such file.")
+    name, path = list(files.items())[position - 1]
+    return send_file(path, "application/octet-stream", as_attachment=True, download_name=file_name(name))
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/view/<path:name>")
+def view_page(number: int, step: int, name: str) -> Response:
+    """Send a page that a command wrote: a file in itself, with the script that its own policy names."""
+    project, found = _step(number, step)
+    path = project.files_of(found).get(name)
+    if path is None or not name.endswith(".html"):
+        abort(404, "There is no such page.")
+    text = path.read_text(encoding="utf-8")
+    policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+    hashes = re.findall(r"'sha256-[A-Za-z0-9+/=]{44}'", Markup(text[:3000]).unescape().partition("</head>")[0])
+    response = Response(text, mimetype="text/html")
+    scripts = f"; script-src {' '.join(hashes)}" if hashes else ""
+    response.headers["Content-Security-Policy"] = f"{policy}; frame-ancestors 'none'{scripts}"
+    return response
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/preflight.html")
+def preflight(number: int, step: int) -> Response:
+    """Send the preflight list with boxes to tick: one file, to print or to keep on a phone."""
+    project, found = _step(number, step)
+    path = project.files_of(found).get("preflight.md")
+    if path is None:
+        abort(404, "This step has no preflight list.")
+    response = Response(preflight_page(path), mimetype="text/html")
+    response.headers["Content-Security-Policy"] = (
+        "default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+    )
+    if request.args.get("save"):
+        response.headers["Content-Disposition"] = 'attachment; filename="preflight.html"'
+    return response
+
+
+def preflight_page(path: Path) -> str:
+    """Return the preflight list of an export as a page in one file, with a box at each thing to do."""
+    box = '<input type="checkbox" aria-label="done"> '
+    parts = re.split(r"(<ol[^>]*>.*?</ol>)", str(markdown(read_text(path))), flags=re.DOTALL)
+    ticked = [part.replace("<li>", f'<li class="tick">{box}') if part.startswith("<ol") else part for part in parts]
+    html = re.sub(r"<(/?)h([4-6])>", lambda tag: f"<{tag[1]}h{int(tag[2]) - 3}>", "".join(ticked))
+    html = re.sub(r"<h2>(?=\d)", f'<h2 class="tick">{box}', html)
+    html = html.replace("<table>", '<div class="scroll" tabindex="0"><table>').replace("</table>", "</table></div>")
+    return render_template("preflight.html", body=Markup(html))
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/files.zip")
+def archive(number: int, step: int) -> Response:
+    """Send all files of a step in one archive, with the preflight list to tick."""
+    project, found = _step(number, step)
+    files, content = project.files_of(found), io.BytesIO()
+    if not files:
+        abort(404, "This step has no files.")
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, path in files.items():
+            packed.write(path, f"{found.folder}/{name}")
+        if "preflight.md" in files:
+            packed.writestr(f"{found.folder}/preflight.html", preflight_page(files["preflight.md"]))
+    content.seek(0)
+    return send_file(content, "application/zip", as_attachment=True, download_name=f"{found.folder}.zip")
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/commands.sh")
+def commands(number: int) -> Response:
+    """Send the commands of all steps as a script."""
+    response = Response(the_runner(number).project.script(), mimetype="text/plain")
+    response.headers["Content-Disposition"] = 'attachment; filename="commands.sh"'
+    return response
+
+
+# Checks of every request, error pages, the server.
+
+SAFE = ("GET", "HEAD", "OPTIONS")
+#: Pages that need no session.
+OPEN = ("pages.start", "pages.asset")
+
+
+def make_app(workbench: Workbench) -> Flask:
+    """Return the application."""
+    folder = data_folder("templates") / "_app"
+    app = Flask("compgen.app", static_folder=None, template_folder=str(folder))
+    app.config.update(MAX_CONTENT_LENGTH=LARGEST_UPLOAD, MAX_FORM_MEMORY_SIZE=LARGEST_FORM, MAX_FORM_PARTS=MOST_PARTS)
+    app.jinja_env.autoescape = True
+    app.jinja_env.undefined = StrictUndefined
+    app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
+    app.jinja_env.filters.update(figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable)
+    app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line)
+    app.url_map.converters["number"] = StepNumber
+    app.extensions["compgen"] = workbench
+    app.before_request(_begin_request)
+    app.after_request(_finish)
+    app.teardown_request(lambda _: request.close())  # the temporary files of an upload
+    app.context_processor(lambda: {"csrf": the_workbench().csrf})
+    app.register_error_handler(HTTPException, _http_error)
+    app.register_error_handler(CompgenError, _program_error)
+    app.register_error_handler(Exception, _unexpected)
+    app.register_blueprint(pages)
+    return app
+
+
+def _begin_request() -> None:
+    workbench = the_workbench()
+    g.session = False
+    check_host(request, workbench.settings)
+    check_method(request)
+    g.session = same(request.cookies.get(cookie_name(workbench.settings, "app"), ""), workbench.session)
+    if request.method not in SAFE:
+        check_origin(request, workbench.settings)
+    if request.endpoint in OPEN:
+        return
+    if not g.session:
+        raise Forbidden("Open the address that `volcomp app` printed; it is valid once, for one browser.")
+    if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+        raise Forbidden("This request comes from a page of another program.")
+    if request.method not in SAFE and not same(request.form.get("csrf", ""), workbench.csrf):
+        raise Forbidden("The form does not belong to this session; reload the page.")
+
+
+def _finish(response: Response) -> Response:
+    policy = response.headers.get("Content-Security-Policy", POLICY)
+    for name, value in {**HEADERS, "Content-Security-Policy": policy}.items():
+        response.headers[name] = value
+    return response
+
+
+def _http_error(error: HTTPException) -> Response | HTTPException:
+    code = error.code or 500
+    if code < 400:
+        return error
+    text = error.description or ""
+    if code == 413:
+        text = f"These files are too large: at most {LARGEST_UPLOAD // 1_000_000} MB at once."
+    page = render_template("error.html", title=error.name, text=text, number=0)
+    response = Response(page, code)
+    for name, value in error.get_headers():
+        if name.lower() in ("allow", "retry-after"):
+            response.headers[name] = value
+    return response
+
+
+def _program_error(error: CompgenError) -> tuple[str, int]:
+    return render_template("error.html", title="Not done", text=str(error), number=0), 409
+
+
+def _unexpected(error: Exception) -> tuple[str, int]:
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    where = f"{Path(place.filename).name}:{place.lineno}"
+    print(f"error: internal error: {type(error).__name__}: {error} ({where})", file=sys.stderr)
+    text = "This is a bug in the program; the terminal shows where. What was shown as saved is saved."
+    return render_template("error.html", title="Internal error", text=text, number=0), 500
+
+
+def _figure(value: Any, digits: int = 3) -> str:
+    """Return a number with significant digits, a dash if it is unknown."""
+    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
+        return "\N{EN DASH}"
+    if 0.0 < abs(value) < 1e-3:
+        return "< 0.001"
+    text = f"{value:.{digits}g}" if abs(value) < 10**digits else f"{value:.0f}"
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def _readable(value: Any) -> str:
+    """Return a fact of a file on one line."""
+    if isinstance(value, float):
+        return _figure(value, 6)
+    if isinstance(value, list | tuple):
+        return ", ".join(_readable(item) for item in value)
+    if isinstance(value, dict):
+        return "; ".join(f"{key}: {_readable(item)}" for key, item in value.items())
+    return "\N{EN DASH}" if value is None else str(value)
+
+
+def serve(folder: Path | None, port: int, announce: Callable[[str], None], *, keep_open: bool = False) -> None:
+    """Serve on this computer until the last page is closed, or Ctrl-C; ``announce`` receives the first address.
+
+    Raises
+    ------
+    InputError
+        for a folder that cannot be a project, and a port in use.
+    """
+    import _thread
+
+    import waitress  # type: ignore[import-untyped]  # shipped without type information
+
+    workbench = Workbench(DashboardSettings("", port=port))
+    if folder is not None:
+        workbench.open(folder)
+    app = make_app(workbench)
+    try:
+        server = waitress.create_server(
+            app, host="127.0.0.1", port=port, threads=8, ident=None, max_request_body_size=LARGEST_UPLOAD,
+            connection_limit=300, asyncore_use_poll=True, channel_timeout=60,
+        )  # fmt: skip
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used: {error.strerror or error}", field="--port") from error
+    workbench.settings = DashboardSettings("", port=int(server.effective_port))
+
+    def watch() -> None:
+        while True:
+            time.sleep(0.5)
+            if workbench.open_pages.over() and not any(runner.busy for runner in workbench.projects):
+                _thread.interrupt_main()
+                return
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    if not keep_open:
+        threading.Thread(target=watch, daemon=True).start()
+    announce(f"http://127.0.0.1:{server.effective_port}/start?token={workbench.ticket}")
+    try:
+        server.run()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.close()
+        workbench.close()

@@ -1,0 +1,480 @@
+"""A project: a folder with the files of the contract, the list of its steps, and the command that runs.
+
+Every step is a command of ``volcomp``, run as a process of its own in the folder of the project, so what the pages show can
+be repeated from a shell. ``project.json`` lists the steps with a revision that grows with every change: who changes the
+project states the revision that was seen, and is refused if it is not the present one. A step has the folder
+``NN-kind``; undoing the last one moves it to ``undone/``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+import unicodedata
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from compgen.data.files import json_text, read_bytes, write_file
+from compgen.errors import InputError
+
+PROJECT, UNDONE, LOCK = "project.json", "undone", ".project.lock"
+#: A project file of another program version with another form is refused.
+FORM = 1
+#: Longest list of steps, bytes.
+LARGEST_PROJECT = 20_000_000
+#: A stopped command is ended by force after this time, s.
+STOP_S = 5.0
+#: Lines of a command's messages that are kept.
+MOST_LINES = 500
+#: Exit codes of a command that has written its result: accepted or not.
+DONE = (0, 1)
+
+
+class StaleError(InputError):
+    """The project was changed by another window after the page had been made."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: its command lines (words after ``volcomp``), its folder, the exit code, and facts of its kind."""
+
+    number: int
+    kind: str
+    title: str
+    commands: Sequence[Sequence[str]] = ()
+    folder: str = ""
+    exit_code: int = 0
+    seconds: float = 0.0
+    time: str = ""
+    warnings: Sequence[str] = ()
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A measurement file of the project: ``step`` that shows it, files that commands take, and open questions."""
+
+    number: int
+    name: str
+    file: str
+    used: Sequence[str]
+    step: Step
+    after: bool
+
+    @property
+    def questions(self) -> Sequence[str]:
+        """What the file leaves open."""
+        found: Sequence[str] = self.step.data["summary"]["doubts"]
+        return found
+
+
+@dataclass(frozen=True)
+class ProjectState:
+    """All steps of a project, and what follows from them."""
+
+    revision: int
+    steps: tuple[Step, ...]
+
+    def last(self, kind: str) -> Step | None:
+        """Return the latest step of a kind, None without one."""
+        return next((step for step in reversed(self.steps) if step.kind == kind), None)
+
+    @property
+    def machine(self) -> str | None:
+        """Name or file of the machine as commands take it."""
+        step = self.last("machine")
+        return None if step is None else str(step.data["machine"])
+
+    @property
+    def numbers(self) -> Mapping[str, Sequence[str]]:
+        """Numbers known without a file, by option."""
+        step = self.last("numbers")
+        return {} if step is None else step.data["numbers"]
+
+    @property
+    def measurements(self) -> list[Measurement]:
+        """Measurement files that were not removed, each as its latest step has it."""
+        found: dict[int, Measurement] = {}
+        for step in self.steps:
+            if step.kind == "measurement":
+                number = int(step.data.get("answers_to", step.number))
+                known = found.get(number)
+                name = known.name if known else step.title
+                file, after = str(step.data["file"]), bool(step.data.get("after"))
+                found[number] = Measurement(number, name, file, tuple(step.data["used"]), step, after)
+            elif step.kind == "removed":
+                found.pop(int(step.data["measurement"]), None)
+        return list(found.values())
+
+    def used_files(self, *, after: bool = False) -> list[str]:
+        """Files that a calculation takes, of before or after the correction."""
+        return [file for item in self.measurements if item.after == after for file in item.used]
+
+    def current(self, kind: str) -> Step | None:
+        """Return the latest step of a kind if nothing that it depends on has changed since, otherwise None."""
+        step = self.last(kind)
+        if step is None or any(
+            other.number > step.number and other.kind in ("machine", "numbers", "removed", "measurement")
+            and not other.data.get("after") for other in self.steps
+        ):  # fmt: skip
+            return None
+        return step
+
+
+def file_name(given: str) -> str:
+    r"""Return a safe name for an uploaded file: one part, letters, digits, dot, underscore and hyphen.
+
+    >>> file_name("../../etc/pass wd"), file_name(".rtl"), file_name("C:\\x\\Z Achse.rtl")
+    ('pass_wd', 'rtl', 'Z_Achse.rtl')
+    """
+    last = re.split(r"[/\\]", unicodedata.normalize("NFC", given))[-1]
+    name = re.sub(r"[^\w.-]", "_", last).lstrip(".-")
+    stem, dot, suffix = name.partition(".")
+    if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", stem):
+        stem = f"_{stem}"
+    while len((stem + dot + suffix).encode()) > 120 and len(stem) + len(suffix) > 2:
+        stem, suffix = (stem[:-1], suffix) if len(stem) >= len(suffix) else (stem, suffix[1:])
+    return stem + dot + suffix or "file"
+
+
+class Project:
+    """The folder of a project; several processes may have it open."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._lock = threading.RLock()
+
+    @classmethod
+    def open(cls, folder: str | Path) -> Project:
+        """Open a project, or make one in a folder that is empty or does not exist.
+
+        Raises
+        ------
+        InputError
+            for a folder with other files, or one that cannot be written to.
+        """
+        path = Path(folder).expanduser()
+        try:
+            path = path.resolve()
+            path.mkdir(parents=True, exist_ok=True)
+            listed = [item.name for item in path.iterdir() if item.name != LOCK]
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"cannot be used as the folder of a project: {reason}", file=path) from error
+        project = cls(path)
+        if PROJECT in listed:
+            project.state()
+        elif listed:
+            raise InputError(
+                f"has {len(listed)} other files; choose an empty folder, a new name, or a folder with {PROJECT}",
+                file=path,
+            )
+        else:
+            project._write(ProjectState(0, ()))
+        return project
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.folder.name
+
+    def state(self) -> ProjectState:
+        """Read the steps; InputError for a file that is damaged or of another form."""
+        path = self.folder / PROJECT
+        try:
+            found = json.loads(read_bytes(path, LARGEST_PROJECT))
+            if found["form"] != FORM:
+                raise InputError(f"has the form {found['form']}; this program reads form {FORM}", file=path)
+            return ProjectState(int(found["revision"]), tuple(Step(**step) for step in found["steps"]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"is not the list of steps of a project: {error}", file=path) from error
+
+    def _write(self, state: ProjectState) -> None:
+        content = {"form": FORM, "revision": state.revision, "steps": [asdict(step) for step in state.steps]}
+        write_file(self.folder / PROJECT, json_text(content))
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[ProjectState]:
+        """Keep other threads and processes out while the list of steps changes."""
+        with self._lock, (self.folder / LOCK).open("a") as stream:
+            try:
+                import fcntl
+
+                fcntl.flock(stream, fcntl.LOCK_EX)
+            except ImportError:  # a system without such locks
+                pass
+            yield self.state()
+
+    def check(self, revision: int) -> ProjectState:
+        """Return the steps; StaleError if ``revision`` is not the present one."""
+        state = self.state()
+        if state.revision != revision:
+            raise StaleError("the project was changed in another window; reload this page, then do it again")
+        return state
+
+    def new_folder(self, kind: str) -> str:
+        """Make the folder of the next step and return its name."""
+        with self._alone() as state:
+            taken = [int(found[1]) for item in self.folder.iterdir() if (found := re.match(r"(\d+)-", item.name))]
+            number = max([0, *taken, *(step.number for step in state.steps)]) + 1
+            name = f"{number:02d}-{kind}"
+            (self.folder / name).mkdir()
+            return name
+
+    def add(self, step: Step, revision: int | None = None) -> ProjectState:
+        """Append a step: its number is that of its folder, or the next one."""
+        with self._alone() as state:
+            if revision is not None and revision != state.revision:
+                raise StaleError("the project was changed in another window; reload this page, then do it again")
+            taken = [item.number for item in state.steps]
+            number = int(step.folder.partition("-")[0]) if step.folder else max([0, *taken]) + 1
+            now = datetime.now(UTC).isoformat(timespec="seconds")
+            step = Step(**{**asdict(step), "number": number, "time": now})
+            state = ProjectState(state.revision + 1, tuple(sorted((*state.steps, step), key=lambda item: item.number)))
+            self._write(state)
+            return state
+
+    def undo(self, revision: int) -> Step:
+        """Remove the last step from the list and move its folder to ``undone/``."""
+        with self._alone() as state:
+            if revision != state.revision:
+                raise StaleError("the project was changed in another window; reload this page, then do it again")
+            if not state.steps:
+                raise InputError("there is no step to undo")
+            step = state.steps[-1]
+            self._write(ProjectState(state.revision + 1, state.steps[:-1]))
+            if step.folder:
+                self.set_aside(step.folder)
+            return step
+
+    def set_aside(self, name: str) -> None:
+        """Move the folder of a step to ``undone/``, under a name that is free; an empty one is removed."""
+        folder, count = self.folder / name, 1
+        if not folder.is_dir():
+            return
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+            return
+        (self.folder / UNDONE).mkdir(exist_ok=True)
+        while (target := self.folder / UNDONE / (name if count == 1 else f"{name}-{count}")).exists():
+            count += 1
+        folder.rename(target)
+
+    def path(self, name: str) -> Path:
+        """Return a path within the project; InputError for one that leads out of it."""
+        path = (self.folder / name).resolve()
+        if not path.is_relative_to(self.folder):
+            raise InputError("is not in the folder of the project", file=name)
+        return path
+
+    def files_of(self, step: Step) -> dict[str, Path]:
+        """Return the files of a step by their path within its folder; links that lead out of it are left out."""
+        root = self.path(step.folder) if step.folder else None
+        if root is None or not root.is_dir():
+            return {}
+        return {
+            path.relative_to(root).as_posix(): path
+            for path in sorted(root.rglob("*"))
+            if path.is_file() and not path.name.startswith(".") and path.resolve().is_relative_to(root)
+        }
+
+    def facts(self, step: Step | None, name: str) -> dict[str, Any]:
+        """Return the JSON object in a file of a step, {} if there is none."""
+        path = None if step is None else self.files_of(step).get(name)
+        if path is None:
+            return {}
+        with contextlib.suppress(ValueError):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            return found if isinstance(found, dict) else {}
+        return {}
+
+    def script(self) -> str:
+        """Return what was done as a script for a shell."""
+        lines = ["#!/bin/sh", "# What was done in this project, by the commands that did it.", "set -e"]
+        lines += [f"cd {shlex.quote(str(self.folder))}"]
+        for step in self.state().steps:
+            lines += ["", f"# {step.number}. {' '.join(step.title.split())}", *step.data.get("by_hand", ())]
+            for words in step.commands:
+                ends = f" || [ $? -eq {step.exit_code} ]" if step.exit_code and words is step.commands[0] else ""
+                lines.append(command_line(words) + ends)
+        return "\n".join(lines) + "\n"
+
+
+def command_line(words: Sequence[str]) -> str:
+    """Return a command as one would type it."""
+    return shlex.join(["volcomp", *words])
+
+
+# Commands that run.
+
+
+@dataclass(frozen=True)
+class StepTask:
+    """A step to run, without its result; ``finish`` completes it from what its last command printed.
+
+    ``codes`` are the exit codes of its commands with which it is kept.
+    """
+
+    step: Step
+    finish: Callable[[Step, str], Step] | None = None
+    codes: Sequence[int] = DONE
+
+
+@dataclass
+class Progress:
+    """What runs, or ran last: its tasks, the line that it printed last, and how it ended."""
+
+    title: str
+    page: str
+    began: float = field(default_factory=time.monotonic)
+    ended: float | None = None
+    stopped: bool = False
+    line: str = ""
+    problems: list[str] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Time since it began, or that it took."""
+        return (time.monotonic() if self.ended is None else self.ended) - self.began
+
+
+def arguments_for(words: Sequence[str]) -> list[str]:
+    """Return the words that start a command as a process of this Python; ``-v`` prints each of its steps."""
+    return [sys.executable, "-m", "compgen", "-v", *words]
+
+
+def environment() -> dict[str, str]:
+    """Return the environment of a command: one thread, UTF-8, and no plain-text colours."""
+    return {**os.environ, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "400"}
+
+
+class Runner:
+    """Runs the commands of one project, one job at a time."""
+
+    def __init__(self, project: Project) -> None:
+        self.project = project
+        self.job: Progress | None = None
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[str] | None = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job runs."""
+        return self.job is not None and self.job.ended is None
+
+    def start(self, title: str, page: str, tasks: Sequence[StepTask]) -> None:
+        """Begin a job; InputError while another one runs."""
+        with self._lock:
+            if self.busy:
+                raise InputError("another calculation is running; wait for it or stop it")
+            self.job = Progress(title, page)
+            self._thread = threading.Thread(target=self._work, args=(self.job, tasks), daemon=True)
+            self._thread.start()
+
+    def wait(self, seconds: float) -> None:
+        """Wait for the end of the job, at most this long."""
+        if self._thread is not None:
+            self._thread.join(seconds)
+
+    def stop(self) -> None:
+        """End the job; nothing of the command that runs is kept."""
+        job = self.job
+        if job is not None and job.ended is None:
+            job.stopped = True
+            self._end()
+
+    def _end(self) -> None:
+        process = self._process
+        if process is None or process.poll() is not None:
+            return
+        _signal(process, signal.SIGTERM)
+        try:
+            process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            _signal(process, getattr(signal, "SIGKILL", signal.SIGTERM))
+
+    def _work(self, job: Progress, tasks: Sequence[StepTask]) -> None:
+        try:
+            for task in tasks:
+                try:
+                    if not job.stopped:
+                        self._run(job, task)
+                except InputError as error:
+                    job.problems.append(str(error))
+            recorded = {step.folder for step in self.project.state().steps}
+            for task in tasks:
+                if task.step.folder and task.step.folder not in recorded:
+                    self.project.set_aside(task.step.folder)
+        except Exception as error:  # a job must end, whatever happens in it
+            job.problems.append(f"internal error: {type(error).__name__}: {error}")
+        finally:
+            job.ended = time.monotonic()
+
+    def _run(self, job: Progress, task: StepTask) -> None:
+        """Run the commands of a task and record its step, unless it was stopped or failed."""
+        began, output, messages, code = time.monotonic(), "", [], 0
+        for words in task.step.commands:
+            output, said, code = self._command(job, words)
+            messages += said
+            if job.stopped:
+                return
+            if code not in task.codes:
+                errors = [line.removeprefix("error: ") for line in said if line.startswith("error: ")]
+                job.problems.append("\n".join(errors) or f"volcomp {words[0]} ended with exit code {code}")
+                return
+        told = [line.partition(": ")[2] for line in messages if line.startswith(("warning: ", "question: "))]
+        found = {"exit_code": code, "seconds": round(time.monotonic() - began, 2), "warnings": told}
+        step = Step(**{**asdict(task.step), **found})
+        self.project.add(step if task.finish is None else task.finish(step, output))
+
+    def _command(self, job: Progress, words: Sequence[str]) -> tuple[str, list[str], int]:
+        """Run one command; return what it printed, its messages, and its exit code."""
+        job.line = f"volcomp {words[0]}"
+        with self._lock:
+            if job.stopped:
+                return "", [], 130
+            self._process = process = subprocess.Popen(
+                arguments_for(words), cwd=self.project.folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE, text=True, encoding="utf-8", errors="replace", env=environment(),
+                start_new_session=True,
+            )  # fmt: skip
+        messages: list[str] = []
+
+        def listen() -> None:
+            assert process.stderr is not None
+            for line in process.stderr:
+                text = line.rstrip()
+                if found := re.match(r"\s*[\d.]+ s  (.+)", text):
+                    job.line = found[1]
+                elif text and len(messages) < MOST_LINES:
+                    messages.append(text)
+
+        listener = threading.Thread(target=listen, daemon=True)
+        listener.start()
+        with process:
+            assert process.stdout is not None
+            output = process.stdout.read()
+            code = process.wait()
+        listener.join(STOP_S)
+        return output, messages, code
+
+
+def _signal(process: subprocess.Popen[str], number: int) -> None:
+    """Send a signal to a command and to the processes that it started."""
+    with contextlib.suppress(OSError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, number)
+        else:
+            process.terminate()

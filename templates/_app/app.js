@@ -1,0 +1,101 @@
+"use strict";
+// What the pages of the workbench do in the browser: they say that they are open, show the progress of a command, take
+// dropped files, and draw the chain of a machine while it is typed. Everything else is made by the server.
+(function () {
+  var body = document.body, root = document.documentElement;
+  var csrf = body.dataset.csrf, project = body.dataset.project;
+
+  function send(path, values, leaving) {
+    var form = new FormData();
+    form.append("csrf", csrf);
+    Object.keys(values).forEach(function (key) { form.append(key, values[key]); });
+    if (leaving) { navigator.sendBeacon(path, form); return Promise.resolve(); }
+    return fetch(path, { method: "POST", body: form }).catch(function () {});
+  }
+
+  // light and dark
+  var theme = document.getElementById("theme"), wanted = window.matchMedia("(prefers-color-scheme: dark)");
+  function isDark() { return root.dataset.theme ? root.dataset.theme === "dark" : wanted.matches; }
+  function nameTheme() { theme.setAttribute("aria-pressed", String(isDark())); }
+  try { if (localStorage.getItem("theme")) { root.dataset.theme = localStorage.getItem("theme"); } } catch (error) { /* not kept */ }
+  theme.addEventListener("click", function () {
+    root.dataset.theme = isDark() ? "light" : "dark";
+    try { localStorage.setItem("theme", root.dataset.theme); } catch (error) { /* not kept */ }
+    nameTheme();
+  });
+  nameTheme();
+
+  // the program ends when the last page is closed
+  var page = Array.from(crypto.getRandomValues(new Uint32Array(3))).join("-");
+  function alive() { send("/alive", { page: page }); }
+  alive();
+  setInterval(alive, 20000);
+  window.addEventListener("pageshow", function (event) { if (event.persisted) { alive(); } });
+  window.addEventListener("pagehide", function () { send("/alive", { page: page, left: "yes" }, true); });
+
+  // progress, and changes by another window
+  var job = document.getElementById("job"), stale = document.getElementById("stale"), busy = body.dataset.busy === "yes";
+  function ask() {
+    fetch("/projects/" + project + "/status").then(function (answer) { return answer.json(); }).then(function (status) {
+      if (busy && !status.busy) { location.reload(); return; }
+      if (status.busy) {
+        job.hidden = false;
+        document.getElementById("job-title").textContent = status.title;
+        document.getElementById("job-line").textContent = status.line;
+        document.getElementById("job-seconds").textContent = status.seconds.toFixed(0) + " s";
+      } else if (String(status.revision) !== body.dataset.revision) { stale.hidden = false; }
+      if (status.busy && !busy) { stale.hidden = false; }
+      setTimeout(ask, busy ? 500 : 3000);
+    }).catch(function () { setTimeout(ask, 3000); });
+  }
+  if (project) {
+    stale.querySelector("a").href = location.pathname;
+    setTimeout(ask, busy ? 300 : 3000);
+  }
+
+  // files that are dropped become those of the form
+  document.querySelectorAll("[data-drop]").forEach(function (form) {
+    var input = form.querySelector("input[type=file]");
+    ["dragenter", "dragover"].forEach(function (name) {
+      form.addEventListener(name, function (event) { event.preventDefault(); form.classList.add("over"); });
+    });
+    form.addEventListener("dragleave", function () { form.classList.remove("over"); });
+    form.addEventListener("drop", function (event) {
+      event.preventDefault();
+      form.classList.remove("over");
+      if (event.dataTransfer.files.length) {
+        input.files = event.dataTransfer.files;
+        if (!form.querySelector("select")) { form.requestSubmit(); }
+      }
+    });
+  });
+  // a file dropped beside a form must not replace the page
+  ["dragover", "drop"].forEach(function (name) { document.addEventListener(name, function (event) { event.preventDefault(); }); });
+
+  // a button is pressed once
+  document.querySelectorAll("form").forEach(function (form) {
+    form.addEventListener("submit", function () {
+      setTimeout(function () { form.querySelectorAll("button").forEach(function (button) { button.disabled = true; }); }, 0);
+    });
+  });
+  window.addEventListener("pageshow", function () {
+    document.querySelectorAll("button[disabled]").forEach(function (button) { button.disabled = false; });
+  });
+
+  // the chain, while it is typed
+  var chain = document.getElementById("chain"), drawing = document.getElementById("drawing"), waiting = 0;
+  function draw() {
+    fetch("/chain.svg?words=" + encodeURIComponent(chain.value)).then(function (answer) {
+      if (answer.status !== 200) { return; }
+      document.getElementById("meaning").textContent = answer.headers.get("X-Meaning");
+      answer.text().then(function (text) {
+        var found = new DOMParser().parseFromString(text, "text/html").querySelector("svg");
+        drawing.replaceChildren(document.importNode(found, true));
+      });
+    }).catch(function () {});
+  }
+  if (chain) {
+    chain.addEventListener("input", function () { clearTimeout(waiting); waiting = setTimeout(draw, 150); });
+    if (chain.value) { draw(); }
+  }
+})();

@@ -1,0 +1,259 @@
+"""The job in the workbench, by its forms: every button, what it writes, and that the commands shown are what was done."""
+
+import csv
+import hashlib
+import io
+import json
+import shlex
+import shutil
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+
+import app_site as helper
+
+from compgen.data.machine import load_machine
+from compgen.kinematics import modelled_errors
+
+ROOT = Path(__file__).resolve().parents[2]
+IMPORTS = ROOT / "tests" / "golden" / "imports"
+MILL = {
+    "name": "my-mill", "chain": "table moves in X and Y, head in Z", "X-low": "0", "X-high": "400", "Y-low": "0",
+    "Y-high": "400", "Z-low": "-240", "Z-high": "0", "control": "siemens-cec",
+}  # fmt: skip
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = helper.Site(tmp_path / "project")
+    yield made
+    made.workbench.close()
+
+
+def upload(*paths, **fields):
+    return {**fields, "files": [(io.BytesIO(Path(path).read_bytes()), Path(path).name) for path in paths]}
+
+
+def values(project, step, name="identified.errors.csv"):
+    """Values of an errors file by error and position, um or urad."""
+    text = project.files_of(step)[name].read_text()
+    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
+    return {(row["error"], row["position_mm"] and float(row["position_mm"])): float(row["value"]) for row in rows}
+
+
+#: Means of both directions of the example of ISO 230-2 (tests/golden/imports/README.md), zero at the reference point, um.
+MEANS = {0.0: 0.0, 100.0: 3.5, 200.0: -2.0, 300.0: -4.5, 400.0: 3.0}
+
+
+def test_laser_files_and_a_square_become_tables_and_the_commands_shown_do_the_same(site, tmp_path):
+    """Laser .rtl of one axis, readings of another that do not name it, and squareness as a number."""
+    state = site.do("machine/describe", {**MILL, "reference_point_mm-Y": "0", "tool_offset_mm-Z": "-80,5"})
+    text = (site.project.folder / state.machine).read_text()
+    assert "tool_offset_mm = [0.0, 0.0, -80.5]" in text
+    assert "from the reference of the spindle to the tip" in text
+    state = site.do("measurement/add", upload(IMPORTS / "linear.rtl", IMPORTS / "ecmc_ISO230.dat"))
+    x, y = state.measurements
+    assert (x.name, list(x.questions)) == ("linear.rtl", [])
+    assert y.questions
+    page = site.get("/projects/1/measurement").text
+    assert page.count("Runs along") == 4  # X, and what each of three answers would mean
+    assert "does not state X, Y or Z" in page
+    assert "not usable yet" in site.post("/projects/1/identify").text
+    state = site.do(f"measurement/{y.number}/answer", {"answer-1": "--axis=Y"})
+    assert [item.questions for item in state.measurements] == [[], []]
+    site.do("numbers", {"squareness-EC0Y": "25±3"})
+    state = site.do("identify")
+    found = values(site.project, state.last("identify"))
+    for name in ("EXX", "EYY"):
+        assert {place: found[name, place] for place in MEANS} == pytest.approx(MEANS, abs=1e-9)
+    assert found["EC0Y", ""] == pytest.approx(25.0)
+    page = site.get("/projects/1/result").text
+    assert "3</strong> errors identified" in page
+    assert "EZZ: no file contains it" in page
+
+    state = site.do("run", {"control": "siemens-cec", "allow-misfit": "on"})
+    step = state.last("run")
+    result = json.loads(site.project.files_of(step)["result.json"].read_text())
+    page = site.get("/projects/1/tables").text
+    assert result["headline"].split(";")[0].replace("'", "&#39;") in page
+    assert result["measured"]["determined"] == 3
+    packed = zipfile.ZipFile(io.BytesIO(site.get(f"/projects/1/steps/{step.number}/files.zip").data))
+    assert f"{step.folder}/manifest.json" in packed.namelist()
+    assert f"{step.folder}/preflight.html" in packed.namelist()
+    for file in result["files"]:
+        assert hashlib.sha256(packed.read(f"{step.folder}/{file['name']}")).hexdigest() == file["sha256"]
+
+    # the same commands, in another folder
+    other = tmp_path / "again"
+    shutil.copytree(site.project.folder, other)
+    for done in (state.last("identify"), step):
+        shutil.rmtree(other / done.folder)
+        for words in done.commands:
+            line = shlex.split(shlex.join(["volcomp", *words]))[1:]
+            again = subprocess.run([sys.executable, "-m", "compgen", *line], cwd=other, capture_output=True, text=True)
+            assert again.returncode in (0, 1), again.stderr
+        for name in ("identified.errors.csv", "NC_CEC.INI", "fitted.errors.csv"):
+            if (site.project.folder / done.folder / name).exists():
+                assert (other / done.folder / name).read_bytes() == (
+                    site.project.folder / done.folder / name
+                ).read_bytes()
+    assert "volcomp run 01-machine/my-mill.toml" in site.get("/projects/1/commands.sh").text
+
+    # what the control holds afterwards, from a backup of it
+    tables = next(path for name, path in site.project.files_of(step).items() if name.endswith("NC_CEC.INI"))
+    state = site.do("verify", upload(tables, control="siemens-cec"))
+    again = json.loads(site.project.files_of(state.last("verify"))["result.json"].read_text())
+    assert again["after"]["rms_um"] == pytest.approx(result["after"]["rms_um"], rel=0.5, abs=0.05)
+    assert "Backup of siemens-cec" in site.get("/projects/1/tables").text
+
+
+def test_tracer_lengths_on_a_shipped_machine_and_the_controls_side_by_side(site):
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    name, content = helper.few_lengths()
+    site.do("measurement/add", {"files": [(io.BytesIO(content), name)]})
+    state = site.do("identify")
+    assert {name for name, _ in values(site.project, state.last("identify"))} == set(
+        modelled_errors(load_machine("zha-gantry"))
+    )
+    page = site.get("/projects/1/result").text
+    assert "17</strong> errors identified" in page
+    assert page.count('class="picture "') == 14
+    state = site.do("run", {"control": "isg-csv"})
+    result = json.loads(site.project.files_of(state.last("run"))["result.json"].read_text())
+    assert result["verdict"] == "accepted"
+    assert "state-accepted" in site.get("/projects/1/tables").text
+    state = site.do("options")
+    page = site.get("/projects/1/tables").text
+    options = json.loads(site.project.files_of(state.last("options"))["options.json"].read_text())
+    assert all(row["controller"] in page for row in options["controls"])
+
+
+def test_a_second_measurement_is_compared_with_the_first(site, tmp_path):
+    site.do("machine/describe", MILL)
+    site.do("measurement/add", upload(IMPORTS / "linear.rtl"))
+    first = site.project.state().measurements[0].used[0]
+    lines = (site.project.folder / first).read_text().splitlines()
+    head = next(k for k, line in enumerate(lines) if line.startswith("axis"))
+    place = lines[head].split(",").index("deviation_um")
+    after = lines[: head + 1]
+    for line in lines[head + 1 :]:
+        cells = line.split(",")
+        cells[place] = f"{0.05 * float(cells[place]):.6f}"
+        after.append(",".join(cells))
+    (tmp_path / "after.axis.csv").write_text("\n".join(after) + "\n")
+    state = site.do("measurement/add", upload(tmp_path / "after.axis.csv", after="yes"))
+    assert [item.after for item in state.measurements] == [False, True]
+    assert state.used_files() == [first]
+    before, later = state.measurements
+    state = site.do("compare", {"before": str(before.number), "after": str(later.number)})
+    compared = json.loads(site.project.files_of(state.last("compare"))["compare.json"].read_text())
+    assert compared["verdict"] == "better"
+    assert compared["figures"]["X"]["A"]["factor"] == pytest.approx(20.0, rel=0.05)
+    page = site.get("/projects/1/after").text
+    assert '<span class="badge">better</span>' in page
+    report = next(name for name in site.project.files_of(state.last("compare")) if name == "report.html")
+    assert report in page
+
+
+def test_a_hidden_effect_is_named_and_added_and_the_residual_shrinks(site, tmp_path):
+    """Circles of a machine with lost motion, which the errors of the machine cannot express."""
+    import math
+
+    rows = ["plane,angle_deg,radius_mm,deviation_um,direction,run"]
+    for run in (1, 2):
+        for direction in (1, -1):
+            for k in range(0, 360, 2):
+                angle = math.radians(k + 0.5)
+                # lost motion of X, 12 um, centred: half of it against the last direction of travel
+                moving = -math.copysign(1.0, math.sin(angle)) * direction
+                radial = -6.0 * moving * math.cos(angle) + 0.05 * math.sin(7.0 * k + 31 * run + 5 * direction)
+                rows.append(f"XY,{math.degrees(angle):.4f},100,{radial:.5f},{direction},{run}")
+    (tmp_path / "xy.circle.csv").write_text("\n".join(rows) + "\n")
+    site.do("machine/describe", MILL)
+    site.do("measurement/add", upload(tmp_path / "xy.circle.csv"))
+    assert "Circle XY" in site.get("/projects/1/measurement").text
+    site.do("identify")
+    state = site.do("diagnose")
+    found = json.loads(site.project.files_of(state.last("diagnose"))["diagnosis.json"].read_text())
+    page = site.get("/projects/1/result").text
+    assert found["verdict"] == "named"
+    assert all(effect["name"] in page for effect in found["effects"])
+    assert ("Add it to the machine" in page) == ("extended.toml" in site.project.files_of(state.last("diagnose")))
+
+
+def test_a_file_that_cannot_be_read_is_refused_in_words_and_the_others_are_taken(site, tmp_path):
+    (tmp_path / "bad.axis.csv").write_text("axis,position_mm,direction,run,deviation_um\nX,0,1,1,ten\n")
+    (tmp_path / "noise.bin").write_bytes(bytes(range(256)) * 40)
+    answer = site.post(
+        "/projects/1/measurement/add", upload(tmp_path / "bad.axis.csv", IMPORTS / "linear.rtl", tmp_path / "noise.bin")
+    )
+    assert answer.status_code == 303
+    page = site.get("/projects/1/measurement").text
+    assert "bad.axis.csv:2: column deviation_um: &#39;ten&#39; is not a number" in page
+    assert "noise.bin:1: contains NUL bytes" in page
+    assert [item.name for item in site.project.state().measurements] == ["linear.rtl"]
+    assert sorted(path.name for path in (site.project.folder / "undone").iterdir()) == [
+        "01-measurement",
+        "03-measurement",
+    ]
+
+
+def test_a_machine_file_with_problems_is_not_kept_and_all_problems_are_shown(site):
+    state = site.do("machine/describe", MILL)
+    text = (site.project.folder / state.machine).read_text()
+    wrong = text.replace("nodes = 5", "nodes = 1").replace("chain =", "chian =")
+    site.post("/projects/1/machine/text", {"text": wrong})
+    assert any("chian" in item and "nodes" in item for item in site.runner.job.problems)
+    assert "chian" in site.get("/projects/1/machine").text
+    assert site.project.state().machine == state.machine
+    state = site.do("machine/settings", {"control": "siemens-cec", "sign": "correction", "profile": "828D"})
+    kept = (site.project.folder / state.machine).read_text()
+    assert 'sign = "correction"' in kept
+    assert 'profile = "828D"' in kept
+    assert len(kept.splitlines()) == len(text.splitlines())
+    state = site.do("machine/settings", {"control": "fanuc-pitch", "axis_numbers": "{ X = 1, Y = 3, Z = 2 }"})
+    assert "[controllers.fanuc-pitch]" in (site.project.folder / state.machine).read_text()
+    site.post("/projects/1/machine/settings", {"control": "fanuc-pitch", "detection_unit_um": "one"})
+    assert site.runner.job.problems
+    assert site.project.state().machine == state.machine
+
+
+def test_positions_outside_the_travel_are_shown_where_the_file_is(site):
+    site.do("machine/describe", {**MILL, "X-high": "250"})
+    site.do("measurement/add", upload(IMPORTS / "linear.rtl"))
+    page = site.get("/projects/1/measurement").text
+    assert "positions of X range from 0 to 400 mm, but my-mill travels from 0 to 250 mm" in page
+    assert site.project.state().used_files() == []
+
+
+def test_undo_brings_back_the_state_before_and_reopening_keeps_it(site):
+    site.do("machine/describe", MILL)
+    site.do("measurement/add", upload(IMPORTS / "linear.rtl"))
+    site.do("identify")
+    before = site.project.state()
+    site.do("measurement/2/remove")
+    assert site.project.state().current("identify") is None
+    assert "Calculate again" in site.get("/projects/1/result").text
+    site.do("undo")
+    assert site.project.state().steps == before.steps
+    again = helper.Site(site.project.folder)
+    assert again.project.state().steps == before.steps
+    assert "1</strong> errors identified" in again.get("/projects/1/result").text
+
+
+def test_the_job_file_of_recalibration_can_be_read(site):
+    from compgen.fleet.job import read_job
+
+    site.do("machine/describe", MILL)
+    site.do("recal", {"name": "mill-1", "control": "siemens-cec", "measured": "bare"})
+    job = read_job(site.project.folder / "recal.toml")
+    assert list(job.machines) == ["mill-1"]
+    assert job.machines["mill-1"].measured_with == "bare"
+    assert "volcomp recal run --job recal.toml" in site.get("/projects/1/project").text

@@ -1,0 +1,267 @@
+"""Attacks on the workbench: other sites, other programs on the computer, crafted addresses, forms and files."""
+
+import io
+import re
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+
+import app_site as helper
+
+from compgen.app import pages
+from compgen.app.pages import OpenPages
+from compgen.app.project import Step
+
+IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
+#: Every address that changes something.
+CHANGES = (
+    "/open", "/projects/1/machine/choose", "/projects/1/machine/describe", "/projects/1/machine/text",
+    "/projects/1/machine/upload", "/projects/1/machine/settings", "/projects/1/measurement/add",
+    "/projects/1/measurement/1/answer", "/projects/1/measurement/1/remove", "/projects/1/numbers", "/projects/1/identify",
+    "/projects/1/diagnose", "/projects/1/apply", "/projects/1/options", "/projects/1/run", "/projects/1/verify",
+    "/projects/1/compare", "/projects/1/recal", "/projects/1/undo", "/projects/1/stop", "/alive",
+)  # fmt: skip
+SHOWN = (
+    "/", "/projects/1/", "/projects/1/machine", "/projects/1/measurement", "/projects/1/result", "/projects/1/tables",
+    "/projects/1/after", "/projects/1/project", "/projects/1/status", "/projects/1/commands.sh", "/chain.svg?words=WXYFZT",
+    "/projects/1/steps/1/files/1", "/projects/1/steps/1/files.zip", "/projects/1/steps/1/view/report.html",
+    "/projects/1/steps/1/preflight.html",
+)  # fmt: skip
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = helper.Site(tmp_path / "project")
+    folder = made.project.new_folder("identify")
+    for name in ("report.html", "a.csv"):
+        (made.project.folder / folder / name).write_text(f"<p>{name}</p>")
+    (made.project.folder / folder / "preflight.md").write_text("# List\n\n1. <script>alert(1)</script> do it\n")
+    made.project.add(Step(0, "identify", "<script>alert(1)</script>", folder=folder))
+    yield made
+    made.workbench.close()
+
+
+def everything(site):
+    """All files of the project and their contents."""
+    return {path: path.read_bytes() for path in sorted(site.project.folder.rglob("*")) if path.is_file()}
+
+
+def test_every_address_that_changes_something_is_in_the_list(site):
+    rules = site.client.application.url_map.iter_rules()
+    known = {re.sub(r"<[^>]+>", "1", rule.rule) for rule in rules if "POST" in rule.methods}
+    assert known == set(CHANGES)
+
+
+def test_the_first_address_is_valid_once_and_for_one_browser(tmp_path):
+    site = helper.Site(tmp_path / "project", start=False)
+    ticket = site.workbench.ticket
+    assert site.get("/projects/1/machine").status_code == 403
+    for wrong in ("", "x", ticket[:-1], ticket + "x", "\u00e9"):
+        assert site.get("/start", query_string={"token": wrong}).status_code == 403
+    answer = site.get(f"/start?token={ticket}")
+    assert answer.status_code == 303
+    cookie = answer.headers["Set-Cookie"]
+    assert "HttpOnly" in cookie
+    assert "SameSite=Strict" in cookie
+    assert ticket not in cookie
+    assert site.get("/projects/1/machine").status_code == 200
+    other = site.client.application.test_client()
+    assert other.get(f"/start?token={ticket}", base_url=site.url).status_code == 403
+    assert other.get("/projects/1/machine", base_url=site.url).status_code == 403
+
+
+@pytest.mark.parametrize("path", SHOWN)
+def test_nothing_is_shown_without_the_session_to_another_name_or_to_another_site(site, path):
+    stranger = site.client.application.test_client()
+    assert stranger.get(path, base_url=site.url).status_code == 403
+    assert site.get(path).status_code in (200, 303)
+    assert site.client.get(path, base_url=site.url, headers={"Host": "evil.example:8765"}).status_code == 421
+    for kind in ("cross-site", "same-site"):
+        assert site.get(path, headers={"Sec-Fetch-Site": kind}).status_code == 403
+
+
+@pytest.mark.parametrize("path", CHANGES)
+def test_nothing_is_changed_without_session_token_and_origin(site, path):
+    before, data = (
+        everything(site),
+        {"csrf": site.workbench.csrf, "revision": "1", "folder": "/tmp", "machine": "zha-gantry"},
+    )
+    origin = {"Origin": site.url}
+    stranger = site.client.application.test_client()
+    assert stranger.post(path, base_url=site.url, data=data, headers=origin).status_code == 403
+    for headers in ({}, {"Origin": "null"}, {"Origin": "http://evil.example"}, {"Origin": "http://127.0.0.1:8766"},
+                    {"Origin": site.url, "Sec-Fetch-Site": "cross-site"}, {"Origin": "http://localhost:8765"}):  # fmt: skip
+        assert site.post(path, data, headers=headers, fields=False).status_code == 403
+    for token in ("", "x", site.workbench.csrf[:-1], site.workbench.session):
+        assert site.post(path, {**data, "csrf": token}, fields=False).status_code == 403
+    assert site.client.get(path, base_url=site.url).status_code in (404, 405)
+    for method in ("PUT", "DELETE", "PATCH", "TRACE", "PROPFIND"):
+        assert site.client.open(path, method=method, base_url=site.url, headers=origin, data=data).status_code == 405
+    assert everything(site) == before
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/projects/1/steps/1/files/0", "/projects/1/steps/1/files/9", "/projects/1/steps/1/files/01", "/projects/0/machine",
+     "/projects/2/machine", "/projects/1/steps/2/files.zip", "/projects/1/steps/1/view/../../project.json",
+     "/projects/1/steps/1/view/..%2f..%2fproject.json", "/projects/1/steps/1/view/%2fetc%2fpasswd",
+     "/projects/1/steps/1/view/a.csv", "/projects/1/steps/1/view/preflight.md", "/app.js/../project.json", "/_parts.html",
+     "/projects/\u0661/machine", "/projects/1/steps/1/files/-1", "/projects/1/evil", "/projects/1/steps/99999999/files/1"],
+)  # fmt: skip
+def test_no_address_leads_to_another_file(site, path):
+    answer = site.get(path, follow_redirects=True)  # a doubled slash leads to the address without
+    assert answer.status_code == 404
+    assert '"steps"' not in answer.text
+    assert "root:" not in answer.text
+
+
+def test_every_answer_has_the_headers_and_no_page_has_a_script_in_itself(site):
+    for path in (*SHOWN, "/nowhere", "/app.js", "/app.css", "/charts.js", "/start?token=x"):
+        answer = site.get(path)
+        policy = answer.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "script-src 'unsafe-inline'" not in policy
+        assert "frame-ancestors 'none'" in policy
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+        assert answer.headers["Cache-Control"] == "no-store"
+        if path.endswith((".sh", ".zip", "/files/1")):
+            assert answer.mimetype in ("text/plain", "application/zip", "application/octet-stream")
+            assert "attachment" in answer.headers["Content-Disposition"]
+            continue
+        kinds = re.findall(r"<script[^>]*>", answer.text)
+        assert all('src="/' in kind or "application/json" in kind for kind in kinds), path
+        assert not re.search(r"\son[a-z]+=", answer.text), path
+        assert not re.search(r"(src|href)=[\"']?(https?:)?//", answer.text), path
+
+
+def test_names_and_contents_of_files_are_shown_as_text(site):
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    evil = b"axis,position_mm,direction,run,deviation_um,<img src=x onerror=alert(1)>\nX,-800,1,1,1,2\nX,0,1,1,2,2\n"
+    files = [(io.BytesIO(evil), '"><script>alert(1)</script>.axis.csv')]
+    site.post("/projects/1/measurement/add", {"files": files})
+    site.post("/projects/1/numbers", {"squareness-EC0Y": "<script>alert(1)</script>"})
+    for name in pages.PAGES:
+        text = site.get(f"/projects/1/{name}").text
+        assert "<script>alert" not in text
+        assert "<img" not in text
+    for path in (site.project.folder).rglob("*"):
+        assert path.resolve().is_relative_to(site.project.folder)
+
+
+@pytest.mark.parametrize("field", ["squareness-EC0Y", "backlash-X", "scale-Y"])
+@pytest.mark.parametrize("value", ["ten", "--out=/tmp", "1;2", "nan", "\x1b[2J", "1" * 400, "25\n--keep-all"])
+def test_numbers_that_are_none_are_refused_before_any_command(site, field, value):
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    before = site.project.state()
+    answer = site.post("/projects/1/numbers", {field: value})
+    assert answer.status_code == 409
+    assert site.project.state() == before
+
+
+@pytest.mark.parametrize(
+    "answer",
+    ["--out=/tmp/x", "--machine=/etc/passwd", "--plugin=/tmp/evil.py", "-v", "X", "--axis", "--axis=X\n--out=y"],
+)
+def test_answers_are_options_of_questions_only(site, answer):
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    file = (io.BytesIO((IMPORTS / "angular.rta").read_bytes()), "a.rta")
+    site.do("measurement/add", {"files": [file]})
+    number = site.project.state().measurements[0].number
+    before = site.project.state()
+    assert site.post(f"/projects/1/measurement/{number}/answer", {"answer-1": answer}).status_code == 409
+    assert site.project.state() == before
+
+
+@pytest.mark.parametrize("name", ["../evil", "-x", "a/b", "a\nb", "", "x" * 70, "$(id)", "a;b"])
+def test_names_of_machines_are_names(site, name):
+    form = {
+        "name": name,
+        "chain": "WXYFZT",
+        "X-low": "0",
+        "X-high": "1",
+        "Y-low": "0",
+        "Y-high": "1",
+        "Z-low": "0",
+        "Z-high": "1",
+    }
+    assert site.post("/projects/1/machine/describe", form).status_code == 409
+    assert site.post("/projects/1/recal", {"name": name, "control": "isg-csv", "measured": "bare"}).status_code == 409
+    assert site.project.state().machine is None
+
+
+def test_too_large_requests_and_forms_of_every_shape_are_refused_without_a_fault(site, monkeypatch):
+    before = everything(site)
+    monkeypatch.setitem(site.client.application.config, "MAX_CONTENT_LENGTH", 100_000)
+    big = {"files": [(io.BytesIO(b"x" * 200_000), "big.csv")]}
+    assert site.post("/projects/1/measurement/add", big).status_code == 413
+    for body, kind in (
+        (b"\xff\xfe%ff=%80&csrf=%00", "application/x-www-form-urlencoded"),
+        (b'{"csrf": 1}', "application/json"),
+        (b"--x\r\nbroken", "multipart/form-data; boundary=x"),
+        (b"x", "multipart/form-data"),
+        (b"&".join(b"a%d=1" % k for k in range(1500)), "application/x-www-form-urlencoded"),
+    ):
+        for path in CHANGES:
+            answer = site.client.post(
+                path, base_url=site.url, data=body, content_type=kind, headers={"Origin": site.url}
+            )
+            assert answer.status_code in (400, 403, 413), (path, body[:20])
+    assert everything(site) == before
+
+
+def test_a_revision_that_is_old_or_no_number_changes_nothing(site):
+    before = everything(site)
+    for revision in ("0", "", "-1", "x", "1.0", "\u0661", "99", "1 "):
+        answer = site.post("/projects/1/machine/choose", {"revision": revision, "machine": "zha-gantry"})
+        assert answer.status_code == 409
+        assert "another window" in answer.text
+    assert everything(site) == before
+
+
+def test_a_job_that_runs_is_alone_and_can_be_stopped(site):
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    name, content = helper.few_lengths()
+    site.do("measurement/add", {"files": [(io.BytesIO(content), name)]})
+    before = site.project.state()
+    form = {"csrf": site.workbench.csrf, "revision": str(before.revision)}
+    sent = {"base_url": site.url, "headers": {"Origin": site.url}}
+    assert site.client.post("/projects/1/diagnose", data=form, **sent).status_code == 303
+    until = time.monotonic() + helper.PATIENCE_S
+    while not site.get("/projects/1/status").json["line"].startswith(("fitting", "building")):
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    assert site.client.post("/projects/1/identify", data=form, **sent).status_code == 409
+    assert site.client.post("/projects/1/undo", data=form, **sent).status_code == 409
+    process = site.runner._process
+    assert site.client.post("/projects/1/stop", data=form, **sent).status_code == 303
+    assert process.poll() is not None
+    assert site.project.state() == before
+    assert "Stopped: looking for missing effects" in site.get("/projects/1/result").text
+    assert not any("diagnose" in path.name for path in site.project.folder.iterdir())
+
+
+def test_the_program_ends_after_the_last_page_was_closed(monkeypatch):
+    now = [1000.0]
+    monkeypatch.setattr(pages.time, "monotonic", lambda: now[0])
+    open_pages = OpenPages()
+    now[0] += 1e6
+    assert not open_pages.over()  # nobody has opened a page yet
+    open_pages.alive("a")
+    open_pages.alive("b")
+    open_pages.left("a")
+    now[0] += 60.0
+    assert not open_pages.over()
+    open_pages.left("b")
+    assert not open_pages.over()  # it may follow a link
+    now[0] += pages.GRACE_S + 0.1
+    assert open_pages.over()
+    open_pages.alive("c")
+    now[0] += pages.SILENT_S - 1.0
+    assert not open_pages.over()
+    now[0] += 2.0
+    assert open_pages.over()  # a browser that was killed says nothing

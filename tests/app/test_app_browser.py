@@ -1,0 +1,242 @@
+"""The workbench in a real browser: the whole job, questions, stop, reopen, two windows, the end; accessibility by axe."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("websocket", reason="websocket-client is not installed: the workbench is not opened in a browser")
+pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the workbench is not tested")
+
+import app_site
+import browser as helper
+
+pytestmark = pytest.mark.skipif(
+    helper.program() is None,
+    reason="chromium is not installed (.ci/system-packages): the workbench is not opened in it",
+)
+ROOT = Path(__file__).resolve().parents[2]
+IMPORTS = ROOT / "tests" / "golden" / "imports"
+AXE = (Path(__file__).parent / "axe-core" / "axe.min.js").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    running = helper.Browser(tmp_path_factory.mktemp("browser"))
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    made = app_site.Served(tmp_path / "project")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def page(browser, site):
+    browser.call("Network.clearBrowserCookies")
+    found = app_site.Page(browser, site.url)
+    found.visit(site.start)
+    return found
+
+
+def complaints(browser, url):
+    """What the browser complains about, and what it asked others for."""
+    found = [
+        str(e["params"]) for e in browser.events if e.get("method") in ("Log.entryAdded", "Runtime.exceptionThrown")
+    ]
+    asked = [e["params"]["request"]["url"] for e in browser.events if e.get("method") == "Network.requestWillBeSent"]
+    return found + [address for address in asked if not address.startswith((f"{url}/", "data:"))]
+
+
+def barriers(browser):
+    """What axe finds against WCAG 2.2, levels A and AA, on the present page: rule and element."""
+    browser.ask(AXE + ";undefined")
+    found = browser.ask(
+        "axe.run(document, {runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']}).then(result => "
+        "result.violations.flatMap(v => v.nodes.map(n => v.id + ': ' + n.target.join(' ') + ' ' + n.failureSummary)))"
+    )
+    return found
+
+
+def describe(page, control="siemens-cec"):
+    page.write("#name", "my-mill")
+    page.write("#chain", "table moves in X and Y, head in Z")
+    for letter, low, high in (("X", "0", "400"), ("Y", "0", "400"), ("Z", "-240", "0")):
+        page.write(f"[name={letter}-low]", low)
+        page.write(f"[name={letter}-high]", high)
+    page.choose("#control", control)
+    page.press("Save the machine")
+
+
+def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, browser):
+    """Every page on the way is looked at by axe, in light and dark, wide and narrow."""
+    seen = []
+
+    def look(name):
+        assert complaints(browser, site.url) == []
+        for dark, width in ((False, 1280), (True, 1280), (False, 1000), (False, 2000)):
+            browser.picture(width=width, dark=dark)
+            wide = browser.ask(
+                "[...document.querySelectorAll('main *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1 &&"
+                " !e.closest('.scroll, pre, .canvas')).map(e => e.outerHTML.slice(0, 100))"
+            )
+            assert wide == [], (name, width)
+            if width == 1280:
+                assert barriers(browser) == [], (name, dark)
+        browser.picture()
+        seen.append(name)
+
+    look("no machine")
+    describe(page)
+    assert "Table moves in X, on a carriage in Y, on the bed; head moves in Z" in page.text()
+    look("machine")
+    page.press("Next: the measurement")
+    page.files("#files-before", IMPORTS / "linear.rtl", IMPORTS / "ecmc_ISO230.dat")
+    page.press("Add")
+    assert "does not state X, Y or Z" in page.text()
+    look("questions")
+    browser.ask("document.querySelector('input[type=radio][value=\"--axis=Y\"]').click()")
+    page.press("Read it with these answers")
+    browser.ask("document.querySelector('#squareness-EC0Y').closest('details').open = true")
+    page.write("#squareness-EC0Y", "25±3")
+    page.press("Save the numbers")
+    look("measurement")
+    page.press("Next: the result")
+    page.press("Calculate")
+    assert "3 errors identified" in page.text()
+    look("result")
+    page.press("Next: the tables")
+    browser.ask("document.querySelector('[name=allow-misfit]').click()")
+    page.press("Make and verify")
+    assert "3 of 17 errors measured" in page.text()
+    look("tables")
+    folder = site.project.state().last("run").folder
+    assert (site.project.folder / folder / "manifest.json").is_file()
+    for path in re.findall(
+        r'href="(/projects/1/steps/\d+/(?:view/report.html|preflight.html))"', browser.ask("document.body.innerHTML")
+    ):
+        page.visit(path)
+        assert complaints(browser, site.url) == []
+        if "preflight" in path:
+            browser.picture(width=390)
+            assert browser.ask("document.documentElement.scrollWidth <= 390")
+            assert browser.ask("document.querySelectorAll('input[type=checkbox]').length") > 5
+            assert barriers(browser) == []
+            browser.picture()
+    page.visit("/projects/1/project")
+    assert "volcomp run 01-machine/my-mill.toml" in page.text()
+    look("project")
+    page.visit("/projects/1/after")
+    look("after")
+    assert len(seen) == 8
+
+
+def test_the_drawing_follows_the_words_while_they_are_typed(page, browser):
+    shown = {}
+    for words in ("table moves in X and Y, head in Z", "Portal in Y, Kopf in X und Z", "WZXYFT"):
+        page.write("#chain", words)
+        until = time.monotonic() + app_site.PATIENCE_S
+        while (drawn := browser.ask("document.querySelector('#drawing svg')?.outerHTML")) in (None, *shown.values()):
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        shown[words] = drawn
+    assert "table does not move" in shown["Portal in Y, Kopf in X und Z"]
+    assert "WZXYFT" in browser.ask("document.getElementById('meaning').textContent")
+
+
+def test_a_refused_file_is_explained_where_it_was_dropped(page, browser, tmp_path):
+    describe(page)
+    (tmp_path / "bad.axis.csv").write_text("axis,position_mm,direction,run,deviation_um\nX,0,1,1,ten\n")
+    page.visit("/projects/1/measurement")
+    page.files("#files-before", tmp_path / "bad.axis.csv")
+    page.press("Add")
+    assert "bad.axis.csv:2: column deviation_um: 'ten' is not a number" in page.text()
+    assert browser.ask("document.querySelectorAll('article').length") == 0
+
+
+def test_a_diagnosis_shows_its_progress_and_can_be_stopped(page, site, browser):
+    page.press("Choose")
+    browser.ask("document.querySelector('#shipped').value = 'zha-gantry'")
+    page.press("Choose")
+    page.visit("/projects/1/measurement")
+    page.files("#files-before", ROOT / "examples" / "zha-gantry.lengths.csv")
+    page.press("Add")
+    page.visit("/projects/1/result")
+    page.press("Calculate")
+    assert "17 errors identified" in page.text()
+    steps = site.project.state().steps
+    page._then(
+        lambda: browser.ask("[...document.querySelectorAll('button')].find(e => e.textContent === 'Diagnose').click()")
+    )
+    lines = set()
+    until = time.monotonic() + app_site.PATIENCE_S
+    while not any("candidate" in line or "noise" in line for line in lines):
+        assert time.monotonic() < until, lines
+        lines.add(browser.ask("document.getElementById('job-line').textContent"))
+        time.sleep(0.1)
+    page.press("Stop")
+    assert "Stopped: looking for missing effects" in page.text()
+    assert site.project.state().steps == steps
+    assert "17 errors identified" in page.text()
+
+
+def test_of_two_windows_on_one_project_the_second_is_told(page, site, browser, tmp_path):
+    """Another window, of another program on the same folder, changes something; this one does not overwrite it."""
+    describe(page)
+    revision = site.project.state().revision
+    other = app_site.Site(site.project.folder)
+    other.do("measurement/add", {"files": [((IMPORTS / "linear.rtl").open("rb"), "linear.rtl")]})
+    browser.ask("document.querySelector('form[action$=choose] button').closest('form').requestSubmit()")
+    until = time.monotonic() + app_site.PATIENCE_S
+    while "changed in another window" not in page.text():
+        assert time.monotonic() < until
+        time.sleep(0.1)
+    state = site.project.state()
+    assert state.revision == revision + 1
+    assert [step.kind for step in state.steps] == ["machine", "measurement"]
+    assert state.machine.endswith("my-mill.toml")
+
+
+def test_the_program_is_stopped_and_opened_again_and_ends_with_its_last_page(browser, tmp_path, monkeypatch):
+    """The command itself: its address, killed without warning, opened again, and closed by closing the page."""
+
+    def start():
+        command = [sys.executable, "-m", "compgen", "app", str(tmp_path / "project"), "--no-browser"]
+        variables = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONUNBUFFERED": "1"}
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=variables)
+        address = re.search(r"http://127\.0\.0\.1:\d+/start\?token=\S+", process.stdout.readline())[0]
+        return process, address
+
+    first, address = start()
+    try:
+        page = app_site.Page(browser, address.partition("/start")[0])
+        page.visit(address)
+        describe(page)
+        shown = page.text()
+    finally:
+        first.kill()
+        first.communicate()
+    second, address = start()
+    try:
+        page = app_site.Page(browser, address.partition("/start")[0])
+        page.visit(address)
+        page.visit("/projects/1/machine")
+        assert "my-mill" in page.text()
+        assert page.text().split("Controls")[0] == shown.split("Controls")[0]
+        page.visit("about:blank")
+        second.communicate(timeout=app_site.PATIENCE_S)
+        assert second.returncode == 0
+    finally:
+        if second.poll() is None:
+            second.send_signal(signal.SIGKILL)
+            second.communicate()
