@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from decimal import ROUND_CEILING, Decimal
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from compgen.controls.shared.grids import (
     common_step,
     curve_nodes_mm,
     equidistant_grid,
+    grid_of_step,
     nearly_best,
     worth_mm,
 )
@@ -80,7 +82,9 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
     wanted_mm = term.start
     loss_mm = max(worth_mm(errors, axis, settings.loss_mm), NEGLIGIBLE_COUNTS * settings.count_mm(axis))
     flat: list[tuple[float, EquidistantGrid]] = []
-    grids = _grids(machine, settings, errors, axis, most)
+    places_mm = (*machine.axes[axis].range_mm, machine.reference_point_mm[axis])
+    common = common_step(machine, errors, axis, anchor=True)
+    grids = _grids(places_mm, common, settings.least_interval_mm, settings.interval_quantum_mm, most)
     for grid in grids:
         at_ends_mm = _extended(grid.nodes_mm, nodes_mm, wanted_mm)
         largest = float(np.max(np.abs(np.diff(at_ends_mm)))) / settings.count_mm(axis)
@@ -93,32 +97,28 @@ def pitch_grid(machine: Machine, settings: PitchSettings, errors: ErrorTable, ax
     return nearly_best(flat) or grids[-1]
 
 
+@lru_cache(maxsize=16)  # hundreds of intervals, for the tables, their verification and the report
 def _grids(
-    machine: Machine, settings: PitchSettings, errors: ErrorTable, axis: int, most: int
+    places_mm: tuple[float, float, float], common: Decimal, least_mm: float, quantum_mm: Decimal, most: int
 ) -> list[EquidistantGrid]:
-    """Possible section ends, by number of sections; only the widest sections if none stays within ``most``."""
-    common = common_step(machine, errors, axis, anchor=True)
-    steps = {_step_mm(machine, settings, axis, intervals) for intervals in range(1, most)}
+    """Possible section ends, by number of sections; only the widest sections if none stays within ``most``.
+
+    ``places_mm`` are the travel ends and the reference point, ``common`` the step of the curves' nodes, ``least_mm`` and
+    ``quantum_mm`` the least interval and the unit of intervals.
+    """
+    low_mm, high_mm, _ = places_mm
+    steps = set()
+    for intervals in range(1, most):
+        # travel over the intervals, rounded up to a writable value, not below the least interval
+        length = Decimal(repr(round(max((high_mm - low_mm) / intervals, least_mm), 9))) / quantum_mm
+        steps.add(float(max(Decimal(1), length.to_integral_value(rounding=ROUND_CEILING)) * quantum_mm))
     parts = [common / part for part in range(1, 11)]
-    steps |= {
-        float(step) for step in parts if step >= settings.least_interval_mm and step % settings.interval_quantum_mm == 0
-    }
-    count_most = machine.axes[axis].length_mm / most
-    grids = [
-        equidistant_grid(machine, errors, axis, most=most, step_mm=step, anchor=True)
-        for step in steps
-        if step > count_most
-    ]
+    steps |= {float(step) for step in parts if step >= least_mm and step % quantum_mm == 0}
+    low, high, origin = (Decimal(repr(place)) for place in places_mm)
+    count_most = (high_mm - low_mm) / most
+    grids = [grid_of_step(low, high, origin, Decimal(repr(step))) for step in steps if step > count_most]
     grids = sorted(grids, key=lambda grid: (grid.count, grid.step))
     return [grid for grid in grids if grid.count <= most] or grids[:1]
-
-
-def _step_mm(machine: Machine, settings: PitchSettings, axis: int, intervals: int) -> float:
-    """Travel over ``intervals``, rounded up to a writable value, not below the least interval."""
-    quantum = settings.interval_quantum_mm
-    length = max(machine.axes[axis].length_mm / intervals, settings.least_interval_mm)
-    steps = Decimal(repr(round(length, 9))) / quantum
-    return float(max(Decimal(1), steps.to_integral_value(rounding=ROUND_CEILING)) * quantum)
 
 
 def _extended(position_mm: FloatArray, nodes_mm: FloatArray, value: FloatArray) -> FloatArray:

@@ -34,7 +34,7 @@ from compgen.controls.shared.base import (
     coverage_violations,
     nodes_by_axis,
 )
-from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.controls.shared.grids import curve_nodes_mm, kept_by_numbers
 from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
@@ -284,6 +284,7 @@ class Polyline:
     square: float
 
 
+@kept_by_numbers
 def best_polyline(
     candidates_mm: FloatArray, position_mm: FloatArray, requested: FloatArray, weight: FloatArray
 ) -> Polyline:

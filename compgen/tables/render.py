@@ -271,8 +271,8 @@ def _inert(value: Any) -> Any:
         return one_line(value)
     if isinstance(value, Mapping):
         return {key: _inert(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_inert(item) for item in value]
+    if isinstance(value, list | tuple):  # tables have thousands of numbers
+        return [item if type(item) is float or type(item) is int else _inert(item) for item in value]
     return value
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, Decimal
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, wraps
 from itertools import product
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,9 +22,27 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.kinematics.first_order import coefficients
 
+Result = TypeVar("Result")
+
+
+def kept_by_numbers(calculation: Callable[..., Result]) -> Callable[..., Result]:
+    """Keep the last results of a calculation with arrays and numbers: several tables and controls have the same nodes."""
+
+    @lru_cache(maxsize=64)
+    def result_of(arguments: bytes) -> Result:
+        return calculation(*pickle.loads(arguments))
+
+    @wraps(calculation)
+    def wrapper(*arguments: Any) -> Result:
+        return copy(result_of(pickle.dumps(arguments)))
+
+    return wrapper
+
+
 # Fewest nodes of a polyline that stays within tolerance of the curves: a shortest path over candidate nodes.
 
 
+@kept_by_numbers
 def fewest_nodes(
     position_mm: FloatArray, values: FloatArray, tolerances: FloatArray, required: Sequence[int] = ()
 ) -> list[int]:
@@ -169,7 +189,7 @@ def equidistant_grid(
     low, high = (Decimal(repr(end)) for end in machine.axes[axis].range_mm)
     travel = low, high, Decimal(repr(machine.reference_point_mm[axis])) if anchor else low
     if step_mm is not None:
-        return _grid(*travel, Decimal(repr(step_mm)))
+        return grid_of_step(*travel, Decimal(repr(step_mm)))
     curves = [
         _ToleratedCurve.of(machine, name, curve, loss_mm) for name, curve in _curves_of(errors, axis, machine, output)
     ]
@@ -180,7 +200,7 @@ def equidistant_grid(
         tried.append((max((item.loss(nodes_mm) for item in curves), default=0.0), grid))
         if tried[-1][0] <= 1.0:
             return grid
-    return nearly_best(tried) or _grid(*travel, _round_up(high - low))
+    return nearly_best(tried) or grid_of_step(*travel, _round_up(high - low))
 
 
 def nearly_best(tried: Sequence[tuple[float, EquidistantGrid]]) -> EquidistantGrid | None:
@@ -269,7 +289,7 @@ def _candidates(
     steps = {_round_up(length / count) for count in counts if count < most}
     parts = (common / part for part in range(1, 11))
     steps |= {step for step in parts if step % STEP_QUANTUM == 0 and length / step <= most}
-    grids = [_grid(low, high, origin, step) for step in steps]
+    grids = [grid_of_step(low, high, origin, step) for step in steps]
     return tuple(sorted((grid for grid in grids if grid.count <= most), key=lambda grid: (grid.count, grid.step)))
 
 
@@ -284,7 +304,8 @@ def _round_up(step: Decimal) -> Decimal:
     return max(step.quantize(STEP_QUANTUM, rounding=ROUND_CEILING), STEP_QUANTUM)
 
 
-def _grid(low: Decimal, high: Decimal, origin: Decimal, step: Decimal) -> EquidistantGrid:
+def grid_of_step(low: Decimal, high: Decimal, origin: Decimal, step: Decimal) -> EquidistantGrid:
+    """Return the nodes a whole number of steps from the origin that cover the travel from ``low`` to ``high``."""
     below = math.ceil((origin - low) / step)
     above = math.ceil((high - origin) / step)
     return EquidistantGrid(origin - below * step, step, below + above + 1)
