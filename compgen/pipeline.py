@@ -35,6 +35,7 @@ from compgen.identify.any_measurement import (
 )
 from compgen.identify.options import StatedNumbers
 from compgen.identify.reversal_errors import SIGNIFICANT
+from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES
 
 if TYPE_CHECKING:
@@ -263,7 +264,7 @@ def verified_export(
 
     What the export itself could not express (an active limit) is a reason, too.
     """
-    with working_folder() as staging:
+    with working_folder() as staging, one_thread():
         output = OutputFolder(staging)
         names = exported.add_to(output, accepted=True)
         paths = output.commit()

@@ -74,7 +74,8 @@ class SmallMotion:
     def taken_out(self, values: FloatArray) -> FloatArray:
         """Remove the motion from a field (n, 3) or (3 n,), or from each of k fields, (3 n, k)."""
         flat = values.reshape(len(self.fields), -1)
-        return np.asarray((flat - self.fields @ (self.reading @ flat)).reshape(values.shape))
+        motion = self.fields @ (self.reading @ flat)
+        return np.subtract(flat, motion, out=motion).reshape(values.shape)
 
     def taken_out_of_weights(self, weight: FloatArray) -> FloatArray:
         """Return weights that give on a field what ``weight`` (n, 3) gives on it without the motion (transpose)."""

@@ -19,6 +19,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import CompgenWarning, InputError
+from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES, program_version
 from compgen.tables.render import Format, companion_files, errors_context, load_format, render, render_files
 from compgen.tables.synthesis import Projector, best_values, projector
@@ -252,8 +253,9 @@ def export(
     control = controller_named(controller)(machine)
     card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(errors)
-    solver = projector(machine, basis, anchored=control.anchored)
-    tables = control.build(basis, table_values(control, machine, errors, solver))
+    with one_thread():
+        solver = projector(machine, basis, anchored=control.anchored)
+        tables = control.build(basis, table_values(control, machine, errors, solver))
     rest = reversal
     if reversal is not None:
         in_tables = control.reversal_in_tables(reversal)

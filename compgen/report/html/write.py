@@ -27,6 +27,7 @@ from compgen.data.machine import Machine
 from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError
+from compgen.kinematics.kernel_switch import one_thread
 from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
     describe_error,
@@ -825,9 +826,11 @@ def build_report(folder: str | Path, language: str = LANGUAGES[0], known: KnownT
     InputError
         if the folder contains no results, or one of its files cannot be read.
     """
-    source = read_folder(folder, known)
-    data = json_values(content(source))
-    page = render_page(source, data, draw(source, data), language=language)
+    with one_thread():
+        source = read_folder(folder, known)
+        data = json_values(content(source))
+        pictures = draw(source, data)
+    page = render_page(source, data, pictures, language=language)
     record = calibration_record(data)
     dossier = dossier_data(data)
     return Report(
