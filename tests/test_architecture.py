@@ -19,6 +19,7 @@ ORDER = (
     ("fit",),
     ("controls",),
     ("tables",),
+    ("programs",),
     ("accuracy",),
     ("foreign",),
     ("diagnose",),

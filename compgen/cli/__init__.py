@@ -47,6 +47,9 @@ _COMMANDS = {
         "merge": "Merge old tables and new errors into one set of tables.",
         "crash-test": "Feed wrong tables to the verification and check that each is rejected.",
     },
+    "program_commands": {
+        "correct": "Correct an NC program for the errors of one machine, read it back and judge it.",
+    },
     "plan_commands": {
         "plan": "Plan a measurement: what it will determine, and how well.",
         "simulate": "Simulate a machine and its measurement.",

@@ -82,6 +82,7 @@ class OutputFolder:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         self._contents: dict[str, bytes] = {}
+        self._copies: dict[str, Path] = {}
         self._aside: list[str] = []
         try:
             existing = self.folder
@@ -107,6 +108,10 @@ class OutputFolder:
         """Add ``content`` (text is encoded as UTF-8, line ends kept) for the file ``name``."""
         self._contents[name] = content.encode("utf-8") if isinstance(content, str) else content
 
+    def add_file(self, name: str, source: Path) -> None:
+        """Add a copy of the file ``source``, which may be large, as the file ``name``; it is read by ``commit``."""
+        self._copies[name] = source
+
     def set_aside(self, name: str) -> Path:
         """Keep the existing file ``name`` under the returned name, which overwrites no other file."""
         self._aside.append(name)
@@ -114,7 +119,8 @@ class OutputFolder:
 
     def commit(self) -> dict[str, Path]:
         """Write everything and return the path of each file by name."""
-        paths = {name: self.folder / name for name in self._contents}
+        contents: dict[str, bytes | Path] = {**self._contents, **self._copies}
+        paths = {name: self.folder / name for name in contents}
         aside = [(self.folder / name, _previous(self.folder / name)) for name in dict.fromkeys(self._aside)]
         temporary: dict[str, Path] = {}
         # folders to create for the targets, the innermost first
@@ -134,7 +140,7 @@ class OutputFolder:
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if path.is_dir():
                     raise IsADirectoryError(21, f"{path.name} is a folder")
-            for name, content in self._contents.items():
+            for name, content in contents.items():
                 temporary[name] = _write_temporary(paths[name], content)
             _replace_all([*aside, *((temporary[name], paths[name]) for name in paths)])
         except OSError as error:
@@ -192,7 +198,7 @@ def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
         raise
 
 
-def _write_temporary(target: Path, content: bytes) -> Path:
+def _write_temporary(target: Path, content: bytes | Path) -> Path:
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=TEMPORARY, dir=target.parent)
     path = Path(name)
     try:
@@ -200,7 +206,11 @@ def _write_temporary(target: Path, content: bytes) -> Path:
         _locks[path] = kept
         _locked(kept)
         with os.fdopen(handle, "wb") as stream:
-            stream.write(content)
+            if isinstance(content, Path):
+                with content.open("rb") as source:
+                    shutil.copyfileobj(source, stream)
+            else:
+                stream.write(content)
             stream.flush()
             if _locks.keys().isdisjoint(target.parents):  # what is in a working folder is not meant to last
                 os.fsync(stream.fileno())

@@ -1,0 +1,324 @@
+"""The path of an NC program on the machine: points of lines and arcs, the exact error there, commands that correct it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.machine import Machine
+from compgen.data.names import error_named
+from compgen.errors import ConvergenceError
+from compgen.kinematics import exact_error
+from compgen.programs.reader import PLANE_AXES, IntArray, Moves
+
+#: The inverse is repeated until commands change by less, mm.
+CONVERGED_MM = 1e-9
+_MOST_STEPS = 30
+_FIRST, _SECOND = np.array(PLANE_AXES).T
+
+
+@dataclass(frozen=True)
+class ExactModel:
+    """The exact error of a machine, with its reversal if known; ``only`` (3,) are the axes that may be corrected."""
+
+    machine: Machine
+    errors: ErrorTable
+    reversal: ReversalCurves | None = None
+    only: tuple[bool, bool, bool] = (True, True, True)
+
+    def error(self, position_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return the error of the tool tip at machine positions (n, 3) after travel in ``direction`` (n, 3): (n, 3), mm."""
+        found = exact_error(self.machine, self.errors, position_mm, tool_mm)
+        return found if self.reversal is None else found + self.reversal.displacement(position_mm, direction)
+
+    def command(self, wanted_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:
+        """Return machine positions (n, 3) at which the tip is where it would be at ``wanted_mm`` without errors.
+
+        Solves command + error(command) = wanted by repetition; an error changes by about 1e-4 of a change of position,
+        so that each step gains four digits. Coordinates that are nan stay nan.
+        """
+        unknown = np.isnan(wanted_mm)
+        travel = np.array([axis.range_mm for axis in self.machine.axes])
+        wanted = np.where(unknown, np.clip(0.0, travel[:, 0], travel[:, 1]), wanted_mm)
+        found, allowed = wanted, np.array(self.only, dtype=np.float64)
+        for _ in range(_MOST_STEPS):
+            before, found = found, wanted - allowed * self.error(found, tool_mm, direction)
+            if np.abs(found - before).max(initial=0.0) < CONVERGED_MM:
+                return np.where(unknown, np.nan, found)
+        raise ConvergenceError("the errors change too fast along the axes to be corrected; check the errors file")
+
+    def bend(self) -> float:
+        """Return half the range of the slope of the error along any line in the volume, an upper bound, mm per mm.
+
+        Over a length l, the error is within bend * l / 2 of the straight line between its ends.
+        """
+        lever_mm = float(np.linalg.norm([max(map(abs, axis.range_mm)) for axis in self.machine.axes]))
+        lever_mm += float(np.linalg.norm(self.machine.tool_offset_mm)) + 300.0
+        total = 0.0
+        for name, curve in self.errors.curves.items():
+            # beyond its ends a curve is constant
+            slopes = np.concatenate([[0.0], np.diff(curve.value) / np.diff(curve.position_mm), [0.0]])
+            if error_named(name).kind == "linear":
+                total += 0.5 * float(np.ptp(slopes))
+            else:
+                total += float(np.abs(slopes).max()) * lever_mm + 0.5 * float(np.ptp(curve.value))
+        return total
+
+
+def lengths_of(moves: Moves) -> FloatArray:
+    """Return the length of each move, (n,), mm; a helix by its angle and rise."""
+    straight = np.linalg.norm(moves.end_mm - moves.start_mm, axis=1)
+    rows = np.flatnonzero(moves.sweep_rad)
+    if len(rows):
+        arcs = moves.part(rows)
+        r, index = _radii(arcs), np.arange(len(rows))
+        rise = (arcs.end_mm - arcs.start_mm)[index, arcs.plane]
+        straight[rows] = np.hypot(0.5 * (r[0] + r[1]) * np.abs(arcs.sweep_rad), rise)
+    return np.asarray(straight, dtype=np.float64)
+
+
+def _in_plane(moves: Moves, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Coordinates of points (n, 3) from the centres of arcs, in the plane of each."""
+    index, a, b = np.arange(len(moves)), _FIRST[moves.plane], _SECOND[moves.plane]
+    return points[index, a] - moves.centre_mm[index, a], points[index, b] - moves.centre_mm[index, b]
+
+
+def _radii(arcs: Moves) -> tuple[FloatArray, FloatArray]:
+    return np.hypot(*_in_plane(arcs, arcs.start_mm)), np.hypot(*_in_plane(arcs, arcs.end_mm))
+
+
+def points_of(moves: Moves, fraction: FloatArray) -> FloatArray:
+    """Return the point of each move at its ``fraction`` (n,) of length, (n, 3), mm."""
+    points = moves.start_mm + fraction[:, None] * (moves.end_mm - moves.start_mm)
+    rows = np.flatnonzero(moves.sweep_rad)
+    if len(rows):
+        arcs, share, index = moves.part(rows), fraction[rows], np.arange(len(rows))
+        u, v = _in_plane(arcs, arcs.start_mm)
+        first, last = _radii(arcs)
+        angle = np.arctan2(v, u) + share * arcs.sweep_rad
+        radius = first + share * (last - first)
+        at, (a, b) = points[rows], (_FIRST[arcs.plane], _SECOND[arcs.plane])
+        at[index, a] = arcs.centre_mm[index, a] + radius * np.cos(angle)
+        at[index, b] = arcs.centre_mm[index, b] + radius * np.sin(angle)
+        at[share == 1.0] = arcs.end_mm[share == 1.0]
+        at[share == 0.0] = arcs.start_mm[share == 0.0]
+        points[rows] = at
+    return points
+
+
+def directions_at(moves: Moves, fraction: FloatArray) -> FloatArray:
+    """Return the sign of travel of each axis at a ``fraction`` of each move, (n, 3); 0 where an axis rests."""
+    change = moves.end_mm - moves.start_mm
+    rows = np.flatnonzero(moves.sweep_rad)
+    if len(rows):
+        arcs, index = moves.part(rows), np.arange(len(rows))
+        u, v = _in_plane(arcs, points_of(arcs, fraction[rows]))
+        own, turn = change[rows], np.sign(arcs.sweep_rad)
+        own[index, _FIRST[arcs.plane]], own[index, _SECOND[arcs.plane]] = -v * turn, u * turn
+        change[rows] = np.where(np.abs(own) > 1e-9 * np.abs(own).max(axis=1, keepdims=True), own, 0.0)
+    return np.where(np.abs(np.nan_to_num(change)) > 1e-9, np.sign(np.nan_to_num(change)), 0.0)
+
+
+def kept_directions(found: FloatArray, before: FloatArray) -> FloatArray:
+    """Return directions (n, 3) where a resting axis (0) keeps its last one; ``before`` (3,) is that of the first."""
+    every = np.vstack([before, found])
+    last = np.maximum.accumulate(np.where(every != 0, np.arange(len(every))[:, None], 0), axis=0)
+    return np.take_along_axis(every, last, axis=0)[1:]
+
+
+def closest_offset(moves: Moves, points_mm: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Return the vectors (n, 3) from the path of each move to points (n, 3); ``fraction`` is about where they belong."""
+    way = moves.end_mm - moves.start_mm
+    square = np.einsum("ij,ij->i", way, way)
+    along = np.einsum("ij,ij->i", points_mm - moves.start_mm, way) / np.where(square > 0, square, 1.0)
+    share = np.where(square > 0, along, 1.0)
+    rows = np.flatnonzero(moves.sweep_rad)
+    if len(rows):
+        arcs = moves.part(rows)
+        u, v = _in_plane(arcs, points_mm[rows])
+        u0, v0 = _in_plane(arcs, arcs.start_mm)
+        angle = (np.arctan2(v, u) - np.arctan2(v0, u0)) / arcs.sweep_rad
+        turn = 2.0 * np.pi / np.abs(arcs.sweep_rad)
+        share[rows] = angle + turn * np.round((fraction[rows] - angle) / turn)
+    return points_mm - points_of(moves, np.clip(share, 0.0, 1.0))
+
+
+# Division of moves: straight pieces, and arcs of which each is again an arc.
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Corrected pieces of moves, in order: index of the move, share where the piece ends, command, centre of an arc."""
+
+    move: IntArray
+    share: FloatArray
+    command_mm: FloatArray
+    centre_mm: FloatArray
+
+
+@dataclass
+class Corrector:
+    """Turns moves into corrected pieces; remembers the direction of each axis from batch to batch.
+
+    ``tolerance_mm`` is the largest deviation within a piece, ``shortest_mm`` the shortest piece that a division makes.
+    ``resolution_mm`` is the last decimal of the program: arcs that change by less stay as they are.
+    """
+
+    model: ExactModel
+    tolerance_mm: float
+    shortest_mm: float
+    resolution_mm: float
+    direction: FloatArray = field(default_factory=lambda: np.zeros(3))
+
+    def __post_init__(self) -> None:
+        bend = self.model.bend()
+        #: Distance of samples, so that the error between them is known to a quarter of the tolerance.
+        self.step_mm = 0.5 * self.tolerance_mm / bend if bend > 0 else np.inf
+
+    def pieces(self, moves: Moves, by_radius: NDArray[np.bool_]) -> Pieces:
+        """Return the corrected pieces of moves; ``by_radius`` (n,) are arcs that are programmed with a radius."""
+        one = np.ones(len(moves))
+        began = kept_directions(directions_at(moves, 1e-7 * one), self.direction)
+        ended = kept_directions(directions_at(moves, one - 1e-7), self.direction)
+        before = np.vstack([self.direction, ended[:-1]])
+        if len(moves):
+            self.direction = ended[-1]
+        correction = self.model.command(moves.at_mm, moves.tool_mm, ended) - moves.at_mm
+        command = moves.end_mm + np.where(moves.corrected, correction, 0.0)
+        divisible = moves.cutting & moves.corrected.all(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
+        turned = np.zeros(len(moves), dtype=bool)
+        if self.model.reversal is not None:
+            turned = ((began * before) < 0).any(axis=1)
+        inner = [self._straight(moves, np.flatnonzero(divisible & (moves.sweep_rad == 0)), ended, turned)]
+        arcs = np.flatnonzero(divisible & (moves.sweep_rad != 0))
+        centre = np.array(moves.centre_mm)
+        if len(arcs):
+            found = self._arcs(moves, arcs, by_radius, ended, turned)
+            last = found.share == 1.0
+            centre[found.move[last]] = found.centre_mm[last]
+            inner.append(Pieces(*(getattr(found, name)[~last] for name in Pieces.__dataclass_fields__)))
+        whole = Pieces(np.arange(len(moves)), one, command, centre)
+        every = [*inner, whole]
+        joined = [np.concatenate([getattr(part, name) for part in every]) for name in Pieces.__dataclass_fields__]
+        order = np.lexsort((joined[1], joined[0]))
+        return Pieces(*(item[order] for item in joined))
+
+    def _straight(self, moves: Moves, rows: IntArray, ended: FloatArray, turned: NDArray[np.bool_]) -> Pieces:
+        """Inner ends of the pieces of straight moves, by Ramer's method: divide where the correction is off its chord most."""
+        length = lengths_of(moves.part(rows))
+        # shorter moves cannot bend by more than the tolerance
+        rows = rows[(length > 4.0 * self.step_mm) | (turned[rows] & (length > 2.0 * self.shortest_mm))]
+        if not len(rows):
+            return Pieces(rows, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
+        length = lengths_of(moves.part(rows))
+        most = np.maximum(np.floor(length / self.shortest_mm), 1.0)
+        count = np.clip(np.ceil(length / self.step_mm), 1.0, most).astype(np.int64) + 1
+        first = np.cumsum(count) - count
+        own = np.repeat(np.arange(len(rows)), count)
+        share = (np.arange(len(own)) - first[own]) / (count[own] - 1)
+        breaks = np.array((share == 0.0) | (share == 1.0), dtype=bool)
+        takes_up = np.flatnonzero(turned[rows] & (count > 2))
+        # after a reversal the slack is taken up at once: the first piece is as short as allowed
+        share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
+        breaks[first[takes_up] + 1] = True
+        sampled = moves.part(rows[own])
+        target = self.model.command(points_of(sampled, share), sampled.tool_mm, ended[rows[own]])
+        while True:
+            at, part = np.flatnonzero(breaks), np.cumsum(breaks) - 1
+            left, right = at[part], at[np.minimum(part + 1, len(at) - 1)]
+            width = np.where(breaks, 1.0, share[right] - share[left])
+            chord = target[left] + ((share - share[left]) / width)[:, None] * (target[right] - target[left])
+            off = np.where(breaks, 0.0, np.linalg.norm(target - chord, axis=1))
+            new = (off > 0.7 * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
+            if not new.any():
+                break
+            breaks[new] = True
+        inner = breaks & (share > 0.0) & (share < 1.0)
+        return Pieces(rows[own[inner]], share[inner], target[inner], np.full((int(inner.sum()), 3), np.nan))
+
+    def _arcs(
+        self, moves: Moves, rows: IntArray, by_radius: NDArray[np.bool_], ended: FloatArray, turned: NDArray[np.bool_]
+    ) -> Pieces:
+        """Pieces of arcs: one arc where that follows the correction, otherwise halves, and halves of these."""
+        done: list[tuple[Any, ...]] = []
+        work = np.array([(row, low, high) for row in rows for low, high in self._cuts(moves.part([row]), turned[row])])
+        length = lengths_of(moves)
+        while len(work):  # all arcs at a time, then the halves of those that do not follow
+            move, low, high = work[:, 0].astype(np.int64), work[:, 1], work[:, 2]
+            steps = max(16, min(2048, int(np.ceil(np.max((high - low) * length[move]) / self.step_mm))))
+            share = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, steps + 1)
+            share[:, -1] = high
+            many = moves.part(np.repeat(move, steps + 1))
+            wanted = points_of(many, share.ravel())
+            middle = np.repeat(directions_at(moves.part(move), 0.5 * (low + high)), steps + 1, axis=0)
+            direction = np.where(middle != 0, middle, ended[np.repeat(move, steps + 1)])
+            target = self.model.command(wanted, many.tool_mm, direction)
+            still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
+            sweep = (high - low) * moves.sweep_rad[move]
+            centre, off = _fitted_arcs(target.reshape(len(move), steps + 1, 3), moves.plane[move], sweep)
+            centre[still] = moves.centre_mm[move[still]]
+            # an arc by its radius is well defined up to a third of a circle; one that nearly closes is not at all
+            wide = by_radius[move] & (np.abs(sweep) > 2.1)
+            ends = target.reshape(len(move), steps + 1, 3)[:, [0, -1]]
+            index, (a, b) = np.arange(len(move)), (_FIRST[moves.plane[move]], _SECOND[moves.plane[move]])
+            gap = np.maximum(*(np.abs(ends[index, 1, k] - ends[index, 0, k]) for k in (a, b)))
+            full = (np.abs(np.abs(sweep) - 2.0 * np.pi) < 1e-9) & (
+                gap < max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
+            )
+            wide |= (np.abs(sweep) > 1.5 * np.pi) & ~full
+            short = (high - low) * length[move] < 2.0 * self.shortest_mm
+            fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
+            done.append((move[fine], high[fine], ends[fine, 1], centre[fine]))
+            again, half = ~fine, 0.5 * (low + high)
+            work = np.concatenate(
+                [np.stack([move, low, half], axis=1)[again], np.stack([move, half, high], axis=1)[again]]
+            )
+        return Pieces(*(np.concatenate(column) for column in zip(*done, strict=True)))
+
+    def _cuts(self, arc: Moves, turned: bool) -> list[tuple[float, float]]:
+        """Shares of an arc between which no axis reverses, with a short piece after each reversal; else the whole arc."""
+        if self.model.reversal is None:
+            return [(0.0, 1.0)]
+        (u,), (v,) = _in_plane(arc, arc.start_mm)
+        sweep, start = float(arc.sweep_rad[0]), float(np.arctan2(v, u))
+        low, high = sorted((start, start + sweep))
+        quarter = 0.5 * np.pi
+        angles = quarter * np.arange(np.ceil(low / quarter), np.floor(high / quarter) + 1)
+        turns = [share for share in np.abs((angles - start) / sweep) if 1e-9 < share < 1 - 1e-9]
+        short = self.shortest_mm / float(lengths_of(arc)[0])
+        points = {0.0, 1.0, *turns, *(share + short for share in ([0.0] if turned else []) + turns)}
+        known = [share for share in sorted(points) if share <= 1.0]
+        return list(zip(known, known[1:], strict=False))
+
+
+def _fitted_arcs(target: FloatArray, plane: IntArray, sweep: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Centres (n, 3) of arcs from first to last of points (n, k, 3) and how far the points are off, (n,), mm.
+
+    The centre has the same distance from both ends. Along the normal of their chord it fits the other points best:
+    |p - c| = |s - c| is linear in the centre. Ends that coincide (a full circle) leave both coordinates free.
+    """
+    index, (a, b) = np.arange(len(target)), (_FIRST[plane], _SECOND[plane])
+    u, v, w = target[index, :, a], target[index, :, b], target[index, :, plane]
+    du, dv = u - u[:, :1], v - v[:, :1]
+    half = 0.5 * (du**2 + dv**2)
+    ends = np.hypot(du[:, -1], dv[:, -1])
+    closed = np.abs(np.abs(sweep) - 2.0 * np.pi * np.round(np.abs(sweep) / (2.0 * np.pi))) < 1e-9
+    width = np.where(closed, 1.0, np.where(ends > 0, ends, 1.0))
+    nu, nv = -dv[:, -1] / width, du[:, -1] / width
+    side = du * nu[:, None] + dv * nv[:, None]
+    middle = 0.5 * (du * du[:, -1:] + dv * dv[:, -1:])
+    off = np.einsum("ij,ij->i", side, half - middle) / np.maximum(np.einsum("ij,ij->i", side, side), 1e-300)
+    cu, cv = 0.5 * du[:, -1] + off * nu, 0.5 * dv[:, -1] + off * nv
+    for k in np.flatnonzero(closed):
+        cu[k], cv[k] = np.linalg.lstsq(np.stack([du[k], dv[k]], axis=1), half[k], rcond=None)[0]
+    radius = np.hypot(cu, cv)
+    radial = np.hypot(du - cu[:, None], dv - cv[:, None]) - radius[:, None]
+    rise = w - (w[:, :1] + np.linspace(0.0, 1.0, w.shape[1]) * (w[:, -1:] - w[:, :1]))
+    centre = np.full((len(target), 3), np.nan)
+    centre[index, a], centre[index, b] = u[:, 0] + cu, v[:, 0] + cv
+    return centre, np.hypot(radial, rise).max(axis=1)

@@ -1,0 +1,864 @@
+"""NC programs read into moves of the machine axes, in batches of blocks: words, modal state, positions.
+
+A position here is that of the machine axes as the control counts them, mm: program position + work offset + G92 + tool
+length. Blocks with nothing but plain words (N, G0, G1, X, Y, Z, F, S) are read many at a time by numpy, others one by
+one; both ways give the same moves.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine, Vector3
+from compgen.data.messages import visible_line
+from compgen.errors import InputError
+from compgen.programs.dialects import REFUSED, Dialect
+
+IntArray = NDArray[np.int64]
+MM_PER_INCH = 25.4
+RAPID, FEED, CW, CCW = range(4)
+#: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
+PLANE_AXES = ((1, 2), (2, 0), (0, 1))
+#: Blocks of a batch, the longest block, and the fewest plain blocks in a row that are read together.
+BATCH, LONGEST_BLOCK, LEAST_PLAIN = 20_000, 4096, 32
+#: Distances of start and end of an arc from its centre may differ by this much, mm.
+RADIUS_TOLERANCE_MM = 0.02
+#: Text in the first comment of a corrected program.
+MARK = "CORRECTED BY VOLCOMP"
+#: What LinuxCNC leaves between a peck and the depth reached before, mm.
+_PECK_CLEARANCE_MM = 0.254
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What a program needs beside its text: work offsets and tools (mm), blocks with ``/``, codes that move nothing.
+
+    ``work_offsets_mm`` by name (``G54``), ``tools_mm`` the offsets that the control adds for a tool, by its number or name.
+    """
+
+    work_offsets_mm: Mapping[str, Vector3] = field(default_factory=dict)
+    tools_mm: Mapping[str, Vector3] = field(default_factory=dict)
+    skip_deleted: bool = False
+    keep_unknown: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Moves of a batch, all of shape (n, ...), in mm of the machine axes.
+
+    ``kind`` is RAPID, FEED, CW or CCW; ``sweep_rad`` the signed angle of an arc about ``centre_mm`` in the plane normal to
+    axis ``plane``. ``offset_mm`` is machine position minus program position, ``tool_mm`` the tool vector of the model.
+    The end of a move is corrected along the axes ``corrected`` by what the model says at ``at_mm``.
+    """
+
+    line: IntArray
+    kind: IntArray
+    start_mm: FloatArray
+    end_mm: FloatArray
+    centre_mm: FloatArray
+    plane: IntArray
+    sweep_rad: FloatArray
+    offset_mm: FloatArray
+    tool_mm: FloatArray
+    at_mm: FloatArray
+    corrected: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    @property
+    def cutting(self) -> NDArray[np.bool_]:
+        """Which moves are at feed."""
+        return np.asarray(self.kind != RAPID)
+
+    def part(self, rows: Any) -> Moves:
+        """Return the moves of ``rows``."""
+        return Moves(*(getattr(self, name)[rows] for name in Moves.__dataclass_fields__))
+
+    @staticmethod
+    def joined(parts: Iterable[Moves]) -> Moves:
+        """Return the moves of several parts in their order."""
+        known = list(parts) or [Moves.of_rows([])]
+        return Moves(*(np.concatenate([getattr(p, name) for p in known]) for name in Moves.__dataclass_fields__))
+
+    @staticmethod
+    def of_rows(rows: list[tuple[float, ...]]) -> Moves:
+        """Return the moves of rows with line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected."""
+        data = np.array(rows, dtype=np.float64).reshape(len(rows), 25)
+        whole = data[:, :3].astype(np.int64)
+        start, end, centre, offset, tool, at, corrected = (data[:, k : k + 3] for k in range(4, 25, 3))
+        return Moves(
+            whole[:, 0], whole[:, 1], start, end, centre, whole[:, 2], data[:, 3], offset, tool, at, corrected > 0
+        )
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block that was read by itself: its words (address, value text, first and last column), moves and modal state.
+
+    ``kind`` says how it is rewritten: ``line``, ``arc``, ``cycle``, ``preset`` (G92), or as it is:
+    ``keep``, ``no preset`` (G92.1), ``store`` (a cycle without a hole).
+    """
+
+    number: int
+    text: str
+    words: list[tuple[str, str, int, int]]
+    first: int
+    count: int
+    kind: str
+    absolute: bool
+    scale: float
+    centre_absolute: bool
+    inverse_time: bool
+
+
+@dataclass(frozen=True)
+class PlainRun:
+    """Plain blocks in a row: their lines in the batch, and for each move its line, values, decimals and columns of values.
+
+    ``value`` (n, 3) is nan where a block does not name the axis; ``span`` (n, 3, 2) are columns in the line.
+    """
+
+    lines: range
+    first: int
+    row: IntArray
+    value: FloatArray
+    decimals: IntArray
+    span: IntArray
+    scale: float
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Blocks in a row: texts with their line ends, moves, and how the blocks were read, in order."""
+
+    first_line: int
+    lines: list[str]
+    moves: Moves
+    segments: list[Block | PlainRun]
+
+
+class Reader:
+    """Reads the blocks of one program in order and keeps its modal state."""
+
+    def __init__(self, machine: Machine, dialect: Dialect, setup: Setup, source: str | Path) -> None:
+        self.machine, self.dialect, self.setup, self.source = machine, dialect, setup, source
+        self._pattern = dialect.word_pattern()
+        self._name = re.compile(r"\s*([A-Z_][A-Z_0-9]+)\s*(\([^()\n]*\))?", re.IGNORECASE)
+        #: How far corrected positions may leave the travel, mm.
+        self.travel_slack_mm = 1e-6
+        self.used_offsets: dict[str, Vector3] = {}
+        self.used_tools: dict[str, Vector3] = {}
+        self.assumed: dict[str, None] = {}
+        self._tools = dict(setup.tools_mm)
+        self.motion: int | None = 0 if dialect.name == "grbl" else None
+        self.cycle: int | None = None
+        self.cycle_z = self.cycle_r = self.initial_z = math.nan
+        self.cycle_peck, self.to_r_level = 0.0, dialect.name == "linuxcnc"
+        self.plane, self.scale, self.absolute, self.centre_absolute = 2, 1.0, True, False
+        self.feed, self.offset_name = "minute", ""
+        self._unit_known = False
+        self.work, self.preset, self.length = (0.0,) * 3, (0.0,) * 3, (0.0,) * 3
+        self.selected = self.loaded = ""
+        self.length_on = False
+        self.pole: list[float] = [math.nan] * 3
+        self.position: list[float] = [math.nan] * 3
+        self.ended = self.seen_percent = self.started = False
+        self.closed_by_percent = False
+        self._line, self._text = 0, ""
+        self._rows: list[tuple[float, ...]] = []
+
+    # Streams of blocks.
+
+    def batches(self, stream: BinaryIO) -> Iterator[Batch]:
+        """Yield the batches of a program; the last one is followed by the check that the program was whole."""
+        number = 1
+        while True:
+            lines: list[bytes] = []
+            for _ in range(BATCH):
+                line = stream.readline(LONGEST_BLOCK)
+                if not line:
+                    break
+                if len(line) == LONGEST_BLOCK:
+                    self._line, self._text = number + len(lines), ""
+                    self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
+                lines.append(line)
+            if not lines:
+                break
+            yield self.batch(lines, number)
+            number += len(lines)
+        self.finish(number - 1)
+
+    def batch(self, lines: list[bytes], first_line: int) -> Batch:
+        """Read lines, each with its line end, the first with the number ``first_line``."""
+        content = b"".join(lines)
+        self._refuse_bytes(content, first_line)
+        texts = [line.decode("latin-1") for line in lines]
+        tokens = _PlainWords(content, lines, self.dialect)
+        self._rows = []
+        parts: list[Moves] = []
+        count, k = 0, 0
+        segments: list[Block | PlainRun] = []
+        while k < len(lines):
+            stop = int(tokens.run_end[k])
+            if stop - k >= LEAST_PLAIN and self._takes_plain():
+                if self._rows:
+                    parts.append(Moves.of_rows(self._rows))
+                    self._rows = []
+                run, moves = self._plain(tokens, range(k, stop), first_line, count)
+                segments.append(run)
+                parts.append(moves)
+                count += len(moves)
+                k = stop
+                continue
+            block = self._block(first_line + k, texts[k], count)
+            segments.append(block)
+            count += block.count
+            k += 1
+        parts.append(Moves.of_rows(self._rows))
+        moves = Moves.joined(parts)
+        self._check(moves)
+        return Batch(first_line, texts, moves, segments)
+
+    def finish(self, last_line: int) -> None:
+        """Refuse a program that ends in the middle."""
+        self._line, self._text = max(last_line, 1), ""
+        if not self.started:
+            self._fail("the program has no moves; expected an NC program")
+        whole = self.ended or ("%" in self.dialect.end and self.closed_by_percent)
+        if self.dialect.end_needed and not whole:
+            codes = " or ".join(sorted(self.dialect.end))
+            self._fail(f"the program ends without {codes}: it may have been cut; give the whole program")
+        if self.dialect.name == "fanuc" and self.seen_percent and not self.closed_by_percent:
+            self._fail(
+                "the program begins with % and does not end with it: it may have been cut; give the whole program"
+            )
+
+    def _refuse_bytes(self, content: bytes, first_line: int) -> None:
+        found = re.search(rb"[\x00-\x08\x0b\x0c\x0e-\x1f]|\r(?!\n)", content)
+        if first_line == 1 and content[:3] == b"\xef\xbb\xbf":
+            self._line = 1
+            self._fail("the program begins with a byte-order mark, which controls do not read; save it as plain text")
+        if found:
+            self._line = first_line + content[: found.start()].count(b"\n")
+            what = (
+                "a carriage return within a line" if found[0] == b"\r" else f"the control character 0x{found[0][0]:02x}"
+            )
+            self._fail(f"contains {what}; expected a text file with one block in a line")
+
+    def _fail(self, message: str, field: str | None = None) -> NoReturn:
+        text = visible_line(self._text)[:60]
+        shown = f" (block: {text})" if text else ""
+        raise InputError(message + shown, file=self.source, line=self._line, field=field)
+
+    # Plain blocks, many at a time.
+
+    def _takes_plain(self) -> bool:
+        known = not any(math.isnan(value) for value in self.position)
+        modal = self.motion in (RAPID, FEED) and self.cycle is None and self.absolute and self.feed != "inverse"
+        return known and modal and not self.ended and self._unit_known and bool(self.offset_name)
+
+    def _plain(self, tokens: _PlainWords, lines: range, first_line: int, first: int) -> tuple[PlainRun, Moves]:
+        rows = slice(lines.start, lines.stop)
+        value, g = tokens.value[rows], tokens.g[rows]
+        offset = np.array(self._offset())
+        named = ~np.isnan(value)
+        at = np.vstack([np.array(self.position), np.where(named, value * self.scale + offset, 0.0)])
+        last = np.maximum.accumulate(
+            np.where(np.vstack([np.ones(3, dtype=bool), named]), np.arange(len(at))[:, None], 0)
+        )
+        at = np.take_along_axis(at, last, axis=0)
+        given = np.where(g >= 0, np.arange(1, len(g) + 1), 0)
+        kind = np.concatenate([[self.motion], g])[np.maximum.accumulate(given)].astype(np.int64)
+        row = np.flatnonzero(named.any(axis=1))
+        n = len(row)
+        self.position, self.motion = at[-1].tolist(), int(kind[-1])
+        self.started = self.started or n > 0
+        end, tool = at[row + 1], np.array(self._tool())
+        moves = Moves(
+            line=first_line + lines.start + row,
+            kind=kind[row],
+            start_mm=at[row],
+            end_mm=end,
+            centre_mm=np.full((n, 3), np.nan),
+            plane=np.full(n, self.plane),
+            sweep_rad=np.zeros(n),
+            offset_mm=np.broadcast_to(offset, (n, 3)),
+            tool_mm=np.broadcast_to(tool, (n, 3)),
+            at_mm=end,
+            corrected=np.ones((n, 3), dtype=bool),
+        )
+        run = PlainRun(lines, first, row, value[row], tokens.decimals[rows][row], tokens.span[rows][row], self.scale)
+        return run, moves
+
+    # One block.
+
+    def _block(self, number: int, text: str, first: int) -> Block:
+        self._line, self._text = number, text
+        before, words = len(self._rows), self._words(text)
+        kind = self._act(words) if words else "keep"
+        return Block(
+            number,
+            text,
+            words,
+            first,
+            len(self._rows) - before,
+            kind,
+            self.absolute,
+            self.scale,
+            self.centre_absolute or (self.dialect.pole and self.absolute),
+            self.feed == "inverse",
+        )
+
+    def _words(self, text: str) -> list[tuple[str, str, int, int]]:
+        """Split a block into words; empty where it has nothing to do: comments, program numbers, % and skipped blocks."""
+        body = text.rstrip()
+        at = len(body) - len(body.lstrip())
+        dialect = self.dialect
+        if at == len(body):
+            return []
+        if body[at] == "/":
+            if self.setup.skip_deleted:
+                return []
+            self.assumed["blocks with / are executed"] = None
+            at += 2 if body[at + 1 : at + 2].isdigit() else 1
+        percent = re.match(r"\s*(?:N\d+\s*)?%(.*)", body)
+        if percent:
+            return self._percent(percent[1])
+        if dialect.name in ("fanuc", "siemens") and re.match(r"\s*[O:]\d", body, re.IGNORECASE):
+            if self.started:
+                self._fail("a second program begins here; give one program at a time")
+            at = re.match(r"\s*[O:]\d+", body, re.IGNORECASE).end()  # type: ignore[union-attr]
+        if dialect.pole:
+            body = body.rstrip("*").rstrip()
+        words: list[tuple[str, str, int, int]] = []
+        while at < len(body):
+            found = self._pattern.match(body, at)
+            if found is None:
+                at = self._unread(body, at, words)
+                continue
+            if found[3] is not None:
+                if MARK in found[3]:
+                    self._fail("the program has been corrected before; give the program as it comes from CAM")
+            else:
+                words.append((found[1].upper(), found[2], found.start(2), found.end(2)))
+            at = found.end()
+            if not body[at:].strip():
+                break
+        return words
+
+    def _percent(self, rest: str) -> list[tuple[str, str, int, int]]:
+        if self.dialect.pole and re.search(r"\bG7[01]\b", rest):  # name of the program, with its unit of length
+            self.scale = MM_PER_INCH if re.search(r"\bG70\b", rest) else 1.0
+            self._unit_known = True
+            self.ended = self.ended or self.started
+        if self.seen_percent or self.started:
+            self.closed_by_percent = True
+        self.seen_percent = True
+        return []
+
+    def _unread(self, body: str, at: int, words: list[tuple[str, str, int, int]]) -> int:
+        """Refuse what is no word, or take a code in letters; returns where the block goes on."""
+        rest = body[at:].strip()
+        name = self._name.match(body, at)
+        if name:
+            code = name[1].upper()
+            if code in self.setup.keep_unknown:
+                return name.end()
+            meaning = self.dialect.codes.get(code)
+            if meaning and not name[2]:
+                words.append((code, "", at, at))
+                return name.end(1)
+        if rest[0] in "#[" or re.match(r"[A-Z]+\d*\s*=?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[A-Z]|=", rest, re.IGNORECASE):
+            self._fail(f"{rest[:20]!r}: variables and expressions are not followed; post the program with numbers")
+        if self.dialect.name == "linuxcnc" and rest[0] in "oO":
+            self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")
+        if name:
+            advice = f"; if it moves nothing, add --keep-unknown {name[1].upper()}"
+            self._fail(f"{name[1]} is not known in the dialect {self.dialect.name}{advice}")
+        self._fail(f"{rest[:20]!r} cannot be read; expected words such as X10.5")
+
+    def _act(self, words: list[tuple[str, str, int, int]]) -> str:
+        """Change the modal state, then move; returns how the block is rewritten."""
+        dialect, values = self.dialect, dict[str, float]()
+        codes: list[str] = []
+        kept = False
+        name = ""
+        for letter, text, _, _ in words:
+            if not text:
+                codes.append(letter)
+                continue
+            if text[0] == '"':
+                if letter != "T":
+                    self._fail(f"{letter}={text} cannot be read; expected a number")
+                name = text.strip('"').upper()
+                continue
+            value = float(text.replace(" ", "").replace("\t", ""))
+            if letter in "GM" and len(letter) == 1:
+                codes.append(f"{letter}{value:g}")
+                continue
+            if letter in "ABCUVWE" and letter != "CR":
+                self._fail(
+                    f"{letter}{text}: rotary and further axes are not followed; correct a program with X, Y and Z"
+                )
+            if letter in values:
+                self._fail(f"{letter} is given twice in a block")
+            if letter in "XYZIJKRQ" and dialect.point_needed and "." not in text and value != 0.0:
+                self._fail(
+                    f"{letter}{text} has no decimal point: mm or increments; post it with a decimal point", letter
+                )
+            values[letter] = value
+        if self.ended and (values.keys() - {"N"} or any(code not in dialect.end for code in codes)):
+            self._fail("blocks after the end of the program; give one program without subprograms")
+        actions: list[str] = []
+        for code in codes:
+            if code[0] == "M" and code[1:].isdigit():
+                self._m_code(code)
+                continue
+            meaning = dialect.codes.get(code)
+            if code in self.setup.keep_unknown:
+                kept = True
+            elif meaning is None:
+                advice = f"if it moves nothing, add --keep-unknown {code}"
+                reason = REFUSED.get(code, f"is not known in the dialect {dialect.name}; {advice}")
+                self._fail(f"{code}: {reason}" if code in REFUSED else f"{code} {reason}")
+            elif meaning.startswith(("motion", "cycle")):
+                actions.insert(0, meaning)
+            else:
+                self._modal(code, meaning, values, actions)
+        self._tool_words(values, codes, name)
+        if "R" in values and dialect.name == "siemens":
+            self._fail("R is a variable; write a radius as CR=")
+        axes = [values.get(letter) for letter in "XYZ"]
+        if kept and any(axis is not None for axis in axes):
+            if any(action.startswith(("motion", "cycle")) for action in actions):
+                self._fail(
+                    "a kept code and a move are in one block, so that the axis words are ambiguous; divide the block"
+                )
+            return "keep"
+        return self._execute(actions, axes, values)
+
+    def _m_code(self, code: str) -> None:
+        if code in self.dialect.end:
+            self.ended = True
+        elif code in self.dialect.m_codes or code in self.setup.keep_unknown:
+            if code == "M6":
+                self.loaded = self.selected
+        elif self.dialect.pole and code in ("M91",):
+            pass
+        else:
+            advice = f"is not known; if it moves nothing, add --keep-unknown {code}"
+            self._fail(f"{code}: {REFUSED[code]}" if code in REFUSED else f"{code} {advice}")
+
+    def _modal(self, code: str, meaning: str, values: dict[str, float], actions: list[str]) -> None:
+        """Take over a code that is no motion; what acts in this block only is added to ``actions``."""
+        what, _, argument = meaning.partition(" ")
+        if what == "plane":
+            self.plane = int(argument)
+        elif meaning in ("inch", "mm"):
+            self.scale, self._unit_known = (MM_PER_INCH if meaning == "inch" else 1.0), True
+        elif meaning in ("absolute", "incremental"):
+            self.absolute = meaning == "absolute"
+        elif what == "centre":
+            self.centre_absolute = argument == "absolute"
+        elif what == "feed":
+            self.feed = argument
+        elif meaning == "work offset":
+            if code in ("G54", "G54.1") and "P" in values and self.dialect.name == "fanuc":
+                code = f"G54.1P{values['P']:g}"
+            self._use_offset(code)
+        elif meaning == "no work offset":
+            self.offset_name, self.work = "none", (0.0,) * 3
+        elif meaning in ("initial level", "R level"):
+            self.to_r_level = meaning == "R level"
+        elif meaning == "no tool":
+            self.length, self.length_on = (0.0,) * 3, False
+        elif meaning == "tool":
+            self.length_on = True
+            key = f"{values['H']:g}" if "H" in values else self.loaded if self.dialect.name == "linuxcnc" else ""
+            if not key:
+                self._fail(f"{code} without H; add the number of the tool offset")
+            self._use_tool(key)
+        elif meaning == "tool offset":
+            given = [values.get(letter, math.nan) * self.scale for letter in "XYZ"]
+            x, y, z = (old if math.isnan(new) else new for new, old in zip(given, self.length, strict=True))
+            self.length = (x, y, z)
+            self.used_tools[f"{code} in line {self._line}"] = self.length
+            actions.append("done")
+        elif meaning == "no preset":
+            self.preset = (0.0,) * 3
+            actions.append(meaning)
+        elif meaning == "no motion":
+            if self.dialect.name != "fanuc":
+                self.motion = None
+            self.cycle = None
+        elif meaning == "tool definition":
+            self._tools[f"{values.get('T', 0):g}"] = (0.0, 0.0, values.get("L", 0.0) * self.scale)
+            actions.append("done")
+        elif meaning != "nothing":
+            actions.append(meaning)
+
+    def _tool_words(self, values: dict[str, float], codes: list[str], name: str) -> None:
+        """Follow T, D and H: which tool's length the control adds."""
+        number = f"{values['T']:g}" if "T" in values else name
+        if number:
+            self.selected = number
+        if "M6" in codes:
+            self.loaded = self.selected
+        if not self.dialect.tool_by_number:
+            if self.length_on and "H" in values and "G43" not in codes:
+                self._use_tool(f"{values['H']:g}")
+        elif self.dialect.pole:
+            if number and "G99" not in codes:
+                self._use_tool(number)
+        elif "D" in values and values["D"] != 1.0:
+            key = f"{self.loaded or self.selected}D{values['D']:g}"
+            self._use_tool("0" if values["D"] == 0.0 else key)
+        elif "D" in values or ("M6" in codes and self.loaded):
+            self._use_tool(self.loaded or self.selected)
+
+    def _use_tool(self, key: str) -> None:
+        if key == "0":
+            self.length = (0.0,) * 3
+            return
+        if key not in self._tools:
+            known = f"; the table has {', '.join(sorted(self._tools))}" if self._tools else ""
+            self._fail(f"the length of tool {key} is not known{known}; give it with --tools FILE (tool, length_mm)")
+        self.length = self._tools[key]
+        self.used_tools[key] = self.length
+
+    def _use_offset(self, name: str) -> None:
+        if name not in self.setup.work_offsets_mm:
+            given = ", ".join(self.setup.work_offsets_mm) or "none"
+            self._fail(f"the work offset {name} is not known (given: {given}); add --wcs {name}=X,Y,Z in mm")
+        self.offset_name, self.work = name, self.setup.work_offsets_mm[name]
+        self.used_offsets[name] = self.work
+
+    def _offset(self) -> Vector3:
+        x, y, z = (a + b + c for a, b, c in zip(self.work, self.preset, self.length, strict=True))
+        return x, y, z
+
+    def _tool(self) -> Vector3:
+        x, y, z = (a - b for a, b in zip(self.machine.tool_offset_mm, self.length, strict=True))
+        return x, y, z
+
+    # Moves of a block.
+
+    def _execute(self, actions: list[str], axes: list[float | None], values: dict[str, float]) -> str:
+        motion = next((action for action in actions if action.startswith(("motion", "cycle"))), "")
+        if motion.startswith("motion"):
+            self.motion, self.cycle = int(motion[7:]), None
+        single = [action for action in actions if not action.startswith(("motion", "cycle"))]
+        if sum(action.startswith(("motion", "cycle")) for action in actions) > 1:
+            self._fail("two motion codes in a block")
+        moving = any(axis is not None for axis in axes)
+        if moving or any(letter in values for letter in "IJK"):
+            if not self.offset_name:
+                self._use_offset(self.dialect.work_offset)
+                self.assumed[f"the work offset {self.dialect.work_offset} is active at the start"] = None
+            if not self._unit_known:
+                self._unit_known = True
+                self.assumed["lengths are in mm"] = None
+        if "done" in single or "dwell" in single or "blank" in single:
+            return "keep"
+        if "no preset" in single:
+            return "no preset"
+        if "home" in single or "unknown position" in single:
+            return self._home(axes, "home" in single)
+        if "preset" in single:
+            return self._preset(axes)
+        if "machine coordinates" in single or (self.dialect.pole and "M91" in self._text.upper()):
+            return self._machine_move(axes)
+        if motion.startswith("cycle") or (self.cycle is not None and (moving or "R" in values)):
+            return self._cycle(motion, axes, values)
+        if self.dialect.pole:
+            self._set_pole(values, "pole here" in single)
+        arc = self.motion in (CW, CCW) and (moving or (any(c in values for c in "IJK") and not self.dialect.pole))
+        if not moving and not arc:
+            return "keep"
+        if self.motion is None:
+            self._fail("axis words before any of G0, G1, G2, G3; post the motion code")
+        end = self._target(axes)
+        if arc:
+            self._arc(end, values)
+            return "arc"
+        self._move(self.motion, end)
+        return "line"
+
+    def _target(self, axes: list[float | None]) -> list[float]:
+        """Machine position that axis words ask for."""
+        base = self._offset() if self.absolute else self.position
+        end = list(self.position)
+        for k, value in enumerate(axes):
+            if value is not None:
+                end[k] = base[k] + value * self.scale
+                if math.isnan(end[k]):
+                    self._fail(
+                        f"{'XYZ'[k]} moves by an increment from a position that is not known; post it in absolute"
+                    )
+        return end
+
+    def _move(
+        self,
+        kind: int,
+        end: list[float],
+        *,
+        arc: tuple[float, ...] = (math.nan,) * 3,
+        sweep: float = 0.0,
+        at: list[float] | None = None,
+        corrected: tuple[int, int, int] = (1, 1, 1),
+    ) -> None:
+        if kind != RAPID and any(math.isnan(value) for value in (*self.position, *end)):
+            missing = "XYZ"[next(k for k in range(3) if math.isnan(self.position[k]) or math.isnan(end[k]))]
+            self._fail(
+                f"moves at feed while the position of {missing} is not known; position it with G0 in absolute first"
+            )
+        head = (self._line, kind, self.plane, sweep)
+        self._rows.append((*head, *self.position, *end, *arc, *self._offset(), *self._tool(), *(at or end), *corrected))
+        self.position = list(end)
+        self.started = True
+
+    def _machine_move(self, axes: list[float | None]) -> str:
+        if not self.absolute:
+            self._fail("machine coordinates in incremental blocks are not followed; post G90")
+        if self.motion not in (RAPID, FEED):
+            self._fail("machine coordinates need G0 or G1")
+        pairs = zip(axes, self.position, strict=True)
+        self._move(RAPID, [p if v is None else v * self.scale for v, p in pairs], corrected=(0, 0, 0))
+        return "keep"
+
+    def _home(self, axes: list[float | None], known: bool) -> str:
+        """Go through an intermediate point to the reference point, which is taken as machine zero."""
+        named = [axis is not None for axis in axes]
+        if not any(named):
+            if self.dialect.name == "fanuc" or not known:
+                return "keep"
+            named = [True] * 3
+        if known:
+            # an increment from a position that is not known is no move
+            pairs = zip(axes, self.position, strict=True)
+            moving = [axis if self.absolute or not math.isnan(place) else None for axis, place in pairs]
+            self._move(RAPID, self._target(moving), corrected=(0, 0, 0))
+        home = 0.0 if known else math.nan
+        self._move(RAPID, [home if n else p for n, p in zip(named, self.position, strict=True)], corrected=(0, 0, 0))
+        if known:
+            self.assumed["the reference point of G28 and G30 is machine zero"] = None
+        return "keep"
+
+    def _preset(self, axes: list[float | None]) -> str:
+        work, preset = self._offset(), list(self.preset)
+        for k, value in enumerate(axes):
+            if value is not None:
+                if math.isnan(self.position[k]):
+                    self._fail(f"G92 {'XYZ'[k]} at a position that is not known; position it in absolute first")
+                preset[k] += self.position[k] - work[k] - value * self.scale
+        self.preset = (preset[0], preset[1], preset[2])
+        return "preset" if any(axis is not None for axis in axes) else "keep"
+
+    def _set_pole(self, values: dict[str, float], here: bool) -> None:
+        offset = self._offset()
+        for k, letter in enumerate("IJK"):
+            if letter in values:
+                self.pole[k] = (offset[k] if self.absolute else self.position[k]) + values[letter] * self.scale
+            elif here:
+                self.pole[k] = self.position[k]
+
+    def _arc(self, end: list[float], values: dict[str, float]) -> None:
+        start, (a, b) = self.position, PLANE_AXES[self.plane]
+        ccw = self.motion == CCW
+        radius = values.get("CR", values.get("R"))
+        if any(math.isnan(value) for value in (*start, *end)):
+            self._move(CCW, end)  # says what is missing
+        dx, dy = end[a] - start[a], end[b] - start[b]
+        if radius is not None:
+            r, chord = radius * self.scale, math.hypot(dx, dy)
+            square = r * r - 0.25 * chord * chord
+            if chord == 0.0 or square < -RADIUS_TOLERANCE_MM * abs(r):
+                self._fail(f"radius {abs(radius):g} and a chord of {chord / self.scale:g} give no arc")
+            side = math.sqrt(max(square, 0.0)) / chord * (1.0 if (r > 0) == ccw else -1.0)
+            u, v = 0.5 * (start[a] + end[a]) - side * dy, 0.5 * (start[b] + end[b]) + side * dx
+        else:
+            u, v = self._centre(values, a), self._centre(values, b)
+        centre = [math.nan] * 3
+        centre[a], centre[b] = u, v
+        first, second = math.hypot(start[a] - u, start[b] - v), math.hypot(end[a] - u, end[b] - v)
+        if abs(first - second) > RADIUS_TOLERANCE_MM or first == 0.0:
+            self._fail(
+                f"start and end of the arc are {first:.4f} and {second:.4f} mm from its centre; expected one radius"
+            )
+        turn = math.atan2(end[b] - v, end[a] - u) - math.atan2(start[b] - v, start[a] - u)
+        turn = (turn if ccw else -turn) % (2.0 * math.pi)
+        if (radius is None and math.hypot(dx, dy) < 1e-9) or turn == 0.0:
+            turn = 2.0 * math.pi
+        more = values.get("TURN", values.get("P", 1.0) - 1.0 if self.dialect.name == "linuxcnc" else 0.0)
+        if more < 0 or more != int(more):
+            self._fail("expected a whole number of turns")
+        turn += 2.0 * math.pi * more
+        self._move(CCW if ccw else CW, end, arc=tuple(centre), sweep=turn if ccw else -turn)
+
+    def _centre(self, values: dict[str, float], axis: int) -> float:
+        letter = "IJK"[axis]
+        if self.dialect.pole:
+            if math.isnan(self.pole[axis]):
+                self._fail(f"an arc without a centre: {letter} has not been given")
+            return self.pole[axis]
+        others = {"IJK"[k] for k in PLANE_AXES[self.plane]}
+        if not others & values.keys():
+            self._fail(f"an arc without centre or radius; expected {' and '.join(sorted(others))}, or a radius")
+        if self.centre_absolute:
+            if letter not in values:
+                self._fail(f"an arc with its centre in absolute needs {letter}")
+            return self._offset()[axis] + values[letter] * self.scale
+        return self.position[axis] + values.get(letter, 0.0) * self.scale
+
+    def _cycle(self, motion: str, axes: list[float | None], values: dict[str, float]) -> str:
+        """Expand a drilling cycle: over the hole, to the R level, to the depth at feed, back."""
+        if self.plane != 2:
+            self._fail("a drilling cycle outside the plane G17 is not followed; post moves")
+        if not self.absolute:
+            self._fail("a drilling cycle in incremental is not followed; post it in absolute (G90)")
+        offset, scale = self._offset(), self.scale
+        if motion:
+            if self.cycle is None:
+                self.initial_z = self.position[2]
+            self.cycle = int(motion[6:])
+        repeats = values.get("L", values.get("K", 1.0) if self.dialect.name == "fanuc" else 1.0)
+        if repeats > 1.0:
+            self._fail("a drilling cycle with repeats is not followed; post each hole")
+        if axes[2] is not None:
+            self.cycle_z = offset[2] + axes[2] * scale
+        if "R" in values:
+            self.cycle_r = offset[2] + values["R"] * scale
+        if "Q" in values:
+            self.cycle_peck = values["Q"] * scale
+        if repeats == 0.0 or not any(axis is not None for axis in axes):
+            return "store"
+        if math.isnan(self.cycle_z) or math.isnan(self.cycle_r):
+            self._fail("a drilling cycle without Z or R")
+        x, y, _ = self._target(axes)
+        if self.cycle_r < self.cycle_z:
+            self._fail("the R level of the drilling cycle is below its depth")
+        bottom = [x, y, self.cycle_z]
+
+        def go(kind: int, z: float, *, there: bool = True) -> None:
+            sides = [x, y] if there else self.position[:2]
+            end, depth = [*sides, z], kind == FEED and z == self.cycle_z
+            if end != self.position:
+                self._move(kind, end, at=bottom, corrected=(int(there), int(there), int(depth)))
+
+        known_z = not math.isnan(self.position[2])
+        if known_z and self.position[2] < self.cycle_r:
+            go(RAPID, self.cycle_r, there=False)
+        go(RAPID, self.position[2])
+        go(RAPID, self.cycle_r)
+        pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
+        depth = self.cycle_r
+        while pecking and depth - self.cycle_peck > self.cycle_z and self.cycle_peck > 0:
+            depth -= self.cycle_peck
+            go(FEED, depth)
+            go(RAPID, self.cycle_r if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)
+            if self.cycle == 83:
+                go(RAPID, depth + _PECK_CLEARANCE_MM)
+        go(FEED, self.cycle_z)
+        back = FEED if self.cycle in (84, 85, 89) else RAPID
+        level = self.cycle_r if self.to_r_level or math.isnan(self.initial_z) else max(self.initial_z, self.cycle_r)
+        if back == FEED or self.dialect.name != "linuxcnc":  # which goes to the initial level at once
+            go(back, self.cycle_r)
+        go(RAPID, level)
+        return "cycle"
+
+    def _check(self, moves: Moves) -> None:
+        """Refuse positions outside the travel: usually the work offset is wrong."""
+        used = moves.corrected.any(axis=1)
+        for k, axis in enumerate(self.machine.axes):
+            low, high = axis.range_mm
+            end = moves.end_mm[:, k]
+            bad = np.flatnonzero(used & ((end < low - self.travel_slack_mm) | (end > high + self.travel_slack_mm)))
+            if len(bad):
+                self._line, self._text = int(moves.line[bad[0]]), ""
+                where = (
+                    f"{'XYZ'[k]} goes to {end[bad[0]]:.3f} mm of the machine, outside its travel {low:g} to {high:g} mm"
+                )
+                self._fail(f"{where}; check --wcs and --tools")
+
+
+class _PlainWords:
+    """Words of the blocks of a batch that have nothing but N, G0, G1, X, Y, Z, F and S, found by numpy.
+
+    ``run_end`` (n,) is the end of the run of plain blocks that each line is part of (its own number if it is not plain);
+    ``g`` (n,) is 0, 1, or -1 without a G code; ``value``, ``decimals`` (n, 3) and ``span`` (n, 3, 2) belong to X, Y, Z.
+    """
+
+    _OTHER, _DIGIT, _POINT, _SIGN, _LETTER, _BLANK = range(6)
+
+    def __init__(self, content: bytes, lines: list[bytes], dialect: Dialect) -> None:
+        table = np.zeros(256, dtype=np.uint8)
+        table[list(b"0123456789")], table[list(b".")], table[list(b"+-")] = self._DIGIT, self._POINT, self._SIGN
+        table[list(b"NGXYZFSngxyzfs")] = self._LETTER
+        table[list(b" \t\r\n" + (b"*" if dialect.pole else b""))] = self._BLANK
+        code = np.frombuffer(content, dtype=np.uint8)
+        what = table[code]
+        count = len(lines)
+        starts = np.concatenate([[0], np.cumsum([len(line) for line in lines])])[:-1]
+        plain = np.ones(count, dtype=bool)
+
+        def spoil(positions: IntArray) -> None:
+            plain[np.searchsorted(starts, positions, side="right") - 1] = False
+
+        spoil(np.flatnonzero(what == self._OTHER))
+        letter = np.flatnonzero(what == self._LETTER)
+        token = np.cumsum(what == self._LETTER) - 1
+        tokens = len(letter)
+        digit, point, sign = (np.flatnonzero(what == kind) for kind in (self._DIGIT, self._POINT, self._SIGN))
+        for positions in (digit, point, sign):
+            spoil(positions[token[positions] < 0])
+        digit, point, sign = (p[token[p] >= 0] for p in (digit, point, sign))
+        digits, points, signs = (np.bincount(token[p], minlength=tokens) for p in (digit, point, sign))
+        length = digits + points + signs
+        for positions in (digit, point, sign):  # a number follows its letter without a gap, in the same line
+            own = token[positions]
+            far = positions - letter[own] > (1 if positions is sign else length[own])
+            spoil(positions[far])
+            spoil(letter[own[far]])
+        spoil(letter[(digits == 0) | (digits > 15) | (points > 1) | (signs > 1)])
+        own = token[digit]
+        first = np.cumsum(digits) - digits
+        rank = digits[own] - 1 - (np.arange(len(digit)) - first[own])
+        weight = 10.0 ** np.arange(16)
+        whole = np.bincount(own, (code[digit] - 48.0) * weight[np.clip(rank, 0, 15)], minlength=tokens)
+        dot = np.full(tokens, len(code) + 1)
+        dot[token[point]] = point
+        decimals = np.bincount(own, digit > dot[own], minlength=tokens).astype(np.int64)
+        value = whole / weight[np.clip(decimals, 0, 15)]
+        value[token[sign][code[sign] == ord("-")]] *= -1.0
+        address, line = code[letter] & 0xDF, np.searchsorted(starts, letter, side="right") - 1
+        self.g = np.full(count, -1)
+        is_g = np.flatnonzero(address == ord("G"))
+        spoil(letter[is_g[(points[is_g] + signs[is_g] > 0) | (whole[is_g] > 1)]])
+        self.g[line[is_g]] = whole[is_g]
+        plain[np.bincount(line[is_g], minlength=count) > 1] = False
+        self.value = np.full((count, 3), np.nan)
+        self.decimals = np.zeros((count, 3), dtype=np.int64)
+        self.span = np.zeros((count, 3, 2), dtype=np.int64)
+        for axis, name in enumerate(b"XYZ"):
+            at = np.flatnonzero(address == name)
+            rows = line[at]
+            if dialect.point_needed:
+                spoil(letter[at[(points[at] == 0) & (whole[at] != 0)]])
+            plain[np.bincount(rows, minlength=count) > 1] = False
+            self.value[rows, axis], self.decimals[rows, axis] = value[at], decimals[at]
+            self.span[rows, axis] = (
+                np.stack([letter[at] + 1, letter[at] + 1 + length[at]], axis=1) - starts[rows][:, None]
+            )
+        # the end of each run of plain lines, found backwards
+        stops = np.where(plain, count, np.arange(count))
+        self.run_end = np.minimum.accumulate(stops[::-1])[::-1]

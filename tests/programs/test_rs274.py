@@ -1,0 +1,123 @@
+"""LinuxCNC's own interpreter (``rs274``) reads programs, original and corrected: its moves are ours, to its last decimal."""
+
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of
+from compgen.programs.dialects import DIALECTS
+from compgen.programs.reader import CCW, PLANE_AXES, RAPID
+from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
+
+pytestmark = pytest.mark.skipif(
+    shutil.which("rs274") is None,
+    reason="LinuxCNC is not installed (rs274 missing): make test installs it on Debian as root",
+)
+SETUP = Setup(OFFSETS_MM, TOOLS_MM)
+
+
+def canonical(program, folder, *, stopped=False):
+    """Moves of the interpreter: kind, end in units of the program, and for arcs centre, turns and normal axis.
+
+    Without an INI file the interpreter's machine is in inches: so are its offsets and tools.
+    """
+    rows = [
+        f"{5221 + 20 * n + k}\t{value / 25.4:.8f}"
+        for n, name in enumerate(OFFSETS_MM)
+        for k, value in enumerate(OFFSETS_MM[name])
+    ]
+    folder.joinpath("sim.var").write_text("\n".join(["5161\t0", "5162\t0", "5163\t0", *rows, ""]))
+    folder.joinpath("tool.tbl").write_text("".join(f"T{n} P{n} Z{v[2] / 25.4:.8f} D0\n" for n, v in TOOLS_MM.items()))
+    done = subprocess.run(
+        ["rs274", "-g", "-v", "sim.var", "-t", "tool.tbl", str(program)],
+        cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    if stopped:
+        assert "PROGRAM_END" not in done.stdout and "is not that of the correction" in done.stderr
+        return []
+    assert "PROGRAM_END" in done.stdout, done.stdout[-500:] + done.stderr[-500:]
+    moves, plane, last = [], 2, None
+    for line in done.stdout.splitlines():
+        found = re.search(r"(\w+)\((.*)\)", line)
+        name, text = (found[1], found[2]) if found else ("", "")
+        if name == "SELECT_PLANE":
+            plane = {"XY": 2, "XZ": 1, "YZ": 0}[text.removeprefix("CANON_PLANE_")]
+        elif name in ("STRAIGHT_TRAVERSE", "STRAIGHT_FEED"):
+            end = np.array([float(part) for part in text.split(",")[:3]])
+            if last is None or np.abs(end - last).max() > 0:
+                moves.append((name == "STRAIGHT_FEED", end, None))
+            last = end
+        elif name == "ARC_FEED":
+            e1, e2, c1, c2, turns, rise = (float(part) for part in text.split(",")[:6])
+            a, b = PLANE_AXES[plane]
+            end = np.zeros(3)
+            end[a], end[b], end[plane] = e1, e2, rise
+            moves.append((True, end, (c1, c2, turns, plane)))
+            last = end
+    return moves
+
+
+def ours(program, setup=SETUP):
+    reader = Reader(mill(), DIALECTS["linuxcnc"], setup, program)
+    moves, last = [], None
+    with open(program, "rb") as stream:
+        for batch in reader.batches(stream):
+            scales = {}
+            for segment in batch.segments:
+                numbers = segment.lines if hasattr(segment, "lines") else [segment.number - batch.first_line]
+                scales |= {batch.first_line + number: segment.scale for number in numbers}
+            for k in range(len(batch.moves)):
+                row = batch.moves.part(k)
+                scale = scales[int(row.line)]
+                end = (row.end_mm - row.offset_mm) / scale
+                if row.sweep_rad:
+                    a, b = PLANE_AXES[row.plane]
+                    c = (row.centre_mm - row.offset_mm) / scale
+                    turns = (1 if row.kind == CCW else -1) * np.ceil(abs(row.sweep_rad) / (2 * np.pi) - 1e-9)
+                    moves.append((True, end, (c[a], c[b], turns, row.plane)))
+                elif last is None or np.abs(np.round(end, 4) - np.round(last, 4)).max() > 0:
+                    moves.append((row.kind != RAPID, end, None))
+                last = end
+    return moves
+
+
+def assert_same(found, truth):
+    assert len(found) == len(truth)
+    for k, ((feed, end, arc), (feed_there, end_there, arc_there)) in enumerate(zip(found, truth, strict=True)):
+        assert feed == feed_there, k
+        known = ~np.isnan(end)
+        assert np.abs(end - end_there)[known].max() < 5.1e-5, (k, end, end_there)
+        assert (arc is None) == (arc_there is None), k
+        if arc is not None:
+            assert arc[2:] == arc_there[2:], k
+            assert np.abs(np.subtract(arc[:2], arc_there[:2])).max() < 5.1e-5, (k, arc, arc_there)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_original_and_corrected_programs_are_read_as_the_interpreter_reads_them(
+    tmp_path, seed, make_errors, monkeypatch
+):
+    if seed % 2:  # plain blocks many at a time, however few there are in a row
+        monkeypatch.setattr("compgen.programs.reader.LEAST_PLAIN", 1)
+    program = tmp_path / "p.ngc"
+    program.write_text(random_program(seed))
+    assert_same(ours(program), canonical(program, tmp_path))
+    model = model_of(mill(), make_errors(mill(), seed), None)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions("linuxcnc"), SETUP)
+    assert result.counts["changed_blocks"] > 0
+    corrected = tmp_path / "out" / result.file
+    text = corrected.read_text()
+    # the header's numbers are for a control in mm: this one, in inches, stops
+    canonical(corrected, tmp_path, stopped=True)
+    corrected.write_text(re.sub(r"(#52\d\d)-\[([-.\d]+)\]", lambda m: f"{m[1]}-[{float(m[2]) / 25.4:.6f}]", text))
+    truth = canonical(corrected, tmp_path)
+    # the check of the work offsets is a conditional, which our reader refuses in programs of others
+    body = tmp_path / "body.ngc"
+    body.write_text(
+        "\n".join(line for line in text.splitlines() if not re.match(r"o<|\(abort|\(CORRECTED", line)) + "\n"
+    )
+    assert_same(ours(body), truth)
+    assert result.after.largest_mm < result.before.largest_mm
