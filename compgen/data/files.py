@@ -25,6 +25,8 @@ from typing import Any
 from compgen.errors import InputError
 
 TEMPORARY = ".tmp"
+#: Put in front of the name of a table or program that was not accepted.
+REJECTED_PREFIX = "NOT-ACCEPTED-"
 #: Prefix of temporary folders, and the file whose lock shows that the process still runs.
 FOLDERS, LOCK = "compgen-", ".lock"
 #: Newer files may be about to be locked, s.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
-from compgen.data.files import OutputFolder, json_text, read_bytes, sha256_of_file, working_folder
+from compgen.data.files import REJECTED_PREFIX, OutputFolder, json_text, read_bytes, sha256_of_file, working_folder
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
@@ -25,13 +25,13 @@ from compgen.programs.path import (
     Pieces,
     closest_offset,
     directions_at,
+    is_closed,
     kept_directions,
     lengths_of,
     points_of,
 )
-from compgen.programs.reader import MARK, MM_PER_INCH, PLANE_AXES, Batch, Block, Moves, PlainRun, Reader, Setup
+from compgen.programs.reader import MARK, MM_PER_INCH, PLANE_AXES, Batch, Moves, PlainRun, Reader, Setup, SingleBlock
 from compgen.resources import program_version
-from compgen.tables import REJECTED_PREFIX
 
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
@@ -162,6 +162,7 @@ class ProgramWriter:
     wanted_mm: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     shift_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     depth: float = np.nan
+    pole_mm: list[float] = field(default_factory=lambda: [np.nan] * 3)
     changed: int = 0
     added: int = 0
 
@@ -209,38 +210,47 @@ class ProgramWriter:
             if last[k] >= 0:
                 self.written_mm[k] = rounded[last[k], k] * run.scale + offset[k]
         self.target_mm, self.wanted_mm = pieces.command_mm[rows][-1], batch.moves.end_mm[run.first + n - 1]
-        touched = (named & ~same).any(axis=1) | add.any(axis=1)
-        numbers, spans = rounded.tolist(), run.span.tolist()
-        renew, add_list, own_list, row = (named & ~same).tolist(), add.tolist(), own.tolist(), run.row.tolist()
-        move_list, first_list, touched_list = move.tolist(), first.tolist(), touched.tolist()
+        renew = named & ~same
+        touched = (renew.any(axis=1) | add.any(axis=1)).tolist()
+        # the usual numbers have the decimals of the dialect: they are written in one go
+        form = f"%.{digits}f\n" * 3 * len(rounded)
+        usual = (form % tuple((rounded + 0.0).ravel().tolist())).split("\n")
+        plain = ((run.decimals == digits)[move] | ~named).tolist()
+        order, spans = np.argsort(run.span[:, :, 0], axis=1).tolist(), run.span.tolist()
+        rows_of, owns, firsts, adds = run.row.tolist(), own.tolist(), first.tolist(), add.tolist()
         at, lines, base = run.lines.start, batch.lines, batch.first_line
-        for p in range(len(move_list)):
-            m = move_list[p]
-            if first_list[p]:
-                here = run.lines.start + row[m]
-                while at < here:
-                    yield base + at, lines[at]
-                    at += 1
-                at = here + 1
-                text = lines[here]
-                if not touched_list[p]:
-                    yield base + here, text
-                    continue
-                self.changed += 1
-                changes = []
-                end = 0
-                for k in range(3):
-                    start, stop = spans[m][k]
-                    end = max(end, stop)
-                    if renew[p][k]:
-                        changes.append((start, stop, self._number(numbers[p][k], own_list[p][k], text[start:stop])))
-                more = "".join(f" {AXES[k]}{self._number(numbers[p][k], digits)}" for k in range(3) if add_list[p][k])
-                yield base + here, _spliced(text, changes, end, more)
-            else:
+        for p, (m, begins, renewed) in enumerate(zip(move.tolist(), firsts, renew.tolist(), strict=True)):
+            here = run.lines.start + rows_of[m]
+            more = [f"{AXES[k]}{self._number(rounded[p, k], digits)}" for k in range(3) if adds[p][k]]
+            if not begins:
                 self.added += 1
-                here = run.lines.start + row[m]
-                words = [f"{AXES[k]}{self._number(numbers[p][k], digits)}" for k in range(3) if add_list[p][k]]
-                yield base + here, " ".join(words) + self._line_end(lines[here])
+                yield base + here, " ".join(more) + self._line_end(lines[here])
+                continue
+            while at < here:
+                yield base + at, lines[at]
+                at += 1
+            at = here + 1
+            text = lines[here]
+            if touched[p]:
+                self.changed += 1
+                parts: list[str] = []
+                done = 0
+                for k in order[m]:
+                    start, stop = spans[m][k]
+                    if renewed[k]:
+                        old = text[start:stop]
+                        new = usual[3 * p + k]
+                        if not plain[p][k] or old[0] == "+":
+                            new = self._number(rounded[p, k], owns[p][k], old)
+                        parts += text[done:start], new
+                        done = stop
+                end = spans[m][order[m][2]][1]
+                if more:
+                    parts += text[done:end], _joined(more, text[:end])
+                    done = end
+                parts.append(text[done:])
+                text = "".join(parts)
+            yield base + here, text
         for k in range(at, run.lines.stop):
             yield base + k, lines[k]
 
@@ -259,7 +269,9 @@ class ProgramWriter:
             text = "+" + text
         return text
 
-    def _block(self, batch: Batch, block: Block, pieces: Pieces, rows: slice, share_before: FloatArray) -> list[str]:
+    def _block(
+        self, batch: Batch, block: SingleBlock, pieces: Pieces, rows: slice, share_before: FloatArray
+    ) -> list[str]:
         """Rewrite one block; moves of a block are one that is divided, or those of a drilling cycle."""
         offset = batch.moves.offset_mm[block.first] + self.shift_mm if block.count else self.shift_mm
         if block.kind == "preset":
@@ -269,6 +281,8 @@ class ProgramWriter:
         if block.kind == "store":
             self.depth = next((float(text) for letter, text, *_ in block.words if letter == "Z"), self.depth)
         if block.kind not in ("line", "arc", "cycle"):
+            if any(word[0] in ("I", "J", "K") for word in block.words):
+                self.pole_mm = [np.nan] * 3  # the pole is again that of the program
             if block.count:
                 self.target_mm = np.array(pieces.command_mm[rows][-1])
                 self.written_mm = np.array(self.target_mm)
@@ -304,7 +318,7 @@ class ProgramWriter:
 
     def _piece(
         self,
-        block: Block,
+        block: SingleBlock,
         move: Moves,
         command: FloatArray,
         centre: FloatArray,
@@ -321,7 +335,7 @@ class ProgramWriter:
         changes: list[tuple[int, int, str]] = []
         more: list[str] = []
         start_mm = np.array(self.written_mm)
-        closed = block.kind == "arc" and abs(abs(sweep) - 2.0 * np.pi) < 1e-9
+        closed = block.kind == "arc" and bool(is_closed(sweep))
 
         def put(letter: str, value: float, needed: bool, always: bool = False) -> float | None:
             """Replace or add a word if its value differs; returns the value that the control then reads."""
@@ -358,7 +372,7 @@ class ProgramWriter:
                 if got is not None:
                     self.written_mm[k] = start_mm[k] + got * scale
         if block.kind == "arc":
-            self._arc_words(block, plane, centre, sweep, offset, start_mm, put)
+            self._arc_words(block, plane, centre, sweep, offset, start_mm, put, move.centre_mm[0])
             if count > 1:
                 for letter in ("P", "TURN"):
                     if letter in words:
@@ -388,23 +402,24 @@ class ProgramWriter:
                     changes.append((begin, last, ""))
         end = max((stop for letter, text, _, stop in block.words if letter in AXES), default=0)
         end = end or max(stop for _, _, _, stop in block.words)
-        text = _spliced(block.text, changes, end, "".join(f" {word}" for word in more))
+        text = _spliced(block.text, changes, end, more)
         return text if count == 1 or text.endswith("\n") else text + "\n"
 
     def _arc_words(
         self,
-        block: Block,
+        block: SingleBlock,
         plane: int,
         centre: FloatArray,
         sweep: float,
         offset: FloatArray,
         start_mm: FloatArray,
         put: Callable[..., float | None],
+        wanted: FloatArray,
     ) -> None:
         a, b = PLANE_AXES[plane]
         end = self.written_mm
         chord = float(np.hypot(end[a] - start_mm[a], end[b] - start_mm[b]))
-        if chord == 0.0 and abs(abs(sweep) - 2.0 * np.pi) > 1e-9 and abs(sweep) < 2.0 * np.pi:
+        if chord == 0.0 and not is_closed(sweep):
             raise InputError("the arc is shorter than the last decimal; give more with --decimals", line=block.number)
         radius_word = next((letter for letter in ("CR", "R") if any(w[0] == letter for w in block.words)), None)
         if radius_word:
@@ -416,14 +431,20 @@ class ProgramWriter:
             letter = "IJK"[k]
             base = offset[k] if block.centre_absolute else start_mm[k]
             value = (centre[k] - base) / block.scale
-            small = not block.centre_absolute and abs(value) <= _HALF * 10.0 ** -self.digits(block.scale)
-            put(letter, value, not small)
+            differs = value
+            if self.dialect.pole:
+                known = wanted[k] if np.isnan(self.pole_mm[k]) else self.pole_mm[k]
+                differs = (centre[k] - known) / block.scale
+            got = put(letter, value, abs(differs) > _HALF * 10.0 ** -self.digits(block.scale))
+            if self.dialect.pole and got is not None:
+                self.pole_mm[k] = got * block.scale + base
 
-    def _cycle(self, block: Block, target: FloatArray, offset: FloatArray, last: FloatArray) -> str:
+    def _cycle(self, block: SingleBlock, target: FloatArray, offset: FloatArray, last: FloatArray) -> str:
         """Rewrite a drilling block: place and depth of the hole; the R level is in the air and stays."""
         scale, digits = block.scale, self.digits(block.scale)
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
-        changes, more = [], ""
+        changes: list[tuple[int, int, str]] = []
+        more: list[str] = []
         before = (self.target_mm - offset) / scale
         before[2] = self.depth
         for k, letter in enumerate(AXES):
@@ -436,7 +457,7 @@ class ProgramWriter:
                 else:
                     value = given
             elif np.rint(value * 10**digits) != np.rint(before[k] * 10**digits) and np.isfinite(before[k]):
-                more += f" {letter}{self._number(value, digits)}"
+                more.append(f"{letter}{self._number(value, digits)}")
             else:
                 continue
             if k == 2:
@@ -449,7 +470,7 @@ class ProgramWriter:
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)
         return _spliced(block.text, changes, end or max(w[3] for w in block.words), more)
 
-    def _preset(self, block: Block) -> str:
+    def _preset(self, block: SingleBlock) -> str:
         """Rewrite G92: the control sets it at its corrected position, the offset has to become that of the program."""
         changes = []
         for letter, text, first, last in block.words:
@@ -463,14 +484,18 @@ class ProgramWriter:
                 if got != given:
                     changes.append((first, last, self._number(got, own, text)))
         self.changed += bool(changes)
-        return _spliced(block.text, changes, 0, "")
+        return _spliced(block.text, changes, 0, ())
 
 
-def _spliced(text: str, changes: list[tuple[int, int, str]], end: int, more: str) -> str:
-    """Replace columns of a block and put ``more`` after column ``end``; without blanks where the block has none."""
-    if more and " " not in text[:end].strip():
-        more = more.replace(" ", "")
-    for start, stop, new in sorted([*changes, (end, end, more)], reverse=True):
+def _joined(words: Sequence[str], before: str) -> str:
+    """Return words that follow ``before`` in a block, without blanks where the block has none."""
+    blank = " " if " " in before.strip() else ""
+    return "".join(blank + word for word in words)
+
+
+def _spliced(text: str, changes: list[tuple[int, int, str]], end: int, more: Sequence[str]) -> str:
+    """Replace columns of a block and put the words ``more`` after column ``end``."""
+    for start, stop, new in sorted([*changes, (end, end, _joined(more, text[:end]))], reverse=True):
         text = text[:start] + new + text[stop:]
     return text
 
@@ -493,7 +518,7 @@ class _ReadBack:
 
     def add(self, wanted: Moves, texts: list[str], origins: list[int]) -> None:
         """Read the corrected blocks ``texts`` and compare them with the moves that are wanted."""
-        read = self.reader.batch([text.encode("latin-1") for text in texts], self.lines + 1).moves
+        read = self.reader.batch("".join(texts).encode("latin-1"), self.lines + 1).moves
         origin = np.array(origins, dtype=np.int64)[read.line - self.lines - 1] if len(read) else read.line
         self.lines += len(texts)
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
@@ -633,7 +658,7 @@ def correct_program(
             for batch in reader.batches(stream):
                 by_radius = np.zeros(len(batch.moves), dtype=bool)
                 for segment in batch.segments:
-                    if isinstance(segment, Block) and segment.kind == "arc":
+                    if isinstance(segment, SingleBlock) and segment.kind == "arc":
                         by_radius[segment.first] = any(word[0] in ("R", "CR") for word in segment.words)
                 pieces = corrector.pieces(batch.moves, by_radius)
                 begin = np.where(np.diff(pieces.move, prepend=-1) > 0, 0.0, np.roll(pieces.share, 1))

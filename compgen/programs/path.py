@@ -124,6 +124,12 @@ def directions_at(moves: Moves, fraction: FloatArray) -> FloatArray:
     return np.where(np.abs(np.nan_to_num(change)) > 1e-9, np.sign(np.nan_to_num(change)), 0.0)
 
 
+def is_closed(sweep_rad: FloatArray | float) -> NDArray[np.bool_]:
+    """Return which arcs are full circles, one or several."""
+    turns = np.abs(np.asarray(sweep_rad)) / (2.0 * np.pi)
+    return np.asarray((turns > 0.5) & (np.abs(turns - np.round(turns)) < 1e-9))
+
+
 def kept_directions(found: FloatArray, before: FloatArray) -> FloatArray:
     """Return directions (n, 3) where a resting axis (0) keeps its last one; ``before`` (3,) is that of the first."""
     every = np.vstack([before, found])
@@ -191,9 +197,9 @@ class Corrector:
         correction = self.model.command(moves.at_mm, moves.tool_mm, ended) - moves.at_mm
         command = moves.end_mm + np.where(moves.corrected, correction, 0.0)
         divisible = moves.cutting & moves.corrected.all(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
-        turned = np.zeros(len(moves), dtype=bool)
+        turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
-            turned = ((began * before) < 0).any(axis=1)
+            turned = np.asarray(((began * before) < 0).any(axis=1))
         inner = [self._straight(moves, np.flatnonzero(divisible & (moves.sweep_rad == 0)), ended, turned)]
         arcs = np.flatnonzero(divisible & (moves.sweep_rad != 0))
         centre = np.array(moves.centre_mm)
@@ -216,12 +222,13 @@ class Corrector:
         if not len(rows):
             return Pieces(rows, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
         length = lengths_of(moves.part(rows))
-        most = np.maximum(np.floor(length / self.shortest_mm), 1.0)
-        count = np.clip(np.ceil(length / self.step_mm), 1.0, most).astype(np.int64) + 1
+        most = np.floor(length / self.shortest_mm)
+        count = np.clip(np.ceil(length / self.step_mm), np.where(turned[rows], 2.0, 1.0), np.maximum(most, 1.0))
+        count = count.astype(np.int64) + 1
         first = np.cumsum(count) - count
         own = np.repeat(np.arange(len(rows)), count)
         share = (np.arange(len(own)) - first[own]) / (count[own] - 1)
-        breaks = np.array((share == 0.0) | (share == 1.0), dtype=bool)
+        breaks = np.isin(share, (0.0, 1.0))
         takes_up = np.flatnonzero(turned[rows] & (count > 2))
         # after a reversal the slack is taken up at once: the first piece is as short as allowed
         share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
@@ -262,15 +269,14 @@ class Corrector:
             sweep = (high - low) * moves.sweep_rad[move]
             centre, off = _fitted_arcs(target.reshape(len(move), steps + 1, 3), moves.plane[move], sweep)
             centre[still] = moves.centre_mm[move[still]]
-            # an arc by its radius is well defined up to a third of a circle; one that nearly closes is not at all
+            # an arc by its radius is well defined up to a third of a circle; one that nearly closes could become a full one
             wide = by_radius[move] & (np.abs(sweep) > 2.1)
             ends = target.reshape(len(move), steps + 1, 3)[:, [0, -1]]
             index, (a, b) = np.arange(len(move)), (_FIRST[moves.plane[move]], _SECOND[moves.plane[move]])
-            gap = np.maximum(*(np.abs(ends[index, 1, k] - ends[index, 0, k]) for k in (a, b)))
-            full = (np.abs(np.abs(sweep) - 2.0 * np.pi) < 1e-9) & (
-                gap < max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
-            )
-            wide |= (np.abs(sweep) > 1.5 * np.pi) & ~full
+            chord = np.hypot(*(ends[index, 1, k] - ends[index, 0, k] for k in (a, b)))
+            gap = np.where(is_closed(sweep), chord, 0.0)
+            wide |= gap > max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
+            wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
             short = (high - low) * length[move] < 2.0 * self.shortest_mm
             fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
             done.append((move[fine], high[fine], ends[fine, 1], centre[fine]))
@@ -307,7 +313,7 @@ def _fitted_arcs(target: FloatArray, plane: IntArray, sweep: FloatArray) -> tupl
     du, dv = u - u[:, :1], v - v[:, :1]
     half = 0.5 * (du**2 + dv**2)
     ends = np.hypot(du[:, -1], dv[:, -1])
-    closed = np.abs(np.abs(sweep) - 2.0 * np.pi * np.round(np.abs(sweep) / (2.0 * np.pi))) < 1e-9
+    closed = is_closed(sweep)
     width = np.where(closed, 1.0, np.where(ends > 0, ends, 1.0))
     nu, nv = -dv[:, -1] / width, du[:, -1] / width
     side = du * nu[:, None] + dv * nv[:, None]

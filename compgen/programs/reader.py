@@ -28,8 +28,9 @@ MM_PER_INCH = 25.4
 RAPID, FEED, CW, CCW = range(4)
 #: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
 PLANE_AXES = ((1, 2), (2, 0), (0, 1))
-#: Blocks of a batch, the longest block, and the fewest plain blocks in a row that are read together.
-BATCH, LONGEST_BLOCK, LEAST_PLAIN = 20_000, 4096, 32
+#: Bytes that are read at a time, the longest block, and the fewest plain blocks in a row that are read together.
+BATCH_BYTES, LONGEST_BLOCK, LEAST_PLAIN = 1 << 20, 4096, 32
+_ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: Distances of start and end of an arc from its centre may differ by this much, mm.
 RADIUS_TOLERANCE_MM = 0.02
 #: Text in the first comment of a corrected program.
@@ -102,7 +103,7 @@ class Moves:
 
 
 @dataclass(frozen=True)
-class Block:
+class SingleBlock:
     """A block that was read by itself: its words (address, value text, first and last column), moves and modal state.
 
     ``kind`` says how it is rewritten: ``line``, ``arc``, ``cycle``, ``preset`` (G92), or as it is:
@@ -144,7 +145,7 @@ class Batch:
     first_line: int
     lines: list[str]
     moves: Moves
-    segments: list[Block | PlainRun]
+    segments: list[SingleBlock | PlainRun]
 
 
 class Reader:
@@ -181,34 +182,36 @@ class Reader:
 
     def batches(self, stream: BinaryIO) -> Iterator[Batch]:
         """Yield the batches of a program; the last one is followed by the check that the program was whole."""
-        number = 1
-        while True:
-            lines: list[bytes] = []
-            for _ in range(BATCH):
-                line = stream.readline(LONGEST_BLOCK)
-                if not line:
-                    break
-                if len(line) == LONGEST_BLOCK:
-                    self._line, self._text = number + len(lines), ""
-                    self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
-                lines.append(line)
-            if not lines:
-                break
-            yield self.batch(lines, number)
-            number += len(lines)
+        number, rest = 1, b""
+        while chunk := stream.read(BATCH_BYTES):
+            content = rest + chunk
+            whole = content.rfind(b"\n") + 1
+            content, rest = content[:whole], content[whole:]
+            if content:
+                yield self.batch(content, number)
+                number += content.count(b"\n")
+            if len(rest) > LONGEST_BLOCK:
+                self._refuse_bytes(rest, number)
+                self._line, self._text = number, ""
+                self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
+        if rest:
+            yield self.batch(rest, number)
+            number += 1
         self.finish(number - 1)
 
-    def batch(self, lines: list[bytes], first_line: int) -> Batch:
-        """Read lines, each with its line end, the first with the number ``first_line``."""
-        content = b"".join(lines)
+    def batch(self, content: bytes, first_line: int) -> Batch:
+        """Read whole lines, the first with the number ``first_line``."""
         self._refuse_bytes(content, first_line)
-        texts = [line.decode("latin-1") for line in lines]
-        tokens = _PlainWords(content, lines, self.dialect)
+        texts = [line + "\n" for line in content.decode("latin-1").split("\n")]
+        last = texts.pop()[:-1]
+        if last:
+            texts.append(last)
+        tokens = _PlainWords(content, len(texts), self.dialect)
         self._rows = []
         parts: list[Moves] = []
         count, k = 0, 0
-        segments: list[Block | PlainRun] = []
-        while k < len(lines):
+        segments: list[SingleBlock | PlainRun] = []
+        while k < len(texts):
             stop = int(tokens.run_end[k])
             if stop - k >= LEAST_PLAIN and self._takes_plain():
                 if self._rows:
@@ -220,6 +223,9 @@ class Reader:
                 count += len(moves)
                 k = stop
                 continue
+            if len(texts[k]) > LONGEST_BLOCK:
+                self._line, self._text = first_line + k, ""
+                self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
             block = self._block(first_line + k, texts[k], count)
             segments.append(block)
             count += block.count
@@ -244,11 +250,13 @@ class Reader:
             )
 
     def _refuse_bytes(self, content: bytes, first_line: int) -> None:
-        found = re.search(rb"[\x00-\x08\x0b\x0c\x0e-\x1f]|\r(?!\n)", content)
         if first_line == 1 and content[:3] == b"\xef\xbb\xbf":
             self._line = 1
             self._fail("the program begins with a byte-order mark, which controls do not read; save it as plain text")
-        if found:
+        if not content.translate(None, _ALLOWED) and content.count(b"\r") == content.count(b"\r\n"):
+            return
+        found = re.search(rb"[\x00-\x08\x0b\x0c\x0e-\x1f]|\r(?!\n)", content)
+        if found and found.end() < len(content):
             self._line = first_line + content[: found.start()].count(b"\n")
             what = (
                 "a carriage return within a line" if found[0] == b"\r" else f"the control character 0x{found[0][0]:02x}"
@@ -302,11 +310,11 @@ class Reader:
 
     # One block.
 
-    def _block(self, number: int, text: str, first: int) -> Block:
+    def _block(self, number: int, text: str, first: int) -> SingleBlock:
         self._line, self._text = number, text
         before, words = len(self._rows), self._words(text)
         kind = self._act(words) if words else "keep"
-        return Block(
+        return SingleBlock(
             number,
             text,
             words,
@@ -350,6 +358,10 @@ class Reader:
                 if MARK in found[3]:
                     self._fail("the program has been corrected before; give the program as it comes from CAM")
             else:
+                if found[1] in "oO":
+                    self._fail(
+                        "subprograms and loops are not followed; post one program without calls (O1234: --dialect fanuc)"
+                    )
                 words.append((found[1].upper(), found[2], found.start(2), found.end(2)))
             at = found.end()
             if not body[at:].strip():
@@ -380,7 +392,7 @@ class Reader:
                 return name.end(1)
         if rest[0] in "#[" or re.match(r"[A-Z]+\d*\s*=?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[A-Z]|=", rest, re.IGNORECASE):
             self._fail(f"{rest[:20]!r}: variables and expressions are not followed; post the program with numbers")
-        if self.dialect.name == "linuxcnc" and rest[0] in "oO":
+        if rest[0] in "oO":
             self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")
         if name:
             advice = f"; if it moves nothing, add --keep-unknown {name[1].upper()}"
@@ -406,13 +418,19 @@ class Reader:
             if letter in "GM" and len(letter) == 1:
                 codes.append(f"{letter}{value:g}")
                 continue
-            if letter in "ABCUVWE" and letter != "CR":
+            if letter == "O":
+                self._fail(
+                    "subprograms and loops are not followed; post one program without calls (--dialect fanuc: O1234)"
+                )
+            if letter in "ABCUVWE":
                 self._fail(
                     f"{letter}{text}: rotary and further axes are not followed; correct a program with X, Y and Z"
                 )
             if letter in values:
                 self._fail(f"{letter} is given twice in a block")
-            if letter in "XYZIJKRQ" and dialect.point_needed and "." not in text and value != 0.0:
+            cycles = self.cycle is not None or any(dialect.codes.get(code, "").startswith("cycle") for code in codes)
+            lengths = "XYZIJKRQ" if cycles else "XYZIJKR"
+            if letter in lengths and dialect.point_needed and "." not in text and value != 0.0:
                 self._fail(
                     f"{letter}{text} has no decimal point: mm or increments; post it with a decimal point", letter
                 )
@@ -800,15 +818,14 @@ class _PlainWords:
 
     _OTHER, _DIGIT, _POINT, _SIGN, _LETTER, _BLANK = range(6)
 
-    def __init__(self, content: bytes, lines: list[bytes], dialect: Dialect) -> None:
+    def __init__(self, content: bytes, count: int, dialect: Dialect) -> None:
         table = np.zeros(256, dtype=np.uint8)
         table[list(b"0123456789")], table[list(b".")], table[list(b"+-")] = self._DIGIT, self._POINT, self._SIGN
         table[list(b"NGXYZFSngxyzfs")] = self._LETTER
         table[list(b" \t\r\n" + (b"*" if dialect.pole else b""))] = self._BLANK
         code = np.frombuffer(content, dtype=np.uint8)
         what = table[code]
-        count = len(lines)
-        starts = np.concatenate([[0], np.cumsum([len(line) for line in lines])])[:-1]
+        starts = np.concatenate([[0], np.flatnonzero(code == ord("\n")) + 1])[:count]
         plain = np.ones(count, dtype=bool)
 
         def spoil(positions: IntArray) -> None:

@@ -6,9 +6,9 @@ from compgen.resources import load_on_first_use
 
 if TYPE_CHECKING:
     from compgen.data.comparison import Residuals, residuals, without_rigid_motion
-    from compgen.data.files import Provenance
+    from compgen.data.files import REJECTED_PREFIX, Provenance
     from compgen.resources import program_version
-    from compgen.tables.export import REJECTED_PREFIX, REPORT_FILES, Export, export, set_aside_superseded, usable_format
+    from compgen.tables.export import REPORT_FILES, Export, export, set_aside_superseded, usable_format
     from compgen.tables.judge import SafetyLimits
     from compgen.tables.render import Format, load_format
     from compgen.tables.signs import check_files

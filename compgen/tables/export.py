@@ -14,7 +14,7 @@ from compgen.controls import CONTROLLERS, AnyController, SourceFile, controller_
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview, shortened
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, format_errors, format_reversal, reversal_name
-from compgen.data.files import OutputFolder, Provenance, sha256_of
+from compgen.data.files import REJECTED_PREFIX, OutputFolder, Provenance, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
@@ -27,8 +27,6 @@ from compgen.tables.synthesis import Projector, best_values, projector
 # What an earlier export left in a folder: kept as ``PREVIOUS-...``, so that no old table is taken for one of the new.
 
 
-#: Put in front of the name of a table that was not accepted.
-REJECTED_PREFIX = "NOT-ACCEPTED-"
 MANIFEST = "manifest.json"
 #: Files that belong to the tables that a manifest names.
 COMPANY = (

@@ -517,7 +517,10 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
     stations.write_text(
         "station,x_mm,y_mm,z_mm\nS1,-420,-210,-420\nS2,330,-190,-405\nS3,310,410,-415\nS4,-400,430,-90\n"
     )
+    program = small_lengths_file.parent / "part.ngc"
+    program.write_text("G21 G90 G17 G54\nG0 X0 Y0 Z-100\nG1 X50 F100\nM2\n")
     return {
+        "correct": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
         "init": ("new", "--chain", "WFYXZT", "--travel", "X=0..500,Y=0..500,Z=0..500", "--out", out),
         "run": (small_machine_file, small_lengths_file, *files, "--out", out),
         "identify": (small_machine_file, small_lengths_file, "--out", out),
@@ -548,6 +551,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
 
 
 WRITING = [
+    "correct",
     "init",
     "run",
     "identify",

@@ -130,6 +130,11 @@ def test_the_note_of_a_command_has_its_options_and_their_help(tmp_path, monkeypa
         (["fit", "zha-gantry", "E", "--out", "o"], "fit_commands", {"numpy", "rich"}),
         (["predict", "zha-gantry", "E", "--points", "P", "--out", "o"], "plan_commands", TABLES),
         (
+            ["correct", "zha-gantry", "N", "--errors", "E", "--wcs", "G54=-400,-500,-200", "--out", "o"],
+            "program_commands",
+            {"numpy", "rich"},
+        ),
+        (
             ["export", "zha-gantry", "E", "--controller", "isg-csv", "--out", "o"],
             "table_commands",
             TABLES,
@@ -138,8 +143,10 @@ def test_the_note_of_a_command_has_its_options_and_their_help(tmp_path, monkeypa
 )
 def test_a_command_loads_its_own_module_and_no_library_that_it_does_not_need(tmp_path, words, module, allowed):
     (tmp_path / "p.points.csv").write_text("x_mm,y_mm,z_mm\n-400,100,-200\n")
+    (tmp_path / "n.ngc").write_text("G21 G90 G17 G54\nG0 X0 Y0 Z0\nG1 X50 F100\nM2\n")
     examples = ROOT / "examples"
     files = {
+        "N": str(tmp_path / "n.ngc"),
         "L": str(examples / "zha-gantry.lengths.csv"),
         "E": str(examples / "zha-gantry.truth.errors.csv"),
         "P": str(tmp_path / "p.points.csv"),

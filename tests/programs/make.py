@@ -13,7 +13,7 @@ def mill():
     return machine_of([(-600.0, 600.0), (-500.0, 500.0), (-400.0, 200.0)], 9, tool_offset_mm=(0.0, 0.0, -50.0))
 
 
-def random_program(seed, count=60, *, linuxcnc=True):
+def random_program(seed, count=60, *, linuxcnc=True, cycles=True):
     """Blocks of a random program within 100 mm of the work offset: lines, arcs in all planes and forms, cycles, offsets."""
     r = np.random.default_rng(seed)
     lines = ["%", "G21 G90 G17 G54 G94 G40 G49", "T1 M6", "G43 H1", "G0 X0.0 Y0.0 Z20.0", "G1 X1.0 F500"]
@@ -94,7 +94,7 @@ def random_program(seed, count=60, *, linuxcnc=True):
                 tool = r.integers(1, 3)
                 lines.append(f"G43 H{tool}")
                 go(["G0"], place(), [0, 1, 2])
-            elif choice == 2:
+            elif choice == 2 and cycles:
                 low, high = np.round(np.array([-0.9, -0.5]) * size, digits)
                 cycle = ["G81", "G82", "G85", "G83", "G73"][r.integers(0, 5)]
                 extra = f" {word('Q', size / 17)}" if cycle in ("G83", "G73") else " P0.1" if cycle == "G82" else ""

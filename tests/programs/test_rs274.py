@@ -6,11 +6,11 @@ import subprocess
 
 import numpy as np
 import pytest
+from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
 
 from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of
 from compgen.programs.dialects import DIALECTS
 from compgen.programs.reader import CCW, PLANE_AXES, RAPID
-from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
 
 pytestmark = pytest.mark.skipif(
     shutil.which("rs274") is None,

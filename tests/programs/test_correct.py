@@ -1,0 +1,444 @@
+"""The correction of NC programs: on a virtual machine, in five dialects, byte for byte, and what is refused."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
+from scipy.spatial import cKDTree
+
+import compgen
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.errors import InputError
+from compgen.kinematics.exact_chain import tip_position
+from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of, read_tools
+from compgen.programs.dialects import DIALECTS
+from compgen.programs.path import lengths_of, points_of
+
+SETUP = Setup(OFFSETS_MM, TOOLS_MM)
+PLAIN = Setup({"G54": (0.0, 0.0, 0.0), "PRESET": (0.0, 0.0, 0.0)}, {"1": (0.0, 0.0, 0.0)})
+
+
+def run(tmp_path, text, errors, dialect="linuxcnc", setup=SETUP, machine=None, reversal=None, only=None, **options):
+    """Correct a program; returns the result and the corrected text."""
+    program = tmp_path / "p.nc"
+    program.write_bytes(text.encode("latin-1"))
+    model = model_of(machine or mill(), errors, reversal, only)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions(dialect, **options), setup)
+    return result, (tmp_path / "out" / result.file).read_bytes().decode("latin-1")
+
+
+def body(text):
+    """A corrected program in the dialect of FANUC without its header."""
+    return re.sub(r"\(CORRECTED BY(.|\n)*POSITION\)\r?\n((IF|#3000|N900\d).*\n)*", "", text)
+
+
+def moves_of(text, dialect, setup, machine=None):
+    """All moves of a program without a header."""
+    reader = Reader(machine or mill(), DIALECTS[dialect], setup, "p")
+    return reader.batch(text.encode("latin-1"), 1).moves
+
+
+def shift(x=0.0, y=0.0, z=0.0, slope=0.0):
+    """Errors that move the tool by a constant (um), and X by a slope (um/mm): hand calculations are easy."""
+    ends = np.array([-600.0, 600.0])
+    curves = {"EXX": 1e-3 * (x + slope * ends), "EYX": np.full(2, 1e-3 * y), "EZX": np.full(2, 1e-3 * z)}
+    return ErrorTable({name: Curve(ends, value, np.zeros(2)) for name, value in curves.items()})
+
+
+# --- the virtual machine ---------------------------------------------------------------------------------------------
+
+
+def sampled(moves, step_mm):
+    """Points along all moves at feed, each with its tool."""
+    cut = moves.part(np.flatnonzero(moves.cutting))
+    count = np.ceil(lengths_of(cut) / step_mm).astype(int) + 1
+    own = np.repeat(np.arange(len(cut)), count)
+    share = (np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)) / np.maximum(count[own] - 1, 1)
+    many = cut.part(own)
+    return points_of(many, share), many.tool_mm
+
+
+def distance_to_path(points, path):
+    """Distance of points from a dense polyline."""
+    near = cKDTree(path).query(points, k=12)[1]  # also those of another move that comes close
+    best = np.full(len(points), np.inf)
+    for first in np.concatenate([near - 1, near], axis=1).T.clip(0, len(path) - 2):
+        a, b = path[first], path[first + 1]
+        square = np.maximum(((b - a) ** 2).sum(axis=1), 1e-30)
+        share = np.clip(((points - a) * (b - a)).sum(axis=1) / square, 0.0, 1.0)
+        best = np.minimum(best, np.linalg.norm(points - a - share[:, None] * (b - a), axis=1))
+    return best
+
+
+@pytest.mark.parametrize("chain", ["WFYXZT", "WXYFZT", "WYFXZT"])
+@pytest.mark.parametrize("seed", [3, 8])
+def test_on_a_machine_of_finite_rotations_the_tool_follows_the_wanted_path(tmp_path, make_errors, chain, seed):
+    """The tool of an independent product of rotations, moved by the corrected text, is on the path of the original."""
+    machine = compgen.Machine("m", compgen.Chain(chain), mill().axes, tool_offset_mm=(0.0, 0.0, -50.0))
+    errors = make_errors(machine, seed, (900e-6, -600e-6, 700e-6)[: len([n for n in ("EC0Y", "EB0Z", "EA0Z")])])
+    text = random_program(seed, linuxcnc=False, cycles=False)
+    result, corrected = run(tmp_path, text, errors, machine=machine)
+    start = corrected.index("G21 G90")
+    wanted, _ = sampled(moves_of(text, "linuxcnc", SETUP, machine), 0.05)
+
+    def tips(program):
+        at, tool = sampled(moves_of(program, "linuxcnc", SETUP, machine), 0.5)
+        return tip_position(machine, errors.at(at), at, tool) - tool
+
+    before, after = (distance_to_path(tips(program), wanted) for program in (text, corrected[start:]))
+    assert before.max() > 0.02
+    assert after.max() < 1.2e-3  # the tolerance, and the decimals
+    assert result.accepted
+    assert abs(result.after.normal_mm - after.max()) < 0.4e-3
+
+
+def test_a_constant_error_is_taken_off_with_its_sign(tmp_path):
+    """The machine moves 10 um too far in X: the corrected program asks for 10 um less. By hand."""
+    text = "%\nO7\nG21 G90 G17 G54\nG0 X10. Y0. Z5.\nG1 Z-1. F100\nX20.\nG2 X30. Y10. I0. J10.\nM30\n%\n"
+    setup = Setup({"G54": (0.0, 0.0, 0.0)})
+    result, corrected = run(tmp_path, text, shift(x=10.0, y=-4.0), "fanuc", setup)
+    moves = "G0 X9.99 Y0.004 Z5.\nG1 Z-1. F100\nX19.99\nG2 X29.99 Y10.004 I0. J10.\nM30\n%\n"
+    assert corrected.endswith(moves)
+    assert corrected.startswith("%\nO7\n(CORRECTED BY VOLCOMP ")
+    assert "IF[ABS[#5221-[0.0000]]LE0.001]GOTO9001\n#3000=1(G54 IS NOT THAT OF THE CORRECTION)\nN9001\n" in corrected
+    assert result.before.largest_mm == pytest.approx(np.hypot(10e-3, 4e-3), abs=1e-9)
+    assert result.after.largest_mm < 1e-9
+    assert result.counts == {"blocks": 9, "changed_blocks": 3, "added_blocks": 0}
+
+
+def test_work_offset_and_tool_length_say_where_the_machine_is(tmp_path):
+    """EXX = 0.1 um/mm at 300 mm of the machine is 30 um; EBZ = 100 urad turns a tool of 50 + 100 mm by -15 um in X."""
+    ends = np.array([-400.0, 200.0])
+    errors = shift(slope=0.1).replace(
+        curves={**shift(slope=0.1).curves, "EBZ": Curve(ends, np.full(2, 100e-6), np.zeros(2))}
+    )
+    setup = Setup({"G55": (290.0, 0.0, -150.0)}, {"7": (0.0, 0.0, 100.0)})
+    text = "G21 G90 G17 G55\nG0 X0. Y0.\nG43 H7 Z60.\nG1 X10. F100\nM2\n"
+    _, corrected = run(tmp_path, text, errors, setup=setup)
+    assert float(re.search(r"G1 X([\d.]+)", corrected)[1]) == pytest.approx(10.0 - 0.030 + 0.015, abs=1e-5)
+
+
+def test_a_reversal_is_taken_up_at_once(tmp_path):
+    """Backlash of 20 um in X, with the mean of both directions in the curves: -10 um going up, +10 um going down."""
+    reversal = ReversalCurves({(0, 0): Curve(np.zeros(1), np.array([-20e-3]), np.zeros(1))})
+    text = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X10. F100\nX20.\nX5.\nX1.\nM2\n"
+    setup = Setup({"G54": (0.0, 0.0, 0.0)})
+    result, corrected = run(tmp_path, text, ErrorTable(), setup=setup, reversal=reversal)
+    ends = [float(x) for x in re.findall(r"^(?:G1 )?X([\d.]+)", corrected, re.MULTILINE)]
+    assert ends == pytest.approx([10.01, 20.01, 19.89, 4.99, 0.99])
+    assert result.after.ends_mm < 1e-9 < 9e-3 < result.before.ends_mm
+
+
+# --- structure -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_without_errors_a_program_stays_the_same_byte_for_byte(tmp_path, seed):
+    text = random_program(seed).replace("\n", "\r\n" if seed % 2 else "\n")
+    result, corrected = run(tmp_path, text, shift())
+    assert corrected == text
+    assert result.accepted
+    assert result.counts["changed_blocks"] == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_plain_blocks_read_together_give_what_single_blocks_give(tmp_path, seed, make_errors, monkeypatch):
+    """Whatever the size of the batches and however blocks are read, the same bytes are written."""
+    generator = np.random.default_rng(seed)
+    rows = []
+    for _ in range(400):
+        words = [f"{'XYZ'[k]}{generator.uniform(-60, 60):.{generator.integers(1, 5)}f}" for k in range(3)]
+        chosen = sorted(generator.choice(3, generator.integers(0, 4), replace=False))
+        code = generator.choice(["", "", "", "G1 ", "G0 ", "N7 ", "g01"])
+        rows.append(code + " ".join(words[k] for k in chosen) + generator.choice(["", "", " F300", " S900"]))
+    text = "\n".join(["G21 G90 G17 G54", "G0 X0 Y0 Z0", "G1 F9", *[row or "N1" for row in rows], "M2", ""])
+    errors = make_errors(mill(), seed, (300e-6, 200e-6, 100e-6))
+    found = set()
+    for least, size in ((32, 1 << 20), (1, 1 << 20), (10**9, 1 << 20), (3, 700)):
+        monkeypatch.setattr("compgen.programs.reader.LEAST_PLAIN", least)
+        monkeypatch.setattr("compgen.programs.reader.BATCH_BYTES", size)
+        result, corrected = run(tmp_path, text, errors)
+        found.add((corrected, round(result.after.rms_mm, 12), result.counts["added_blocks"]))
+    assert len(found) == 1
+    assert result.counts["added_blocks"] > 0
+
+
+def test_line_ends_comments_numbers_and_signs_stay(tmp_path):
+    text = "%\r\nO12 (Stück 4)\r\n/N5 M8\r\nG21 G90 G17 G54\r\nN10 G0X+10.Y0.Z5.(über)\r\nN20 G1 Z-1. F100 M9\r\n\r\nM30\r\n%\r\n"
+    _, corrected = run(tmp_path, text, shift(x=10.0), "fanuc", PLAIN)
+    assert body(corrected).replace("X+9.99", "X+10.") == text
+    assert "\n" not in corrected.replace("\r\n", "")
+
+
+def test_a_long_move_is_divided_where_the_correction_bends(tmp_path):
+    """A kink of 40 um in the middle of 400 mm: two pieces; M9 and the comment act where they acted."""
+    nodes = np.array([-600.0, 0.0, 600.0])
+    errors = ErrorTable({"EYX": Curve(nodes, np.array([0.0, 40e-3, 0.0]), np.zeros(3))})
+    text = "G21 G90 G17 G54\nG0 X-200. Y0. Z0.\nN5 G1 X200. F100 M9 (side)\nM2\n"
+    result, corrected = run(tmp_path, text, errors, setup=PLAIN)
+    first, second = corrected.splitlines()[-3:-1]
+    assert re.fullmatch(r"N5 G1 X-?0\.[0-9]* Y-0\.0[34]\d+ F100  \(side\)|N5 G1 X\S+ Y-0\.\d+ F100 .*\(side\)", first)
+    assert re.fullmatch(r"X200\.? ?Y-0\.02667 M9|Y-0\.02667 M9|X200\.0+ Y-0\.02667 M9", second), second
+    assert result.counts["added_blocks"] == 1
+    assert result.after.normal_mm < 1.1e-3
+    inverse = text.replace("N5 G1", "N5 G93 G1").replace("F100", "F2")
+    _, corrected = run(tmp_path, inverse, errors, setup=PLAIN)
+    rates = [float(rate) for rate in re.findall(r"F([\d.]+)", corrected)]
+    assert sum(1 / rate for rate in rates) == pytest.approx(1 / 2, rel=1e-5)  # the time of the block
+
+
+def test_arcs_stay_arcs(tmp_path):
+    """A scale error makes ellipses: pieces of circles within the tolerance, none of them straight."""
+    text = "G21 G90 G17 G54\nG0 X50. Y0. Z0.\nG3 I-50. F100\nG2 X50. Y20. R10.\nG3 X-50. Y20. R-50.\nM2\n"
+    result, corrected = run(tmp_path, text, shift(slope=0.2), setup=PLAIN)
+    assert result.after.normal_mm < 1.1e-3 < 9e-3 < result.before.normal_mm
+    assert re.findall(r"\bG[01]\b", corrected) == ["G0"]
+    assert 4 <= result.counts["added_blocks"] <= 20
+
+
+def test_only_some_axes(tmp_path):
+    text = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X10. Y10. Z10. F100\nM2\n"
+    _, corrected = run(tmp_path, text, shift(10.0, 20.0, 30.0), setup=PLAIN, only="X,Z")
+    assert "G1 X9.99 Y10. Z9.97 F100" in corrected
+
+
+def test_incremental_moves_do_not_add_up_their_rounding(tmp_path):
+    """A scale of 1 um in 10 mm, steps of 1 mm with three decimals: each would be rounded to 1 mm."""
+    steps = "X1.\n" * 200
+    text = f"%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z0.\nG91 G1 F100\n{steps}G90\nM30\n%\n"
+    result, corrected = run(tmp_path, text, shift(slope=0.1), "fanuc", PLAIN)
+    total = sum(float(x) for x in re.findall(r"^X([\d.]+)", corrected, re.MULTILINE))
+    assert total == pytest.approx(200 - 0.020, abs=0.6e-3)
+    assert result.after.largest_mm < 0.6e-3
+
+
+def test_inches(tmp_path):
+    text = "G20 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X1. F4\nM2\n"
+    _, corrected = run(tmp_path, text, shift(x=25.4), setup=PLAIN)
+    assert "G1 X0.999 F4" in corrected
+
+
+# --- dialects: golden programs, the errors are 10 um in X and -20 um in Y ----------------------------------------------
+
+GOLDEN = {
+    "siemens": (
+        '%_N_PART_MPF\n;$PATH=/_N_WKS_DIR\nN10 G17 G71 G90 G54 ; start\nN20 T1 D1\nN30 MSG("side")\nN40 G0 X10 Y20 Z5\n'
+        "N50 G1 Z-2 F200\nN60 G2 X20 Y30 CR=10\nN70 G3 X=30 Y=20 I0 J-10\nN75 G2 X30 Y20 Z-3 I5 J0 TURN=1\n"
+        "N80 SUPA G0 Z0 D0\nN90 M30\n",
+        "N40 G0 X9.99 Y20.02 Z5\nN50 G1 Z-2 F200\nN60 G2 X19.99 Y30.02 CR=10\nN70 G3 X=29.99 Y=20.02 I0 J-10\n"
+        "N75 G2 X29.99 Y20.02 Z-3 I5 J0 TURN=1\nN80 SUPA G0 Z0 D0\nN90 M30\n",
+    ),
+    "heidenhain-iso": (
+        "%PART G71 *\nN10 G30 G17 X+0 Y+0 Z-40*\nN20 G31 G90 X+100 Y+100 Z+0*\nN30 T1 G17 S3000*\nN40 G00 G40 G90 Z+50*\n"
+        "N50 X+10 Y+20 M3*\nN60 G01 Z-2 F200*\nN70 I+20 J+20*\nN80 G02 X+30 Y+20*\nN90 G03 X+50 Y+20 I+40 J+20*\n"
+        "N100 G00 Z+50 M2*\nN99999999 %PART G71 *\n",
+        "N50 X+9.99 Y+20.02 M3*\nN60 G01 Z-2 F200*\nN70 I+20 J+20*\nN80 G02 X+29.99 Y+20.02 I+19.99 J+20.02*\n"
+        "N90 G03 X+49.99 Y+20.02 I+39.99 J+20.02*\nN100 G00 Z+50 M2*\nN99999999 %PART G71 *\n",
+    ),
+    "grbl": (
+        "(made by CAM)\nG21\nG90 G17 G54\nG0 X10 Y20 Z5 ; go\nM3 S1000\nG1 Z-2 F200\nG2 X20 Y30 I10 J0\n"
+        "X30 Y20 R10\nG91\nG1 X1\nG90\nG53 G0 Z0\nM5\n",
+        "G0 X9.99 Y20.02 Z5 ; go\nM3 S1000\nG1 Z-2 F200\nG2 X19.99 Y30.02 I10 J0\nX29.99 Y20.02 R10\nG91\nG1 X1\n"
+        "G90\nG53 G0 Z0\nM5\n",
+    ),
+    "fanuc": (
+        "%\nO0001(PART)\nN1 G21 G17 G40 G80 G90\nN2 T1 M6\nN3 G0 G54 X10. Y20. S1000 M3\nN4 G43 H1 Z5. M8\n"
+        "N5 G98 G81 Z-3. R2. F90\n"
+        "N6 X30.\nN7 Y40. Z-4.\nN8 G80\nN9 G91 G28 Z0.\nN10 G90\nN11 M30\n%\n",
+        "N3 G0 G54 X9.99 Y20.02 S1000 M3\nN4 G43 H1 Z5. M8\nN5 G98 G81 Z-3. R2. F90\nN6 X29.99\nN7 Y40.02 Z-4.\nN8 G80\n"
+        "N9 G91 G28 Z0.\nN10 G90\nN11 M30\n%\n",
+    ),
+}
+
+
+@pytest.mark.parametrize("dialect", GOLDEN)
+def test_golden_programs_of_the_dialects(tmp_path, dialect):
+    text, expected = GOLDEN[dialect]
+    result, corrected = run(tmp_path, text, shift(x=10.0, y=-20.0), dialect, PLAIN)
+    assert corrected.endswith(expected)
+    assert corrected.startswith(text.splitlines()[0]) or dialect == "grbl"
+    assert result.after.largest_mm < 1e-9
+    unchanged, same = run(tmp_path, text, shift(), dialect, PLAIN)
+    assert (same, unchanged.accepted) == (text, True)
+
+
+def test_siemens_and_linuxcnc_stop_where_the_work_offset_is_another(tmp_path):
+    setup = Setup({"G55": (1.5, -2.0, -3.25)})
+    _, corrected = run(tmp_path, "G71 G90 G55\nG0 X0 Y0 Z0\nG1 X9 F9\nM30\n", shift(x=5.0), "siemens", setup)
+    assert "IF ABS($P_UIFR[2,Y,TR]-(-2.0000))<=0.001 GOTOF VC9002\nMSG(" in corrected
+    assert re.search(r"MSG\(.*\)\nM30\nVC9002:\n", corrected)
+
+
+# --- what is refused -------------------------------------------------------------------------------------------------
+
+START = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\n"
+REFUSED = [
+    ("linuxcnc", START + "G41 D1\nM2\n", 3, "cutter radius compensation"),
+    ("linuxcnc", START + "#1=5\nM2\n", 3, "variables"),
+    ("linuxcnc", START + "G1 X[1+2] F9\nM2\n", 3, "variables and expressions"),
+    ("linuxcnc", START + "o100 call\nM2\n", 3, "subprograms"),
+    ("fanuc", START + "M98 P1000\nM30\n", 3, "subprograms"),
+    ("fanuc", START + "G65 P9810 X1.\nM30\n", 3, "subprograms and macros"),
+    ("fanuc", START + "G68 X0. Y0. R30.\nM30\n", 3, "turned"),
+    ("fanuc", START + "G5.1 Q1\nM30\n", 3, "G5.1"),
+    ("fanuc", START + "WHILE[#1LT5]DO1\nM30\n", 3, "WHILE"),
+    ("fanuc", START + "G1 X10 F100\nM30\n", 3, "decimal point"),
+    ("fanuc", START + "G1 X1. A30. F100\nM30\n", 3, "rotary"),
+    ("fanuc", START + "G33.7\nM30\n", 3, "is not known"),
+    ("fanuc", START + "M123\nM30\n", 3, "--keep-unknown M123"),
+    ("fanuc", START + "G1 X1. X2. F1\nM30\n", 3, "twice"),
+    ("fanuc", START + "G43 H9 Z1.\nM30\n", 3, "tool 9 is not known"),
+    ("fanuc", START + "G56\nM30\n", 3, "--wcs G56=X,Y,Z"),
+    ("fanuc", START + "G1 X9000. F1\nM30\n", 3, "outside its travel"),
+    ("fanuc", START + "G2 X5. Y5. F1\nM30\n", 3, "without centre or radius"),
+    ("fanuc", START + "G2 X5. Y5. I3. J0. F1\nM30\n", 3, "from its centre"),
+    ("fanuc", START + "G2 X5. R1. F1\nM30\n", 3, "give no arc"),
+    ("fanuc", "G21 G90 G54\nG1 X5. F1\nM30\n", 2, "is not known"),
+    ("fanuc", "G21 G90 G54\nX5.\nM30\n", 2, "before any of G0"),
+    ("fanuc", "G21 G91 G54\nG0 X5.\nM30\n", 2, "increment"),
+    ("fanuc", START + "M30\nO2\nG1 X1. F1\nM99\n", 4, "second program"),
+    ("fanuc", "%\nO1\n" + START + "G1 X1. F1\n", 5, "may have been cut"),
+    ("fanuc", "%\nO1\n" + START + "G1 X1. F1\nM30\n", 6, "does not end with it"),
+    ("linuxcnc", START + "G1 X1. F1\n", 3, "may have been cut"),
+    ("linuxcnc", START + "G1 X1. Y2", 3, "may have been cut|X and Z"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nCYCLE81(5,0,2,-10)\nM30\n", 3, "CYCLE81 is not known"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nR1=5\nM30\n", 3, "variables"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nX=IC(5)\nM30\n", 3, "variables"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nTRANS X5\nM30\n", 3, "TRANS is not known"),
+    ("heidenhain-iso", "%A G71 *\nG00 G90 X+0 Y+0 Z+0*\nG54 X+10*\nN9 %A G71 *\n", 3, "G54"),
+    ("heidenhain-iso", "%A G71 *\nG00 G90 X+0 Y+0 Z+0*\nG12 H+90*\nN9 %A G71 *\n", 3, "G12"),
+    ("grbl", "G21 G90\nG0 X0 Y0 Z0\nG38.2 Z-5 F9\n", 3, "G38.2"),
+    ("linuxcnc", "", 1, "no moves"),
+    ("linuxcnc", "\xef\xbb\xbf" + START + "M2\n", 1, "byte-order mark"),
+    ("linuxcnc", START + "G1 X1\x00 F1\nM2\n", 3, "control character 0x00"),
+    ("linuxcnc", START + "G1 X1 F1\rG1 X2\nM2\n", 3, "carriage return"),
+    ("linuxcnc", START + "G1 X1 F1 \xfcber\nM2\n", 3, "cannot be read"),
+    ("linuxcnc", START + "G1 X1 F1 (open\nM2\n", 3, "cannot be read"),
+    ("linuxcnc", START + "X" + "1" * 6_000 + "\nM2\n", 3, "longer than"),
+    ("linuxcnc", "G1X1.5" * 3_500_000, 1, "longer than"),
+    ("linuxcnc", "(CORRECTED BY VOLCOMP 1 FOR MACHINE a)\n" + START + "M2\n", 1, "corrected before"),
+]
+
+
+@pytest.mark.parametrize(
+    ("dialect", "text", "line", "words"), REFUSED, ids=[f"{r[0]}-{r[3][:24]}-{i}" for i, r in enumerate(REFUSED)]
+)
+def test_what_cannot_be_followed_is_refused_with_its_line(tmp_path, listing, dialect, text, line, words):
+    with pytest.raises(InputError, match=words) as caught:
+        run(tmp_path, text, shift(x=10.0), dialect, Setup({"G54": (0.0, 0.0, 0.0), "PRESET": (0.0, 0.0, 0.0)}))
+    assert caught.value.line == line
+    assert not (tmp_path / "out").exists()
+    assert len(caught.value.message) < 400
+
+
+def test_codes_that_move_nothing_can_be_kept(tmp_path):
+    text = "%\nO1\n" + START + "G5.1 Q1\nM123\nG187 X5. (not a move)\nG1 X1. F1\nM30\n%\n"
+    setup = Setup({"G54": (0.0, 0.0, 0.0)}, keep_unknown=frozenset({"G5.1", "M123", "G187"}))
+    _, corrected = run(tmp_path, text, shift(x=10.0), "fanuc", setup)
+    assert corrected.endswith("G5.1 Q1\nM123\nG187 X5. (not a move)\nG1 X0.99 F1\nM30\n%\n")
+    with pytest.raises(InputError, match="ambiguous"):
+        run(tmp_path, text.replace("G187", "G1 G187"), shift(x=10.0), "fanuc", setup)
+
+
+def test_skipped_blocks_stay(tmp_path):
+    text = START + "/G1 X5. F1\nG1 X7. F1\nM2\n"
+    setup = Setup({"G54": (0.0, 0.0, 0.0)}, skip_deleted=True)
+    assert "/G1 X5. F1\nG1 X6.99 F1" in run(tmp_path, text, shift(x=10.0), setup=setup)[1]
+    assert "/G1 X4.99 F1\nG1 X6.99 F1" in run(tmp_path, text, shift(x=10.0), setup=PLAIN)[1]
+
+
+def test_tool_tables(tmp_path):
+    table = tmp_path / "t.csv"
+    table.write_text("tool,length_mm,x_mm\n01,101.5,0\nMILL,50,0.25\n")
+    assert {key: tuple(value) for key, value in read_tools(table).items()} == {
+        "1": (0.0, 0.0, 101.5),
+        "MILL": (0.25, 0.0, 50.0),
+    }
+    native = tmp_path / "tool.tbl"
+    native.write_text("; tools\nT1 P1 Z+101.5 D6 ; end mill\nT22 P3 X0.1 Z30\n")
+    assert read_tools(native) == {"1": (0.0, 0.0, 101.5), "22": (0.1, 0.0, 30.0)}
+    table.write_text("tool,length_mm\n1,5\n1,6\n")
+    with pytest.raises(InputError, match="twice"):
+        read_tools(table)
+
+
+# --- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shop(tmp_path, small_machine_file, small_errors):
+    """A folder with machine, errors, tools and a program in reach of the small machine."""
+    shutil.copy(small_machine_file, tmp_path / "mill.toml")
+    (tmp_path / "e.errors.csv").write_text(compgen.format_errors(small_errors))
+    (tmp_path / "tools.csv").write_text("tool,length_mm\n1,20\n")
+    (tmp_path / "p.nc").write_text("%\nO1\nG21 G90 G17 G54\nG43 H1\nG0 X0. Y0. Z60.\nG1 Z0. F100\nX50.\nY50.\nM30\n%\n")
+    return tmp_path
+
+
+def test_the_command_writes_the_program_its_figures_and_what_to_check(shop, call):
+    words = [
+        "--errors",
+        shop / "e.errors.csv",
+        "--dialect",
+        "fanuc",
+        "--tools",
+        shop / "tools.csv",
+        "--wcs",
+        "G54=0,0,-150",
+    ]
+    code, out, _ = call("correct", shop / "mill.toml", shop / "p.nc", *words, "--out", shop / "o")
+    assert code == 0, out
+    assert "before" in out
+    assert {path.name for path in (shop / "o").iterdir()} == {"p.nc", "correction.json", "preflight.md"}
+    assert "G54: X 0, Y 0, Z -150 mm" in (shop / "o" / "preflight.md").read_text()
+    code, again, _ = call("correct", shop / "mill.toml", shop / "p.nc", *words, "--out", shop / "o", "--json")
+    found = compgen.data.files.json.loads(again)
+    assert found["accepted"]
+    assert found["after"]["max_um"] < 1.5 < found["before"]["max_um"]
+    assert found["errors"]["sha256"] == compgen.data.files.sha256_of_file(shop / "e.errors.csv")
+
+
+def test_a_result_that_is_not_smaller_is_named_so(shop, call):
+    """With one decimal the rounding, up to 50 um, is more than the errors."""
+    words = [
+        "--errors",
+        shop / "e.errors.csv",
+        "--dialect",
+        "fanuc",
+        "--tools",
+        shop / "tools.csv",
+        "--wcs",
+        "G54=0,0,-150",
+    ]
+    text = (shop / "p.nc").read_text().replace("X50.", "X50.049")
+    (shop / "p.nc").write_text(text.replace("X50.049", "X1.").replace("Y50.", "Y1."))
+    code, _, error = call("correct", shop / "mill.toml", shop / "p.nc", *words, "--decimals", 1, "--out", shop / "o")
+    names = {path.name for path in (shop / "o").iterdir()}
+    if code == 0:
+        pytest.fail("rounding to 0.1 mm was accepted")
+    assert code == 1
+    assert "NOT-ACCEPTED-p.nc" in names
+    assert "p.nc" not in names
+    assert "not acceptable" in error
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--wcs", "G54=1,2"], "expected e.g. G54="),
+        (["--wcs", "G54=1,2,3", "--wcs", "g54=1,2,3"], "given twice"),
+        (["--only", "X,Q"], "does not name axes"),
+        (["--tolerance-um", "0"], "above 0"),
+        (["--dialect", "mazak"], "mazak"),
+        (["--tools", "none.csv"], "no such file"),
+        (["--dialect", "fanuc"], "add --wcs G54="),
+    ],
+)
+def test_wrong_usage_writes_nothing(shop, call, words, message):
+    code, _, error = call(
+        "correct", shop / "mill.toml", shop / "p.nc", "--errors", shop / "e.errors.csv", *words, "--out", shop / "o"
+    )
+    assert (code, (shop / "o").exists()) == (2, False)
+    assert message in error
