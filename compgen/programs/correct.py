@@ -347,7 +347,8 @@ class ProgramWriter:
                 changes.append((first, last, self._number(value, own, text)))
                 return round(value, own)
             if needed or always:
-                more.append(f"{letter}{self._number(value, digits)}")
+                equals = "=" if len(letter) > 1 else ""  # CR= of SINUMERIK
+                more.append(f"{letter}{equals}{self._number(value, digits)}")
                 return round(value, digits)
             return None
 

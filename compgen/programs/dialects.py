@@ -126,7 +126,8 @@ class Dialect:
         return self.comment.format(clean.replace(";", ",").upper())
 
 
-_SIEMENS_WORDS = rf"(CR|TURN|[A-Z])\s*=?\s*({_VALUE}|\"[^\"]*\")"
+#: An address of more than one letter needs its equals sign; CR5 is none.
+_SIEMENS_WORDS = rf"((?:CR|TURN)(?=\s*=)|[A-Z])\s*=?\s*({_VALUE}|\"[^\"]*\")"
 DIALECTS = {
     item.name: item
     for item in (

@@ -198,6 +198,14 @@ def test_arcs_stay_arcs(tmp_path):
     assert 4 <= result.counts["added_blocks"] <= 20
 
 
+def test_the_radius_of_siemens_keeps_its_equals_sign_in_divided_arcs(tmp_path):
+    text = "G71 G90 G17 G54\nG0 X50 Y20 Z0\nG1 F100 Z-1\nG3 X-50 Y20 CR=-53\nM30\n"
+    result, corrected = run(tmp_path, text, shift(slope=0.2), "siemens", PLAIN)
+    assert result.after.normal_mm < 1.1e-3 < 9e-3 < result.before.normal_mm
+    assert corrected.count("CR=") == 1 + result.counts["added_blocks"] > 3
+    assert "CR" not in corrected[corrected.index("G3") :].replace("CR=", "")
+
+
 def test_only_some_axes(tmp_path):
     text = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X10. Y10. Z10. F100\nM2\n"
     _, corrected = run(tmp_path, text, shift(10.0, 20.0, 30.0), setup=PLAIN, only="X,Z")
@@ -304,6 +312,7 @@ REFUSED = [
     ("linuxcnc", START + "G1 X1. F1\n", 3, "may have been cut"),
     ("linuxcnc", START + "G1 X1. Y2", 3, "may have been cut|X and Z"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nCYCLE81(5,0,2,-10)\nM30\n", 3, "CYCLE81 is not known"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nG2 X5 Y5 CR5\nM30\n", 3, "CR5"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nR1=5\nM30\n", 3, "variables"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nX=IC(5)\nM30\n", 3, "variables"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nTRANS X5\nM30\n", 3, "TRANS is not known"),
