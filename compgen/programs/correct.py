@@ -292,7 +292,9 @@ class ProgramWriter:
             depth = np.flatnonzero((move.kind != 0) & move.corrected.all(axis=1))
             if not len(depth):
                 return [block.text]
-            target = pieces.command_mm[rows][int(depth[0])]
+            # the stroke to the depth may be several pieces; the hole is where the last ends
+            stroke = np.flatnonzero(pieces.move[rows] == block.first + depth[0])
+            target = pieces.command_mm[rows][stroke[-1]]
             return [self._cycle(block, target, offset, pieces.command_mm[rows][-1])]
         count = rows.stop - rows.start
         texts = []

@@ -222,6 +222,15 @@ def test_incremental_moves_do_not_add_up_their_rounding(tmp_path):
     assert result.after.largest_mm < 0.6e-3
 
 
+def test_a_hole_is_drilled_to_its_depth_where_the_correction_bends_on_the_way(tmp_path):
+    """The slope of EZZ changes at Z = 0, within the stroke from the R level 5 to the depth -20: EZZ is 0.1 mm there."""
+    bent = ErrorTable({"EZZ": Curve(np.array([-20.0, 0.0, 600.0]), np.array([0.1, 0.0, 0.0]), np.zeros(3))})
+    text = "%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z9.\nG98 G81 X10. Z-20. R5. F90\nX20.\nG80\nM30\n%\n"
+    result, corrected = run(tmp_path, text, bent, "fanuc", PLAIN)
+    assert "G98 G81 X10. Z-20.1 R5. F90\nX20.\nG80" in corrected
+    assert result.accepted
+
+
 def test_inches(tmp_path):
     text = "G20 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X1. F4\nM2\n"
     _, corrected = run(tmp_path, text, shift(x=25.4), setup=PLAIN)
