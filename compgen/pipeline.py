@@ -444,7 +444,11 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         )
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
-    fitted = fit(machine, identification.errors, fit_options or FitOptions(), covariance=known)
+    smoothing = fit_options or FitOptions()
+    if smoothing.smoothness is None and "tied_nodes_mm" in identification.details:
+        # of few readings the curves are strongly correlated: each smoothed alone, they would no longer fit together
+        smoothing = replace(smoothing, smoothness=0.0)
+    fitted = fit(machine, identification.errors, smoothing, covariance=known)
     reversal = identified_reversal(identification)
     source = str(machine.source or machine.name)  # for the command that searches for the missing effect
     words = ["diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]

@@ -207,7 +207,8 @@ def import_command(
 ) -> int:
     """Show what a measurement or error file of another program contains, and convert it to the native format.
 
-    Renishaw .rtl, .rta, .rts (text) and .rtx (captures), Etalon exchange files, ISO 230-2 .dat files of ecmc, tables as
+    Renishaw .rtl, .rta, .rts (text) and .rtx (captures), Etalon exchange files, ISO 230-2 .dat files of ecmc, logs of the
+    probe programs of volcomp plan, tables as
     text (any separator, decimal comma or point) and Excel workbooks (.xlsx). It shows axis, targets, runs, directions,
     unit, sign, instrument, and what the file leaves open. Deviations are measured minus commanded; units in the written
     file are mm, um and urad. A native file is shown, too, and copied with --out. Nothing is written while a question is

@@ -63,6 +63,7 @@ from compgen.simulate import (
 )
 from compgen.simulate.gauges import circle_from_text, pose_from_text, read_gauge
 from compgen.tables import residuals
+from compgen.tables.probe_program import PROGRAM_NAME, probe_program, read_probing
 
 # ``volcomp plan``.
 
@@ -94,6 +95,7 @@ Progress = Callable[[str], None]
     metavar="PLANE:RADIUS[:X,Y,Z]",
     help="Circular test: plane, radius and centre in mm (XY:150; the middle of the travel), or a TOML file.",
 )
+@click.option("--program", metavar="CONTROLLER", help="Write the program that probes the artefact, probe-program.nc.")
 @click.option(
     "--errors", type=PATH, help="Known errors (um, urad), whose effect on artefact and circles plan.html shows."
 )
@@ -127,6 +129,7 @@ def plan_command(
     artefact: tuple[Path, ...],
     pose: tuple[str, ...],
     circle: tuple[str, ...],
+    program: str | None,
     errors: Path | None,
     readings: IdentifyOptions,
     search: bool,
@@ -143,6 +146,7 @@ def plan_command(
 
     With --stations: a laser tracer. With --artefact, --circle or both: gauges of the workshop, alone or with a tracer in
     one adjustment; plan.html then shows deviation arrows and the polar diagram for --errors, with a slider for each error.
+    With --program also the NC program that probes the artefact (mm); volcomp import reads its log.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
     suggested.stations.csv, with --target-um proposed.points.csv (mm). Lists the effects other than the geometric errors
@@ -163,10 +167,22 @@ def plan_command(
                 "--suggest and --target-um are for a laser tracer alone; leave out --artefact and --circle"
             )
         return _plan_gauges(
-            machine, artefact, pose, circle, errors, stations, points, readings, out, grid=grid, as_json=as_json
+            machine,
+            artefact,
+            pose,
+            circle,
+            program,
+            errors,
+            stations,
+            points,
+            readings,
+            out,
+            grid=grid,
+            as_json=as_json,
         )
-    if pose or errors:
-        raise InputError(f"{'--pose' if pose else '--errors'} belongs to --artefact or --circle, and neither is given")
+    if pose or errors or program:
+        option = "--pose" if pose else "--program" if program else "--errors"
+        raise InputError(f"{option} belongs to --artefact or --circle, and neither is given")
     if stations is None:
         raise InputError("give --stations FILE (laser tracer), --artefact FILE or --circle PLANE:RADIUS")
     noise = planned_noise(readings)
@@ -207,6 +223,7 @@ def _plan_gauges(
     artefact: tuple[Path, ...],
     pose: tuple[str, ...],
     circle: tuple[str, ...],
+    program: str | None,
     errors: Path | None,
     stations: Path | None,
     points: Path | None,
@@ -221,6 +238,8 @@ def _plan_gauges(
         raise InputError("--pose is the set-up of an artefact; give --artefact FILE as well")
     if stations is None and (points or grid):
         raise InputError("--points and --grid are where a laser tracer reads; give --stations FILE as well")
+    if program and len(artefact) != 1:
+        raise InputError("--program probes one artefact; give one --artefact FILE")
     poses = tuple(pose_from_text(text) for item in pose for text in item.split(";"))
     gauges = [read_gauge(path, "touch-probe", poses) for path in artefact]
     gauges += [read_gauge(item, "ballbar") if item.endswith(".toml") else circle_from_text(item) for item in circle]
@@ -234,6 +253,8 @@ def _plan_gauges(
         found = plan_gauges(machine, gauges, lengths, readings)
         page = plan_page(found, known)
     folder = OutputFolder(out)
+    if program and isinstance(gauges[0], TouchProbe):
+        folder.add(PROGRAM_NAME, probe_program(machine, gauges[0], read_probing(artefact[0]), program))
     folder.add("plan.errors.csv", format_errors(found.errors))
     folder.add("plan.html", page)
     folder.add("plan.json", json.dumps(found.summary(), indent=2) + "\n")

@@ -39,6 +39,7 @@ __all__ = [
     "aligned",
     "format_artefact",
     "format_deviations",
+    "join_artefacts",
     "read_artefacts",
     "read_deviations",
     "read_parts",
@@ -346,6 +347,11 @@ def read_artefacts(files: str | Path | Sequence[str | Path]) -> Artefact:
         shifted = np.where(missing, found.nominal_mm + _origin(table), found.nominal_mm)
         parts.append(replace(found, nominal_mm=shifted))
         first = int(found.setup.max()) + 1
+    return join_artefacts(parts)
+
+
+def join_artefacts(parts: Sequence[Artefact]) -> Artefact:
+    """Return several records as one, whose set-ups are numbered differently; InputError if only some state the probe's offset."""
     tools = [part.tool_mm for part in parts]
     if any(tool is None for tool in tools) and any(tool is not None for tool in tools):
         raise InputError("some files have tool_x_mm, tool_y_mm, tool_z_mm, others not; give them in every file")

@@ -18,7 +18,15 @@ import numpy as np
 from compgen.data.axis_runs import AxisRuns, join_axis_runs, read_axis_runs, read_diagonals
 from compgen.data.circles import Circles, read_circles
 from compgen.data.csv_files import CsvTable, read_csv
-from compgen.data.deviations import Deviations, join_deviations, read_artefacts, read_deviations, read_parts
+from compgen.data.deviations import (
+    Artefact,
+    Deviations,
+    join_artefacts,
+    join_deviations,
+    read_artefacts,
+    read_deviations,
+    read_parts,
+)
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
@@ -33,7 +41,7 @@ from compgen.identify.axis_tests import positioning_errors
 from compgen.identify.identification import metadata_of, without_adjustment
 from compgen.instruments.sixdof_readings import read_sixdof
 
-Plain = Lengths | Deviations | AxisRuns
+Plain = Lengths | Deviations | AxisRuns | Artefact
 #: Number of labels of a column that are shown.
 _SHOWN_LABELS = 8
 _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
@@ -60,7 +68,12 @@ def converted_parts(
         if kind is ErrorTable or len(own) == 1:
             parts += own
             continue
-        measured = [data for _, data in own if not isinstance(data, ErrorTable)]
+        if kind is Artefact:
+            parts.append(
+                (", ".join(name for name, _ in own), _joined([data for _, data in own if isinstance(data, Artefact)]))
+            )
+            continue
+        measured = [data for _, data in own if not isinstance(data, ErrorTable | Artefact)]
         dated = all(data.metadata.get("measured_at") and "time_s" in data.covariates for data in measured)
         begun = [datetime.fromisoformat(data.metadata["measured_at"]) for data in measured if dated and not any(kinds)]
         if len({time.tzinfo is None for time in begun}) == 1:
@@ -149,6 +162,14 @@ def _joined(parts: Sequence[Plain]) -> Plain:
         return join_axis_runs([part for part in parts if isinstance(part, AxisRuns)])
     if isinstance(parts[0], Lengths):
         return join_lengths([part for part in parts if isinstance(part, Lengths)])
+    if isinstance(parts[0], Artefact):
+        first, renumbered = 0, []
+        for part in parts:
+            if isinstance(part, Artefact):
+                _, setup = np.unique(part.setup, return_inverse=True)
+                renumbered.append(replace(part, setup=setup.ravel() + first))
+                first += int(setup.max()) + 1
+        return join_artefacts(renumbered)
     return join_deviations([part for part in parts if isinstance(part, Deviations)])
 
 

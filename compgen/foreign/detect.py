@@ -46,6 +46,7 @@ from compgen.foreign.laser_files import (
     without_runs,
 )
 from compgen.foreign.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
+from compgen.foreign.probe_logs import import_probe_log, is_probe_log
 from compgen.foreign.source import (
     MOST_BYTES,
     MOST_CAPTURE_BYTES,
@@ -325,6 +326,7 @@ _TAKES: dict[str, tuple[str, ...]] = {
     "renishaw-capture": ("dates",),
     "ecmc-iso230": _ONE_AXIS[:-1],
     "etalon-exchange": ("sign", "units"),
+    "probe-log": (),
     "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
     "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
 }
@@ -345,6 +347,8 @@ def form_of(path: Path) -> str:
         return "ecmc-iso230"
     if is_exchange_text(text.lstrip("\ufeff")):
         return "etalon-exchange"
+    if is_probe_log(text):
+        return "probe-log"
     check_size(path, MOST_BYTES)
     return "table"
 
@@ -447,5 +451,6 @@ READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
     "renishaw-capture": import_capture,
     "ecmc-iso230": import_ecmc,
     "etalon-exchange": import_exchange,
+    "probe-log": import_probe_log,
     "xlsx": _import_workbook,
 }

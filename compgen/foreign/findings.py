@@ -17,7 +17,7 @@ import numpy as np
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.circles import PLANES, Circles, format_circles
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations, format_deviations
+from compgen.data.deviations import Artefact, Deviations, format_artefact, format_deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.names import AXES
@@ -38,8 +38,8 @@ from compgen.foreign.source import Order, parse_number, shown
 # The result of an import: the object, what was understood, and what is in doubt.
 
 
-Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle"]
-KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture", "circle")
+Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle", "artefact"]
+KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture", "circle", "artefact")
 SUFFIXES = {
     "axis": ".axis.csv",
     "lengths": ".lengths.csv",
@@ -47,12 +47,13 @@ SUFFIXES = {
     "errors": ".errors.csv",
     "capture": ".capture.csv",
     "circle": ".circle.csv",
+    "artefact": ".artefact.csv",
 }
 #: The comment ``# squareness = ...`` of errors whose squareness and straightness come from separate sheets.
 SQUARENESS_APART = "measured apart from straightness"
 #: Answers to ``--sign`` for all tables; the others are for squareness.
 TABLE_SIGNS = ("error", "correction")
-Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles
+Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
     Lengths: format_lengths,
@@ -60,6 +61,7 @@ _WRITERS: dict[type, Callable[[Any], str]] = {
     ErrorTable: format_errors,
     Capture: format_capture,
     Circles: format_circles,
+    Artefact: format_artefact,
 }
 
 

@@ -446,13 +446,13 @@ def open_measurement(
     measured = [k for k, kind in enumerate(kinds) if kind != "errors"]
     # of a file that has the name of a native one, the native reader says best what is missing
     foreign = any(kinds[k] is None and not Path(paths[k]).name.lower().endswith(_NATIVE_SUFFIXES) for k in measured)
-    posed = [k for k in measured if kinds[k] == "sixdof"] if foreign else []
-    plain = [paths[k] for k in measured if k not in posed]
+    apart = [k for k in measured if kinds[k] in ("sixdof", "circle", "artefact")] if foreign else []
+    plain = [paths[k] for k in measured if k not in apart]
     if foreign:
         from compgen.foreign.converted import converted_parts
 
-        parts += converted_parts(plain, [kinds[k] for k in measured if k not in posed], axis)
-        plain = [paths[k] for k in posed]
+        parts += converted_parts(plain, [kinds[k] for k in measured if k not in apart], axis)
+        plain = [paths[k] for k in apart]
     if plain or instrument is not None or not (paths or stated):
         found = read_measurement(plain, instrument)
         parts += (

@@ -16,7 +16,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify.adjust.determined import Determined, Observations, least_squares
+from compgen.identify.adjust.determined import FAINT, SHOWS, Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import residual_series
@@ -374,7 +374,9 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
     around = np.zeros(layout.size)
     for _ in range(2):  # repeat about the first result, to keep second-order terms out
         observations, count, source = artefact_observations(machine, layout, artefact, options, around)
-        solution, accepted = _robust(layout, observations, count, reject=options.reject)
+        # what a calibrated plate shows only because it lies a little tilted is not determined
+        least = FAINT if artefact.calibrated.all() else SHOWS
+        solution, accepted = _robust(layout, observations, count, least, reject=options.reject)
         around = solution.on(layout)
     standardised = solution.residual / observations.sigma
     adjusted = AdjustedReadings(
@@ -412,14 +414,13 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
 
 
 def _robust(
-    layout: ErrorParameters, observations: Observations, count: int, *, reject: bool
+    layout: ErrorParameters, observations: Observations, count: int, least: float, *, reject: bool
 ) -> tuple[Determined, NDArray[np.bool_]]:
     """The adjustment without outliers among the probed coordinates, the first ``count`` readings; and which fit."""
 
     def fit(accepted: NDArray[np.bool_], _: Determined | None) -> Determined:
-        return least_squares(
-            layout, observations, np.concatenate([accepted, np.ones(len(observations) - count, dtype=bool)])
-        )
+        used = np.concatenate([accepted, np.ones(len(observations) - count, dtype=bool)])
+        return least_squares(layout, observations, used, least)
 
     return fit_accepted(
         fit,

@@ -27,6 +27,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, UndeterminedError
 from compgen.identify.adjust.determined import (
+    FAINT,
     SHOWS,
     Determined,
     Observations,
@@ -51,10 +52,6 @@ from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import artefact_observations, position_observations
 from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import modelled_errors
-
-#: Lengths of few stations show many errors by second-order terms only: directions below this share of the largest, which
-#: such readings determine about a hundred times worse than themselves, count as not determined.
-FAINT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -227,7 +224,10 @@ def solve_together(
 
 def _least(parts: Sequence[Source]) -> float:
     """Share of the largest direction below which one counts as not determined."""
-    return FAINT if any(part.new_lengths for part in parts) else SHOWS
+    plates = [part.measurement for part in parts if isinstance(part.measurement, Artefact)]
+    return (
+        FAINT if any(part.new_lengths for part in parts) or any(plate.calibrated.all() for plate in plates) else SHOWS
+    )
 
 
 def _determined_errors(layout: ErrorParameters, observations: Observations, least: float) -> set[str]:

@@ -223,6 +223,14 @@ class TouchProbe:
     feed_mm_min: float = setting(toml_files.positive, 2000.0)
     dwell_s: float = setting(toml_files.positive, 5.0)
 
+    def features_mm(self) -> FloatArray:
+        """Nominal places of the features in the artefact, (n, 3); its middle is the origin."""
+        counts = (self.columns, self.rows, self.layers)
+        steps = [
+            (np.arange(size) - 0.5 * (size - 1)) * pitch for size, pitch in zip(counts, self.pitch_mm, strict=True)
+        ]
+        return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+
     def measure(
         self,
         machine: Machine,
@@ -233,11 +241,7 @@ class TouchProbe:
     ) -> Artefact:
         """Return the axis positions at which the true tip is at the features."""
         _moving_only(effects, "an artefact")
-        counts = (self.columns, self.rows, self.layers)
-        steps = [
-            (np.arange(size) - 0.5 * (size - 1)) * pitch for size, pitch in zip(counts, self.pitch_mm, strict=True)
-        ]
-        nominal_mm = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+        nominal_mm = self.features_mm()
         measured = np.isin(np.arange(3), self.components)
         true_mm = nominal_mm + measured * self.form_um * MM_PER_UM * rng.standard_normal(nominal_mm.shape)
         u_mm = self.u_calibration_um * MM_PER_UM
@@ -326,6 +330,8 @@ def read_gauge(path: str | Path, kind: str, poses: tuple[PlatePose, ...] = ()) -
     """
     root = toml_files.read_toml(path)
     section = root.section("instrument") if "instrument" in root else root
+    if kind == "touch-probe":
+        root.section("probing", required=False)  # only the probe program needs it
     stated = section.take("type", toml_files.choice("touch-probe", "ballbar"), kind)
     if stated != kind:
         raise section.fail("type", f"{stated!r} is not expected here; this file must describe a {kind}")

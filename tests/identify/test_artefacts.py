@@ -166,3 +166,30 @@ def test_set_ups_that_hardly_separate_plate_and_machine_are_named_as_the_reason(
         UndeterminedError, match="turned by 180 degrees and shifted, too, or give the machine fewer nodes"
     ):
         identify_measurement(machine, plate)
+
+
+def test_tables_of_a_turned_plate_are_those_of_its_errors(tmp_path, call):
+    """Curves of few readings are strongly correlated: smoothed one by one they would no longer fit together."""
+    scenario = tmp_path / "plate.toml"
+    poses = [(300, 200, 0), (300, 200, 90), (300, 200, 180), (350, 230, 0)]
+    lines = ['name = "plate"\nseed = 3\n[instrument]\ntype = "touch-probe"\ncomponents = "xy"\ncalibrated = false']
+    lines.append("form_um = 15\ncolumns = 6\nrows = 6")
+    for x, y, angle in poses:
+        lines.append(f"[[instrument.poses]]\norigin_mm = [{x}, {y}, 200]\nrotation_deg = [0, 0, {angle}]")
+    scenario.write_text("\n".join(lines))
+    machine = compgen.load_machine("moving-table-mill")
+    compgen.write_simulation(simulate_axis_runs(machine, compgen.read_scenario(scenario)), tmp_path)
+    code, _, _ = call(
+        "run",
+        "moving-table-mill",
+        tmp_path / "plate.artefact.csv",
+        "--controller",
+        "isg-csv",
+        "--out",
+        tmp_path / "t",
+        "--no-report",
+    )
+    assert code == 0
+    fitted, found = (compgen.read_errors(tmp_path / "t" / f"{name}.errors.csv") for name in ("fitted", "identified"))
+    for name, curve in found.curves.items():
+        assert fitted.curves[name].value == pytest.approx(curve.value, abs=1e-8), name

@@ -23,6 +23,9 @@ from compgen.identify.adjust.unknowns import CurveParameters, ErrorParameters, e
 
 #: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
 SHOWS, RCOND = 1e-6, 1e-9
+#: Lengths of few stations and a plate that lies a little tilted show many errors by terms of second order only: directions
+#: below this share, which they determine about a hundred times worse than their readings, count as not determined.
+FAINT = 1e-3
 #: Angles are expressed in mm at this lever, comparable to translations.
 LEVER_MM = 1000.0
 #: Nodes with less than this share of the readings of the median node are tied to their neighbours.
