@@ -35,7 +35,7 @@ from compgen.data.toml_files import (
     whole,
 )
 from compgen.errors import CompgenWarning, InputError
-from compgen.kinematics.first_order import coefficients, factor
+from compgen.kinematics.first_order import coefficients
 from compgen.kinematics.many_points import full_grid
 
 # Error parameters of the ISG kernel's volumetric compensation: names, grids and number syntax of both file formats.
@@ -474,13 +474,13 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         # E = C P (squareness reference X) from the parsed numbers
         cells: dict[tuple[int, bytes], Cell] = {}
         values = {name: item.at(position, cells) for name, item in tables.fields.items()}
-        result = np.zeros((len(position), 3))
+        result = np.zeros((3, len(position)))
+        levers = [*np.ascontiguousarray(position.T), *np.broadcast_to(tool, position.shape).T]
         for part in coefficients(chain, "X"):
             if part.error in values:
-                result[:, part.output] += (
-                    part.sign * factor(part.lever, position, np.asarray(tool)) * values[part.error]
-                )
-        return np.asarray(result * signs + 0.0)
+                lever = 1.0 if part.lever is None else levers[part.lever]
+                result[part.output] += part.sign * lever * values[part.error]
+        return np.asarray(np.ascontiguousarray(result.T) * signs + 0.0)
 
     def tool_of(self, tables: IsgTables) -> FloatArray:
         """Tool offset used if the points do not give one, shape (3,), mm."""

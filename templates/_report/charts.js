@@ -45,6 +45,8 @@
     this.frame = numbers(this.axes.dataset.frame);
     this.full = this.view = numbers(this.axes.dataset.limits);
     this.item = data[figure.dataset.key];
+    // values may be the key of another picture that has the same
+    if (this.item && typeof this.item.values === "string") { this.item.values = data[this.item.values].values; }
   }
   Picture.prototype.placeOf = function (x, y, limits) {
     var f = this.frame, l = limits || this.view;

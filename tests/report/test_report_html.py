@@ -21,7 +21,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.pipeline import write_all
 from compgen.report.html import FILES, build_report, write_report
 from compgen.report.html.folder import read_folder, table_curves
-from compgen.report.html.pictures import describe_error, grid_of, histogram, nice, projected, resampled
+from compgen.report.html.pictures import describe_error, draw_slices, grid_of, histogram, nice, projected, resampled
 from compgen.report.html.write import markdown, script_data
 from compgen.tables import read_tables, residuals
 from compgen.tables.verification import verification_files
@@ -398,6 +398,16 @@ def test_grid_takes_the_mean_of_both_directions_and_refuses_scattered_points(ran
         assert found.ravel() == pytest.approx(corners.mean(axis=0))
     scattered = type(volume)(volume.position_mm[:-1], volume.before_mm[:-1], volume.after_mm[:-1])
     assert grid_of(scattered) is None
+
+
+def test_cells_that_controls_share_are_on_the_page_once_and_are_those_of_each(ran):
+    text = (ran / "report.html").read_text()
+    items = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
+    shared = {key: item["values"] for key, item in items.items() if isinstance(item.get("values"), str)}
+    assert shared == {f"slice-1-before-{axis}": f"slice-0-before-{axis}" for axis in range(3)}
+    own = draw_slices(grid_of(read_folder(ran).controls[1].volume), 1, {})
+    for picture in own:
+        assert picture.data["values"] == items[shared.get(picture.key, picture.key)]["values"]
 
 
 def test_projection_shows_z_upright_and_histograms_count_every_value():

@@ -412,6 +412,9 @@ class ParameterGrid:
             if key not in known:
                 known[key] = _cell(nodes, position_mm[:, axis])
             own.append(known[key])
+        if len(own) == 1:
+            ((before, after, share),) = own
+            return np.asarray(self.values.take(before) * (1.0 - share) + self.values.take(after) * share)
         result = np.zeros(len(position_mm))
         for corner in product((0, 1), repeat=len(own)):
             value = self.values[tuple(cell[side] for side, cell in zip(corner, own, strict=True))]

@@ -286,8 +286,11 @@ def _space(points: Sequence[FloatArray]) -> Plot:
     return Plot((float(x0), float(x1)), (float(y0), float(y1)), box, bare=True)
 
 
-def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
-    """Return |error| on the three middle planes before and after, all before and all after on one scale of colours."""
+def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> list[Picture]:
+    """Return |error| on the three middle planes before and after, all before and all after on one scale of colours.
+
+    ``known`` are the keys of the pictures that the page has of the same numbers: it contains these once.
+    """
     pictures = []
     cut = [(axis, *_plane(grid, axis)) for axis in (2, 1, 0)]
     for side, when in enumerate(("before", "after")):
@@ -305,10 +308,11 @@ def draw_slices(grid: VolumeOnGrid, number: int) -> list[Picture]:
             name = name.replace("-", "−")
             title = f"Length of the error vector in µm, {when}, {name}"
             drawn = svg(key, title, [plot], more=colour_bar(210.0, BOX[1], BOX[3], (0.0, top_um), "µm", HEAT))
+            first = known.setdefault(errors_um.tobytes(), key)
             cells = {
                 "axes": [AXES[across], AXES[up]],
                 "cells": [len(edges[across]) - 1, len(edges[up]) - 1],
-                "values": rounded(errors_um.reshape(-1, 3), 3),
+                "values": rounded(errors_um.reshape(-1, 3), 3) if first == key else first,
             }
             note = f"{name}, at most {um_text(float(length_um.max()), whole_from=100.0)} µm"
             pictures.append(Picture(key, when.capitalize(), drawn, {**plot.data, **cells}, note))

@@ -882,10 +882,11 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
     if source.residuals is not None:
         found["measurement"] = draw_residuals(source.residuals)
     found["stations"] = draw_stations(source.identify.get("stations", []), source.residuals)
+    known: dict[bytes, str] = {}
     for k, item in enumerate(source.controls):
         grid = grid_of(item.volume)
         found[f"space-{k}"] = [draw_space(grid, k)] if grid is not None else []
-        found[f"slices-{k}"] = draw_slices(grid, k) if grid is not None else []
+        found[f"slices-{k}"] = draw_slices(grid, k, known) if grid is not None else []
         found[f"tables-{k}"] = draw_tables(item.name, k, tables[item.name])
     return found
 
