@@ -64,8 +64,8 @@ class SkewControl(Controller[Settings, SkewFactors]):
     anchored = True
     #: Output axis and base axis of each shear that the control has.
     shears: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 2))
-    #: How a file of this firmware marks a comment, and what the user calls the limits of an axis.
-    comment, axis_limits = ";", ""
+    #: How a file of this firmware marks a comment.
+    comment = ";"
 
     @abstractmethod
     def shifted(self, factors: SkewFactors, position_mm: FloatArray) -> FloatArray:
@@ -74,6 +74,10 @@ class SkewControl(Controller[Settings, SkewFactors]):
     @abstractmethod
     def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
         """Return the factors that add ``slopes[output, base]`` times the base axis' position to the output axis."""
+
+    @abstractmethod
+    def limits_of(self, letter: str) -> str:
+        """Return what the user calls the limits of an axis."""
 
     @abstractmethod
     def words_of(self, source: SourceFile, strict: bool) -> Iterator[tuple[int, str, str]]:
@@ -125,7 +129,7 @@ class SkewControl(Controller[Settings, SkewFactors]):
         reached = self._reached_mm(tables)
         return [
             parameter_row(
-                self.axis_limits.format(letter, letter.lower()),
+                self.limits_of(letter),
                 f"{fixed(float(low), 3)} ... {fixed(float(high), 3)} mm, or more",
                 f"where {letter} goes for commands within its travel",
             )
@@ -263,13 +267,17 @@ class Klipper(SkewControl[KlipperSettings]):
 
     name = "klipper"
     settings_class = KlipperSettings
-    comment, axis_limits = "#", "[stepper_{1}] position_min ... position_max"
+    comment = "#"
     #: What Klipper puts before the lines that SAVE_CONFIG writes.
     SAVED = "#*#"
 
     def shifted(self, factors: SkewFactors, position_mm: FloatArray) -> FloatArray:
         """Apply ``calc_skew`` of klippy/extras/skew_correction.py."""
         return klipper_shift(factors, position_mm)
+
+    def limits_of(self, letter: str) -> str:
+        """Return the settings of the firmware."""
+        return f"[stepper_{letter.lower()}] position_min ... position_max"
 
     def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
         """Return ``xy_skew``, ``xz_skew`` and ``yz_skew``."""
@@ -362,7 +370,6 @@ class Marlin(GcodeSkew[MarlinSettings]):
 
     name = "marlin"
     settings_class = MarlinSettings
-    axis_limits = "{0}_MIN_POS ... {0}_MAX_POS"
     command, letters, besides = "M852", {"xy": "I", "xz": "J", "yz": "K"}, ("G21",)
 
     def __init__(self, machine: Machine, settings: MarlinSettings | None = None) -> None:
@@ -373,6 +380,10 @@ class Marlin(GcodeSkew[MarlinSettings]):
         """Apply ``skew`` of Marlin/src/module/planner.h, which is Klipper's formula with factors in float32."""
         xy, xz, yz = (float(np.float32(value)) for value in (factors.xy, factors.xz, factors.yz))
         return klipper_shift(SkewFactors(xy, xz, yz), position_mm)
+
+    def limits_of(self, letter: str) -> str:
+        """Return the settings of the firmware."""
+        return f"{letter}_MIN_POS ... {letter}_MAX_POS"
 
     def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
         """Return I, J and K."""
@@ -387,7 +398,7 @@ class Marlin(GcodeSkew[MarlinSettings]):
         low, high = self._least_limits_mm(tables)
         rows = [
             parameter_row(
-                self.axis_limits.format(letter),
+                self.limits_of(letter),
                 f"at most {fixed(float(low[k]), 3)}, at least {fixed(float(high[k]), 3)} mm",
                 "beyond them, and within 1 mm of the lower one, Marlin does not correct X and Y at all",
             )
@@ -443,7 +454,6 @@ class RepRapFirmware(GcodeSkew[RepRapFirmwareSettings]):
 
     name = "reprapfirmware"
     settings_class = RepRapFirmwareSettings
-    axis_limits = "M208 {0}"
     command = "M556"
     letters = {"height": "S", "xy": "X", "yz": "Y", "xz": "Z", "along_y": "P"}
 
@@ -465,6 +475,10 @@ class RepRapFirmware(GcodeSkew[RepRapFirmwareSettings]):
         xy, xz, yz = (float(np.float32(value)) for value in (factors.xy, factors.xz, factors.yz))
         moved_x = x + (0.0 if factors.along_y else xy * y) + xz * z
         return np.stack([moved_x, y + (xy * moved_x if factors.along_y else 0.0) + yz * z, z], axis=1)
+
+    def limits_of(self, letter: str) -> str:
+        """Return the settings of the firmware."""
+        return f"M208 {letter}"
 
     def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
         """Return the three tangents; with P1 that of YZ makes up for Y following the moved X."""
@@ -505,7 +519,6 @@ class Ucnc(SkewControl[UcncSettings]):
     name = "ucnc"
     settings_class = UcncSettings
     finite_rotations = True  # the product of two factors is not in the terms
-    axis_limits = "soft limits of {0} ($20, $130 ff.)"
     KEYS = {"37": "xy", "38": "xz", "39": "yz"}
 
     def __init__(self, machine: Machine, settings: UcncSettings | None = None) -> None:
@@ -526,6 +539,10 @@ class Ucnc(SkewControl[UcncSettings]):
         if self.settings.build == "xy-only":
             return np.stack([x - y * xy, y, z], axis=1)
         return np.stack([x - y * xy - z * (xy - xz * yz), y - z * yz, z], axis=1)
+
+    def limits_of(self, letter: str) -> str:
+        """Return the settings of the firmware."""
+        return f"soft limits of {letter} ($20, $130 ff.)"
 
     def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
         """Return the factors; xz = xy is the only one for which the firmware's two directions are inverses."""

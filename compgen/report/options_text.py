@@ -16,6 +16,8 @@ from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 # What the options of a control would gain: tables for the terminal, and ``options.md``.
 
 
+#: What three skew factors correct: this is none of the levels.
+SQUARENESS_ALONE = "squareness alone"
 #: Errors that leave less than this at every tool and level are not listed, um.
 LISTED_FROM_UM = 0.1
 #: A level that reduces the rms by less than this share, or by less than this much, gains nothing.
@@ -62,7 +64,7 @@ def control_rows(result: Capability) -> list[list[str]]:
     rows = []
     for item in result.controls:
         directional = f", {LABELS['directional'].lstrip('+ ')}" if item.directional else ""
-        level = "-" if item.level is None else LABELS[item.level] + directional
+        level = "-" if item.level is None else LABELS.get(item.level, SQUARENESS_ALONE) + directional
         left = ["-", "-"] if item.left is None else [_three(item.left.after), _three(item.left.rigid_removed)]
         broken = [f"{len(item.broken)} limits exceeded, first: {item.broken[0]}"] if item.broken else []
         other = [] if item.own else ["not as in the machine file"]
@@ -167,7 +169,7 @@ def options_markdown(result: Capability) -> str:
 LEAST_HELP = 0.9
 #: What a control of each level corrects, in words.
 CORRECTS = {
-    "skew": "squareness alone",
+    "skew": SQUARENESS_ALONE,
     "pitch": "positioning along each axis",
     "squareness": "positioning, straightness and squareness",
     "products": "positioning, straightness, squareness, and angles as products of tables",

@@ -45,7 +45,6 @@ LABELS = {
     "products": "+ angles, as products of tables",
     "volumetric": "full volumetric",
     "directional": "+ direction-dependent",
-    "skew": "squareness alone",  # of some controls; no level of its own
 }
 #: The bases get additional nodes between the nodes of the curves, as long as an axis has no more than this many:
 #:
@@ -194,7 +193,7 @@ def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | N
 
 
 def level_key(basis: Sequence[Term]) -> str:
-    """Return the level that a control's tables belong to, from its basis."""
+    """Return the level that a control's tables belong to, from its basis; ``"skew"``, which is none, for shears alone."""
     if any(term.name in ERROR_NAMES for term in basis):
         return "volumetric"
     if all(term.axis is None for term in basis):
