@@ -725,6 +725,10 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             warnings.warn(message, CompgenWarning, stacklevel=3)
         return np.asarray(size * 0.5 * (1.0 - np.sign(travel * self.settings.counts_per_mm[axis])))
 
+    def by_direction(self, tables: PmacTables) -> bool:
+        """Return whether there is a backlash, as a table or a constant."""
+        return bool(tables.backlash) or any(tables.constants.values())
+
     def violations(self, tables: PmacTables) -> list[str]:
         """Return tables out of order, too long, shorter than the travel, or not enabled."""
         settings = self.settings

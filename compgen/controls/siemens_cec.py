@@ -273,6 +273,10 @@ class SiemensCec(Controller[CecSettings, CecTables]):
             total = np.clip(total, -np.array(settings.max_sum_mm), np.array(settings.max_sum_mm))
         return -total if settings.subtracts else total
 
+    def by_direction(self, tables: CecTables) -> bool:
+        """Return whether a table has a DIRECTION."""
+        return any(entry.direction for entry in tables.tables.values())
+
     def violations(self, tables: CecTables) -> list[str]:
         """Return broken rules of the set, and sums above MD32720 or too fast for MD32730 if those limits are stated."""
         settings = self.settings

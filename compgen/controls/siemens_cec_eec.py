@@ -116,6 +116,10 @@ class SiemensCecEec(Controller[CecEecSettings, CecEecTables]):
         """Return the tables plus a pair of CEC tables, DIRECTION 1 and -1, for each reversal."""
         return CecEecTables(self._cec.with_reversal(tables.cec, reversal), tables.eec)
 
+    def by_direction(self, tables: CecEecTables) -> bool:
+        """Return whether a CEC table has a DIRECTION."""
+        return self._cec.by_direction(tables.cec)
+
     def context(self, tables: CecEecTables) -> dict[str, Any]:
         """Return the contexts of both kinds under ``cec`` and ``eec``, and their combined texts."""
         cec = self._cec.context(tables.cec)

@@ -707,6 +707,10 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             result[:, axis] = self.settings.screw_factor * screw + self.settings.cross_factor * cross
         return result + 0.0
 
+    def by_direction(self, tables: TwincatTables) -> bool:
+        """Return whether a leadscrew table has values for both directions of travel."""
+        return any(item.screw is not None and item.screw.neg is not None for item in tables.lists.values())
+
     def violations(self, tables: TwincatTables) -> list[str]:
         """Return tables with too many points, numbers that do not fit, travel not covered, missing lists."""
         settings = self.settings

@@ -18,6 +18,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from decimal import Decimal
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
     from compgen.tables.verification import ReadTables
 
 BoolArray = NDArray[np.bool_]
+#: All numbers in tables by their place, see :func:`numbers_of`.
+Numbers = Mapping[str, FloatArray]
 
 #: Tables that differ from the remade ones in at most this many numbers were edited by hand ...
 FEW_CHANGED = 2
@@ -93,30 +96,32 @@ def _numbers(item: object, place: str) -> Iterator[tuple[str, FloatArray]]:
             yield from _numbers(value, f"{place}[{k}]")
 
 
-def numbers_changed(one: object, other: object) -> dict[str, BoolArray]:
+def numbers_changed(first: Numbers, second: Numbers) -> dict[str, BoolArray]:
     """Return which numbers of two sets of tables differ, by place; zeros that only one of them has are ignored."""
-    first, second = numbers_of(one), numbers_of(other)
+    both = [place for place, values in first.items() if place in second and values.shape == second[place].shape]
+    ends = np.cumsum([0, *(first[place].size for place in both)]).tolist()
+    values, others = (np.concatenate([np.zeros(0), *(part[place] for place in both)]) for part in (first, second))
+    differ = ~_same(values, others)
+    compared = {place: differ[start:end] for place, start, end in zip(both, ends, ends[1:], strict=False)}
     changed = {}
     for place in [*first, *(place for place in second if place not in first)]:
-        values, others = first.get(place), second.get(place)
-        if values is None or others is None:
-            alone = values if others is None else others
-            changed[place] = np.zeros(0, dtype=np.bool_) if alone is None else np.not_equal(alone, 0.0)
-        elif values.shape != others.shape:
-            changed[place] = np.ones(max(values.size, others.size), dtype=np.bool_)
+        if place in compared:
+            changed[place] = compared[place]
+        elif place in first and place in second:
+            changed[place] = np.ones(max(first[place].size, second[place].size), dtype=np.bool_)
         else:
-            changed[place] = ~_same(values, others)
+            changed[place] = np.not_equal(first[place] if place in first else second[place], 0.0)
     return changed
 
 
 def count_changed(one: object, other: object) -> int:
     """Return how many numbers of two sets of tables differ; a run of numbers that moved by one place counts as one."""
-    return sum(_changed_by_list(one, other).values())
+    return sum(_changed_by_list(numbers_of(one), numbers_of(other)).values())
 
 
-def _changed_by_list(one: object, other: object) -> dict[str, int]:
+def _changed_by_list(first: Numbers, second: Numbers) -> dict[str, int]:
     """Return how many numbers differ in each array, and in each list of single numbers."""
-    first, second, changed = numbers_of(one), numbers_of(other), numbers_changed(one, other)
+    changed = numbers_changed(first, second)
     lists: dict[str, list[str]] = {}
     for place in changed:
         lists.setdefault(_list_of(place), []).append(place)
@@ -236,23 +241,32 @@ class _Sample:
 class EntryCheck:
     """Given tables, and the tables made from a judge's errors with the same settings.
 
-    ``made`` is None if the control cannot make tables of these errors. ``changed`` is how many numbers differ in each
-    list, ``depends`` which numbers depend on the errors at all (positions do not), by place. ``reversal_known`` says
-    whether the reversal is part of ``made``.
+    ``made`` is None if the control cannot make tables of these errors; ``made_numbers`` are its numbers, ``depends`` says
+    which of them depend on the errors at all (positions do not), by place. ``reversal_known`` says whether the reversal is
+    part of ``made``.
     """
 
     machine: Machine
     judge: Judge
     given: ReadTables
     made: ReadTables | None
-    changed_in: Mapping[str, int]
+    made_numbers: Numbers
     depends: Mapping[str, BoolArray]
     reversal_known: bool
 
     def of(self, tables: ReadTables) -> EntryCheck:
         """Return the check of other tables of the same control and settings; what the errors give stays the same."""
-        changed = {} if self.made is None else _changed_by_list(tables.tables, self.made.tables)
-        return replace(self, given=tables, changed_in=changed)
+        return replace(self, given=tables)
+
+    @cached_property
+    def given_numbers(self) -> Numbers:
+        """All numbers of the given tables."""
+        return numbers_of(self.given.tables)
+
+    @cached_property
+    def changed_in(self) -> Mapping[str, int]:
+        """How many numbers differ in each list."""
+        return {} if self.made is None else _changed_by_list(self.given_numbers, self.made_numbers)
 
     def reasons(self) -> list[str]:
         """Describe for each axis the place with the largest excess over what the errors require; empty if there is none."""
@@ -302,7 +316,9 @@ class EntryCheck:
     @property
     def _sides(self) -> tuple[float | None, ...]:
         """Directions of travel to compare; None: the mean of both."""
-        both = self.reversal_known or (self._few_differ and self.given.controller.bidirectional)
+        sets = [part for part in (self.given, self.made) if part is not None]
+        differ = any(part.controller.by_direction(part.tables) for part in sets)
+        both = differ and (self.reversal_known or self._few_differ)
         return (1.0, -1.0) if both else (None,)
 
     # --- where the tables are compared ---------------------------------------------------------------------------
@@ -315,7 +331,7 @@ class EntryCheck:
         ]
 
     def _at_nodes(self, nodes: Sequence[FloatArray]) -> Iterator[_Sample]:
-        for levels in _grids(self.machine, nodes, sum(part.size for part in numbers_of(self.given.tables).values())):
+        for levels in _grids(self.machine, nodes, sum(part.size for part in self.given_numbers.values())):
             position_mm = full_grid(levels)
             for side in self._sides:
                 yield self._sample(position_mm, None, side)
@@ -488,13 +504,14 @@ def entry_check(
         values = table_values(control, machine, judge.errors, judge.solver, judge.values)
         tables = control.build(basis, values)
         half = control.build(basis, {name: 0.5 * part for name, part in values.items()})
-        depends = numbers_changed(tables, half)
+        numbers = numbers_of(tables)
+        depends = numbers_changed(numbers, numbers_of(half))
         in_tables = None if reversal is None else control.reversal_in_tables(reversal)
         if in_tables is not None and in_tables.curves:
             tables = control.with_reversal(tables, in_tables)
+            numbers = numbers_of(tables)
     except (CompgenError, OverflowError):  # these errors are too large for the control: others than it was made of
         return EntryCheck(machine, judge, given, None, {}, {}, reversal_known=False)
     known = in_tables is not None and bool(in_tables.curves)
     made = replace(given, tables=tables, files=(), contradictions=())
-    changed = _changed_by_list(given.tables, tables)
-    return EntryCheck(machine, judge, given, made, changed, depends, reversal_known=known)
+    return EntryCheck(machine, judge, given, made, numbers, depends, reversal_known=known)

@@ -21,8 +21,8 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, factor, tool_of
-from compgen.kinematics.many_points import VolumeGrid, full_grid, volume_grid
-from compgen.tables.synthesis import Projector, best_values, error_at, kept, kept_field, projector
+from compgen.kinematics.many_points import VolumeGrid, volume_grid
+from compgen.tables.synthesis import Projector, best_values, error_at, kept, projector
 
 # A field on a full grid, split into parts that depend on one axis, on a pair of axes, and on all three.
 #
@@ -76,16 +76,17 @@ POINT_FLOOR_MM = 1.0 * MM_PER_UM
 POINT_UNCERTAINTIES = 5.0
 
 
-def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> FloatArray:
-    """Return the points (n, 3) of nine lines along each axis, with the other two at both ends and in the middle."""
+def scan_lines(machine: Machine, nodes_mm: tuple[FloatArray, ...]) -> tuple[VolumeGrid, VolumeGrid, VolumeGrid]:
+    """Return nine lines along each axis, with the other two at both ends and in the middle, as one grid for each axis."""
     low, high = machine.lower_mm, machine.upper_mm
     lines = []
     for axis in range(3):
         nodes = nodes_mm[axis][(nodes_mm[axis] >= low[axis]) & (nodes_mm[axis] <= high[axis])]
         levels = [np.array([low[k], 0.5 * (low[k] + high[k]), high[k]]) for k in range(3)]
         levels[axis] = np.unique(np.concatenate([np.linspace(low[axis], high[axis], SCAN_POSITIONS), nodes]))
-        lines.append(full_grid(levels).reshape(-1, 3))
-    return np.vstack(lines)
+        lines.append(VolumeGrid((levels[0], levels[1], levels[2])))
+    x, y, z = lines
+    return x, y, z
 
 
 @kept
@@ -180,7 +181,7 @@ class Judge:
     line_mm, line_best_mm : points (m, 3) on lines along the axes, and the best correction there (m, 3).
     bent_mm : largest range of the best correction of an axis without its linear part.
     goal_mm : how far one entry of a table may move the tip and still pass.
-    slack_mm, u_mm : what quantum and uncertainty explain of a component, and the uncertainty of E, shapes (3,).
+    slack_mm : what quantum and uncertainty explain of a component, shape (3,).
     resolution_mm : largest error of the format's rounding.
     """
 
@@ -195,7 +196,6 @@ class Judge:
     bent_mm: float
     goal_mm: float
     slack_mm: FloatArray
-    u_mm: FloatArray
     resolution_mm: float
 
     def reasons(
@@ -208,10 +208,16 @@ class Judge:
         return [
             *self.shrink_reasons(grid_correction_mm, left),
             *self.component_reasons(grid_correction_mm),
-            *point_reasons(
-                self.line_mm, line_correction_mm, self.line_best_mm, self.bent_mm, self.u_mm, self.resolution_mm
-            ),
+            *self.line_reasons(line_correction_mm),
         ]
+
+    def line_reasons(self, correction_mm: FloatArray) -> list[str]:
+        """Describe for each axis the point on the lines where a correction (m, 3) is too far from the best one."""
+        against = self.line_mm, correction_mm, self.line_best_mm, self.bent_mm
+        if not point_reasons(*against, np.zeros(3), self.resolution_mm):
+            return []  # the usual case; the uncertainty of the errors only widens the limit
+        u_mm = displacement_uncertainty(self.machine, self.errors, self.line_mm)
+        return point_reasons(*against, u_mm, self.resolution_mm)
 
     @cached_property
     def best_components(self) -> dict[str, tuple[FloatArray, float]]:
@@ -268,8 +274,8 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
     values = best_values(machine, errors, solver)
     nodes = _nodes(machine, errors, solver)
     grid = volume_grid(machine, nodes)
-    line_mm = scan_lines(machine, nodes)
-    best_mm = kept_field(machine, errors, grid.position_mm, solver, values)
+    lines = scan_lines(machine, nodes)
+    best_mm = solver.field_on_grid(values, grid)
     # the bent part: the field without its best-fit constant and slopes (squareness, pitch)
     columns = np.column_stack([np.ones(len(best_mm)), grid.position_mm - grid.position_mm.mean(axis=0)])
     bent_mm = best_mm - columns @ np.linalg.lstsq(columns, best_mm, rcond=None)[0]
@@ -282,12 +288,11 @@ def judge_of(machine: Machine, control: AnyController, errors: ErrorTable, table
         values=values,
         grid=grid,
         best_mm=best_mm,
-        line_mm=line_mm,
-        line_best_mm=kept_field(machine, errors, line_mm, solver, values),
+        line_mm=np.vstack([part.position_mm for part in lines]),
+        line_best_mm=np.vstack([solver.field_on_grid(values, part) for part in lines]),
         bent_mm=float(np.ptp(bent_mm, axis=0).max()),
         goal_mm=max(GOAL_MM, GOAL_SHARE * float(np.max(np.linalg.norm(bent_mm, axis=1)))),
         slack_mm=resolution_mm + np.minimum(grid_u_mm, COMPONENT_SHARE * np.std(best_mm, axis=0)),
-        u_mm=displacement_uncertainty(machine, errors, line_mm),
         resolution_mm=resolution_mm,
     )
 
@@ -507,14 +512,15 @@ def safety_of(
         points = Points(position_mm, approach=np.full_like(position_mm, side))
         return np.asarray(control.emulate(tables, points))
 
+    sides = (1.0, -1.0) if control.by_direction(tables) else (1.0,)
     slack_um = 2.0 * control.resolution_mm() / MM_PER_UM
     steps: list[LargestStep] = []
     reasons: list[str] = []
     for axis in range(3):
         along = node_positions(machine, nodes[axis], axis)
         lines = lines_along(machine, axis, along)
-        added = np.concatenate([_on_lines(partial(correction, side=side), lines) for side in (1.0, -1.0)])
-        required = np.tile(_on_lines(best, lines), (2, 1, 1))
+        added = np.concatenate([_on_lines(partial(correction, side=side), lines) for side in sides])
+        required = np.tile(_on_lines(best, lines), (len(sides), 1, 1))
         for output in range(3):
             profile = _Profile(axis, output, along, added[:, :, output], required[:, :, output], slack_um)
             steps.append(profile.largest())
@@ -547,7 +553,10 @@ def safety_of(
 
 @dataclass(frozen=True)
 class _Profile:
-    """Correction of one axis along another on nine lines in both directions, given and best, (18, n), mm, at (n,)."""
+    """Correction of one axis along another on nine lines, given and best, (9, n), mm, at (n,).
+
+    If the directions of travel differ, there are 18 lines.
+    """
 
     axis: int
     output: int

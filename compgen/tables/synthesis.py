@@ -27,7 +27,7 @@ from compgen.errors import ConvergenceError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.kernel_switch import kernel_choice, lapack
-from compgen.kinematics.many_points import volume_sample
+from compgen.kinematics.many_points import VolumeGrid, volume_sample
 
 #: Where the volume leaves a choice, values stay at their start at the positions ``Term.keep_mm``; where even that
 #: leaves one, everywhere. Both weights are far below that of any data (the normal matrix has unit diagonal).
@@ -35,6 +35,8 @@ KEEP = 1e-7
 RIDGE = 1e-11
 #: An end interval of a table with less than this share within the travel says too little about the node outside.
 LEAST_SHARE = 0.5
+#: Margin of the change that the next iteration of the required correction would make.
+SAFE = 10.0
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
 #: Fields that move the tip by less than this are rounding.
@@ -107,13 +109,16 @@ def wanted_correction(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
     """Return what must be added to commands (n, 3) so that the exact machine reaches the commanded position, mm."""
-    correction = np.zeros_like(position_mm)
+    correction, before = np.zeros_like(position_mm), np.inf
     for _ in range(50):
         previous = correction
         moved = position_mm + previous
         correction = -exact_error(machine, errors, moved, tool_mm)
-        if np.max(np.abs(correction - previous)) < 1e-10:
+        change = float(np.max(np.abs(correction - previous), initial=0.0))
+        # the changes decrease by the same factor each time: the next one would be change^2 / before
+        if change < 1e-10 or SAFE * change * change < 1e-10 * before < np.inf:
             return correction
+        before = change
     raise ConvergenceError("the errors are too large for a compensation: tip(p + c) = p has no solution by iteration")
 
 
@@ -306,6 +311,23 @@ class Projector:
             return basis_field(self.basis, values, self.position_mm, self.sample_tool_mm)
         return basis_field(self.basis, values, position_mm, self.tool_mm)
 
+    def field_on_grid(self, values: FloatArray, grid: VolumeGrid) -> FloatArray:
+        """Return the correction field of table values at the points of a grid, (n, 3): one look-up at each level."""
+        fields = np.zeros((3, *grid.shape))
+        levels = [part.reshape([-1 if k == axis else 1 for k in range(3)]) for axis, part in enumerate(grid.levels_mm)]
+        for term, place in placed_terms(self.basis):
+            curve = (
+                values[place][0] if term.axis is None else np.interp(levels[term.axis], term.nodes_mm, values[place])
+            )
+            for output in {part.output for part in term.carrier}:
+                carrier = np.zeros((1, 1, 1))
+                for part in term.carrier:
+                    if part.output == output:
+                        lever = 1.0 if part.lever is None else [*levels, *self.tool_mm][part.lever]
+                        carrier = carrier + part.sign * (lever - part.origin_mm)
+                fields[output] += carrier * curve
+        return np.ascontiguousarray(fields.reshape(3, -1).T)
+
     def by_name(self, values: FloatArray) -> dict[str, FloatArray]:
         """Split a vector of all table values by term."""
         return {term.name: values[place] for term, place in placed_terms(self.basis)}
@@ -348,14 +370,6 @@ def basis_field(basis: Sequence[Term], values: FloatArray, position_mm: FloatArr
             fields[:, output] += carrier * along
     fields = np.ascontiguousarray(np.moveaxis(fields, 1, 2))
     return fields if values.ndim == 2 else np.asarray(fields[0])
-
-
-@kept
-def kept_field(
-    machine: Machine, errors: ErrorTable, position_mm: FloatArray, solver: Projector, values: FloatArray
-) -> FloatArray:
-    """Return :meth:`Projector.field` of table values at points (n, 3): controls with the same tables share it."""
-    return solver.field(values, position_mm)
 
 
 def rigid_fields(position_mm: FloatArray) -> FloatArray:

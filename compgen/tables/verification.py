@@ -13,10 +13,11 @@ from typing import Any, Literal
 import numpy as np
 
 from compgen.controls import AnyController, SourceFile, controller_named
+from compgen.controls.shared.base import Monomial, Term
 from compgen.data.comparison import Difference, Residuals, residuals_twice, rms, small_motion
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
@@ -26,7 +27,7 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.identify.covariance import Covariance, covariance_or_independent, error_design
 from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import observable_errors, tool_of
+from compgen.kinematics.first_order import coefficients, observable_errors, tool_of
 from compgen.kinematics.many_points import blocks, volumetric_error
 from compgen.tables.entries import EntryCheck, entry_check
 from compgen.tables.judge import (
@@ -41,7 +42,7 @@ from compgen.tables.judge import (
     reversal_reasons,
     safety_of,
 )
-from compgen.tables.synthesis import Projector, error_at, kept, wanted_correction
+from compgen.tables.synthesis import Projector, error_at, kept, placed_terms, wanted_correction
 
 # The verdict on tables and on the measurement behind them: one state, one headline, and the objections.
 #
@@ -265,6 +266,8 @@ NAMED_FROM_MM = 0.1 * MM_PER_UM
 #: Largest controller file that is read; the largest tables of the controls have about 200 000 rows.
 MOST_BYTES, MOST_LINES = 20_000_000, 250_000
 
+#: Share of an error by which table values may miss it and still contain it exactly, but for rounding.
+IN_TABLES = 1e-9
 #: A smaller correction counts as none; 1e-9 mm is far below what any control resolves.
 ZERO_MM = 1e-9
 #: Points that are tried at a time for a correction that is not zero.
@@ -312,8 +315,8 @@ class ReadTables(Displayed):
 
         ``tool_mm`` are the tool offsets (n, 3), None for that of the machine file.
         """
-        if not self.controller.bidirectional:
-            return self.correction(machine, Points(position_mm, tool_mm))
+        if not self.controller.by_direction(self.tables):
+            return self.correction(machine, Points(position_mm, tool_mm)) - self.anchor_offset_mm(machine)
 
         def added(points: Points) -> FloatArray:
             return self.correction(machine, points)
@@ -724,7 +727,7 @@ def verify(
     )
     figures, rigid_removed = zip(twice_before, residuals_twice(nominal, after), strict=True)
     # on the grid, tables of both directions say the same to the judge
-    same = points is None and reversal is None and not control.bidirectional
+    same = points is None and reversal is None and not control.by_direction(tables.tables)
     on_grid = (correction, rigid_removed[1]) if same else None
     safety, reasons = reasons_against(machine, tables, judge, limits, reversal, on_grid=on_grid)
     useless = _useless_reasons(
@@ -813,7 +816,7 @@ def _useless_reasons(
         Points(position_mm[part], approach=np.full_like(position_mm[part], side))
         for position_mm in points_mm
         for part in blocks(len(position_mm), FEW_POINTS)  # tables that do something show it at the first points
-        for side in (1.0, -1.0)
+        for side in ((1.0, -1.0) if tables.controller.by_direction(tables.tables) else (1.0,))
     )
     if all((np.abs(tables.correction(machine, points)) < ZERO_MM).all() for points in parts):
         return [
@@ -841,9 +844,14 @@ def _uncorrected(machine: Machine, errors: ErrorTable, position_mm: FloatArray, 
 
     ``position_mm`` are the sample points of the ``solver``.
     """
+    # beside rotations that are fitted together with the tables, the tables are not unique
+    given = _in_tables(machine, errors, solver) if solver.offsets <= 3 else set()
+    rest_of = errors.only(*(name for name in errors.names if name not in given))
+    if not rest_of.names:
+        return {}
     found = {}
-    required = _single_errors(machine, errors, position_mm)
-    for name, rest in zip(errors.names, solver.left_of(required), strict=True):
+    required = _single_errors(machine, rest_of, position_mm)
+    for name, rest in zip(rest_of.names, solver.left_of(required), strict=True):
         if solver.offsets:
             rest = rest - np.average(rest, axis=0, weights=solver.weight)
         x, y, z = rest.T
@@ -851,6 +859,76 @@ def _uncorrected(machine: Machine, errors: ErrorTable, position_mm: FloatArray, 
         if largest > NAMED_FROM_MM:
             found[name] = round(largest / MM_PER_UM, 3)
     return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+
+def _in_tables(machine: Machine, errors: ErrorTable, solver: Projector) -> set[str]:
+    """Return the errors whose displacement (first order) some table values give exactly: the best leave nothing of them.
+
+    The displacement by a curve c over an axis is c times monomials (1, x, y, z, by output). It is a sum of tables over
+    the same axis that contain multiples of c, if the monomials are that sum of their carriers. That by a squareness is
+    such a sum of constants, or of straight lines over the axes of its levers.
+    """
+    carried: dict[int | None, list[tuple[Term, slice, FloatArray]]] = {}
+    for term, place in placed_terms(solver.basis):
+        carried.setdefault(term.axis, []).append((term, place, _monomials(term.carrier, solver.tool_mm)))
+
+    def given(pieces: Sequence[tuple[int | None, Curve, FloatArray]]) -> bool:
+        """Whether table values give the sum of curves over an axis (None: constants), each times monomials (12,)."""
+        values = np.zeros(len(solver.freedom.free) + len(solver.freedom.bound))
+        for axis, curve, wanted in pieces:
+            able = []
+            for term, place, carrier in carried.get(axis, ()):
+                at_nodes = curve.at(term.nodes_mm)
+                if axis is not None:
+                    ends_mm = machine.axes[axis].range_mm
+                    kinks_mm = np.clip(np.concatenate([term.nodes_mm, curve.position_mm, ends_mm]), *ends_mm)
+                    miss = np.interp(kinks_mm, term.nodes_mm, at_nodes) - curve.at(kinks_mm)
+                    if np.max(np.abs(miss)) > IN_TABLES * np.max(np.abs(at_nodes)):
+                        continue
+                if solver.offsets and term.zero_at_mm is not None and not carrier.reshape(3, 4)[:, 1:].any():
+                    at_nodes = at_nodes - np.interp(term.zero_at_mm, term.nodes_mm, at_nodes)  # a constant is free
+                able.append((place, at_nodes, carrier))
+            if not able:
+                return False
+            columns = np.stack([carrier for *_, carrier in able], axis=1)
+            share = np.linalg.lstsq(columns, wanted, rcond=None)[0]
+            if np.max(np.abs(columns @ share - wanted)) > IN_TABLES * np.max(np.abs(wanted)):
+                return False
+            for (place, at_nodes, _), part in zip(able, share, strict=True):
+                values[place] += part * at_nodes
+        broken = values[solver.freedom.bound] - solver.freedom.rows @ values[solver.freedom.free]
+        return bool(np.max(np.abs(broken), initial=0.0) <= IN_TABLES * np.max(np.abs(values)))
+
+    found = set()
+    for name in errors.names:
+        of_matrix = [part for part in coefficients(machine.chain, machine.squareness_reference) if part.error == name]
+        parts = [Monomial(part.output, part.sign, part.lever) for part in of_matrix]
+        whole = _monomials(parts, solver.tool_mm)
+        ways: list[list[tuple[int | None, Curve, FloatArray]]]
+        if name in errors.curves:
+            ways = [[(error_named(name).axis, errors.curves[name], whole)]]
+        else:
+            rad, far_mm = errors.squareness[name][0], np.array([-1e6, 1e6])
+            ways = [[(None, Curve(np.zeros(1), np.full(1, rad), np.zeros(1)), whole)]]
+            if all(part.lever in (0, 1, 2) for part in parts):
+                line = Curve(far_mm, rad * far_mm, np.zeros(2))
+                plain = [_monomials([replace(part, lever=None)], solver.tool_mm) for part in parts]
+                ways.append([(part.lever, line, carrier) for part, carrier in zip(parts, plain, strict=True)])
+        if any(given(pieces) for pieces in ways):
+            found.add(name)
+    return found
+
+
+def _monomials(parts: Sequence[Monomial], tool_mm: FloatArray) -> FloatArray:
+    """A sum of monomials as twelve factors: for each output those of 1, x, y and z."""
+    factors = np.zeros((3, 4))
+    for part in parts:
+        if part.lever in (0, 1, 2):
+            factors[part.output, 1 + part.lever] += part.sign
+        else:
+            factors[part.output, 0] += part.sign * (1.0 if part.lever is None else float(tool_mm[part.lever - 3]))
+        factors[part.output, 0] -= part.sign * part.origin_mm
+    return factors.ravel()
 
 
 # The files of a verification: its figures, and the points behind them.

@@ -232,7 +232,7 @@ def test_beyond_the_travel_the_correction_goes_on_without_a_jump(name, machine, 
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_reversal_goes_into_the_tables_of_one_direction_or_is_named(name, machine, errors):
+def test_a_reversal_goes_into_the_tables_of_one_direction_or_is_named(name, machine, errors, exported):
     """X comes 6 um further in its positive direction, Y 8 um less far; the control takes that out."""
     wanted = ReversalCurves({(0, 0): constant(6 * UM), (1, 1): constant(-8 * UM)})
     with warnings.catch_warnings():
@@ -241,10 +241,21 @@ def test_a_reversal_goes_into_the_tables_of_one_direction_or_is_named(name, mach
     control, settings, tables = parsed(machine, name, made.files)
     held = control(machine, settings).reversal_in_tables(wanted)
     position = inside(machine).position_mm
+    ones = np.ones_like(position)
     both = [
         control(machine, settings).emulate(tables, Points(position, approach=np.full_like(position, sign)))
         for sign in (1.0, -1.0)
     ]
+    plain = parsed(machine, name, exported(name).files)[2]
+    for of_one_way, item in ((bool(held.curves), tables), (False, plain)):
+        bound = control(machine, settings)
+        assert bound.by_direction(item) or not of_one_way
+        if not bound.by_direction(item):  # then the direction does not matter, nor whether it is known
+            found = [
+                bound.emulate(item, Points(position, approach=side)) for side in (None, *(s * ones for s in (1, -1)))
+            ]
+            assert np.array_equal(found[0], found[1])
+            assert np.array_equal(found[0], found[2])
     expected = np.zeros_like(position)
     for axis, value in ((0, -6 * UM), (1, 8 * UM)):
         if (axis, axis) in held.curves:

@@ -63,7 +63,7 @@ def test_the_figures_of_a_field_by_hand():
 def test_lines_run_at_both_ends_and_in_the_middle_and_hold_the_nodes_within_the_travel():
     ranges = ((-300.0, 500.0), (-150.0, 700.0), (-420.0, 80.0))
     nodes = (np.array([-301.0, -300.0, 0.123, 500.0, 501.0]), np.array([33.3]), np.zeros(0))
-    points = scan_lines(machine_of(ranges, 5), nodes)
+    points = np.vstack([lines.position_mm for lines in scan_lines(machine_of(ranges, 5), nodes)])
     assert points.min(axis=0) == pytest.approx([low for low, _ in ranges])
     assert points.max(axis=0) == pytest.approx([high for _, high in ranges])
     assert len(points) == 9 * (1002 + 1002 + 1001)
@@ -135,7 +135,6 @@ def judge_with(best_mm, errors=None, slack_um=0.0, resolution_um=0.0):
         bent_mm=0.0,
         goal_mm=0.0,
         slack_mm=np.array([0.0, 0.0, slack_um]) * UM,
-        u_mm=np.zeros(3),
         resolution_mm=resolution_um * UM,
     )
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 import compgen
+from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import volumetric_error
-from compgen.tables import Residuals, export, read_tables, residuals, verify, without_rigid_motion
+from compgen.tables import Residuals, export, projector, read_tables, residuals, verify, without_rigid_motion
 
 PICOMETRE = 1e-9
 NANOMETRE = 1e-6
@@ -512,6 +513,36 @@ def test_one_error_alone_is_uncorrected_by_its_own_displacement(small_machine, e
     mean = np.trapezoid(value, nodes) / (nodes[-1] - nodes[0])
     expected_um = 1e3 * np.max(np.abs(value - mean))
     assert result.uncorrected_um["EZX"] == pytest.approx(expected_um, abs=0.002)
+
+
+@pytest.mark.parametrize("more_nodes", [False, True])
+@pytest.mark.parametrize("name", ["fanuc-pitch", "heidenhain-com", "isg-csv", "siemens-cec", "siemens-eec"])
+def test_what_is_left_of_every_single_error_is_its_least_squares_residual(
+    name, more_nodes, small_machine, small_errors, tmp_path
+):
+    """Errors that the tables hold exactly are not projected: the figures are those of projecting every one."""
+    errors = small_errors
+    if more_nodes:  # bends between the nodes of the tables: of no error but the squareness do tables hold all
+        curves = {}
+        for axis, curve in errors.curves.items():
+            position = np.linspace(curve.position_mm[0], curve.position_mm[-1], 40)
+            value = curve.at(position) * (1.0 + 0.3 * np.sin(np.linspace(0.0, 30.0, 40)))
+            curves[axis] = Curve(position, value, np.full(40, 1e-9))
+        errors = errors.replace(curves=curves)
+    files = export(small_machine, errors, name, allow_unverified=True).files
+    result = judged(small_machine, errors, name, files, tmp_path)
+    control = CONTROLLERS[name](small_machine)
+    solver = projector(small_machine, control.basis(errors), anchored=control.anchored)
+    expected_um = {}
+    for error in errors.names:
+        required = -volumetric_error(small_machine, errors.only(error), solver.position_mm)
+        rest = required - solver.field(solver.project(required))
+        if control.anchored:
+            rest = rest - np.average(rest, axis=0, weights=solver.weight)
+        expected_um[error] = 1e3 * np.max(np.linalg.norm(rest, axis=1))
+    assert result.uncorrected_um == pytest.approx({k: v for k, v in expected_um.items() if v > 0.1}, abs=0.002)
+    small = [error for error, um in expected_um.items() if um < 1e-3]
+    assert len(small) >= (1 if name.startswith(("fanuc", "siemens-eec")) else 3) or more_nodes
 
 
 # --- the example -----------------------------------------------------------------------------------------------------

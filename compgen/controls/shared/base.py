@@ -263,6 +263,10 @@ class Controller(ABC, Generic[Settings, Tables]):
         """
         return (np.zeros(0), np.zeros(0), np.zeros(0))
 
+    def by_direction(self, tables: Tables) -> bool:
+        """Return whether what parsed tables add depends on the direction of travel; True if the control cannot say."""
+        return self.bidirectional
+
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Return the part of a reversal that goes into direction-dependent tables; ``with_reversal`` gets only this."""
         return reversal if self.bidirectional else ReversalCurves({})

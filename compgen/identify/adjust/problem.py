@@ -149,12 +149,17 @@ class MachinePoses:
 
     def chunks(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
         """MachinePoses, tips (p, 3) and derivatives of the tips by the unknown errors (p, 3, size)."""
+        for rows, tip, columns, bases in self.columns(state):
+            yield rows, tip, self.parameters.design(columns, bases)
+
+    def columns(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray, list[FloatArray]]]:
+        """MachinePoses, tips (p, 3), derivatives of the tips by the 21 errors (p, 3, 21), and the curve bases there."""
         for first in range(0, len(self.position_mm), CHUNK_POSES):
             rows = slice(first, first + CHUNK_POSES)
             bases = [basis[rows] for basis in self.bases]
             values = self.parameters.values(state.errors, bases)
             tip, columns = exact_columns(self.parameters.machine, values, self.position_mm[rows], self.tool_mm[rows])
-            yield rows, tip, self.parameters.design(columns, bases)
+            yield rows, tip, columns, bases
 
 
 # The least-squares problem of the tracer lengths (Zha & Zhang 2024, eq. 22) with the exact machine model:
@@ -336,16 +341,16 @@ class SeparationProblem(MachinePoses):
 
     def evaluate(self, state: State) -> tuple[float, FloatArray]:
         """Half the weighted sum of squares, and its exact gradient (size,)."""
-        rest = self.residuals(state).reshape(-1, 3)
         own = self.station_information @ state.dead_length_mm
-        cost = 0.5 * float(np.einsum("mi,mij,mj->", rest, self.information, rest) + state.dead_length_mm @ own)
-        gradient, size = np.zeros(self.size), self.parameters.size
+        squares, gradient, size = state.dead_length_mm @ own, np.zeros(self.size), self.parameters.size
         back, _ = frame_rotation(-state.stations_mm[1])
-        for _, design, by_own, pull in self._pulled(state):
-            gradient[:size] += design.reshape(-1, size).T @ (pull @ back).ravel()
+        for rows, tip, columns, bases in self.columns(state):
+            by_own, rest, pull = self._pulled(state, rows, tip)
+            squares += np.vdot(rest, pull)
+            gradient[:size] += self.parameters.pulled(columns, bases, pull @ back)
             gradient[size:] += np.einsum("miq,mi->q", by_own, pull)
         gradient[size + 6 :] += own
-        return cost, gradient
+        return 0.5 * float(squares), gradient
 
     def normal_matrix(self, state: State) -> FloatArray:
         """J^T W J (size, size) with the exact derivative at ``state``."""
@@ -359,7 +364,8 @@ class SeparationProblem(MachinePoses):
     def _equations(self, state: State) -> Iterator[tuple[PointEquations, FloatArray]]:
         """Return the five sums: derivatives of r_j by its tip R(-w), by shift and rotation of the placement, by stations -L_j."""
         back, _ = frame_rotation(-state.stations_mm[1])
-        for rows, design, by_own, pull in self._pulled(state):
+        for rows, tip, design in self.chunks(state):
+            by_own, _, pull = self._pulled(state, rows, tip)
             weighted = self.information[rows] @ by_own
             size = by_own.shape[2]
             yield (
@@ -373,14 +379,14 @@ class SeparationProblem(MachinePoses):
                 design,
             )
 
-    def _pulled(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
-        """Points, derivatives of their tips, of r_j by placement and stations, and U_j r_j (p, 3): enough for a gradient."""
+    def _pulled(self, state: State, rows: slice, tip_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Derivatives of r_j by placement and stations (p, 3, 6 + q), r_j and U_j r_j (p, 3) of some points."""
         back, jacobian = frame_rotation(-state.stations_mm[1])
-        for rows, tip, design in self.chunks(state):
-            seen = self._seen(state, tip)
-            turn = cross_matrices(seen) @ jacobian / LEVER_MM
-            by_own = np.concatenate([np.broadcast_to(-back, turn.shape), turn, -self.lever[rows]], axis=2)
-            yield rows, design, by_own, np.einsum("mij,mj->mi", self.information[rows], self._rest(state, rows, seen))
+        seen = self._seen(state, tip_mm)
+        turn = cross_matrices(seen) @ jacobian / LEVER_MM
+        by_own = np.concatenate([np.broadcast_to(-back, turn.shape), turn, -self.lever[rows]], axis=2)
+        rest = self._rest(state, rows, seen)
+        return by_own, rest, np.einsum("mij,mj->mi", self.information[rows], rest)
 
     def unknown_names(self, station_unknowns: tuple[str, ...] = ()) -> list[str]:
         """Names of all unknowns for messages; ``station_unknowns`` (q,) names b."""

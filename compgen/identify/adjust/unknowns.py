@@ -83,6 +83,12 @@ class ErrorParameters:
             design[:, :, self.size - len(self.squareness) + k] = columns[:, :, ERROR_INDEX[name]]
         return design
 
+    def pulled(self, columns: FloatArray, bases: Sequence[FloatArray], force: FloatArray) -> FloatArray:
+        """Product of the transposed :meth:`design` with one vector (m, 3) for each tip, without the matrix: (size,)."""
+        by_error = np.einsum("mij,mi->jm", columns, force)
+        sums = [by_error[ERROR_INDEX[c.error.name]] @ bases[c.error.axis] @ c.free for c in self.curves]
+        return np.concatenate([*sums, [by_error[ERROR_INDEX[name]].sum() for name in self.squareness]])
+
     def columns(self) -> list[tuple[str, slice]]:
         """Name and columns of every unknown error."""
         first = self.size - len(self.squareness)
