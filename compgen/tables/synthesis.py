@@ -35,8 +35,8 @@ KEEP = 1e-7
 RIDGE = 1e-11
 #: An end interval of a table with less than this share within the travel says too little about the node outside.
 LEAST_SHARE = 0.5
-#: Margin of the change that the next iteration of the required correction would make.
-SAFE = 10.0
+#: The required correction is iterated until it changes by less, mm, or until the next change would be less than the second.
+CHANGED_MM, NEXT_CHANGE_MM = 1e-10, 1e-13
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
 #: Fields that move the tip by less than this are rounding.
@@ -115,8 +115,8 @@ def wanted_correction(
         moved = position_mm + previous
         correction = -exact_error(machine, errors, moved, tool_mm)
         change = float(np.max(np.abs(correction - previous), initial=0.0))
-        # the changes decrease by the same factor each time: the next one would be change^2 / before
-        if change < 1e-10 or SAFE * change * change < 1e-10 * before < np.inf:
+        # the changes decrease by about the same factor each time: the next one would be change^2 / before
+        if change < CHANGED_MM or change * change < NEXT_CHANGE_MM * before < np.inf:
             return correction
         before = change
     raise ConvergenceError("the errors are too large for a compensation: tip(p + c) = p has no solution by iteration")
@@ -175,7 +175,7 @@ class FreeValues:
 class SampledTerm:
     """A term at n sample points: two values count at each, those at ``node`` (2, n) with the shares ``share`` (2, n).
 
-    ``place`` is that of the term in the vector of all values, ``carrier`` (n, 3) its carrier, zero but for ``outputs``;
+    ``place`` is that of the term in the vector of all values, ``carrier`` (3, n) its carrier, zero but for ``outputs``;
     ``hat`` says which terms have the same nodes.
     """
 
@@ -196,18 +196,18 @@ class SampledTerm:
         node = np.stack([left, np.minimum(left + 1, len(term.nodes_mm) - 1)])
         hat = term.axis, np.asarray(term.nodes_mm, dtype=np.float64).tobytes()
         outputs = tuple(sorted({part.output for part in term.carrier}))
-        return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, term.carrier_field(position_mm, tool_mm))
+        carrier = np.ascontiguousarray(term.carrier_field(position_mm, tool_mm).T)
+        return cls(place, hat, node, np.stack([1.0 - share, share]), outputs, carrier)
 
     def gather(self, fields_mm: FloatArray, moved: Any, hats: _Hats) -> FloatArray:
         """Products of the values' fields with k fields (3, k, n), (values, k); ``moved`` (3, k): where these are not zero."""
         size = self.place.stop - self.place.start
         products = np.zeros((size, fields_mm.shape[1]))
         some = _places(np.any(moved[list(self.outputs)], axis=0))
-        # copies of columns are contiguous, so that products of k fields take a third of the time
         first, *others = self.outputs
-        along = self.carrier[:, first].copy() * fields_mm[first, some]
+        along = self.carrier[first] * fields_mm[first, some]
         for output in others:
-            along += self.carrier[:, output].copy() * fields_mm[output, some]
+            along += self.carrier[output] * fields_mm[output, some]
         hat = hats.of(self, len(along))
         if hat is not None:
             products[:, some] = hat @ along.T
@@ -224,7 +224,7 @@ class SampledTerm:
         left, right = self.share
         along = left * own[:, self.node[0]] + right * own[:, self.node[1]] if hat is None else own @ hat
         for output in self.outputs:
-            fields_mm[output, some] -= self.carrier[:, output].copy() * along
+            fields_mm[output, some] -= self.carrier[output] * along
 
 
 def _places(chosen: Any) -> slice | NDArray[np.intp]:
@@ -240,7 +240,7 @@ class _Hats:
 
     def of(self, term: SampledTerm, fields: int) -> FloatArray | None:
         """Return the matrix of a term, None if it would serve too few fields, or be too large."""
-        size, points = term.place.stop - term.place.start, np.arange(len(term.carrier))
+        size, points = term.place.stop - term.place.start, np.arange(term.carrier.shape[1])
         if fields <= _FEW or size * len(points) > _LARGEST_HAT:
             return None
         if term.hat not in self._found:
@@ -279,7 +279,10 @@ class Projector:
         """Return all table values (parameters,) whose field is closest to ``required_mm`` (n, 3)."""
         if start is None:
             return np.asarray(self.project_all(required_mm[None])[0])
-        return np.asarray(start + self.project_all((required_mm - self.field(start))[None])[0])
+        left, hats = required_mm.T[:, None].copy(), _Hats()
+        for term in self.terms:
+            term.take(start[term.place, None], left, hats)
+        return np.asarray(start + self._solved(left, hats)[:, 0])
 
     def project_all(self, required_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
@@ -388,10 +391,9 @@ def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArr
     normal = np.zeros((size, size))
     entries: dict[tuple[object, object], tuple[NDArray[np.int64], FloatArray]] = {}
     done: dict[tuple[object, object, bytes], tuple[slice, slice]] = {}  # e.g. EXX with EXY is as EYX with EYY
-    carriers = [np.ascontiguousarray(term.carrier.T) for term in terms]
-    for k, (one, carrier) in enumerate(zip(terms, carriers, strict=True)):
-        counting = weight * carrier
-        for other, across in zip(terms[k:], carriers[k:], strict=True):
+    for k, one in enumerate(terms):
+        counting = weight * one.carrier
+        for other in terms[k:]:
             common = [output for output in one.outputs if output in other.outputs]
             if not common:
                 continue
@@ -399,9 +401,9 @@ def _normal_matrix(terms: Sequence[SampledTerm], weight: FloatArray) -> FloatArr
             if (one.hat, other.hat) not in entries:
                 where = one.node[:, None] * width + other.node[None]
                 entries[one.hat, other.hat] = where.ravel(), one.share[:, None] * other.share[None]
-            product = counting[common[0]] * across[common[0]]
+            product = counting[common[0]] * other.carrier[common[0]]
             for output in common[1:]:
-                product += counting[output] * across[output]
+                product += counting[output] * other.carrier[output]
             key = one.hat, other.hat, product.tobytes()
             if key not in done:
                 where, share = entries[one.hat, other.hat]

@@ -19,7 +19,7 @@ from compgen.identify.adjust.unknowns import (
     distinct_poses,
 )
 from compgen.kinematics.exact_chain import cross_matrices, exact_columns, level_rotations, tip_position
-from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.first_order import c_matrix, tool_of
 
 # Normal equations point by point, for lengths, positions, and networks of distances alike.
 #
@@ -154,11 +154,15 @@ class MachinePoses:
 
     def columns(self, state: State) -> Iterator[tuple[slice, FloatArray, FloatArray, list[FloatArray]]]:
         """MachinePoses, tips (p, 3), derivatives of the tips by the 21 errors (p, 3, 21), and the curve bases there."""
+        machine = self.parameters.machine
         for first in range(0, len(self.position_mm), CHUNK_POSES):
             rows = slice(first, first + CHUNK_POSES)
             bases = [basis[rows] for basis in self.bases]
-            values = self.parameters.values(state.errors, bases)
-            tip, columns = exact_columns(self.parameters.machine, values, self.position_mm[rows], self.tool_mm[rows])
+            poses = self.position_mm[rows], self.tool_mm[rows]
+            if state.errors.any():
+                tip, columns = exact_columns(machine, self.parameters.values(state.errors, bases), *poses)
+            else:  # the start of most adjustments: the tip is where it should be, and the derivatives are C
+                tip, columns = poses[0] + poses[1], c_matrix(machine, *poses)
             yield rows, tip, columns, bases
 
 
