@@ -33,7 +33,7 @@ from compgen.data.names import AXES, ERROR_INDEX, error_named
 from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import full_grid
+from compgen.kinematics.many_points import blocks, full_grid
 
 # The table of the LinuxCNC kinematics ``volkins``: E = C P or a grid, evaluated in the arithmetic of the C sources.
 #
@@ -86,9 +86,12 @@ class VolCurve:
     def within(self, cells: tuple[NDArray[np.int64], NDArray[np.int64], FloatArray, NDArray[np.bool_]]) -> FloatArray:
         """Value in the cells of :meth:`cells`, shape (m,)."""
         left, right, share, at_end = cells
-        below = self.values[left]
-        between = below + share * (self.values[right] - below)
-        return np.asarray(np.where(at_end, self.values[-1], between))
+        below, between = self.values.take(left), self.values.take(right)
+        between -= below
+        between *= share
+        between += below
+        between[at_end] = self.values[-1]
+        return between
 
 
 @dataclass(frozen=True)
@@ -158,14 +161,16 @@ class VolTable:
                 self.grid.vertices_mm, np.array(self.grid.first_mm), np.array(self.grid.step_mm), position_mm
             )
         tool = np.broadcast_to(tool_mm, position_mm.shape)
-        levers = dict(zip(LEVERS, [np.ones(len(position_mm)), *position_mm.T, *tool.T], strict=True))
         # usually all curves over an axis have the same nodes: what depends only on these is computed once
         grids = {curve.grid: curve for curve in self.curves}
-        cells = {grid: curve.cells(position_mm[:, curve.axis]) for grid, curve in grids.items()}
-        values = {curve.name: curve.within(cells[curve.grid]) for curve in self.curves}
-        error = np.zeros((len(position_mm), 3))
-        for term in self.terms:
-            error[:, term.output] += term.coefficient * levers[term.lever] * values[term.curve]
+        error = np.zeros(position_mm.shape)
+        for part in blocks(len(position_mm), _BLOCK):
+            along = np.ascontiguousarray(position_mm[part].T)
+            levers = dict(zip(LEVERS, [1.0, *along, *tool[part].T], strict=True))
+            cells = {grid: curve.cells(along[curve.axis]) for grid, curve in grids.items()}
+            values = {curve.name: curve.within(cells[curve.grid]) for curve in self.curves}
+            for term in self.terms:
+                error[part, term.output] += term.coefficient * levers[term.lever] * values[term.curve]
         return error
 
     def forward(self, position_mm: FloatArray, tool_mm: FloatArray) -> FloatArray:
@@ -230,6 +235,8 @@ def checksum(words: Iterable[str]) -> str:
 # One ``crc32 XXXXXXXX`` of all words up to ``end`` must follow; comments (``#`` to the end of the line) may be added.
 
 
+#: Points at a time: intermediate arrays stay in the cache of one core.
+_BLOCK = 4096
 _LONGEST_LINE = 4096
 _MOST_CHARACTERS = 32_000_000
 _MAGIC = ("volcomp", "1")

@@ -15,6 +15,7 @@ import math
 import os
 import re
 import shutil
+import stat
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -33,6 +34,9 @@ FOLDERS, LOCK = "compgen-", ".lock"
 NEW_S = 2.0
 #: An empty temporary folder without a lock that is older than this belongs to nobody, s.
 EMPTY_S = 3600.0
+#: One with contents but no lock (of a version that had none, or whose lock someone deleted) in which nothing has changed for
+#: this long is removed, too, s. Its name and mode must be those that this program gives.
+OLD_S, OLD_NAME, OWN_MODE = 7 * 86400.0, re.compile(rf"{FOLDERS}(recal|restore|lengths)-[a-z0-9_]{{8}}"), 0o700
 #: Temporary files and folders of this process, each with the open file that keeps its lock.
 _locks: dict[Path, int] = {}
 
@@ -298,10 +302,19 @@ def remove_abandoned_folders() -> None:
                 found = entry.stat(follow_symlinks=False)
                 mine = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
                 if mine and entry.is_dir(follow_symlinks=False):
-                    if _abandoned(Path(entry.path) / LOCK):
+                    if _abandoned(Path(entry.path) / LOCK) or _long_left(entry.path, found):
                         _remove_folder(Path(entry.path))
                     elif time.time() - found.st_mtime > EMPTY_S:
                         os.rmdir(entry.path)  # refused unless it is empty: killed before or after there was a lock
+
+
+def _long_left(folder: str, found: os.stat_result) -> bool:
+    """Whether a folder made by this program has no lock, and neither it nor anything in it has changed for long."""
+    made_here = OLD_NAME.fullmatch(os.path.basename(folder)) and stat.S_IMODE(found.st_mode) == OWN_MODE
+    if not made_here or os.path.lexists(os.path.join(folder, LOCK)):
+        return False
+    paths = (os.path.join(top, name) for top, folders, files in os.walk(folder) for name in ("", *folders, *files))
+    return all(time.time() - os.lstat(path).st_mtime > OLD_S for path in paths)
 
 
 def write_file(path: str | Path, content: str | bytes) -> Path:

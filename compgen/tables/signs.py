@@ -216,7 +216,7 @@ def _entry_trials(machine: Machine, judge: Judge, right: ReadTables, most: int) 
     position_mm = np.vstack([judge.grid.position_mm, judge.line_mm])
     corners_mm = np.array(machine.tool_corners_mm)[np.arange(len(judge.line_mm)) % len(machine.tool_corners_mm)]
     points = [Points(judge.line_mm, corners_mm)]
-    for side in (1.0, -1.0) if right.controller.bidirectional else (1.0,):
+    for side in (1.0, -1.0) if right.controller.by_direction(right.tables) else (1.0,):
         points.append(Points(position_mm, approach=np.full_like(position_mm, side)))
     before = np.vstack([right.correction(machine, part) for part in points])
     numbers = numbers_of(right.tables)

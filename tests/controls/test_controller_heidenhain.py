@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
@@ -492,12 +491,12 @@ GARBAGE = [b"\n" * 10_000_000, b"A" * 100_000_000, b"0 " * 5_000_000, b"NR\n" * 
 
 
 @pytest.mark.parametrize("garbage", GARBAGE, ids=["lines", "one line", "numbers", "headers"])
-def test_garbage_is_refused_within_a_second(tmp_path, garbage):
+def test_garbage_is_refused_for_its_size_before_it_is_parsed(tmp_path, garbage):
     machine, text = machine_of(tmp_path), garbage.decode("ascii")
-    start = time.process_time()
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(
+        InputError, match=f"has {len(text)} characters; a file of this kind has at most 2000000"
+    ) as caught:
         parse(machine, text)
-    assert time.process_time() - start < 1.0
     assert caught.value.line is not None
 
 

@@ -2,7 +2,6 @@
 
 import itertools
 import re
-import time
 from dataclasses import replace
 from decimal import Decimal
 from pathlib import Path
@@ -962,15 +961,15 @@ def test_the_control_without_public_format_is_refused_with_the_way_round():
     ],
     ids=["one line", "one assignment", "not ASCII", "zeros"],
 )
-def test_a_hundred_megabytes_of_garbage_are_refused_within_a_second(name, garbage):
+def test_a_hundred_megabytes_of_garbage_are_refused_for_their_size_before_they_are_parsed(name, garbage):
     machine, text = machine_with(), garbage()
     control = controller_named(name)
     settings = control.read_settings(machine)
     source = SourceFile(Path("g.ini"), text)
-    began = time.perf_counter()
-    with pytest.raises(InputError, match=r"g\.ini"):
+    with pytest.raises(
+        InputError, match=rf"g\.ini:1: has {len(text)} characters; a file of this kind has at most 20000000"
+    ):
         control(machine, settings).parse([source])
-    assert time.perf_counter() - began < 1.0
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """TwinCAT CNC axis lists (TF5200): leadscrew, cross and plane tables, signs, units, index order, malformed text."""
 
 import re
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -295,15 +294,17 @@ def test_an_exported_list_that_is_cut_is_refused(make_errors):
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["\xff" * 30_000_000, "1\n" * 20_000_000, "kw.ssfk.unit 1\n" * 1_000_000],
+    ("text", "reason"),
+    [
+        ("\xff" * 30_000_000, ":1: the line has 30000000 characters; at most 4000 are read"),
+        ("1\n" * 20_000_000, "has 20000000 lines; at most 200000 are read"),
+        ("kw.ssfk.unit 1\n" * 1_000_000, "has 1000000 lines; at most 200000 are read"),
+    ],
     ids=["one line", "numbers", "keys"],  # not these texts themselves
 )
-def test_huge_garbage_is_refused_within_a_second(text):
-    start = time.perf_counter()
-    with pytest.raises(InputError):
+def test_huge_garbage_is_refused_for_its_size_before_it_is_parsed(text, reason):
+    with pytest.raises(InputError, match=reason):
         parsed(text)
-    assert time.perf_counter() - start < 1.0
 
 
 @settings(max_examples=60, deadline=None)

@@ -867,3 +867,50 @@ def test_a_run_with_nothing_to_do_removes_the_working_folder_of_a_killed_one(sit
     assert site.run() == 0
     assert not left.exists()
     assert (foreign / "a").read_text() == "kept"
+
+
+#: Changes to a folder without a lock that has long been left: its name, what is touched in it, its mode, whether there is a lock.
+LONG_LEFT = {
+    "long left": ({}, True),
+    "a file in it is new": ({"touched": "out/b"}, False),
+    "a folder in it is new": ({"touched": "out"}, False),
+    "made by a person": ({"mode": 0o755}, False),
+    "another name": ({"name": "compgen-recal-of-my-mills"}, False),
+    "another kind of name": ({"name": "compgen-projects"}, False),
+}
+
+
+@pytest.mark.parametrize("case", LONG_LEFT)
+def test_a_folder_without_a_lock_is_removed_if_nothing_in_it_changed_for_a_week_and_this_program_made_it(
+    tmp_path, monkeypatch, case
+):
+    changes, removed = LONG_LEFT[case]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = tmp_path / changes.get("name", "compgen-recal-a_1b2c3d")
+    (folder / "out").mkdir(parents=True)
+    (folder / "a").write_text("half")
+    (folder / "out" / "b").write_text("half")
+    folder.chmod(changes.get("mode", 0o700))
+    for path in (folder / "out" / "b", folder / "out", folder / "a", folder):
+        age_s = 60.0 if str(path.relative_to(folder)) == changes.get("touched") else 8 * 86400.0
+        os.utime(path, (time.time() - age_s,) * 2)
+    files.remove_abandoned_folders()
+    assert folder.exists() != removed
+    assert removed or (folder / "out" / "b").read_text() == "half"
+
+
+def test_a_folder_without_a_lock_of_another_user_stays(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    folder = tmp_path / "compgen-recal-a_1b2c3d"
+    folder.mkdir(mode=0o700)
+    (folder / "a").write_text("half")
+    for path in (folder / "a", folder):
+        os.utime(path, (time.time() - 8 * 86400.0,) * 2)
+    user = os.geteuid()
+    monkeypatch.setattr(files, "os", SimpleNamespace(**{**vars(os), "geteuid": lambda: user + 1}))
+    files.remove_abandoned_folders()
+    assert (folder / "a").read_text() == "half"
+    monkeypatch.undo()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    files.remove_abandoned_folders()
+    assert not folder.exists()
