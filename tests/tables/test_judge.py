@@ -300,6 +300,7 @@ def safety_with(values_um, best_um=None, limit_um=None, drops=0.0):
     control = SimpleNamespace(
         table_nodes_mm=lambda _: (NODES, np.zeros(0), np.zeros(1)),
         emulate=emulate,
+        by_direction=lambda _: True,
         resolution_mm=lambda: 0.5 * SLACK_UM * UM,
     )
     best = over(np.zeros(11) if best_um is None else best_um)
