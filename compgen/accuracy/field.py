@@ -392,7 +392,8 @@ def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int],
         sizes[beside] = 0.0  # not known so well: to be evaluated
         for k, (values, unknown) in enumerate(((squares, False), (sizes, beside))):
             largest[k] = max(largest[k], float(values.max()))
-            i, j = np.nonzero((values > (1.0 - _ROUNDING) * largest[k]) | unknown)
+            chosen = np.flatnonzero((values > (1.0 - _ROUNDING) * largest[k]) | unknown)
+            i, j = np.divmod(chosen, values.shape[1])
             rows[k].append(part.start + np.stack([i, j], axis=1)[j > i])
     found = [(0, 0), (0, 0)]
     for k, pairs in enumerate(np.concatenate(some) for some in rows):

@@ -146,8 +146,9 @@ def figures_of(size_mm: FloatArray) -> dict[str, float]:
 
 def residuals(error_mm: FloatArray) -> Residuals:
     """Return the figures of errors (n, 3)."""
-    x, y, z = (float(value) for value in np.ptp(error_mm, axis=0) / MM_PER_UM)
-    return Residuals(**figures_of(np.linalg.norm(error_mm, axis=1)), v_x_um=x, v_y_um=y, v_z_um=z)
+    columns = np.ascontiguousarray(error_mm.T)  # several times as fast as along rows of three
+    x, y, z = (float(np.ptp(part)) / MM_PER_UM for part in columns)
+    return Residuals(**figures_of(np.sqrt(np.sum(columns**2, axis=0))), v_x_um=x, v_y_um=y, v_z_um=z)
 
 
 def residuals_twice(tip_mm: FloatArray, error_mm: FloatArray) -> tuple[Residuals, Residuals]:
