@@ -71,9 +71,14 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        warnings.showwarning = lambda message, category, *_, **__: (
-            _complain(f"warning: {message}", "yellow") if issubclass(category, CompgenWarning) else None
-        )
+        said = set[str]()  # a step that is made twice, to fit and to judge, warns once
+
+        def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+            if issubclass(category, CompgenWarning) and str(message) not in said:
+                said.add(str(message))
+                _complain(f"warning: {message}", "yellow")
+
+        warnings.showwarning = show
         try:
             called = Path(sys.argv[0]).name
             name = called if called in PROGRAM_NAMES else PROGRAM_NAMES[0]

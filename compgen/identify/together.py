@@ -192,7 +192,10 @@ def solve_together(
     Raises UndeterminedError if no error is determined. Positions in a frame of unknown pose and lengths from unknown
     stations are linear around approximate errors only: those of a first solution.
     """
-    around, least = None, _least(parts)
+    around = None
+    plates = [part.measurement for part in parts if isinstance(part.measurement, Artefact)]
+    few = any(part.new_lengths for part in parts) or any(plate.calibrated.all() for plate in plates)
+    least = FAINT if few else SHOWS
     posed = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
     for _ in range(2 if posed else 1):
         found = [part.observed(machine, layout, options, around) for part in parts]
@@ -220,14 +223,6 @@ def solve_together(
             reject=options.reject,
         )
     return found, solution, accepted
-
-
-def _least(parts: Sequence[Source]) -> float:
-    """Share of the largest direction below which one counts as not determined."""
-    plates = [part.measurement for part in parts if isinstance(part.measurement, Artefact)]
-    return (
-        FAINT if any(part.new_lengths for part in parts) or any(plate.calibrated.all() for plate in plates) else SHOWS
-    )
 
 
 def _determined_errors(layout: ErrorParameters, observations: Observations, least: float) -> set[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
@@ -88,7 +89,7 @@ def probe_program(
     """
     card = load_format(controller, templates)
     if not has_probe_program(controller, templates):
-        known = ", ".join(name for name in _controllers() if has_probe_program(name))
+        known = ", ".join(name for name in CONTROLLERS if has_probe_program(name))
         message = (
             f"no public document of {controller} describes probing in machine coordinates; programs exist for {known}"
         )
@@ -132,12 +133,6 @@ def probe_program(
         "u_calibration_um": probe.u_calibration_um,
     }
     return render(replace(card), TEMPLATE, context, templates)
-
-
-def _controllers() -> list[str]:
-    from compgen.controls import CONTROLLERS
-
-    return list(CONTROLLERS)
 
 
 def _touches(place_mm: np.ndarray, probing: Probing) -> list[dict[str, Any]]:
