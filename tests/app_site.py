@@ -26,8 +26,8 @@ def few_lengths():
 class Site:
     """The workbench in a test client, with one open project."""
 
-    def __init__(self, folder, *, start=True):
-        self.workbench = Workbench(DashboardSettings("", port=8765))
+    def __init__(self, folder, *, start=True, language="en"):
+        self.workbench = Workbench(DashboardSettings("", port=8765), language)
         self.number = self.workbench.open(folder)
         self.runner = self.workbench.projects[0]
         self.project = self.runner.project

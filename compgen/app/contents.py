@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from compgen.app.project import Project, ProjectState, Step, command_line
+from compgen.app.project import INPUTS, Project, ProjectState, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -27,7 +28,7 @@ from compgen.data.files import read_text
 from compgen.data.machine import CHAINS, Chain, machine_files
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
-from compgen.errors import CompgenError, InputError
+from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.report.html.pictures import draw_curve
 from compgen.tables import load_format
@@ -123,8 +124,10 @@ def _deviation_pictures(data: Deviations, key: str) -> list[Picture]:
 
 @lru_cache(maxsize=64)
 def _drawn(path: Path, _stamp: tuple[int, int], answers: tuple[str, ...], key: str) -> tuple[Picture, ...]:
-    kind = native_format(path)
-    data = describe_native(path, kind)[1] if kind else import_file(path, options_from(answers)).data
+    with warnings.catch_warnings():  # the command that reads the file shows them
+        warnings.simplefilter("ignore", CompgenWarning)
+        kind = native_format(path)
+        data = describe_native(path, kind)[1] if kind else import_file(path, options_from(answers)).data
     return tuple(pictures_of(data, key))
 
 
@@ -546,7 +549,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         {
             "step": step, "result": project.facts(step, "result.json"), "files": project.files_of(step),
             "current": not any(
-                other.number > step.number and other.kind in ("machine", "numbers", "removed", "measurement")
+                other.number > step.number and other.kind in INPUTS
                 and not other.data.get("after") for other in state.steps
             ),
             "views": views(project, step), "control": step.data["control"],
@@ -563,6 +566,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "options": project.facts(step, "options.json"), "options_step": step, "results": results, "verified": verified,
         "options_current": state.current("options") is not None,
         "controls": list(parsed.get("controllers", {})), "identified": state.current("identify"),
+        "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
     }  # fmt: skip
 

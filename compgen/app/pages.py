@@ -46,6 +46,7 @@ from compgen.app.project import (
 from compgen.controls import CONTROLLERS
 from compgen.data.charts import LABEL
 from compgen.data.files import json_text, read_text, write_file
+from compgen.data.language import texts_of
 from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
@@ -55,7 +56,7 @@ from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
 from compgen.report.html.write import markdown
-from compgen.resources import cache_folder, data_folder
+from compgen.resources import LANGUAGES, cache_folder, data_folder
 
 #: Largest request (files that are dropped together), largest part of a form that is not a file, bytes; parts of a form.
 LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 500_000_000, 2_000_000, 400
@@ -118,6 +119,7 @@ class Workbench:
     """Everything that exists as long as the program runs; ``ticket`` is the token of the first address, used once."""
 
     settings: DashboardSettings
+    language: str = LANGUAGES[0]
     projects: list[Runner] = field(default_factory=list)
     ticket: str | None = field(default_factory=lambda: secrets.token_urlsafe(32))
     session: str = field(default_factory=lambda: secrets.token_urlsafe(32))
@@ -310,6 +312,8 @@ def action(name: str, path: str) -> Callable[[Callable[..., str | None]], Callab
             try:
                 text = request.form.get("revision", "")
                 state = runner.project.check(int(text) if re.fullmatch(r"[0-9]{1,9}", text) else -1)
+                if runner.busy:
+                    raise InputError("a calculation is running; wait for it or stop it")
                 target = change(runner, state, **arguments)
             except CompgenError as error:
                 return _page(number, name, 409, problem=str(error))
@@ -326,6 +330,11 @@ def _field(name: str, most: int = 300) -> str:
     if len(text) > most or any(ord(char) < 32 for char in text):
         raise InputError(f"expected one line of at most {most} characters", field=name)
     return text
+
+
+def _language() -> list[str]:
+    language = the_workbench().language
+    return [] if language == LANGUAGES[0] else ["--language", language]
 
 
 def _machine_of(state: ProjectState) -> str:
@@ -453,17 +462,17 @@ def _store_machine(runner: Runner, text: str, name: str, title: str, by_hand: st
     path = f"{folder}/{name}"
     write_file(runner.project.path(path), text)
 
-    def finish(step: Step, output: str) -> Step:
-        listed = json.loads(output)["files"][0]
-        if listed["problems"]:
-            raise InputError("\n".join(problem["text"] for problem in listed["problems"]))
-        data = {"machine": path, "by_hand": [f"# {path}: {by_hand}"], "remarks": listed["warnings"]}
-        return Step(**{**step.__dict__, "data": data})
-
     words = ["check", path, "--kind", "machine", "--json"]
-    runner.start(
-        "checking the machine file", "machine", [StepTask(Step(0, "machine", title, [words], folder), finish, (0, 2))]
-    )
+    step = Step(0, "machine", title, [words], folder, data={"machine": path, "by_hand": [f"# {path}: {by_hand}"]})
+    runner.start("checking the machine file", "machine", [StepTask(step, _without_problems, (0, 2))])
+
+
+def _without_problems(step: Step, output: str) -> Step:
+    """Keep a step whose file ``volcomp check`` accepts; InputError with all problems of another one."""
+    listed = json.loads(output)["files"][0]
+    if listed["problems"]:
+        raise InputError("\n".join(problem["text"] for problem in listed["problems"]))
+    return Step(**{**step.__dict__, "data": {**step.data, "remarks": listed["warnings"]}})
 
 
 @action("measurement", "measurement/add")
@@ -473,13 +482,16 @@ def add_measurements(runner: Runner, state: ProjectState) -> str | None:
     files = [item for item in request.files.getlist("files") if item.filename]
     if not files:
         raise InputError("choose one or more files")
-    if runner.busy:
-        raise InputError("another calculation is running; wait for it or stop it")
     tasks = []
     for file in files[:30]:
         folder = runner.project.new_folder("measurement")
         path = f"{folder}/{file_name(file.filename or '')}"
         file.save(runner.project.path(path))
+        if path.endswith(".toml") and not after:
+            words = ["check", path, "--kind", "instrument", "--json"]
+            step = Step(0, "instrument", f"Instrument {Path(path).name}", [words], folder, data={"file": path})
+            tasks.append(StepTask(step, _without_problems, (0, 2)))
+            continue
         tasks.append(_import_task(runner.project, state, path, folder, (), {"after": after}))
     runner.start("reading the files", "after" if after else "measurement", tasks)
     return "after" if after else None
@@ -578,7 +590,11 @@ def _inputs(state: ProjectState) -> list[str]:
     numbers = [f"--{option}={word}" for option, words in state.numbers.items() for word in words]
     if not files and not numbers:
         raise InputError("add a measurement first")
-    return [machine, *files, *numbers]
+    return [machine, *files, *numbers, *_instrument(state)]
+
+
+def _instrument(state: ProjectState) -> list[str]:
+    return [] if state.instrument is None else [f"--instrument={state.instrument}"]
 
 
 @action("result", "identify")
@@ -590,7 +606,7 @@ def identify(runner: Runner, state: ProjectState) -> None:
 
 def _identify_task(project: Project, words: Sequence[str]) -> StepTask:
     folder = project.new_folder("identify")
-    commands = [["identify", *words, "--out", folder], ["report", folder]]
+    commands = [["identify", *words, "--out", folder], ["report", folder, *_language()]]
     return StepTask(Step(0, "identify", "Errors identified", commands, folder))
 
 
@@ -601,7 +617,7 @@ def diagnose(runner: Runner, state: ProjectState) -> None:
     if not files:
         raise InputError("add a measurement first: numbers alone have no residuals")
     folder = runner.project.new_folder("diagnose")
-    words = ["diagnose", machine, *files, "--out", folder]
+    words = ["diagnose", machine, *files, *_instrument(state), "--out", folder]
     runner.start("looking for missing effects", "result", [StepTask(Step(0, "diagnose", "Diagnosis", [words], folder))])
 
 
@@ -643,10 +659,23 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     """Make, read back and verify the tables of a control."""
     words, control = _inputs(state), _control()
     folder = runner.project.new_folder("tables")
-    words = ["run", *words, "--controller", control, "--out", folder]
+    words = ["run", *words, "--controller", control, *_language(), "--out", folder]
     words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
+    words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active", "active")]
+    kind = (CONTROLLERS[control].sample_setting or "style_from").replace("_", "-")
+    words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample", "sample")]
     step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control})
     runner.start(f"tables for {control}", "tables", [StepTask(step)])
+
+
+def _uploaded(project: Project, folder: str, name: str, into: str) -> list[str]:
+    """Save the files of a field below the folder of a step and return their paths in the project."""
+    files = [item for item in request.files.getlist(name) if item.filename][:50]
+    paths = [f"{folder}/{into}/{k}-{file_name(item.filename or '')}" for k, item in enumerate(files, start=1)]
+    for item, path in zip(files, paths, strict=True):
+        project.path(path).parent.mkdir(exist_ok=True)
+        item.save(project.path(path))
+    return paths
 
 
 def _control() -> str:
@@ -660,16 +689,11 @@ def _control() -> str:
 def verify_backup(runner: Runner, state: ProjectState) -> None:
     """Verify what the control holds: a backup of it against the identified errors."""
     step, control = _identified(state), _control()
-    files = [item for item in request.files.getlist("files") if item.filename]
-    if not files:
-        raise InputError("choose the backup of the control")
-    if runner.busy:
-        raise InputError("another calculation is running; wait for it or stop it")
     folder = runner.project.new_folder("verify")
-    (runner.project.path(folder) / "backup").mkdir()
-    paths = [f"{folder}/backup/{k}-{file_name(item.filename or '')}" for k, item in enumerate(files[:50], start=1)]
-    for item, path in zip(files, paths, strict=False):
-        item.save(runner.project.path(path))
+    paths = _uploaded(runner.project, folder, "files", "backup")
+    if not paths:
+        runner.project.set_aside(folder)
+        raise InputError("choose the backup of the control")
     errors = f"{step.folder}/identified.errors.csv"
     words = ["verify", _machine_of(state), *paths, "--controller", control, "--errors", errors, "--out", folder]
     verified = Step(0, "verify", f"Backup of {control} verified", [words], folder, data={"control": control})
@@ -688,7 +712,7 @@ def compare(runner: Runner, state: ProjectState) -> None:
         pair.append(item)
     folder = runner.project.new_folder("compare")
     before, after = (item.used[0] for item in pair)
-    commands = [["compare", _machine_of(state), before, after, "--out", folder], ["report", folder]]
+    commands = [["compare", _machine_of(state), before, after, "--out", folder], ["report", folder, *_language()]]
     step = Step(0, "compare", f"{pair[0].name} against {pair[1].name}", commands, folder)
     runner.start("comparing before and after", "after", [StepTask(step)])
 
@@ -711,8 +735,6 @@ def hand_over(runner: Runner, state: ProjectState) -> None:
 @action("project", "undo")
 def undo(runner: Runner, state: ProjectState) -> None:
     """Take back the last step."""
-    if runner.busy:
-        raise InputError("a calculation is running; wait for it or stop it")
     runner.project.undo(state.revision)
 
 
@@ -828,8 +850,10 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.autoescape = True
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
-    app.jinja_env.filters.update(figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable)
-    app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line)
+    app.jinja_env.filters.update(word=str, figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable)
+    app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
+    if workbench.language != LANGUAGES[0]:
+        texts_of(workbench.language).translate(app.jinja_env, html=True)
     app.url_map.converters["number"] = StepNumber
     app.extensions["compgen"] = workbench
     app.before_request(_begin_request)
@@ -916,7 +940,14 @@ def _readable(value: Any) -> str:
     return "\N{EN DASH}" if value is None else str(value)
 
 
-def serve(folder: Path | None, port: int, announce: Callable[[str], None], *, keep_open: bool = False) -> None:
+def serve(
+    folder: Path | None,
+    port: int,
+    announce: Callable[[str], None],
+    *,
+    keep_open: bool = False,
+    language: str = LANGUAGES[0],
+) -> None:
     """Serve on this computer until the last page is closed, or Ctrl-C; ``announce`` receives the first address.
 
     Raises
@@ -928,7 +959,7 @@ def serve(folder: Path | None, port: int, announce: Callable[[str], None], *, ke
 
     import waitress  # type: ignore[import-untyped]  # shipped without type information
 
-    workbench = Workbench(DashboardSettings("", port=port))
+    workbench = Workbench(DashboardSettings("", port=port), language)
     if folder is not None:
         workbench.open(folder)
     app = make_app(workbench)

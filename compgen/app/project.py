@@ -37,6 +37,8 @@ LARGEST_PROJECT = 20_000_000
 STOP_S = 5.0
 #: Lines of a command's messages that are kept.
 MOST_LINES = 500
+#: Steps that a result depends on.
+INPUTS = ("machine", "instrument", "numbers", "removed", "measurement")
 #: Exit codes of a command that has written its result: accepted or not.
 DONE = (0, 1)
 
@@ -103,6 +105,13 @@ class ProjectState:
         return {} if step is None else step.data["numbers"]
 
     @property
+    def instrument(self) -> str | None:
+        """File with the constants of a six-DOF instrument, for measurements of that kind."""
+        step = self.last("instrument")
+        kinds = [item.step.data["summary"]["kind"] for item in self.measurements]
+        return str(step.data["file"]) if step is not None and "sixdof" in kinds else None
+
+    @property
     def measurements(self) -> list[Measurement]:
         """Measurement files that were not removed, each as its latest step has it."""
         found: dict[int, Measurement] = {}
@@ -125,7 +134,7 @@ class ProjectState:
         """Return the latest step of a kind if nothing that it depends on has changed since, otherwise None."""
         step = self.last(kind)
         if step is None or any(
-            other.number > step.number and other.kind in ("machine", "numbers", "removed", "measurement")
+            other.number > step.number and other.kind in INPUTS
             and not other.data.get("after") for other in self.steps
         ):  # fmt: skip
             return None
@@ -226,19 +235,22 @@ class Project:
     def new_folder(self, kind: str) -> str:
         """Make the folder of the next step and return its name."""
         with self._alone() as state:
-            taken = [int(found[1]) for item in self.folder.iterdir() if (found := re.match(r"(\d+)-", item.name))]
-            number = max([0, *taken, *(step.number for step in state.steps)]) + 1
+            number = self._next(state)
             name = f"{number:02d}-{kind}"
             (self.folder / name).mkdir()
             return name
+
+    def _next(self, state: ProjectState) -> int:
+        """Return a number that no step has, and no folder of one that runs."""
+        taken = [int(found[1]) for item in self.folder.iterdir() if (found := re.match(r"(\d+)-", item.name))]
+        return max([0, *taken, *(step.number for step in state.steps)]) + 1
 
     def add(self, step: Step, revision: int | None = None) -> ProjectState:
         """Append a step: its number is that of its folder, or the next one."""
         with self._alone() as state:
             if revision is not None and revision != state.revision:
                 raise StaleError("the project was changed in another window; reload this page, then do it again")
-            taken = [item.number for item in state.steps]
-            number = int(step.folder.partition("-")[0]) if step.folder else max([0, *taken]) + 1
+            number = int(step.folder.partition("-")[0]) if step.folder else self._next(state)
             now = datetime.now(UTC).isoformat(timespec="seconds")
             step = Step(**{**asdict(step), "number": number, "time": now})
             state = ProjectState(state.revision + 1, tuple(sorted((*state.steps, step), key=lambda item: item.number)))

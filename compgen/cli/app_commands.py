@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from compgen.cli.common import PATH
+from compgen.cli.shared_options import language_option
 from compgen.cli.terminal import say
 from compgen.errors import InputError
 
@@ -17,7 +18,8 @@ from compgen.errors import InputError
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this computer. Default: any free one.")
 @click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
 @click.option("--keep-open", is_flag=True, help="Run until Ctrl-C, also after the last page is closed.")
-def app_command(folder: Path | None, port: int, no_browser: bool, keep_open: bool) -> int:
+@language_option
+def app_command(folder: Path | None, port: int, no_browser: bool, keep_open: bool, language: str) -> int:
     """Open the workbench in the browser: from files to checked tables without a command line.
 
     DIR is the folder of a project; without it a page asks for one. The pages are served to this computer only (127.0.0.1),
@@ -38,5 +40,5 @@ def app_command(folder: Path | None, port: int, no_browser: bool, keep_open: boo
         if not no_browser:
             webbrowser.open(address)
 
-    serve(folder, port, announce, keep_open=keep_open)
+    serve(folder, port, announce, keep_open=keep_open, language=language)
     return 0

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import re
 import shlex
 import shutil
 import subprocess
@@ -12,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from markupsafe import escape
 
 pytest.importorskip("flask", reason="the extra compgen[serve] is not installed: the workbench is not tested")
 pytest.importorskip("waitress", reason="the extra compgen[serve] is not installed: the workbench is not tested")
@@ -82,7 +84,9 @@ def test_laser_files_and_a_square_become_tables_and_the_commands_shown_do_the_sa
     step = state.last("run")
     result = json.loads(site.project.files_of(step)["result.json"].read_text())
     page = site.get("/projects/1/tables").text
-    assert result["headline"].split(";")[0].replace("'", "&#39;") in page
+    texts = [item["text"] for item in result["objections"]]
+    assert texts
+    assert all(str(escape(text)) in page for text in [*texts, result["headline"].rpartition("; ")[2]])
     assert result["measured"]["determined"] == 3
     packed = zipfile.ZipFile(io.BytesIO(site.get(f"/projects/1/steps/{step.number}/files.zip").data))
     assert f"{step.folder}/manifest.json" in packed.namelist()
@@ -257,3 +261,58 @@ def test_the_job_file_of_recalibration_can_be_read(site):
     assert list(job.machines) == ["mill-1"]
     assert job.machines["mill-1"].measured_with == "bare"
     assert "volcomp recal run --job recal.toml" in site.get("/projects/1/project").text
+
+
+def test_six_dof_readings_are_read_with_their_instrument(site):
+    site.do("machine/choose", {"machine": "jia-xytz"})
+    examples = ROOT / "examples"
+    state = site.do("measurement/add", upload(examples / "jia-xytz.sixdof.csv", examples / "jia-xytz.instrument.toml"))
+    assert state.instrument == state.last("instrument").data["file"]
+    state = site.do("identify")
+    assert "--instrument=" in " ".join(state.last("identify").commands[0])
+    found = values(site.project, state.last("identify"))
+    assert {name for name, _ in found} >= {"EXX", "EAX", "EC0Y"}
+    (site.project.folder / "wrong.toml").write_text('kind = "none"\n')
+    site.post("/projects/1/measurement/add", upload(site.project.folder / "wrong.toml"))
+    assert any("wrong.toml" in problem for problem in site.runner.job.problems)
+    assert site.project.state() == state
+
+
+def test_tables_that_were_active_are_taken_out_of_the_measurement(site):
+    """Their effect is removed: a machine measured with its tables on has their errors besides those measured."""
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    name, content = helper.few_lengths()
+    site.do("measurement/add", {"files": [(io.BytesIO(content), name)]})
+    site.do("identify")
+    state = site.do("run", {"control": "isg-csv"})
+    first = values(site.project, state.last("run"))
+    files = site.project.files_of(state.last("run"))
+    tables = [(io.BytesIO(files[name].read_bytes()), name) for name in ("volcomp0.csv", "volcomp0.lis")]
+    state = site.do("run", {"control": "isg-csv", "active": tables})
+    step = state.last("run")
+    assert f"--active={step.folder}/active/1-volcomp0.csv" in step.commands[0]
+    second = values(site.project, step)
+    assert second["EC0Y", ""] == pytest.approx(2.0 * first["EC0Y", ""], rel=1e-3)
+    assert second["EXX", -800.0] == pytest.approx(2.0 * first["EXX", -800.0], abs=0.5)
+
+
+def test_german_pages_are_german_and_their_reports_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    site = helper.Site(tmp_path / "project", language="de")
+    assert "Zeichnung zeigt, welcher Körper welchen trägt" in site.get("/projects/1/machine").text
+    site.do("machine/describe", {**MILL, "chain": "Tisch in X und Y, Kopf in Z"})
+    site.do("measurement/add", upload(IMPORTS / "linear.rtl"))
+    state = site.do("identify")
+    assert state.last("identify").commands[1][-2:] == ["--language", "de"]
+    state = site.do("run", {"control": "siemens-cec", "allow-misfit": "on"})
+    number = state.last("run").number
+    for path, words in (
+        ("measurement", "Messdateien hier ablegen"), ("result", "Abweichungen bestimmt"), ("tables", "Erzeugen und prüfen"),
+        ("after", "Vorher und nachher"), ("project", "Letzten Schritt zurücknehmen"),
+        (f"steps/{number}/preflight.html", "Datum"), (f"steps/{number}/view/report.html", '<html lang="de">'),
+    ):  # fmt: skip
+        page = site.get(f"/projects/1/{path}").text
+        assert words in page
+        assert '<html lang="de">' in page
+        assert not re.search(r">(Next|Add|Calculate|Choose|Save|Undo|Compare|Verify)\b", page), path
+    site.workbench.close()

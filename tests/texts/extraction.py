@@ -165,6 +165,8 @@ def messages():
     for path in sorted(templates.glob("_report/*.html.j2")):
         source = path.read_text("utf-8")
         add(path, of_template(source, html=True))
+    for path in sorted(templates.glob("_app/*.html")):
+        add(path, of_template(path.read_text("utf-8"), html=True))
     for path in sorted([*templates.glob("*/preflight.md.j2"), *templates.glob("_common/*.md.j2")]):
         add(path, of_template(path.read_text("utf-8"), html=False))
     for path in sorted(templates.glob("*/format.toml")):
