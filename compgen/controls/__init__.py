@@ -78,7 +78,7 @@ CONTROLLERS = Controls(
         "reprapfirmware": "firmware_skew.RepRapFirmware",
         "ucnc": "firmware_skew.Ucnc",
         "smoothieware": "screw_maps.Smoothieware",
-        "ecmc": "screw_maps.Ecmc",
+        "ecmc": "screw_maps.EcmcLookup",
         "aerotech": "screw_maps.Aerotech",
         "aerotech-2d": "planar_grids.Aerotech2d",
         "kmotion": "planar_grids.Kmotion",

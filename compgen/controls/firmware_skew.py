@@ -39,6 +39,10 @@ HEIGHT_MM = 1000.0
 MARLIN_LARGEST = 1.0
 #: Marlin corrects nothing within this distance of the lower end of X and Y.
 MARLIN_MARGIN_MM = 1.0
+SHEAR_WARNING = (
+    "The shear acts about machine zero: home the axes before it is switched on, and set work offsets again afterwards, "
+    "because it also moves the place of every old offset."
+)
 _MOST_CHARACTERS = 20_000_000
 _FLOAT32 = float(np.finfo(np.float32).eps)
 
@@ -117,7 +121,7 @@ class SkewControl(Controller[Settings, SkewFactors]):
         return {
             "sign_statement": self._sign_statement(tables),
             "parameters": self.parameters(tables),
-            "warnings": self._warnings(),
+            "warnings": [SHEAR_WARNING],
             "factors": self.shown(tables),
             "checks": self._checks(tables),
             "in_y": tables.along_y,
@@ -203,12 +207,6 @@ class SkewControl(Controller[Settings, SkewFactors]):
     def _reached_mm(self, tables: SkewFactors) -> FloatArray:
         """Where the axes go for commands at the corners of the travel: a shear is largest there."""
         return self.shifted(tables, np.array(list(product(*(axis.range_mm for axis in self.machine.axes)))))
-
-    def _warnings(self) -> list[str]:
-        return [
-            "The shear acts about machine zero: home the axes before it is switched on, and set work offsets again "
-            "afterwards, because it also moves the place of every old offset."
-        ]
 
     def _checks(self, tables: SkewFactors) -> list[dict[str, str]]:
         """What each shear does over the whole travel of its base axis, for the check at the machine."""

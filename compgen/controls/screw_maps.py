@@ -439,7 +439,7 @@ def _version(value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class EcmcSettings:
+class EcmcLookupSettings:
     """Settings ``[controllers.ecmc]``."""
 
     version: str = setting(
@@ -449,18 +449,18 @@ class EcmcSettings:
     loss_mm: float = loss_setting()
 
 
-class Ecmc(ScrewMapControl[EcmcSettings]):
+class EcmcLookup(ScrewMapControl[EcmcLookupSettings]):
     """``ecmc``: lookup tables of the encoders, one file per axis."""
 
     name = "ecmc"
-    settings_class = EcmcSettings
+    settings_class = EcmcLookupSettings
     at_axes = True
     least, digits = 3, 9
     table_name = "lookup table"
     #: First release that subtracts the table.
     SUBTRACTS_FROM = 10
 
-    def __init__(self, machine: Any, settings: EcmcSettings | None = None) -> None:
+    def __init__(self, machine: Any, settings: EcmcLookupSettings | None = None) -> None:
         super().__init__(machine, settings)
         # the axis stands where encoder - table = command, so the control adds the table to the command
         self.sign = 1.0 if self.subtracts else -1.0

@@ -16,6 +16,8 @@ from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 # What the options of a control would gain: tables for the terminal, and ``options.md``.
 
 
+#: The row of a corrected NC program among the levels.
+PROGRAM = "any or none, and the NC program corrected"
 #: What three skew factors correct: this is none of the levels.
 SQUARENESS_ALONE = "squareness alone"
 #: Errors that leave less than this at every tool and level are not listed, um.
@@ -26,7 +28,9 @@ LEGEND = (
     "left: what the best table of that level leaves, largest / rms / 95 % in um; left*: the best-fit rigid motion of the "
     "workpiece removed; gain: reduction of rms* compared with the level above, with the tool of the machine file: full "
     "volumetric compensation pays off with other tools. A level may contain a constant shift of "
-    "an axis, which a workpiece offset can do as well; controls whose tables are zero at the reference point do not."
+    "an axis, which a workpiece offset can do as well; controls whose tables are zero at the reference point do not. "
+    "A program corrected by `volcomp correct` leaves the last decimal of its coordinates and the uncertainty of the errors, "
+    "with the errors of the machine as it runs: with its tables active, those measured with them."
 )
 
 
@@ -47,6 +51,10 @@ def level_rows(result: Capability) -> list[list[str]]:
         rms = item.left.rigid_removed.rms_um
         rows.append([item.label, _three(item.left.after), _three(item.left.rigid_removed), _gain(before, rms)])
         before = rms
+    if result.program is not None:
+        left = result.program.left
+        uncertainty = "" if result.program.u_um is None else f", U {um_text(2.0 * result.program.u_um)} um (k = 2)"
+        rows.append([PROGRAM, _three(left.after), _three(left.rigid_removed), f"rounding{uncertainty}"])
     return rows
 
 

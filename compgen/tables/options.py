@@ -25,7 +25,13 @@ from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid, volume_grid, volumetric_error
 from compgen.tables import Export, export
-from compgen.tables.judge import LargestStep, in_both_directions, left_by_reversal, safety_of
+from compgen.tables.judge import (
+    LargestStep,
+    displacement_uncertainty,
+    in_both_directions,
+    left_by_reversal,
+    safety_of,
+)
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
 
 # Levels of compensation that controls offer, as bases of terms, and the best that each could do for given errors.
@@ -212,6 +218,8 @@ def level_key(basis: Sequence[Term]) -> str:
 
 #: Tool lengths that are evaluated in addition to the tool of the machine file, along Z, mm.
 TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
+#: Coordinates of a corrected NC program are written in steps of this length.
+PROGRAM_STEP_MM = 0.001
 #: Options of a control that are evaluated in addition to the machine file: their description and settings.
 VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
     "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True})),
@@ -285,6 +293,19 @@ class ControlResult:
 
 
 @dataclass(frozen=True)
+class ProgramResult:
+    """What a corrected NC program leaves (``volcomp correct``), without tables or with any of them active.
+
+    ``left`` is the rounding of its coordinates to ``step_mm``, ``u_um`` the largest standard uncertainty that the errors
+    give the tool tip, None if it is not known.
+    """
+
+    left: Left
+    step_mm: float
+    u_um: float | None
+
+
+@dataclass(frozen=True)
 class Capability:
     """Result of :func:`capability`; ``tools_mm`` are the evaluated tool offsets, that of the machine file first."""
 
@@ -296,6 +317,7 @@ class Capability:
     levels: tuple[LevelResult, ...]
     controls: tuple[ControlResult, ...]
     notes: tuple[str, ...] = field(default_factory=tuple)
+    program: ProgramResult | None = None
 
     def level(self, key: str) -> LevelResult:
         """Return one level."""
@@ -341,6 +363,13 @@ class Capability:
                 }
                 for item in self.controls
             ],
+            "program": None
+            if self.program is None
+            else {
+                **self.program.left.as_dict(),
+                "step_um": self.program.step_mm / MM_PER_UM,
+                "u_um": self.program.u_um,
+            },
             "notes": list(self.notes),
         }
 
@@ -391,6 +420,13 @@ def capability(
             left = _left(zone, errors, points, correction, reversal, tool)
             by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
         levels.append(LevelResult(level.key, by_tool[0][0], tuple(by_tool)))
+    # the exact inverse at each point, as a program states it; the direction of travel is known there
+    wanted = wanted_correction(zone, errors, points.position_mm)
+    if reversal is not None:
+        wanted = wanted - reversal.displacement(points.position_mm, approach)
+    written = PROGRAM_STEP_MM * np.round((points.position_mm + wanted) / PROGRAM_STEP_MM) - points.position_mm
+    u_um = float(np.linalg.norm(displacement_uncertainty(zone, errors, points.position_mm))) / MM_PER_UM
+    program = _left(zone, errors, points, written, reversal, tool_of(machine, None))
     controls = [
         _control_result(variant, changed, errors, points, reversal, templates)
         for name in (CONTROLLERS if controllers is None else controllers)
@@ -405,6 +441,7 @@ def capability(
         levels=tuple(levels),
         controls=tuple(controls),
         notes=tuple(_notes(errors, reversal)),
+        program=ProgramResult(program, PROGRAM_STEP_MM, u_um or None),
     )
 
 

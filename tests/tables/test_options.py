@@ -15,6 +15,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import zone_of
 from compgen.errors import InputError
 from compgen.pipeline import export_and_verify, identified_reversal
+from compgen.report.options_text import options_markdown
 from compgen.tables import ReadTables, export, read_tables, verify
 from compgen.tables.options import LABELS, capability, explain, levels_of
 from compgen.tables.signs import check_program
@@ -521,3 +522,15 @@ def test_verify_and_export_take_a_reversal_file(call, small_machine_file, errors
     path.write_text(format_reversal(reversal_of(X=8.0)))
     code, _, _ = call("verify", small_machine_file, table, *judge, "--reversal", path)
     assert code == 1
+
+
+def test_a_corrected_program_leaves_half_a_step_and_the_uncertainty(small_machine, small_errors):
+    """Rounding to 1 um: uniform, so 1/sqrt(12) um rms on each axis, at most half a step; no control is needed for it."""
+    found = capability(small_machine, small_errors, controllers=("klipper",))
+    left = found.program.left.after
+    assert left.max_um <= 0.5 * np.sqrt(3) * 1.001
+    assert left.rms_um == pytest.approx(np.sqrt(3 / 12), abs=0.1)
+    u = [curve.u.max() for curve in small_errors.curves.values()]
+    assert (found.program.u_um is None) == bool(np.all(np.isnan(u)))
+    assert found.as_dict()["program"]["after"]["max_um"] == left.max_um
+    assert "NC program corrected" in options_markdown(found)
