@@ -216,9 +216,9 @@ class SampledTerm:
                 products[:, k] = np.bincount(self.node.ravel(), (self.share * one).ravel(), size)
         return products
 
-    def take(self, values: FloatArray, fields_mm: FloatArray, hats: _Hats) -> None:
-        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n), if they are not rounding only."""
-        some = _places(np.abs(values).max(axis=0) * np.abs(self.carrier).max() > NOTHING_MM)
+    def take(self, values: FloatArray, fields_mm: FloatArray, hats: _Hats, least_mm: float = 0.0) -> None:
+        """Subtract the fields of k sets of values (values, k) from k fields (3, k, n), if they exceed ``least_mm``."""
+        some = _places(np.abs(values).max(axis=0) * np.abs(self.carrier).max() > least_mm)
         own = values.T[some]
         hat = hats.of(self, len(own))
         left, right = self.share
@@ -293,7 +293,7 @@ class Projector:
         left, hats = np.ascontiguousarray(np.moveaxis(required_mm, 2, 0)), _Hats()
         values = self._solved(left, hats)  # a constant per axis is left to whoever asks
         for term in self.terms:
-            term.take(values[term.place], left, hats)
+            term.take(values[term.place], left, hats, NOTHING_MM)
         return np.moveaxis(left, 0, 2)
 
     def _solved(self, required_mm: FloatArray, hats: _Hats) -> FloatArray:
