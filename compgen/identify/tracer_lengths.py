@@ -102,7 +102,8 @@ def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
         raise InputError(
             f"contains readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
             f"needs at least {least}: with fewer unknown stations a function-valued ambiguity remains. Add the "
-            "missing station, measure with the same tracer from more places, or give known stations",
+            "missing station, measure with the same tracer from more places, give known stations, or give other measurements "
+            "as well (axis runs, a plate)",
             file=lengths.origin[0][0] if lengths.origin else None,
         )
     check_travel(machine, lengths.position_mm, lengths.origin)

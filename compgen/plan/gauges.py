@@ -99,6 +99,12 @@ class GaugePlan(Displayed):
         """Errors of the machine's model that the readings do not show, or not separately from others."""
         return tuple(name for name in modelled_errors(self.machine) if name not in self.errors.names)
 
+    @property
+    def within_circles(self) -> str:
+        """A note on squareness by circles, empty without circles."""
+        circles = any(isinstance(gauge, Ballbar) for gauge in self.gauges)
+        return "squareness by circles is that within the circle, unless straightness is determined" if circles else ""
+
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``plan.json``."""
         largest, empty = {}, self.solution.unreached if self.solution else {}
@@ -534,6 +540,7 @@ def plan_page(found: GaugePlan, errors: ErrorTable | None = None) -> str:
         '<th class="needs-script"></th><th>u of this plan</th></tr>' + "".join(rows) + "</table></div>",
         f"<p>Not visible here: {', '.join(hidden)}.</p>" if hidden else "",
         f"<p>Not determined by this plan: {', '.join(found.left_out)}.</p>" if found.left_out else "",
+        f"<p>{escape(found.within_circles.capitalize())}.</p>" if found.within_circles else "",
         "<h2>What to add</h2><ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else "",
     ]
     style, script, policy = page_assets("gauges.js")

@@ -56,11 +56,17 @@ def identification_table(result: Identification) -> Group:
         return Group(Text(text), _errors_table(result))
     if result.method == "together":
         listed = [
-            f"{part['name']}: {', '.join(part['errors'])}"
+            f"{part['name']}: {', '.join(part['errors']) or 'nothing alone,'}"
             + (f" from {part['readings']} readings" if part["readings"] else "")
             for part in result.details["parts"]
         ]
-        quality = f"{len(result.errors.names)} errors, residual {result.rms_um:.3f} um rms"
+        count = len(result.errors.names)
+        quality = f"{count} error{'s' if count > 1 else ''}, residual {result.rms_um:.3f} um rms"
+        apart = [text.partition(":")[0] for text in result.unobservable if text.endswith("stations and other errors")]
+        if apart:
+            quality += (
+                f"\nleft out, the readings do not separate them from the stations and other errors: {', '.join(apart)}"
+            )
         disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
                     for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
         return Group(Text("\n".join([*listed, quality, *disagree])), _errors_table(result))
@@ -467,6 +473,8 @@ def gauge_plan_table(plan: GaugePlan) -> Group:
         notes.append(
             Text("partly: not separable from poses, the artefact or other errors in every direction", "yellow")
         )
+    if plan.within_circles:
+        notes.append(Text(plan.within_circles))
     empty = {axis: nodes for name, nodes in summary["nodes_without_data"].items() if (axis := name[2])}
     notes += [
         Text(
