@@ -149,8 +149,9 @@ def _curve_figure(source: ErrorSource, name: str, line: str) -> Figure:
         meaning = f"straightness {name}, reference line: {LINES[line]}; ISO 230-1"
     else:
         value, weight = float(np.ptp(curve.value)), range_weight(curve.value)
-        what = "mean bidirectional positioning error M (ISO 230-2)" if error.kind == "linear" else "angular error"
-        meaning = f"{what} {name}, range over the travel"
+        meaning = f"angular error {name}, range over the travel"
+        if error.kind == "linear":
+            meaning = f"mean bidirectional positioning error M (ISO 230-2) {name}, range over the travel"
     u = source.u_of(source.value_gradient(name, weight))
     return Figure(value / error.si_per_unit, u / error.si_per_unit, error.unit, meaning)
 

@@ -514,9 +514,9 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
             ]
             old = {key: sample.values[key] for key, _ in block.points() if key in sample.values}
             changed = sum(1 for key, value in block.points() if key in old and old[key] != value)
-            remark = f"; {changed} of them differ from the sample" if old else ""
             both = f"{texts[0]} and {texts[1]}" if block.negative else texts[0]
-            found.append(f"Points of {name}: {both}{remark}")
+            text = f"Points of {name}: {both}"
+            found.append(f"{text}; {changed} of them differ from the sample" if old else text)
         return found
 
     def _preflight_parameters(self, present: list[tuple[int, PitchBlock]]) -> list[dict[str, str]]:

@@ -49,9 +49,12 @@ _CODE = re.compile(r"`[^`]*`|<code>.*?</code>")
 _UNREAD = re.compile(r"\b(mm|um|µm|ISO|SHA|En|rms)\b")
 _WORDS = re.compile(r"[^\W\d_]{2,}")
 _COUNTED = re.compile(r"([\d.]+ )?(.*)", re.DOTALL)
-#: A message with fewer characters of its own is looked for only in texts that are shorter than this.
-_SURE, _SHORT = 12, 120
+#: A message with fewer letters of its own is looked for only in texts that are shorter than this.
+_SURE, _SHORT = 10, 120
+#: A message with fewer letters, e.g. "{low} to {high}", is taken only if its values are numbers and names, or known.
+_WEAK, _LOWER = 5, re.compile(r"(?:^|\s)[a-z]{3,}(?:$|[\s,;:.])")
 _SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?]) (?=\S)"), re.compile(r"(?<=;) (?=\S)")
+_COMMAS = re.compile(r"(?<=,) (?=\S)")
 _AFTER_COLON = re.compile(r"(?<=:) (?=\S)")
 #: Several words in small letters, as only sentences have them.
 _PROSE = re.compile(r"\b[a-z]{2,},? [a-z]{2,}\b")
@@ -94,25 +97,30 @@ class Texts:
     def __init__(self, messages: dict[str, str], language: str = "de") -> None:
         self.language = language
         self.messages = {english: text for english, text in messages.items() if english and text}
+        for end in ("; ", ", "):  # what is appended to a sentence is also found apart from it
+            for english, text in tuple(self.messages.items()):
+                if english.startswith(end) and text.startswith(end):
+                    self.messages.setdefault(english.removeprefix(end), text.removeprefix(end))
         found = []
         for english in self.messages:
             literals = _PLACE.split(english)[::2]
             if len(literals) > 1 and "\x04" not in english and any(map(str.isalpha, english)):
-                found.append((sum(map(len, literals)), max(literals, key=len), _patterns(english), english))
+                letters = sum(map(str.isalpha, "".join(literals)))
+                found.append((letters, max(literals, key=len), english))
         # the more of a text is in the message itself, the surer is the message
-        self._patterns = sorted(found, key=lambda item: -item[0])
-        self._known: dict[str, str | None] = {}
+        self._patterns = sorted(found, key=lambda item: (-item[0], -len(item[2])))
+        self._known: dict[tuple[str, int], str | None] = {}
 
-    def text(self, english: str) -> str:
+    def text(self, english: str, least: int = 0) -> str:
         """Return a text in this language; sentences that the catalogue does not contain stay in English.
 
         Values within a sentence are translated in the same way, and those that are sentences must be known, too: a
-        sentence is never a mixture of two languages.
+        sentence is never a mixture of two languages. Messages with fewer than ``least`` letters of their own are only
+        looked for in values.
         """
-        found = self._complete(english)
+        found = self._complete(english, least)
         if found is None:
-            pieces = _SENTENCES.split(english)
-            found = " ".join(self._part(piece) or piece for piece in pieces)
+            found = " ".join(self._part(piece, least) or piece for piece in _SENTENCES.split(english))
         return found
 
     def label(self, english: str) -> str:
@@ -124,60 +132,71 @@ class Texts:
         known = self.messages.get(f"{WORD}\x04{word.strip()}")
         return None if known is None else (number or "") + word.replace(word.strip(), known)
 
-    def _complete(self, english: str) -> str | None:
+    def _complete(self, english: str, least: int = 0) -> str | None:
         """Return a text in this language, as it is if it contains no sentence; None if a sentence has no translation."""
-        if english not in self._known:
+        if (english, least) not in self._known:
             if len(self._known) > 20_000:
                 self._known.clear()
             core = english.strip()
-            found = self._whole(core) or self._by_parts(core) or (None if _PROSE.search(core) else core)
-            self._known[english] = None if found is None else english.replace(core, found) if core else english
-        return self._known[english]
+            found = self._whole(core, least) or self._by_parts(core, least) or (None if _PROSE.search(core) else core)
+            self._known[english, least] = None if found is None else english.replace(core, found) if core else english
+        return self._known[english, least]
 
-    def _whole(self, english: str) -> str | None:
+    def _whole(self, english: str, least: int) -> str | None:
         known = self.messages.get(english)
-        return self._matched(english) if known is None and " " in english else known
+        return self._matched(english, least) if known is None and " " in english else known
 
-    def _matched(self, english: str) -> str | None:
-        for size, longest, patterns, message in self._patterns:
-            if longest not in english or (size < _SURE and len(english) > _SHORT):
+    def _matched(self, english: str, least: int) -> str | None:
+        for letters, longest, message in self._patterns:
+            if longest not in english or letters < least or (letters < _SURE and len(english) > _SHORT):
                 continue
-            for pattern in patterns:
+            for pattern in _patterns(message):
                 if match := pattern.fullmatch(english):
-                    values = {
-                        name: self._word(text) or self._complete(text) for name, text in match.groupdict().items()
-                    }
-                    if None not in values.values():
-                        return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
+                    texts = match.groupdict()
+                    values = {name: self._word(text) or self._complete(text) for name, text in texts.items()}
+                    if None in values.values():
+                        continue
+                    if letters < _WEAK and any(
+                        not text or (values[name] == text and _LOWER.search(text)) for name, text in texts.items()
+                    ):
+                        continue
+                    return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
         return None
 
-    def _by_parts(self, english: str) -> str | None:
-        """Translate a name and what follows its colon, several sentences, or parts between semicolons."""
+    def _by_parts(self, english: str, least: int) -> str | None:
+        """Translate a name and what follows its colon, several sentences, or parts between semicolons or commas."""
         name, _, rest = english.partition(": ")
-        known = self._whole(rest)
+        known = self._whole(rest, least)
         if known is not None and not _PROSE.search(name):
             return f"{self._word(name) or name}: {known}"
-        for end in (_SENTENCES, _CLAUSES, _AFTER_COLON):
+        for end in (_SENTENCES, _CLAUSES, _AFTER_COLON, _COMMAS):
             pieces = end.split(english)
             found: list[str | None] = []
             first = 0
             while first < len(pieces) > 1 and None not in found:
                 last = len(pieces) - (first == 0)
-                while last > first + 1 and self._whole(" ".join(pieces[first:last])) is None:
+                while last > first + 1 and self._ended(" ".join(pieces[first:last]), least) is None:
                     last -= 1  # a message may have several sentences itself
-                found.append(self._part(" ".join(pieces[first:last])))
+                found.append(self._part(" ".join(pieces[first:last]), least))
                 first = last
-            if found and None not in found:
+            if found and None not in found and found != pieces:
                 return " ".join(found)  # type: ignore[arg-type]
         return None
 
-    def _part(self, english: str) -> str | None:
-        """Return one of several parts; its full stop or semicolon may not belong to the message."""
-        found = self._word(english) or self._whole(english)
-        if found is None and english[-1:] in (".", ";", ":"):
-            shorter = self._word(english[:-1]) or self._complete(english[:-1])
+    def _ended(self, english: str, least: int) -> str | None:
+        """Return the translation of a whole message, also where its end is followed by what separates it from others."""
+        found = self._word(english) or self._whole(english, least)
+        if found is None and english[-1:] in (".", ";", ":", ","):
+            shorter = self._word(english[:-1]) or self._whole(english[:-1], least)
             return None if shorter is None else shorter + english[-1]
-        return found or self._complete(english)
+        return found
+
+    def _part(self, english: str, least: int) -> str | None:
+        found = self._ended(english, least) or self._complete(english, least)
+        if found is None and english[-1:] in (".", ";", ":", ","):
+            shorter = self._complete(english[:-1], least)
+            return None if shorter is None else shorter + english[-1]
+        return found
 
     def picture(self, picture: Picture) -> Picture:
         """Return a picture with heading, note and texts in this language; names of series are for the script of its page."""
@@ -197,12 +216,6 @@ class Texts:
     def _escaped(self, found: re.Match[str]) -> str:
         return escape(self.label(unescape(found[0])))
 
-    def page(self, html: str) -> str:
-        """Return a finished page whose texts are all messages, each between two tags, in this language."""
-        kept = re.split(r"(<style.*?</style>|<script.*?</script>|<code>.*?</code>)", html, flags=re.DOTALL)
-        kept[::2] = [re.sub(r"(?<=>)[^<>]+(?=<)", self._escaped, part) for part in kept[::2]]
-        return self.drawn("".join(kept))
-
     def template(self, source: str, *, html: bool) -> str:
         """Return the source of a template in this language; parts that the catalogue does not contain stay in English."""
         found, end = [], 0
@@ -220,23 +233,22 @@ class Texts:
         assert environment.loader is not None
         environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
         environment.finalize = self.filled
-        environment.filters["word"] = lambda value: self.label(str(value))
+        environment.filters["word"] = lambda value: self._word(str(value)) or self.filled(str(value))
         environment.globals["language"] = self.language
         return environment
 
     def filled(self, value: Any) -> Any:
         """Return a value that is filled into a template: a text in this language, lines of a file and all else as they are."""
-        return self.text(value) if type(value) is str and "\n" not in value else value
+        return self.text(value, _WEAK) if type(value) is str and "\n" not in value else value
 
 
+@lru_cache(maxsize=4096)
 def _patterns(message: str) -> list[re.Pattern[str]]:
     """Return what texts of a message look like; of two values side by side the first one has no blank, if possible."""
     literals = re.escape(message).replace(r"\{", "{").replace(r"\}", "}")
-    found = [_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", literals)]
-    if "}{" in message:
-        close = re.sub(r"\{(\w+)\}(?=\{)", lambda place: f"(?P<{place[1]}>[\\w.+-]*)", literals)
-        found.append(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", close))
-    return [re.compile(pattern, re.DOTALL) for pattern in found]
+    close = re.sub(r"\{(\w+)\}(?=\{)", lambda place: f"(?P<{place[1]}>[\\w.+-]*)", literals)
+    forms = dict.fromkeys(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", form) for form in (close, literals))
+    return [re.compile(form, re.DOTALL) for form in forms]
 
 
 def _loader(loader: BaseLoader, translate: Callable[[str], str]) -> BaseLoader:
@@ -331,7 +343,8 @@ def _paragraphs(source: str) -> Iterator[tuple[int, int]]:
 def wrapped(markdown: str) -> str:
     """Return Markdown whose long paragraphs and items are wrapped, as those of the English templates are."""
     lines = []
-    for line in markdown.split("\n"):
+    # never before a sign or a number with a full stop: at the beginning of a line they would make a list
+    for line in re.sub(r" (?=(?:[-+*=#>]+|\d+[.)]) )", "\0", markdown).split("\n"):
         if len(line) <= _COLUMN or line.startswith(("|", "#")):
             lines.append(line)
             continue
@@ -340,4 +353,4 @@ def wrapped(markdown: str) -> str:
         lines += textwrap.wrap(
             line, _COLUMN, subsequent_indent=" " * marker.end(), break_long_words=False, break_on_hyphens=False
         )
-    return "\n".join(lines)
+    return "\n".join(lines).replace("\0", " ")

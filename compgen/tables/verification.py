@@ -556,8 +556,8 @@ class Verification(Drawable):
     def headline(self) -> str:
         """The verdict in one sentence, with its decisive figure."""
         if not self.accepted:
-            more = f" (and {len(self.reasons) - 1} more)" if len(self.reasons) > 1 else ""
-            return f"not accepted: {self.reasons[0]}{more}"
+            first, more = self.reasons[0], len(self.reasons) - 1
+            return f"not accepted: {first} (and {more} more)" if more else f"not accepted: {first}"
         said = []
         if self.worse_as_it_stands:
             before, after = self.before_rigid_removed, self.after_rigid_removed

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from texts.reading import left_in_english, shown
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
@@ -14,7 +15,7 @@ from compgen.data.error_table import Curve, format_errors
 from compgen.fleet import claims, decisions
 from compgen.fleet import claims as results
 from compgen.fleet.change import calibrations_of
-from compgen.fleet.drift import drift_report
+from compgen.fleet.drift import DriftSettings, drift_report
 from compgen.fleet.history_page import history_page
 from compgen.fleet.job import read_job
 from compgen.fleet.records import NewMeasurement, NewResult
@@ -129,6 +130,15 @@ def test_the_page_needs_nothing_else_and_escapes_texts(folder):
     picture = page[start : page.index("</svg></div>", start) + 6]  # the axes are an svg within the svg
     assert ElementTree.fromstring(picture.replace("xlink:href", "href")).tag == "svg"
     assert len(set(part.split('"')[0] for part in page.split(' id="')[1:])) == page.count(' id="')
+
+
+def test_the_page_in_german_has_no_english_text(folder):
+    store = open_store(read_job(folder / "recal.toml").store)
+    history, _, machine = calibrations_of(store, store.machine("mill"))
+    store.close()
+    page = history_page(drift_report(machine, history, DriftSettings({"EC0Y": 20e-6})), "de")
+    assert [text for text in shown(page) if left_in_english(text, ())] == []
+    assert "EC0Y verlässt die Toleranz in etwa " in page and '<html lang="de">' in page
 
 
 def test_a_recheck_is_found_and_its_points_written(call, folder):

@@ -9,9 +9,13 @@ from pathlib import Path
 import browser as helper
 import numpy as np
 import pytest
+from texts.reading import left_in_english, shown
 
 from compgen.data.circles import arcs_of
 
+#: The statement of the certificate stands behind those of the program, which are German.
+ENGLISH_REST = ([], ["ISO 230-2:2014; an veröffentlichten Formeln und gerechneten Beispielen geprüft, nicht zertifiziert. "
+                     "Traceability: The instruments are calibrated; their certificates are named with them."])  # fmt: skip
 GOLDEN_CSV = Path(__file__).resolve().parents[1] / "golden" / "accuracy" / "iso230_2_constructed_golden.csv"
 
 
@@ -60,6 +64,25 @@ def values_of(points, frame, limits):
     (left, top, right, bottom), (x0, x1, y0, y1) = frame, limits
     x = x0 + (points[:, 0] - left) / (right - left) * (x1 - x0)
     return np.column_stack([x, y0 + (bottom - points[:, 1]) / (bottom - top) * (y1 - y0)])
+
+
+def test_german_sheets_are_german_but_for_what_the_laboratory_says(tmp_path, call):
+    runs, circle = write_runs(tmp_path / "x.axis.csv", comments=["operator = M. Muster"]), tmp_path / "c.circle.csv"
+    write_circle(circle)
+    lab = Path(__file__).resolve().parents[2] / "examples" / "certificate.toml"
+    said = lab.read_text(encoding="utf-8")
+    for file, more in ((runs, ("--certificate", lab, "--tolerance", "A=18")), (circle, ())):
+        code, _, error = call("accuracy", "zha-gantry", file, *more, "--language", "de", "--out", tmp_path / "out")
+        assert code == 0, error
+        page = (tmp_path / "out" / "sheet.html").read_text(encoding="utf-8")
+        english = [text for text in shown(page) if left_in_english(text, ())]
+        assert [text for text in english if text not in said and text.split(", ")[-1] not in said] == ENGLISH_REST[
+            more != ()
+        ]
+    assert "Kreisformprüfung XY, Radius 150 mm, ISO 230-4" in page
+    assert json.loads((tmp_path / "out" / "accuracy.json").read_text())["statements"][0].startswith(
+        "ISO 230-4, about the centre"
+    )
 
 
 def test_the_sheet_of_an_axis_has_the_worked_figures_and_draws_the_means(tmp_path, call):

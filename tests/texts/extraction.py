@@ -20,9 +20,9 @@ CATALOGUES = ROOT / "templates" / "_language"
 #: Modules whose sentences are shown on a page or in a preflight list.
 MODULES = (
     "accuracy/*.py", "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py",
-    "fleet/history_page.py", "identify/identification.py", "identify/adjust/residual_tests.py",
-    "identify/adjust/robust.py", "report/html/*.py", "report/sheets.py", "tables/active.py", "tables/entries.py",
-    "tables/export.py", "tables/judge.py", "tables/signs.py", "tables/verification.py",
+    "fleet/history_page.py", "identify/*.py", "identify/adjust/*.py", "report/html/*.py", "report/sheets.py",
+    "tables/active.py", "tables/entries.py", "tables/export.py", "tables/judge.py", "tables/signs.py",
+    "tables/verification.py",
 )  # fmt: skip
 #: Readers of controls' files: their texts are messages of the terminal.
 READERS = ("heidenhain_text.py", "siemens_text.py")
@@ -37,11 +37,12 @@ NOT_SHOWN_IN = re.compile(
 )
 #: Single words that pages show: no rule tells them from keys.
 WORDS = (
-    "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted",
+    "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
+    "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um", "urad",
     "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness", "Temperature",
     "The", "Volume", "accepted", "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day",
     "days", "exceeded", "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning",
-    "positive", "readings", "rejected", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
+    "positive", "readings", "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
     "within", "without", "worse",
 )  # fmt: skip
 
@@ -90,7 +91,13 @@ def is_sentence(text):
     """Return whether a string is meant to be read: several words, or one word beside a value."""
     literal = re.sub(r"\{\w+\}", " ", text)
     words = re.findall(r"[^\W\d_]{2,}", literal)
-    if not words or "<" in text or "\n" in text or text.startswith(("_", "--", "/", "compgen ", "bold ")):
+    if (
+        not words
+        or "<" in text
+        or " | " in text
+        or "\n" in text
+        or text.startswith(("_", "--", "/", "compgen ", "bold "))
+    ):
         return False
     return " " in text.strip() and bool(re.search(r"[a-z]{2,}", literal))
 

@@ -1,6 +1,5 @@
 """German pages and lists: every text has a translation with the same numbers, and nothing that a control reads is touched."""
 
-import html
 import json
 import re
 import subprocess
@@ -11,6 +10,7 @@ from gettext import GNUTranslations
 import pytest
 from babel.messages.pofile import read_po
 from texts import extraction
+from texts.reading import left_in_english, numbers, shown
 
 import compgen
 from compgen.controls import CONTROLLERS
@@ -22,10 +22,6 @@ from compgen.tables.render import load_format
 
 ERRORS = "examples/zha-gantry.truth.errors.csv"
 HOW_TO = "write their German texts into templates/_language/de.po and run `make texts` (CONTRIBUTING.md, Texts)"
-#: Words that only an English sentence has; names and keys are taken out before.
-ENGLISH = re.compile(
-    r"\b(the|of|and|with|are|which|this|these|must|has|have|only|from|to|is|not|by|for|before|after)\b"
-)
 
 
 @pytest.fixture(scope="module")
@@ -107,11 +103,6 @@ def test_a_translation_has_the_same_units(catalogue):
     assert not wrong, "other units:\n" + "\n".join(wrong)
 
 
-def numbers(text):
-    """All numbers with their signs; a hyphen between letters or digits is none."""
-    return re.findall(r"(?<![\w.])[-+−]?\d+(?:\.\d+)*|(?<=[^\W\d])\d+(?:\.\d+)*", text)
-
-
 def lists(machine, name, language):
     errors = compgen.read_errors(ERRORS)
     made = compgen.export(machine, errors, name, allow_unverified=True, language=language)
@@ -132,30 +123,6 @@ def test_the_preflight_list_says_the_same_in_german(name, machine, german):
             for code in re.findall(r"`[^`]*`", " ".join(before.split()))
         ) or any(german.text(code[1:-1]) != code[1:-1] for code in re.findall(r"`[^`]*`", before))
         assert left_in_english(after, card.sources) == []
-
-
-def left_in_english(text, sources):
-    """Return the lines of a list or page that contain English words; titles of sources are names."""
-    for source in sources:
-        text = (
-            " ".join(text.split()).replace(source, "") if "\n" not in text else text.replace(wrapped(f"- {source}"), "")
-        )
-    text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    found = []
-    for piece in re.split(r"\n(?=\s*$|- |\d+\. |\||#)", text):
-        plain = re.sub(
-            r'`[^`]*`|"[^"]*"|„[^“]*“|\([a-z -]+\)|\S*[_/\[\]=.-]\S*\w|\bkw\.\S+', " ", " ".join(piece.split())
-        )
-        if ENGLISH.search(plain):
-            found.append(piece)
-    return found
-
-
-def shown(page):
-    """Return the texts of a page, without code and files."""
-    body = re.sub(r"<style.*?</style>|<script.*?</script>|<code>.*?</code>|<pre.*?</pre>", "", page, flags=re.DOTALL)
-    found = re.findall(r">([^<>]+)<", body) + re.findall(r'(?:title|aria-label)="([^"]*)"', body)
-    return [" ".join(html.unescape(text).split()) for text in found if text.strip()]
 
 
 def test_a_german_report_is_german(ran):
@@ -204,6 +171,20 @@ def test_what_has_to_be_typed_is_never_translated(machine, german):
     assert german.label("accepted") == "angenommen" and german.label("7 weeks") == "7 Wochen"
 
 
+def test_every_sentence_is_found_by_its_text_with_values(german):
+    wrong = []
+    for text, translation in german.messages.items():
+        if "\x04" in text:
+            continue
+        values = {name: f"{k + 1}.5" for k, name in enumerate(dict.fromkeys(re.findall(r"\{(\w+)\}", text)))}
+        filled, expected = (
+            re.sub(r"\{(\w+)\}", lambda place, values=values: values[place[1]], item) for item in (text, translation)
+        )
+        if german.text(filled) != expected:
+            wrong.append(f"{filled}\n  {german.text(filled)}")
+    assert not wrong, "another message takes these texts; use other words:\n" + "\n".join(wrong)
+
+
 def test_a_sentence_is_never_a_mixture():
     texts = Texts({"the table {name} is {state}": "die Tabelle {name} ist {state}", "not used": "unbenutzt"})
     assert texts.text("the table X.TAB is not used") == "die Tabelle X.TAB ist unbenutzt"
@@ -248,6 +229,8 @@ def test_long_paragraphs_are_wrapped_and_tables_are_not():
     text = wrapped("- " + "word " * 40 + "\n" + row)
     assert max(map(len, text.split("\n")[:-1])) <= 120 and text.split("\n")[1].startswith("  word")
     assert text.endswith(row)
+    for width in range(90, 130):  # "- 99.990" would be an item, "2. " a numbered one
+        assert not re.search(r"(?m)^\s*([-+=]|2\.) ", wrapped("x" * width + " (100.000 - 99.990) + 2. = 1"))
 
 
 def test_a_language_without_a_catalogue_is_refused(machine):
