@@ -53,6 +53,7 @@ _COUNTED = re.compile(r"([\d.]+ )?(.*)", re.DOTALL)
 _SURE, _SHORT = 10, 120
 #: A message with fewer letters, e.g. "{low} to {high}", is taken only if its values are numbers and names, or known.
 _WEAK, _LOWER = 5, re.compile(r"(?:^|\s)[a-z]{3,}(?:$|[\s,;:.])")
+_LETTERS = re.compile(r"[a-z]{2,}")
 _SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?]) (?=\S)"), re.compile(r"(?<=;) (?=\S)")
 _COMMAS = re.compile(r"(?<=,) (?=\S)")
 _AFTER_COLON = re.compile(r"(?<=:) (?=\S)")
@@ -116,7 +117,7 @@ class Texts:
 
         Values within a sentence are translated in the same way, and those that are sentences must be known, too: a
         sentence is never a mixture of two languages. Messages with fewer than ``least`` letters of their own are only
-        looked for in values.
+        looked for in values, and between numbers.
         """
         found = self._complete(english, least)
         if found is None:
@@ -148,11 +149,13 @@ class Texts:
 
     def _matched(self, english: str, least: int) -> str | None:
         for letters, longest, message in self._patterns:
-            if longest not in english or letters < least or (letters < _SURE and len(english) > _SHORT):
+            if longest not in english or (letters < _SURE and len(english) > _SHORT):
                 continue
             for pattern in _patterns(message):
                 if match := pattern.fullmatch(english):
                     texts = match.groupdict()
+                    if letters < least and any(_LETTERS.search(text) for text in texts.values()):
+                        continue
                     values = {name: self._word(text) or self._complete(text) for name, text in texts.items()}
                     if None in values.values():
                         continue
@@ -235,6 +238,10 @@ class Texts:
         environment.finalize = self.filled
         environment.filters["word"] = lambda value: self._word(str(value)) or self.filled(str(value))
         environment.globals["language"] = self.language
+        if not html:  # in HTML this would switch off the escaping
+            from markupsafe import Markup
+
+            environment.filters["name"] = Markup
         return environment
 
     def filled(self, value: Any) -> Any:

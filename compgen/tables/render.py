@@ -257,7 +257,7 @@ def _environment(folders: tuple[Path, ...], language: str = LANGUAGES[0]) -> Imm
     )
     environment.filters["fixed"] = lambda value, digits: fixed(float(value), digits)
     environment.filters["plain"] = lambda value: one_line(value)
-    environment.filters["word"] = str
+    environment.filters |= {"word": str, "name": str}
     if language != LANGUAGES[0]:
         from compgen.data.language import texts_of
 
