@@ -122,7 +122,9 @@ def squeezed(text):
     return [" ".join(line.split()) for line in text.splitlines() if line.strip()]
 
 
-@pytest.mark.parametrize("name", ["tutorial-first-table", "tutorial-diagnose", "tutorial-router"])
+@pytest.mark.parametrize(
+    "name", ["tutorial-first-table", "tutorial-diagnose", "tutorial-router", "tutorial-pitch-and-program"]
+)
 def test_every_command_of_a_tutorial_works_and_prints_what_the_page_shows(name, tmp_path, monkeypatch, capsys):
     """A block of text without a name holds beginnings of lines that the commands before it print, in their order."""
     monkeypatch.chdir(tmp_path)

@@ -29,7 +29,7 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
-from compgen.data.names import AXES
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import accepts, axis_setting, choice, setting, whole
 from compgen.errors import InputError
 
@@ -358,7 +358,13 @@ class Mach4Settings:
         toml_files.flag, False, meaning="the build has a map for each direction (after 4780 of 2021-11-29)"
     )
     most_points: int = setting(whole(2, 1000), 60, meaning="most points of one axis that you are willing to type in")
-    loss_mm: float = loss_setting()
+    loss_mm: float = setting(
+        toml_files.positive,
+        key="loss_um",
+        unit=MM_PER_UM,
+        stated=0.5,
+        meaning="interpolation loss between points that does not justify typing in another one, um",
+    )
 
 
 class Mach4(SheetControl[Mach4Settings]):
