@@ -262,3 +262,26 @@ def test_one_language_for_all_commands_in_the_configuration(ran, tmp_path, monke
     (tmp_path / "config.toml").write_text('language = "fr"\n')
     assert run_command(cli, ["report", str(ran)]) == 2
     assert "language" in capsys.readouterr().err
+
+
+def test_a_job_file_states_the_language_of_a_machine(tmp_path):
+    from compgen.fleet.job import read_job
+
+    text = """store = "recal.sqlite"
+[machines.mill]
+machine = "zha-gantry"
+inbox = "inbox"
+controllers = ["isg-csv"]
+out = "out"
+measured_with = "bare"
+"""
+    (tmp_path / "recal.toml").write_text(text)
+    english = read_job(tmp_path / "recal.toml").machine("mill")
+    (tmp_path / "recal.toml").write_text(text + 'language = "de"\n')
+    translated = read_job(tmp_path / "recal.toml").machine("mill")
+    assert (english.language, translated.language) == ("en", "de")
+    # its lists are made again; those of jobs that state no language are not
+    assert english.settings_sha256() != translated.settings_sha256()
+    (tmp_path / "recal.toml").write_text(text + 'language = "fr"\n')
+    with pytest.raises(InputError, match="language: expected one of 'en', 'de'"):
+        read_job(tmp_path / "recal.toml")
