@@ -55,9 +55,13 @@ class Placed:
         """Number of columns."""
         return int(self.values.shape[1])
 
-    def columns(self) -> FloatArray:
-        """All columns, (n, k)."""
-        return self.values if self.place is None else np.asarray(self.place @ self.values)
+    def columns(self, out: FloatArray | None = None) -> FloatArray:
+        """All columns, (n, k), written to ``out`` if given."""
+        found = self.values if self.place is None else np.asarray(self.place @ self.values)
+        if out is None:
+            return found
+        out[:] = found
+        return out
 
     def products(self, vectors: FloatArray, summed: dict[int, FloatArray]) -> FloatArray:
         """Products (k, q) with vectors (n, q); ``summed`` caches the products with ``place``, which terms share."""
@@ -83,10 +87,15 @@ class Scanned:
         """Number of columns."""
         return int(self.changes.shape[1])
 
-    def columns(self) -> FloatArray:
-        """All columns, (n, k)."""
-        dense = self.changes.toarray().reshape(self.changes.shape[0], -1, self.each)
-        return np.asarray(np.cumsum(dense, axis=1, out=dense).reshape(len(dense), -1))
+    def columns(self, out: FloatArray | None = None) -> FloatArray:
+        """All columns, (n, k), written to ``out`` if given."""
+        found = np.empty(self.changes.shape) if out is None else out
+        found[:] = 0.0
+        changes = self.changes.tocoo()
+        found[changes.row, changes.col] = changes.data
+        by_position = found.reshape(len(found), -1, self.each)
+        np.cumsum(by_position, axis=1, out=by_position)
+        return found
 
     def products(self, vectors: FloatArray, _: dict[int, FloatArray]) -> FloatArray:
         """Products (k, q) with vectors (n, q)."""
@@ -183,11 +192,11 @@ def source_of(every: Sequence[FloatArray]) -> Placed | Scanned:
     width = every[0].shape[1]
     if len(every) > 1 and all(columns.shape[1] == width for columns in every):  # scanning a degree changes the number
         changes = [every[0], *(after - before for before, after in pairwise(every))]
-        if sum(map(np.count_nonzero, changes)) < LEAST_CHANGED * len(changes) * changes[0].size:
-            places = [np.nonzero(change) for change in changes]
-            values = np.concatenate([change[place] for change, place in zip(changes, places, strict=True)])
-            rows = np.concatenate([rows for rows, _ in places])
-            columns = np.concatenate([width * k + column for k, (_, column) in enumerate(places)])
+        places = [np.flatnonzero(change) for change in changes]
+        if sum(map(len, places)) < LEAST_CHANGED * len(changes) * changes[0].size:
+            values = np.concatenate([change.ravel()[place] for change, place in zip(changes, places, strict=True)])
+            rows = np.concatenate([place // width for place in places])
+            columns = np.concatenate([width * k + place % width for k, place in enumerate(places)])
             return Scanned(csr_array((values, (rows, columns)), shape=(len(every[0]), width * len(every))), width)
     return Placed(np.hstack(every))
 

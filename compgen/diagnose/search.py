@@ -197,37 +197,41 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
     white = whiten(fit.residual_mm)
     residual = white - base @ (base.T @ white)
     size = base.shape[1]
-    vectors = np.hstack([whiten.transposed(np.column_stack([base, residual])), whiten.averages])
-    constants = vectors[:, : size + 1].T @ (whiten.averages > 0.0)
     owners: dict[int, list[int]] = {}
     for g, group in enumerate(groups):
         owners.setdefault(id(group.source), []).append(g)
-    chunks: list[list[list[int]]] = [[]]
-    widths = [0]
-    for own in owners.values():
-        width = groups[own[0]].source.width
-        if chunks[-1] and widths[-1] + width > CHUNK:
+    sources = [groups[own[0]].source for own in owners.values()]
+    vectors = np.hstack([whiten.transposed(np.column_stack([base, residual])), whiten.averages])
+    summed: dict[int, FloatArray] = {}
+    each = [source.products(vectors, summed) for source in sources]
+    products = np.vstack([np.zeros((0, vectors.shape[1])), *each])
+    constants = vectors[:, : size + 1].T @ (whiten.averages > 0.0)
+    del vectors, summed  # free the memory before columns are whitened
+    chunks: list[list[list[int]]] = []
+    widths: list[int] = []
+    for own, source in zip(owners.values(), sources, strict=True):
+        if not chunks or widths[-1] + source.width > CHUNK:
             chunks.append([])
             widths.append(0)
         chunks[-1].append(own)
-        widths[-1] += width
+        widths[-1] += source.width
     reduced: dict[int, tuple[FloatArray, FloatArray, float]] = {}
-    summed: dict[int, FloatArray] = {}
-    space = np.empty(len(residual) * max(widths))
+    space = np.empty((2, len(residual) * max(widths, default=0)))
     for chunk, width in zip(chunks, widths, strict=True):
-        if not chunk:
-            continue
-        sources = [groups[of[0]].source for of in chunk]
-        products = np.vstack([source.products(vectors, summed) for source in sources])
         # less the mean on each channel, which a dead length would absorb
-        mean = products[:, size + 1 :].T
-        seen = products[:, : size + 1].T - constants @ mean
+        own, products = products[:width], products[width:]
+        mean = own[:, size + 1 :].T
+        seen = own[:, : size + 1].T - constants @ mean
         seen, score, at = seen[:-1], seen[-1], 0
-        out = space[: len(residual) * width].reshape(-1, width)
-        tall = whiten(np.hstack([source.columns() for source in sources]), less=mean, out=out)
+        columns, tall = space[:, : len(residual) * width].reshape(2, -1, width)
+        for of in chunk:
+            source = groups[of[0]].source
+            source.columns(columns[:, at : at + source.width])
+            at += source.width
+        whiten(columns, less=mean, out=tall)
         whole = np.einsum("nk,nk->k", tall, tall)
         left = np.maximum(whole - np.einsum("pk,pk->k", seen, seen), 0.0)
-        shares = np.sqrt(left / np.where(whole > 0.0, whole, np.inf))
+        shares, at = np.sqrt(left / np.where(whole > 0.0, whole, np.inf)), 0
         for of in chunk:
             for g in of:
                 where = range(at, at + groups[g].source.width)[groups[g].place or slice(None)]

@@ -17,6 +17,7 @@ from compgen.diagnose.base_fit import first_basis, fit_base, least_norm, orthono
 from compgen.diagnose.diagnose import observed_of
 from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.noise_model import (
+    bounded_step,
     difference_matrix,
     fit_reml,
     kernels,
@@ -138,20 +139,71 @@ def test_repeats_are_found_and_their_differences_hold_no_static_effect(gantry):
     assert np.abs(matrix @ static[block.rows]).max() < 1e-9
 
 
-def test_the_gradient_of_the_restricted_likelihood_agrees_with_finite_differences(gantry):
+def restricted(gantry):
+    """A restricted likelihood with two fixed effects, and variances to look at it."""
     observed = observed_of(gantry, session(3, lines=8))
     fit = fit_smooth(observed)
     time = observed.layout.time[observed.layout.stop]
     fixed = np.column_stack([time, np.where(observed.lengths.station == 1, time, 0.0)])
     problem = reml_problem(observed.layout, fit.residual_mm, fixed)
-    x = np.log(problem.starts) + 0.3 * np.sin(np.arange(len(problem.starts)))
-    gradient = problem.value(x)[1]
-    for k in range(0, len(x), 3):
-        up, down = x.copy(), x.copy()
-        up[k] += 1e-4
-        down[k] -= 1e-4
-        numeric = (problem.value(up)[0] - problem.value(down)[0]) / 2e-4
-        assert gradient[k] == pytest.approx(numeric, rel=1e-4, abs=1e-5)
+    return problem, problem.starts * np.exp(0.3 * np.sin(np.arange(len(problem.starts))))
+
+
+def test_the_gradient_of_the_restricted_likelihood_agrees_with_finite_differences(gantry):
+    problem, theta = restricted(gantry)
+    gradient = problem.at(theta).gradient
+    for k in range(0, len(theta), 3):
+        up, down = theta.copy(), theta.copy()
+        up[k] *= 1.0 + 1e-4
+        down[k] *= 1.0 - 1e-4
+        numeric = (problem.at(up).criterion - problem.at(down).criterion) / (2e-4 * theta[k])
+        assert gradient[k] == pytest.approx(numeric, rel=1e-4, abs=1e-5 / theta[k])
+
+
+def test_the_average_information_agrees_with_dense_matrices(gantry):
+    """1/2 d' P K P K P d from the whole covariance, with every channel of every difference in one vector."""
+    problem, theta = restricted(gantry)
+    (part,) = problem.parts
+    channels, size = part.data.shape
+    own = [np.kron(np.eye(channels), kernel) for kernel in part.square]
+    first = np.zeros((channels, channels))
+    first[0, 0] = channels  # what all channels share shows in their mean, the first one
+    every = [np.eye(channels * size), *own, *(np.kron(first, kernel) for kernel in part.square)]
+    inverse = np.linalg.inv(sum(value * kernel for value, kernel in zip(theta, every, strict=True)))
+    fixed, data = part.columns[:, :, :-1].reshape(channels * size, -1), part.data.ravel()
+    seen = inverse @ fixed
+    lacking = inverse - seen @ np.linalg.solve(fixed.T @ seen, seen.T)
+    moved = np.column_stack([kernel @ lacking @ data for kernel in every])
+    expected = 0.5 * moved.T @ lacking @ moved
+    found = problem.at(theta)
+    assert found.information == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
+    assert found.quadratic == pytest.approx(data @ lacking @ data, rel=1e-9)
+
+
+def test_without_parts_of_the_runs_the_restricted_likelihood_is_that_with_their_variances_at_zero(gantry):
+    observed = observed_of(gantry, session(3, lines=8))
+    residual, nothing = fit_smooth(observed).residual_mm, np.zeros((len(observed), 0))
+    whole, less = (reml_problem(observed.layout, residual, nothing, runs=runs) for runs in (True, False))
+    of_runs = np.isin(np.arange(15), [6, 7, 13, 14])
+    theta = np.where(of_runs, 0.0, whole.starts)
+    assert less.at(whole.starts).criterion == pytest.approx(whole.at(theta).criterion, rel=1e-12)
+    assert not less.at(whole.starts).gradient[of_runs].any()
+
+
+def test_a_bounded_step_is_the_best_within_its_bounds():
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        root, gradient = rng.normal(size=(6, 6)), rng.normal(size=6)
+        curvature = root @ root.T + 0.01 * np.eye(6)
+        low, high = -rng.uniform(0.0, 0.5, 6), rng.uniform(0.0, 0.5, 6)
+        step = bounded_step(gradient, curvature, low, high)
+        assert np.all((step >= low) & (step <= high))
+        # where the slope is not zero, it points out of the box
+        slope = gradient + curvature @ step
+        inside = (step > low + 1e-9) & (step < high - 1e-9)
+        assert np.abs(slope[inside]).max(initial=0.0) < 1e-5
+        assert np.all(slope[step <= low + 1e-9] > -1e-5)
+        assert np.all(slope[step >= high - 1e-9] < 1e-5)
 
 
 def test_the_restricted_likelihood_finds_the_noise_of_the_readings(gantry):
