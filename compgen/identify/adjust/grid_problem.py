@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -750,7 +751,12 @@ def grid_problem(
     tool_mm : their tool offsets, (3,) or (n, 3).
     station, group, reading_mm : of each reading, shape (n,).
     """
-    count = len(reading_mm)
+    count, groups = len(reading_mm), int(group.max()) + 1
+    # some positions already show that those of a path form no grid, without sorting all of them
+    some = position_mm[:: max(1, count // 1999) | 1]
+    least = groups * math.prod(len(np.unique(column, return_index=True)[0]) for column in some.T)
+    if least * LEAST_FILL > count:
+        return None
     compiled = use_compiled(count, LARGE)
     found = [levels_of(position_mm[:, axis], compiled=compiled) for axis in range(3)]
     levels, at = [item[0] for item in found], [item[1] for item in found]
@@ -759,7 +765,6 @@ def grid_problem(
     else:
         tools, tool = np.unique(tool_mm, axis=0, return_inverse=True)
         tool = tool.ravel()
-    groups = int(group.max()) + 1
     cells = groups * int(np.prod([len(level) for level in levels]))
     if len(tools) * cells * LEAST_FILL > count:
         return None

@@ -115,13 +115,19 @@ def _search(p: FloatArray, reading: FloatArray, member: NDArray[np.bool_]) -> Fl
     def misfit(x: FloatArray) -> FloatArray:
         return _residual(p, reading, member, x)
 
+    def derivative(x: FloatArray) -> FloatArray:
+        sight = p - x[:3]
+        sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-12)[:, None]
+        return np.hstack([-sight, -member.astype(np.float64)])
+
     for direction in np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3, indexing="ij"), axis=-1).reshape(-1, 3):
         for distance in (1.0, 3.0):
             start = direction * distance
             dead = np.linalg.norm(p - start, axis=1) - reading
             x0 = np.concatenate([start, member.T @ dead / member.sum(axis=0)])
-            found = least_squares(misfit, x0, loss="soft_l1", f_scale=1e-3, max_nfev=60)
-            if best is None or found.cost < best[0]:
+            found = least_squares(misfit, x0, derivative, loss="soft_l1", f_scale=1e-3, max_nfev=60)
+            # the two sides of a plane fit equally well: the first one is kept, whatever the rounding errors
+            if best is None or found.cost < best[0] * (1.0 - 1e-6) - 1e-20:
                 best = (float(found.cost), found.x)
     assert best is not None
     return best[1]
