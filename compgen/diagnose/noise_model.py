@@ -28,9 +28,10 @@ TAU = (3.0, 10.0, 40.0, 200.0, 2000.0)
 LEAST_SHARE = 1e-5
 #: Maximum numbers of differences of repeats, and of stops without repeats: more cost time and add little information.
 MOST_DIFFERENCES, MOST_STOPS = 640, 450
-#: A step of the variances that is expected to improve the log-likelihood by less than this ends their search; how often
-#: a step that does not improve it is shortened; share added to the curvature, because neighbouring kernels look alike.
-NEGLIGIBLE, HALVINGS, RIDGE = 2e-3, 8, 1e-7
+#: The prior is proportional to this power of every variance; least improvement of the log-likelihood that is worth another step.
+PRIOR, NEGLIGIBLE = 0.02, 2e-3
+#: How often a step that improves nothing is shortened.
+HALVINGS = 8
 
 
 @dataclass(frozen=True)
@@ -331,24 +332,28 @@ def _with_fixed(parts: list[_Part]) -> Reml:
 def fit_reml(problem: Reml, *, start: FloatArray | None = None, steps: int = 60) -> tuple[Variances, float, float, int]:
     """Return variances, d' P d, the criterion, and the degrees of freedom of the differences.
 
-    Newton's method with the average information in place of the second derivative.
+    Newton's method with the average information in place of the second derivative, and a weak prior that grows with every
+    variance (Chung et al. 2013): the likelihood alone would set parts to zero that it hardly determines.
     """
     raw = float(problem.starts[0]) / 0.8
     low, high = LEAST_SHARE * raw, 100.0 * raw
     theta = np.clip(problem.starts if start is None else start, low, high)
     now = problem.at(theta)
     for _ in range(steps):
-        step = bounded_step(now.gradient, now.information, low - theta, high - theta)
-        if -(now.gradient + 0.5 * now.information @ step) @ step < NEGLIGIBLE:
+        better = np.clip(away_from_zero(now, theta), low, high)
+        step = better - theta
+        gained = PRIOR * float(np.log(better / theta).sum())
+        if gained - (now.gradient + 0.5 * now.information @ step) @ step < NEGLIGIBLE:
             break
         for _ in range(HALVINGS):
-            trial = problem.at(np.clip(theta + step, low, high))
-            if trial.criterion < now.criterion:
+            better = theta + step
+            trial = problem.at(better)
+            if trial.criterion - PRIOR * float(np.log(better / theta).sum()) < now.criterion:
                 break
             step = 0.25 * step
         else:
             break
-        theta, now = np.clip(theta + step, low, high), trial
+        theta, now = better, trial
     theta = np.where(theta <= LEAST_SHARE * raw * 1.01, 0.0, theta)
     count = len(TAU) + 2
     common = theta[1 + count :] if problem.common else np.zeros(count)
@@ -357,26 +362,26 @@ def fit_reml(problem: Reml, *, start: FloatArray | None = None, steps: int = 60)
     return Variances(white, theta[1 : 1 + count], common), now.quadratic, 2 * now.criterion, freedom
 
 
-def bounded_step(gradient: FloatArray, curvature: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Step s (k,) within ``low`` <= 0 <= ``high`` that minimises g' s + s' C s / 2, by active sets."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(curvature), 1e-300))
-    matrix = curvature * np.outer(scale, scale) + RIDGE * np.eye(len(scale))
-    slope, bounds = gradient * scale, (low / scale, high / scale)
-    step, free = np.zeros(len(scale)), np.ones(len(scale), dtype=bool)
-    for _ in range(4 * len(scale)):
-        target = -slope[free] - matrix[np.ix_(free, ~free)] @ step[~free]
-        step[free] = np.linalg.solve(matrix[np.ix_(free, free)], target)
-        beyond = (step < bounds[0]) | (step > bounds[1])
-        step = np.clip(step, *bounds)
-        if beyond.any():
-            free &= ~beyond
-            continue
-        # a variable at a bound that the slope draws back is free again, the most drawn one first
-        drawn = np.where(free, 0.0, (slope + matrix @ step) * np.where(step <= bounds[0], -1.0, 1.0))
-        if drawn.max() <= 0.0:
+def away_from_zero(point: RemlPoint, theta: FloatArray) -> FloatArray:
+    """Variances t (k,) > 0 that minimise the quadratic model of the criterion at ``theta`` less the prior of log t."""
+    # in units of ``theta``; each step keeps a tenth of every variance, and is shortened until it improves the model
+    slope, curvature = point.gradient * theta, point.information * np.outer(theta, theta)
+
+    def model(t: FloatArray) -> float:
+        return float((slope + 0.5 * curvature @ (t - 1.0)) @ (t - 1.0) - PRIOR * np.log(t).sum())
+
+    t = np.ones(len(theta))
+    now = model(t)
+    for _ in range(100):
+        pull = slope + curvature @ (t - 1.0) - PRIOR / t
+        step = np.linalg.solve(curvature + np.diag(PRIOR / t**2), -pull)
+        if -float(pull @ step) < 1e-3 * NEGLIGIBLE:
             break
-        free[np.argmax(drawn)] = True
-    return np.clip(step * scale, low, high)
+        share = min(1.0, 0.9 / max(float((-step / t).max()), 1e-300))
+        while (trial := model(t + share * step)) > now and share > 1e-9:
+            share *= 0.5
+        t, now = t + share * step, trial
+    return np.asarray(t * theta)
 
 
 def packed(variances: Variances, common: bool) -> FloatArray:

@@ -17,7 +17,9 @@ from compgen.diagnose.base_fit import first_basis, fit_base, least_norm, orthono
 from compgen.diagnose.diagnose import observed_of
 from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.noise_model import (
-    bounded_step,
+    PRIOR,
+    RemlPoint,
+    away_from_zero,
     difference_matrix,
     fit_reml,
     kernels,
@@ -190,20 +192,16 @@ def test_without_parts_of_the_runs_the_restricted_likelihood_is_that_with_their_
     assert not less.at(whole.starts).gradient[of_runs].any()
 
 
-def test_a_bounded_step_is_the_best_within_its_bounds():
+def test_the_next_variances_are_the_best_of_the_model_and_its_prior():
     rng = np.random.default_rng(1)
     for _ in range(50):
-        root, gradient = rng.normal(size=(6, 6)), rng.normal(size=6)
-        curvature = root @ root.T + 0.01 * np.eye(6)
-        low, high = -rng.uniform(0.0, 0.5, 6), rng.uniform(0.0, 0.5, 6)
-        step = bounded_step(gradient, curvature, low, high)
-        assert np.all((step >= low) & (step <= high))
-        # where the slope is not zero, it points out of the box
-        slope = gradient + curvature @ step
-        inside = (step > low + 1e-9) & (step < high - 1e-9)
-        assert np.abs(slope[inside]).max(initial=0.0) < 1e-5
-        assert np.all(slope[step <= low + 1e-9] > -1e-5)
-        assert np.all(slope[step >= high - 1e-9] < 1e-5)
+        root, theta = rng.normal(size=(6, 6)), np.exp(rng.normal(0.0, 3.0, 6))
+        information = root @ root.T / np.outer(theta, theta)
+        point = RemlPoint(0.0, rng.normal(0.0, 3.0, 6) / theta, information, 0.0)
+        found = away_from_zero(point, theta)
+        assert found.min() > 0.0
+        slope = (point.gradient + information @ (found - theta)) * found
+        assert slope == pytest.approx(np.full(6, PRIOR), abs=0.05 * PRIOR)  # the gradient of PRIOR log t by log t
 
 
 def test_the_restricted_likelihood_finds_the_noise_of_the_readings(gantry):
