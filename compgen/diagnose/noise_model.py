@@ -363,14 +363,19 @@ def fit_reml(problem: Reml, *, start: FloatArray | None = None, steps: int = 60)
 
 
 def away_from_zero(point: RemlPoint, theta: FloatArray) -> FloatArray:
-    """Variances t (k,) > 0 that minimise the quadratic model of the criterion at ``theta`` less the prior of log t."""
+    """Variances t (k,) > 0 that minimise the quadratic model of the criterion at ``theta`` less the prior of log t.
+
+    Those that the criterion does not depend on stay as they are.
+    """
+    used = np.diag(point.information) > 0.0
     # in units of ``theta``; each step keeps a tenth of every variance, and is shortened until it improves the model
-    slope, curvature = point.gradient * theta, point.information * np.outer(theta, theta)
+    slope = (point.gradient * theta)[used]
+    curvature = (point.information * np.outer(theta, theta))[np.ix_(used, used)]
 
     def model(t: FloatArray) -> float:
         return float((slope + 0.5 * curvature @ (t - 1.0)) @ (t - 1.0) - PRIOR * np.log(t).sum())
 
-    t = np.ones(len(theta))
+    t = np.ones(len(slope))
     now = model(t)
     for _ in range(100):
         pull = slope + curvature @ (t - 1.0) - PRIOR / t
@@ -381,7 +386,9 @@ def away_from_zero(point: RemlPoint, theta: FloatArray) -> FloatArray:
         while (trial := model(t + share * step)) > now and share > 1e-9:
             share *= 0.5
         t, now = t + share * step, trial
-    return np.asarray(t * theta)
+    found = theta.copy()
+    found[used] *= t
+    return found
 
 
 def packed(variances: Variances, common: bool) -> FloatArray:

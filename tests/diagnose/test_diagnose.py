@@ -199,6 +199,8 @@ def test_the_next_variances_are_the_best_of_the_model_and_its_prior():
         information = root @ root.T / np.outer(theta, theta)
         point = RemlPoint(0.0, rng.normal(0.0, 3.0, 6) / theta, information, 0.0)
         found = away_from_zero(point, theta)
+        without = RemlPoint(0.0, np.append(point.gradient, 0.0), np.pad(information, (0, 1)), 0.0)
+        assert away_from_zero(without, np.append(theta, 2.0)) == pytest.approx(np.append(found, 2.0), rel=1e-9)
         assert found.min() > 0.0
         slope = (point.gradient + information @ (found - theta)) * found
         assert slope == pytest.approx(np.full(6, PRIOR), abs=0.05 * PRIOR)  # the gradient of PRIOR log t by log t
