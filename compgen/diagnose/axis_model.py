@@ -17,13 +17,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
 from scipy.special import logsumexp
 
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.axis_session import AxisSession
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Effect
+from compgen.kinematics.kernel_switch import lapack
 
 Tier = Literal["named", "generic"]
 
@@ -126,7 +126,7 @@ class NoiseGrid:
     def solve(self, point: int, columns: FloatArray) -> FloatArray:
         """inv(V) times columns (n, k)."""
         inverse, factor, _ = self._bands[point]
-        return np.asarray(cho_solve_banded((factor, True), _times(inverse, columns), check_finite=False))
+        return np.asarray(lapack().dpbtrs(factor, _times(inverse, columns), lower=1)[0])
 
     def inverse(self, point: int) -> FloatArray:
         """inv(V), (n, n)."""
@@ -173,7 +173,9 @@ def _bands(apart: FloatArray, phi: float, w: float) -> tuple[FloatArray, FloatAr
     a, b = (1.0 - w, w + 1e-9) if phi else (1.0, 0.0)
     sum_of_both = b * inverse
     sum_of_both[0] += a
-    factor = cholesky_banded(sum_of_both, lower=True)
+    factor, failed = lapack().dpbtrf(sum_of_both, lower=1)
+    if failed:
+        raise np.linalg.LinAlgError("the covariance of the noise is not positive definite")
     determinant = 2.0 * float(np.sum(np.log(factor[0]))) + float(np.sum(np.log1p(-(r**2))))
     return inverse, factor, determinant
 
