@@ -279,10 +279,7 @@ class Projector:
         """Return all table values (parameters,) whose field is closest to ``required_mm`` (n, 3)."""
         if start is None:
             return np.asarray(self.project_all(required_mm[None])[0])
-        left, hats = required_mm.T[:, None].copy(), _Hats()
-        for term in self.terms:
-            term.take(start[term.place, None], left, hats)
-        return np.asarray(start + self._solved(left, hats)[:, 0])
+        return np.asarray(start + self.project_all((required_mm - self.field(start))[None])[0])
 
     def project_all(self, required_mm: FloatArray) -> FloatArray:
         """Return table values (k, parameters) for k target fields (k, n, 3) at once."""
