@@ -35,8 +35,6 @@ KEEP = 1e-7
 RIDGE = 1e-11
 #: An end interval of a table with less than this share within the travel says too little about the node outside.
 LEAST_SHARE = 0.5
-#: The required correction is iterated until it changes by less, mm, or until the next change would be less than the second.
-CHANGED_MM, NEXT_CHANGE_MM = 1e-10, 1e-13
 #: Iterations for a control whose correction is not the sum of its tables: 1e-3 rad in the first are 1e-9 after three.
 APPLIED_STEPS = 3
 #: Fields that move the tip by less than this are rounding.
@@ -109,16 +107,13 @@ def wanted_correction(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
     """Return what must be added to commands (n, 3) so that the exact machine reaches the commanded position, mm."""
-    correction, before = np.zeros_like(position_mm), np.inf
+    correction = np.zeros_like(position_mm)
     for _ in range(50):
         previous = correction
         moved = position_mm + previous
         correction = -exact_error(machine, errors, moved, tool_mm)
-        change = float(np.max(np.abs(correction - previous), initial=0.0))
-        # the changes decrease by about the same factor each time: the next one would be change^2 / before
-        if change < CHANGED_MM or change * change < NEXT_CHANGE_MM * before < np.inf:
+        if np.max(np.abs(correction - previous)) < 1e-10:
             return correction
-        before = change
     raise ConvergenceError("the errors are too large for a compensation: tip(p + c) = p has no solution by iteration")
 
 
