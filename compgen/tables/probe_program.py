@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls import CONTROLLERS
+from compgen.controls import CONTROLLERS, controller_named
 from compgen.data import toml_files
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
@@ -87,6 +87,7 @@ def probe_program(
     InputError
         for a control without documented probing, components that the contacts do not show, motions outside the travel.
     """
+    controller_named(controller)
     card = load_format(controller, templates)
     if not has_probe_program(controller, templates):
         known = ", ".join(name for name in CONTROLLERS if has_probe_program(name))
