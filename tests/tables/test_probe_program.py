@@ -216,7 +216,7 @@ def test_damaged_logs_are_refused(tmp_path, whole_log, change, message):
     ("probe", "probing", "controller", "message"),
     [
         (PLATE, BORES, "fanuc-3d", "no public document of fanuc-3d describes probing"),
-        (PLATE, BORES, "linuxcnc", "there is no controller .linuxcnc.; did you mean .linuxcnc-comp."),
+        (PLATE, BORES, "linuxcnc", "there is no controller 'linuxcnc'; did you mean 'linuxcnc-comp'"),
         (PLATE, SPHERES, "isg-csv", 'expected "xyz" for spheres'),
         (BALLS, BORES, "isg-csv", 'expected "xy" for bores'),
         (PLATE, replace(BORES, clearance_z_mm=-150.0), "isg-csv", "is below the start of a contact"),
