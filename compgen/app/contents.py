@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from compgen.app.project import INPUTS, Project, ProjectState, Step, command_line
+from compgen.app.project import INPUTS, Project, ProjectState, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -508,6 +508,9 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
                 "item": item,
                 "summary": item.step.data["summary"],
                 "pictures": () if item.questions else measurement_pictures(path, answers, key),
+                "sheet": next(
+                    (step for step in reversed(state.steps) if step.data.get("sheet_of") == item.step.number), None
+                ),
                 "questions": questions_of(path, item.questions, answers, f"q{item.number}"),
             }
         )
@@ -532,8 +535,8 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "pictures": (drawn := error_pictures(errors) if errors else []),
         "values": {picture.key: picture.data for picture in drawn},
         "squareness": squareness_rows(errors) if errors else [],
-        "current": state.current("identify") is not None, "views": views(project, step),
-        "found": found, "diagnosis": diagnosis, "diagnosed_views": views(project, found),
+        "current": state.current("identify") is not None, "views": list(project.pages_of(step)),
+        "found": found, "diagnosis": diagnosis, "diagnosed_views": list(project.pages_of(found)),
         "gap": gap_picture(diagnosis), "applied": applied,
         "may_add": found is not None and "extended.toml" in project.files_of(found) and not applied,
         "current_diagnosis": state.current("diagnose") is not None,
@@ -552,7 +555,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
                 other.number > step.number and other.kind in INPUTS
                 and not other.data.get("after") for other in state.steps
             ),
-            "views": views(project, step), "control": step.data["control"],
+            "views": list(project.pages_of(step)), "control": step.data["control"],
         }
         for step in reversed(runs)
     ]  # fmt: skip
@@ -562,10 +565,12 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         if step.kind == "verify"
     ]
     step = state.last("options")
+    controls = list(parsed.get("controllers", {}))
     return {
         "options": project.facts(step, "options.json"), "options_step": step, "results": results, "verified": verified,
         "options_current": state.current("options") is not None,
-        "controls": list(parsed.get("controllers", {})), "identified": state.current("identify"),
+        "controls": controls, "chosen": results[0]["control"] if results else next(iter(controls), ""),
+        "identified": state.current("identify"),
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
     }  # fmt: skip
@@ -577,7 +582,7 @@ def after_page(project: Project, state: ProjectState) -> dict[str, Any]:
     return {
         "items": shown_measurements(project, state, after=True), "step": step,
         "before": [item for item in state.measurements if not item.after and item.used],
-        "facts": project.facts(step, "compare.json"), "views": views(project, step),
+        "facts": project.facts(step, "compare.json"), "views": list(project.pages_of(step)),
     }  # fmt: skip
 
 
@@ -600,9 +605,3 @@ SHOWN: dict[str, Callable[[Project, ProjectState], dict[str, Any]]] = {
     "machine": machine_page, "measurement": measurement_page, "result": result_page, "tables": tables_page,
     "after": after_page, "project": project_page,
 }  # fmt: skip
-
-
-def views(project: Project, step: Step | None) -> list[str]:
-    """Return the names of the pages that a step wrote, the main one first."""
-    names = [] if step is None else [name for name in project.files_of(step) if name.endswith(".html")]
-    return sorted(names, key=lambda name: (name not in ("report.html", "index.html"), name))

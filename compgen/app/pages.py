@@ -33,6 +33,7 @@ from werkzeug.wrappers import Response as BaseResponse
 
 from compgen.app import contents
 from compgen.app.project import (
+    GIVEN,
     PROJECT,
     Progress,
     Project,
@@ -560,6 +561,20 @@ def remove_measurement(runner: Runner, state: ProjectState, item: int) -> str | 
     return "after" if found.after else None
 
 
+@action("measurement", f"measurement/<{_NUMBER}:item>/sheet")
+def make_sheet(runner: Runner, state: ProjectState, item: int) -> str | None:
+    """Evaluate axis runs or circles by their standard, and write the sheet to print."""
+    found = _measurement(state, item)
+    if not found.used:
+        raise InputError("answer the open questions first")
+    folder = runner.project.new_folder("accuracy")
+    words = ["accuracy", _machine_of(state), found.used[0], *_language(), "--out", folder]
+    step = Step(0, "accuracy", f"Figures of {found.name}", [words], folder, data={"sheet_of": found.step.number})
+    page = "after" if found.after else "measurement"
+    runner.start("evaluating by the standard", page, [StepTask(step)])
+    return page
+
+
 @action("measurement", "numbers")
 def state_numbers(runner: Runner, state: ProjectState) -> None:
     """Take numbers that are known without a file, with unit and uncertainty as one types them."""
@@ -661,17 +676,17 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     folder = runner.project.new_folder("tables")
     words = ["run", *words, "--controller", control, *_language(), "--out", folder]
     words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
-    words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active", "active")]
+    words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active")]
     kind = (CONTROLLERS[control].sample_setting or "style_from").replace("_", "-")
-    words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample", "sample")]
+    words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample")]
     step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control})
     runner.start(f"tables for {control}", "tables", [StepTask(step)])
 
 
-def _uploaded(project: Project, folder: str, name: str, into: str) -> list[str]:
+def _uploaded(project: Project, folder: str, name: str) -> list[str]:
     """Save the files of a field below the folder of a step and return their paths in the project."""
     files = [item for item in request.files.getlist(name) if item.filename][:50]
-    paths = [f"{folder}/{into}/{k}-{file_name(item.filename or '')}" for k, item in enumerate(files, start=1)]
+    paths = [f"{folder}/{GIVEN}/{name}-{k}-{file_name(item.filename or '')}" for k, item in enumerate(files, start=1)]
     for item, path in zip(files, paths, strict=True):
         project.path(path).parent.mkdir(exist_ok=True)
         item.save(project.path(path))
@@ -690,7 +705,7 @@ def verify_backup(runner: Runner, state: ProjectState) -> None:
     """Verify what the control holds: a backup of it against the identified errors."""
     step, control = _identified(state), _control()
     folder = runner.project.new_folder("verify")
-    paths = _uploaded(runner.project, folder, "files", "backup")
+    paths = _uploaded(runner.project, folder, "files")
     if not paths:
         runner.project.set_aside(folder)
         raise InputError("choose the backup of the control")
@@ -772,8 +787,8 @@ def download(number: int, step: int, position: int) -> Response:
 def view_page(number: int, step: int, name: str) -> Response:
     """Send a page that a command wrote: a file in itself, with the script that its own policy names."""
     project, found = _step(number, step)
-    path = project.files_of(found).get(name)
-    if path is None or not name.endswith(".html"):
+    path = project.pages_of(found).get(name)
+    if path is None:
         abort(404, "There is no such page.")
     text = path.read_text(encoding="utf-8")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"

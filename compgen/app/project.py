@@ -37,8 +37,11 @@ LARGEST_PROJECT = 20_000_000
 STOP_S = 5.0
 #: Lines of a command's messages that are kept.
 MOST_LINES = 500
+#: Sub-folder of a step for the files that a user gave it, and steps whose command writes pages.
+GIVEN, WITH_PAGES = "given", ("identify", "diagnose", "run", "compare", "accuracy")
 #: Steps that a result depends on.
 INPUTS = ("machine", "instrument", "numbers", "removed", "measurement")
+MAIN_PAGES = ("report.html", "index.html", "sheet.html")
 #: Exit codes of a command that has written its result: accepted or not.
 DONE = (0, 1)
 
@@ -300,6 +303,14 @@ class Project:
             for path in sorted(root.rglob("*"))
             if path.is_file() and not path.name.startswith(".") and path.resolve().is_relative_to(root)
         }
+
+    def pages_of(self, step: Step | None) -> dict[str, Path]:
+        """Return the pages that the command of a step wrote, the main one first; never a file that a user gave."""
+        if step is None or step.kind not in WITH_PAGES:
+            return {}
+        found = self.files_of(step)
+        names = [name for name in found if name.endswith(".html") and not name.startswith(f"{GIVEN}/")]
+        return {name: found[name] for name in sorted(names, key=lambda name: (name not in MAIN_PAGES, name))}
 
     def facts(self, step: Step | None, name: str) -> dict[str, Any]:
         """Return the JSON object in a file of a step, {} if there is none."""

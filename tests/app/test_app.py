@@ -71,6 +71,12 @@ def test_laser_files_and_a_square_become_tables_and_the_commands_shown_do_the_sa
     state = site.do(f"measurement/{y.number}/answer", {"answer-1": "--axis=Y"})
     assert [item.questions for item in state.measurements] == [[], []]
     site.do("numbers", {"squareness-EC0Y": "25±3"})
+    state = site.do(f"measurement/{x.number}/sheet")
+    figures = json.loads(site.project.files_of(state.last("accuracy"))["accuracy.json"].read_text())
+    assert figures["figures"]["X"]["A"]["value"] == pytest.approx(19.0)  # a whole number by construction of the example
+    sheet = site.get(f"/projects/1/steps/{state.last('accuracy').number}/view/sheet.html")
+    assert sheet.status_code == 200
+    assert "view/sheet.html" in site.get("/projects/1/measurement").text
     state = site.do("identify")
     found = values(site.project, state.last("identify"))
     for name in ("EXX", "EYY"):
@@ -290,7 +296,7 @@ def test_tables_that_were_active_are_taken_out_of_the_measurement(site):
     tables = [(io.BytesIO(files[name].read_bytes()), name) for name in ("volcomp0.csv", "volcomp0.lis")]
     state = site.do("run", {"control": "isg-csv", "active": tables})
     step = state.last("run")
-    assert f"--active={step.folder}/active/1-volcomp0.csv" in step.commands[0]
+    assert f"--active={step.folder}/given/active-1-volcomp0.csv" in step.commands[0]
     second = values(site.project, step)
     assert second["EC0Y", ""] == pytest.approx(2.0 * first["EC0Y", ""], rel=1e-3)
     assert second["EXX", -800.0] == pytest.approx(2.0 * first["EXX", -800.0], abs=0.5)

@@ -21,7 +21,8 @@ IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
 CHANGES = (
     "/open", "/projects/1/machine/choose", "/projects/1/machine/describe", "/projects/1/machine/text",
     "/projects/1/machine/upload", "/projects/1/machine/settings", "/projects/1/measurement/add",
-    "/projects/1/measurement/1/answer", "/projects/1/measurement/1/remove", "/projects/1/numbers", "/projects/1/identify",
+    "/projects/1/measurement/1/answer", "/projects/1/measurement/1/remove", "/projects/1/measurement/1/sheet",
+    "/projects/1/numbers", "/projects/1/identify",
     "/projects/1/diagnose", "/projects/1/apply", "/projects/1/options", "/projects/1/run", "/projects/1/verify",
     "/projects/1/compare", "/projects/1/recal", "/projects/1/undo", "/projects/1/stop", "/alive",
 )  # fmt: skip
@@ -212,6 +213,33 @@ def test_too_large_requests_and_forms_of_every_shape_are_refused_without_a_fault
             )
             assert answer.status_code in (400, 403, 413), (path, body[:20])
     assert everything(site) == before
+
+
+def test_a_page_that_a_user_was_given_is_never_shown_as_one_of_ours(site):
+    """Its own policy would allow its script, with the rights of the pages."""
+    evil = (
+        b"<html><head><meta http-equiv=Content-Security-Policy content=\"script-src 'sha256-"
+        + b"A" * 44
+        + b"'\"></head>"
+    )
+    for kind, name in (
+        ("verify", "given/files-1-evil.html"),
+        ("measurement", "evil.html"),
+        ("run", "given/sample-1-x.html"),
+    ):
+        folder = site.project.new_folder(kind)
+        path = site.project.folder / folder / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(evil)
+        data = {"control": "isg-csv"} if kind != "measurement" else {"file": name, "used": [], "answers": [], "summary": {
+            "doubts": [], "understood": {}, "notes": [], "kind": "axis", "machine": None}}  # fmt: skip
+        step = site.project.add(Step(0, kind, "evil", folder=folder, data=data)).steps[-1]
+        assert site.get(f"/projects/1/steps/{step.number}/view/{name}").status_code == 404
+        for page in pages.PAGES:
+            assert f"/view/{name}" not in site.get(f"/projects/1/{page}").text
+        sent = site.get(f"/projects/1/steps/{step.number}/files/1")
+        assert sent.mimetype == "application/octet-stream"
+        assert "attachment" in sent.headers["Content-Disposition"]
 
 
 def test_a_revision_that_is_old_or_no_number_changes_nothing(site):
