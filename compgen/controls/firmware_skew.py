@@ -517,6 +517,20 @@ class Ucnc(SkewControl[UcncSettings]):
     name = "ucnc"
     settings_class = UcncSettings
     finite_rotations = True  # the product of two factors is not in the terms
+
+    @classmethod
+    def settings_section(cls, machine: Machine) -> Section:
+        """Return the section, which must state how the firmware was compiled."""
+        section = super().settings_section(machine)
+        if "build" not in section:
+            raise section.fail(
+                "build",
+                'is missing: a factor acts otherwise in each; set build = "xy-only" ($I lists SKXY) or "three" ($I lists SK)',
+                kind="missing",
+                instead="xy-only",
+            )
+        return section
+
     KEYS = {"37": "xy", "38": "xz", "39": "yz"}
 
     def __init__(self, machine: Machine, settings: UcncSettings | None = None) -> None:

@@ -29,8 +29,9 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
+from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.data.toml_files import accepts, axis_setting, choice, setting, whole
+from compgen.data.toml_files import Section, accepts, axis_setting, choice, setting, whole
 from compgen.errors import InputError
 
 _MOST_CHARACTERS = 5_000_000
@@ -262,6 +263,21 @@ class StatedSign(ScrewMapControl[Settings]):
     bidirectional = True
     digits = 4
 
+    @classmethod
+    def settings_section(cls, machine: Machine) -> Section:
+        """Return the section, which must state the sign."""
+        section = super().settings_section(machine)
+        if "sign" not in section:
+            raise section.fail(
+                "sign",
+                "is missing: no document of the vendor says whether the control adds or subtracts the values; set sign = "
+                '"error" (actual minus nominal, subtracted) or "correction" (added). The card (volcomp controllers NAME) says '
+                "what speaks for which; check it at the machine",
+                kind="missing",
+                instead="error",
+            )
+        return section
+
     def __init__(self, machine: Any, settings: Settings | None = None) -> None:
         super().__init__(machine, settings)
         self.sign = -1.0 if getattr(self.settings, "sign") == "error" else 1.0  # noqa: B009
@@ -465,6 +481,19 @@ class EcmcLookup(ScrewMapControl[EcmcLookupSettings]):
     table_name = "lookup table"
     #: First release that subtracts the table.
     SUBTRACTS_FROM = 10
+
+    @classmethod
+    def settings_section(cls, machine: Machine) -> Section:
+        """Return the section, which must state the release."""
+        section = super().settings_section(machine)
+        if "version" not in section:
+            raise section.fail(
+                "version",
+                'is missing: release 10.0.0 reversed the sign of the table; set the release that runs, e.g. version = "11.0.8"',
+                kind="missing",
+                instead="10.0.0",
+            )
+        return section
 
     def __init__(self, machine: Any, settings: EcmcLookupSettings | None = None) -> None:
         super().__init__(machine, settings)

@@ -83,7 +83,7 @@ def control_card(name: str, templates: Path | None = None) -> ControlCard:
 def card_text(card: ControlCard, origin: str | None) -> RenderableType:
     """Return the card: what it expresses, files, settings, limits, open points, sources."""
     about = card.format
-    offset = "no: the tables are zero at the reference point" if card.anchored else "yes"
+    offset = "no: the tables are zero at the reference point (or machine zero)" if card.anchored else "yes"
     direction = "yes" if card.bidirectional else "no: a reversal goes into the control's backlash parameters"
     return Group(
         Text(f"{about.name}: {about.title}", style="bold"),

@@ -264,15 +264,11 @@ def test_the_sign_of_ecmc_follows_its_release():
     assert last[1] == pytest.approx(-0.05 * 700.0 / 750.0, rel=1e-3)  # encoder minus true; zero at the reference point
 
 
-def test_a_sign_or_release_that_is_not_stated_is_asked_for():
-    for name, key in (
-        ("ecmc", "version"),
-        ("weihong", "sign"),
-        ("mach4", "sign"),
-        ("fagor-8055", "sign"),
-        ("ucnc", "build"),
-    ):
-        with pytest.raises(InputError, match=key):
+def test_a_sign_or_release_that_is_not_stated_is_asked_for_with_the_reason():
+    asked = {"ecmc": "version: is missing: release 10.0.0 reversed", "ucnc": "build: is missing: a factor acts"}
+    asked |= dict.fromkeys(("weihong", "mach4", "fagor-8055"), 'sign: is missing: .* set sign = "error"')
+    for name, words in asked.items():
+        with pytest.raises(InputError, match=words):
             CONTROLLERS[name](machine_with())
 
 
