@@ -49,6 +49,7 @@ _COMMANDS = {
     },
     "program_commands": {
         "correct": "Correct an NC program for the errors of one machine, read it back and judge it.",
+        "part": "Predict what the errors of a machine leave on the part of an NC program.",
     },
     "plan_commands": {
         "plan": "Plan a measurement: what it will determine, and how well.",

@@ -1,4 +1,4 @@
-"""``volcomp correct``: the NC program itself."""
+"""``volcomp correct`` and ``volcomp part``: the NC program itself, and what a machine makes of it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from typing import Any
 import click
 
 from compgen.cli.common import PATH, Command, json_option, options_of, out_option
-from compgen.cli.shared_options import machine_argument, path_option
+from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
-from compgen.data.files import sha256_of_file
+from compgen.data.files import OutputFolder, json_text, sha256_of_file
 from compgen.data.machine import Machine, Vector3
+from compgen.data.messages import number_text
 from compgen.effects import effects_reversal
 from compgen.errors import InputError
 from compgen.foreign import open_errors
+from compgen.identify.covariance import covariance_or_independent
 from compgen.programs import CorrectOptions, Setup, correct_program, model_of, read_tools
 
 WCS_HELP = (
@@ -128,3 +130,117 @@ def correct_command(
     says = [f"assumed: {text}" for text in result.assumed]
     answer(as_json, {**found, "file": str(out / result.file)}, table, counts, *says, f"-> {out / result.file}")
     return 0 if result.accepted else 1
+
+
+# ``volcomp part``.
+
+
+ALSO_HELP = (
+    "Another machine with its errors, e.g. mill2.toml=mill2.errors.csv (several times): the machines are ranked."
+)
+MOST_ROWS = 30
+
+
+@click.command("part")
+@machine_argument
+@click.argument("program", type=PATH)
+@program_options
+@options_of(CorrectOptions, "options", only=("dialect",))
+@click.option("--uncertainty", is_flag=True, help="Require the uncertainty: exit code 2 if the errors have none.")
+@path_option("--tables", "Table of a control (several times): also evaluate the part with it active.", multiple=True)
+@click.option("--controller", metavar="NAME", help="Name of the control that the tables belong to.")
+@click.option("--also", multiple=True, metavar="MACHINE=ERRORS", help=ALSO_HELP)
+@click.option("--out", metavar="DIR", type=PATH, help="Folder for part.json and part.html.")
+@json_option
+def part_command(
+    model: Any,
+    setup: Setup,
+    errors: Path,
+    program: Path,
+    options: CorrectOptions,
+    uncertainty: bool,
+    tables: tuple[Path, ...],
+    controller: str | None,
+    also: tuple[str, ...],
+    out: Path | None,
+    as_json: bool,
+) -> int:
+    """Predict what the errors of a machine leave on the part of an NC program.
+
+    Figures: the deviation of the tool from the path at all moves at feed (um). Features: position of drilled holes and full
+    circles, diameters, distances, angles of corners (urad) and distances of parallel sides in the plane XY, with the
+    standard uncertainty that the measurement of the machine gives them. --tables evaluates the same with the tables of a
+    control. --also ranks several machines by the largest deviation normal to the path. DIR gets part.json and part.html.
+
+    \b
+    Example:
+      volcomp part zha-gantry part.nc --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350 --out part/
+    """
+    from compgen.programs import part_page, predict_part
+
+    if bool(tables) != (controller is not None):
+        raise InputError("--tables and --controller belong together; give both")
+    folder = OutputFolder(out) if out is not None else None
+    read = None
+    if tables:
+        from compgen.tables import read_tables
+
+        read = read_tables(model.machine, tables, str(controller), foreign=True)
+    covariance = covariance_or_independent(model.errors, covariance_of(errors, model.errors, None, independent=False))
+    if uncertainty and covariance is None:
+        raise InputError("has no uncertainties; identify the errors again, or leave out --uncertainty", file=errors)
+    with progress(quiet=as_json) as show:
+        found = predict_part(model, program, options.dialect, setup, covariance=covariance, tables=read, show=show)
+        others = []
+        for text in also:
+            name, _, file = text.rpartition("=")
+            if not name:
+                raise InputError(f"{text!r} is not of the form MACHINE=ERRORS", field="--also")
+            machine, table = open_machine(name), open_errors(Path(file))
+            other = model_of(machine, table, effects_reversal(machine))
+            others.append(predict_part(other, program, options.dialect, setup, show=show))
+    ranked = sorted([found, *others], key=lambda item: item.figures.normal_mm)
+    data = found.as_dict()
+    if also:
+        data["machines"] = [{"machine": item.machine, **item.figures.as_dict()} for item in ranked]
+    if folder is not None:
+        folder.add("part.json", json_text(data))
+        folder.add("part.html", part_page(found))
+        paths = list(folder.commit().values())
+    titles = (
+        "tool from the path, moves at feed (um)",
+        "largest",
+        "rms",
+        "largest, normal",
+        "rms, normal",
+        "ends",
+        "line",
+    )
+    keys = ("max_um", "rms_um", "normal_max_um", "normal_rms_um", "ends_max_um")
+    lines = [(item.machine, item.figures.as_dict()) for item in ranked]
+    if found.after is not None:
+        lines.append((f"{found.machine}, {controller}", found.after.as_dict()))
+    rows = [(name, *(f"{one[key]:.2f}" for key in keys), str(one["worst_line"])) for name, one in lines]
+    shown = [table_of(titles, rows)]
+    features = [
+        (
+            item.name,
+            item.quantity,
+            str(item.line),
+            f"{item.nominal:.3f}",
+            f"{item.error:+.2f}",
+            number_text(item.after, 2),
+            number_text(item.u, 2),
+            item.unit,
+        )
+        for item in found.features[:MOST_ROWS]
+    ]
+    if features:
+        names = ("feature", "quantity", "line", "nominal (mm, deg)", "error", "with tables", "u (k = 1)", "unit")
+        shown.append(table_of(names, features))
+    says = [f"assumed: {text}" for text in found.assumed]
+    more = len(found.features) + found.left_out - MOST_ROWS
+    if more > 0:
+        says.append(f"{more} more features{' in part.json' if folder is not None and not found.left_out else ''}")
+    answer(as_json, data, *shown, *says, *([f"  {path}" for path in paths] if folder is not None else []))
+    return 0

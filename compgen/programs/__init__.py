@@ -1,16 +1,27 @@
 """NC programs: read in the dialect of a control, corrected for the errors of a machine, and what a part will look like."""
 
-from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program, model_of
-from compgen.programs.dialects import DIALECTS, read_tools
-from compgen.programs.reader import Reader, Setup
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program, model_of
+    from compgen.programs.dialects import DIALECTS, read_tools
+    from compgen.programs.part import PartPrediction, part_page, predict_part
+    from compgen.programs.reader import Reader, Setup
 
 __all__ = [
     "DIALECTS",
     "CorrectOptions",
+    "PartPrediction",
     "ProgramCorrection",
     "Reader",
     "Setup",
     "correct_program",
     "model_of",
+    "part_page",
+    "predict_part",
     "read_tools",
 ]
+
+load_on_first_use(__name__, __all__)

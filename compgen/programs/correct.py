@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
@@ -22,15 +23,26 @@ from compgen.programs.dialects import AT_THE_END, Dialect, dialect_named
 from compgen.programs.path import (
     Corrector,
     ExactModel,
+    PathFigures,
     Pieces,
-    closest_offset,
     directions_at,
     is_closed,
     kept_directions,
     lengths_of,
-    points_of,
+    path_deviations,
 )
-from compgen.programs.reader import MARK, MM_PER_INCH, PLANE_AXES, Batch, Moves, PlainRun, Reader, Setup, SingleBlock
+from compgen.programs.reader import (
+    MARK,
+    MM_PER_INCH,
+    PLANE_AXES,
+    Batch,
+    IntArray,
+    Moves,
+    PlainRun,
+    Reader,
+    Setup,
+    SingleBlock,
+)
 from compgen.resources import program_version
 
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
@@ -49,54 +61,6 @@ class CorrectOptions:
     decimals: int | None = option(
         None, "Decimals of rewritten coordinates (default: those of the dialect, 3 to 6).", within=(1, 9)
     )
-
-
-@dataclass
-class PathFigures:
-    """Deviations of the tool from the programmed path over the length of all moves at feed, in mm.
-
-    ``largest`` and ``rms`` compare with the point at the same share of a move, ``normal`` ones with the nearest point of
-    the path, ``ends`` with the ends of the moves; ``line`` is that of the largest deviation.
-    """
-
-    largest_mm: float = 0.0
-    line: int = 0
-    normal_mm: float = 0.0
-    ends_mm: float = 0.0
-    length_mm: float = 0.0
-    _square: float = 0.0
-    _normal_square: float = 0.0
-
-    def add(self, line: Any, whole: FloatArray, normal: FloatArray, weight_mm: FloatArray, at_end: Any) -> None:
-        """Add samples: their lines, vectors from the point and from the path (n, 3), lengths, and which are ends."""
-        if not len(whole):
-            return
-        size, across = np.linalg.norm(whole, axis=1), np.linalg.norm(normal, axis=1)
-        worst = int(np.argmax(size))
-        if size[worst] > self.largest_mm:
-            self.largest_mm, self.line = float(size[worst]), int(line[worst])
-        self.normal_mm = max(self.normal_mm, float(across.max()))
-        self.ends_mm = max(self.ends_mm, float(size[at_end].max(initial=0.0)))
-        self.length_mm += float(weight_mm.sum())
-        self._square += float(weight_mm @ size**2)
-        self._normal_square += float(weight_mm @ across**2)
-
-    @property
-    def rms_mm(self) -> float:
-        """Root mean square of the deviation over the length."""
-        return float(np.sqrt(self._square / self.length_mm)) if self.length_mm else 0.0
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures in um."""
-        normal = float(np.sqrt(self._normal_square / self.length_mm)) if self.length_mm else 0.0
-        return {
-            "max_um": self.largest_mm / MM_PER_UM,
-            "rms_um": self.rms_mm / MM_PER_UM,
-            "normal_max_um": self.normal_mm / MM_PER_UM,
-            "normal_rms_um": normal / MM_PER_UM,
-            "ends_max_um": self.ends_mm / MM_PER_UM,
-            "worst_line": self.line,
-        }
 
 
 @dataclass(frozen=True)
@@ -289,13 +253,13 @@ class ProgramWriter:
             return [block.text]
         move = batch.moves.part(slice(block.first, block.first + block.count))
         if block.kind == "cycle":
-            depth = np.flatnonzero((move.kind != 0) & move.corrected.all(axis=1))
+            depth = np.flatnonzero((move.kind != 0) & move.corrected[:, 2])
             if not len(depth):
                 return [block.text]
             # the stroke to the depth may be several pieces; the hole is where the last ends
             stroke = np.flatnonzero(pieces.move[rows] == block.first + depth[0])
-            target = pieces.command_mm[rows][stroke[-1]]
-            return [self._cycle(block, target, offset, pieces.command_mm[rows][-1])]
+            target, allowed = pieces.command_mm[rows][stroke[-1]], move.corrected[int(depth[0])]
+            return [self._cycle(block, target, offset, pieces.command_mm[rows][-1], allowed)]
         count = rows.stop - rows.start
         texts = []
         total = share_before[rows]
@@ -358,7 +322,7 @@ class ProgramWriter:
         for k, letter in enumerate(AXES):
             before = (self.target_mm[k] - offset[k]) / scale
             value = (command[k] - offset[k]) / scale
-            if np.isnan(value):
+            if np.isnan(value) or not move.corrected[0, k]:
                 continue
             in_arc = block.kind == "arc" and k != plane
             if closed and in_arc and not np.isnan(start_mm[k]):
@@ -442,7 +406,9 @@ class ProgramWriter:
             if self.dialect.pole and got is not None:
                 self.pole_mm[k] = got * block.scale + base
 
-    def _cycle(self, block: SingleBlock, target: FloatArray, offset: FloatArray, last: FloatArray) -> str:
+    def _cycle(
+        self, block: SingleBlock, target: FloatArray, offset: FloatArray, last: FloatArray, allowed: NDArray[np.bool_]
+    ) -> str:
         """Rewrite a drilling block: place and depth of the hole; the R level is in the air and stays."""
         scale, digits = block.scale, self.digits(block.scale)
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
@@ -459,7 +425,9 @@ class ProgramWriter:
                     changes.append((first, stop, self._number(value, own, text)))
                 else:
                     value = given
-            elif np.rint(value * 10**digits) != np.rint(before[k] * 10**digits) and np.isfinite(before[k]):
+            elif (
+                np.rint(value * 10**digits) != np.rint(before[k] * 10**digits) and np.isfinite(before[k]) and allowed[k]
+            ):
                 more.append(f"{letter}{self._number(value, digits)}")
             else:
                 continue
@@ -528,11 +496,24 @@ class _ReadBack:
         if len(wanted):
             self.direction = ended[-1]
         rows = np.flatnonzero(wanted.cutting)
-        self._compare(self.before, wanted, rows, wanted, rows, np.zeros(len(rows)), np.ones(len(rows)), ended)
+        zero, one = np.zeros(len(rows)), np.ones(len(rows))
+        self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), ended)
         back = np.flatnonzero(read.cutting)
         owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
         if owner is not None:
-            self._compare(self.after, wanted, owner, read, back, low, high, ended)
+            self._add(self.after, wanted, owner, read.part(back), (low, high), ended)
+
+    def _add(
+        self,
+        figures: PathFigures,
+        wanted: Moves,
+        owner: IntArray,
+        driven: Moves,
+        shares: tuple[FloatArray, FloatArray],
+        ended: FloatArray,
+    ) -> None:
+        for found in path_deviations(self.model, self.step_mm, wanted, owner, driven, shares, ended):
+            figures.add(found)
 
     def _owners(self, wanted: Moves, rows: Any, read: Moves, origin: Any) -> tuple[Any, FloatArray, FloatArray]:
         """Which wanted move each corrected move belongs to, and the shares of it where that begins and ends."""
@@ -556,34 +537,6 @@ class _ReadBack:
         high = np.where(several, 1.0, low + length / total)
         high[np.concatenate([np.flatnonzero(np.diff(index)), [len(index) - 1]]) if len(index) else []] = 1.0
         return owner, low, high
-
-    def _compare(
-        self, figures: PathFigures, wanted: Moves, owner: Any, driven: Moves, rows: Any, low: Any, high: Any, ended: Any
-    ) -> None:
-        """Sample driven moves ``rows``, move the exact machine there, compare with the moves ``owner`` of the path."""
-        if not len(rows):
-            return
-        own = driven.part(rows)
-        length = lengths_of(own)
-        count = np.clip(np.ceil(length / self.step_mm), 2, 2000).astype(np.int64)
-        for first in range(0, len(rows), 50_000):
-            part = np.arange(first, min(first + 50_000, len(rows)))
-            which = np.repeat(part, count[part])
-            share = (np.arange(len(which)) - np.repeat(np.cumsum(count[part]) - count[part], count[part]) + 1) / count[
-                which
-            ]
-            sampled, path = own.part(which), wanted.part(owner[which])
-            at = points_of(sampled, share)
-            direction = ended[owner[which]]
-            if self.model.reversal is not None:
-                now = directions_at(sampled, np.clip(share, 1e-7, 1.0 - 1e-7))
-                turning = sampled.sweep_rad != 0
-                direction = np.where(turning[:, None] & (now != 0), now, direction)
-            actual = at + self.model.error(at, path.tool_mm, direction)
-            where = np.clip(low[which] + share * (high - low)[which], 0.0, 1.0)
-            whole = actual - points_of(path, where)
-            normal = closest_offset(path, actual, where)
-            figures.add(path.line, whole, normal, length[which] / count[which], (share == 1.0) & (high[which] == 1.0))
 
 
 # The whole program.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
-from compgen.data.names import error_named
+from compgen.data.names import MM_PER_UM, error_named
 from compgen.errors import ConvergenceError
 from compgen.kinematics import exact_error
 from compgen.programs.reader import PLANE_AXES, IntArray, Moves
@@ -196,7 +197,7 @@ class Corrector:
             self.direction = ended[-1]
         correction = self.model.command(moves.at_mm, moves.tool_mm, ended) - moves.at_mm
         command = moves.end_mm + np.where(moves.corrected, correction, 0.0)
-        divisible = moves.cutting & moves.corrected.all(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
+        divisible = moves.cutting & moves.corrected.any(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
         turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
             turned = np.asarray(((began * before) < 0).any(axis=1))
@@ -234,7 +235,8 @@ class Corrector:
         share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
         breaks[first[takes_up] + 1] = True
         sampled = moves.part(rows[own])
-        target = self.model.command(points_of(sampled, share), sampled.tool_mm, ended[rows[own]])
+        wanted = points_of(sampled, share)
+        target = np.where(sampled.corrected, self.model.command(wanted, sampled.tool_mm, ended[rows[own]]), wanted)
         while True:
             at, part = np.flatnonzero(breaks), np.cumsum(breaks) - 1
             left, right = at[part], at[np.minimum(part + 1, len(at) - 1)]
@@ -264,7 +266,7 @@ class Corrector:
             wanted = points_of(many, share.ravel())
             middle = np.repeat(directions_at(moves.part(move), 0.5 * (low + high)), steps + 1, axis=0)
             direction = np.where(middle != 0, middle, ended[np.repeat(move, steps + 1)])
-            target = self.model.command(wanted, many.tool_mm, direction)
+            target = np.where(many.corrected, self.model.command(wanted, many.tool_mm, direction), wanted)
             still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
             sweep = (high - low) * moves.sweep_rad[move]
             centre, off = _fitted_arcs(target.reshape(len(move), steps + 1, 3), moves.plane[move], sweep)
@@ -328,3 +330,110 @@ def _fitted_arcs(target: FloatArray, plane: IntArray, sweep: FloatArray) -> tupl
     centre = np.full((len(target), 3), np.nan)
     centre[index, a], centre[index, b] = u[:, 0] + cu, v[:, 0] + cv
     return centre, np.hypot(radial, rise).max(axis=1)
+
+
+# Deviations of the tool from the path.
+
+
+@dataclass(frozen=True)
+class PathDeviations:
+    """Samples (n,) of moves at feed: machine position, vectors to the tool from the point at the same share and from the path.
+
+    ``line`` is that of the block, ``weight_mm`` the length that a sample stands for, ``at_end`` the ends of moves.
+    """
+
+    line: IntArray
+    position_mm: FloatArray
+    whole_mm: FloatArray
+    normal_mm: FloatArray
+    weight_mm: FloatArray
+    at_end: NDArray[np.bool_]
+
+
+def path_deviations(
+    model: ExactModel,
+    step_mm: float,
+    wanted: Moves,
+    owner: IntArray,
+    driven: Moves,
+    shares: tuple[FloatArray, FloatArray],
+    ended: FloatArray,
+) -> Iterator[PathDeviations]:
+    """Sample moves that are driven and compare the tool there with the moves that are wanted.
+
+    Parameters
+    ----------
+    model, step_mm : the machine, and the distance of samples.
+    wanted, ended : moves of the program, and the directions of the axes at their ends.
+    owner, shares : for each driven move the wanted one, and the shares of that at which it begins and ends.
+    driven : the moves at feed that the machine executes.
+    """
+    low, high = shares
+    length = lengths_of(driven)
+    count = np.clip(np.ceil(length / step_mm), 2, 2000).astype(np.int64)
+    for first in range(0, len(driven), 50_000):
+        part = np.arange(first, min(first + 50_000, len(driven)))
+        own = np.repeat(part, count[part])
+        begin = np.repeat(np.cumsum(count[part]) - count[part], count[part])
+        share = (np.arange(len(own)) - begin + 1) / count[own]
+        sampled, path = driven.part(own), wanted.part(owner[own])
+        at, direction = points_of(sampled, share), ended[owner[own]]
+        if model.reversal is not None:
+            now = directions_at(sampled, np.clip(share, 1e-7, 1.0 - 1e-7))
+            direction = np.where((sampled.sweep_rad != 0)[:, None] & (now != 0), now, direction)
+        actual = at + model.error(at, path.tool_mm, direction)
+        where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
+        yield PathDeviations(
+            path.line,
+            at,
+            actual - points_of(path, where),
+            closest_offset(path, actual, where),
+            length[own] / count[own],
+            (share == 1.0) & (high[own] == 1.0),
+        )
+
+
+@dataclass
+class PathFigures:
+    """Deviations of the tool from the programmed path over the length of all moves at feed, in mm.
+
+    ``largest`` and ``rms`` compare with the point at the same share of a move, ``normal`` ones with the nearest point of
+    the path, ``ends`` with the ends of the moves; ``line`` is that of the largest deviation.
+    """
+
+    largest_mm: float = 0.0
+    line: int = 0
+    normal_mm: float = 0.0
+    ends_mm: float = 0.0
+    length_mm: float = 0.0
+    _square: float = 0.0
+    _normal_square: float = 0.0
+
+    def add(self, found: PathDeviations) -> None:
+        """Add the deviations of some samples."""
+        size, across = np.linalg.norm(found.whole_mm, axis=1), np.linalg.norm(found.normal_mm, axis=1)
+        worst = int(np.argmax(size))
+        if size[worst] > self.largest_mm:
+            self.largest_mm, self.line = float(size[worst]), int(found.line[worst])
+        self.normal_mm = max(self.normal_mm, float(across.max()))
+        self.ends_mm = max(self.ends_mm, float(size[found.at_end].max(initial=0.0)))
+        self.length_mm += float(found.weight_mm.sum())
+        self._square += float(found.weight_mm @ size**2)
+        self._normal_square += float(found.weight_mm @ across**2)
+
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square of the deviation over the length."""
+        return float(np.sqrt(self._square / self.length_mm)) if self.length_mm else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures in um."""
+        normal = float(np.sqrt(self._normal_square / self.length_mm)) if self.length_mm else 0.0
+        return {
+            "max_um": self.largest_mm / MM_PER_UM,
+            "rms_um": self.rms_mm / MM_PER_UM,
+            "normal_max_um": self.normal_mm / MM_PER_UM,
+            "normal_rms_um": normal / MM_PER_UM,
+            "ends_max_um": self.ends_mm / MM_PER_UM,
+            "worst_line": self.line,
+        }

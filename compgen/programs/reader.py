@@ -173,6 +173,9 @@ class Reader:
         self.length_on = False
         self.pole: list[float] = [math.nan] * 3
         self.position: list[float] = [math.nan] * 3
+        #: Which axes blocks have named since their offset changed or they went to a machine position: only these are corrected,
+        #: so that no word is added for an axis whose place at the control depends on numbers that were not used yet.
+        self.named = [False] * 3
         self.ended = self.seen_percent = self.started = False
         self.closed_by_percent = False
         self._line, self._text = 0, ""
@@ -273,7 +276,7 @@ class Reader:
     def _takes_plain(self) -> bool:
         known = not any(math.isnan(value) for value in self.position)
         modal = self.motion in (RAPID, FEED) and self.cycle is None and self.absolute and self.feed != "inverse"
-        return known and modal and not self.ended and self._unit_known and bool(self.offset_name)
+        return known and modal and all(self.named) and not self.ended and self._unit_known and bool(self.offset_name)
 
     def _plain(self, tokens: _PlainWords, lines: range, first_line: int, first: int) -> tuple[PlainRun, Moves]:
         rows = slice(lines.start, lines.stop)
@@ -495,11 +498,12 @@ class Reader:
                 code = f"G54.1P{values['P']:g}"
             self._use_offset(code)
         elif meaning == "no work offset":
-            self.offset_name, self.work = "none", (0.0,) * 3
+            self.offset_name, self.work, self.named = "none", (0.0,) * 3, [False] * 3
         elif meaning in ("initial level", "R level"):
             self.to_r_level = meaning == "R level"
         elif meaning == "no tool":
-            self.length, self.length_on = (0.0,) * 3, False
+            self._set_length((0.0,) * 3)
+            self.length_on = False
         elif meaning == "tool":
             self.length_on = True
             key = f"{values['H']:g}" if "H" in values else self.loaded if self.dialect.name == "linuxcnc" else ""
@@ -509,7 +513,7 @@ class Reader:
         elif meaning == "tool offset":
             given = [values.get(letter, math.nan) * self.scale for letter in "XYZ"]
             x, y, z = (old if math.isnan(new) else new for new, old in zip(given, self.length, strict=True))
-            self.length = (x, y, z)
+            self._set_length((x, y, z))
             self.used_tools[f"{code} in line {self._line}"] = self.length
             actions.append("done")
         elif meaning == "no preset":
@@ -546,18 +550,24 @@ class Reader:
 
     def _use_tool(self, key: str) -> None:
         if key == "0":
-            self.length = (0.0,) * 3
+            self._set_length((0.0,) * 3)
             return
         if key not in self._tools:
             known = f"; the table has {', '.join(sorted(self._tools))}" if self._tools else ""
             self._fail(f"the length of tool {key} is not known{known}; give it with --tools FILE (tool, length_mm)")
-        self.length = self._tools[key]
+        self._set_length(self._tools[key])
         self.used_tools[key] = self.length
+
+    def _set_length(self, length: Vector3) -> None:
+        self.named = [n and a == b for n, a, b in zip(self.named, self.length, length, strict=True)]
+        self.length = length
 
     def _use_offset(self, name: str) -> None:
         if name not in self.setup.work_offsets_mm:
             given = ", ".join(self.setup.work_offsets_mm) or "none"
             self._fail(f"the work offset {name} is not known (given: {given}); add --wcs {name}=X,Y,Z in mm")
+        if name != self.offset_name:
+            self.named = [False] * 3
         self.offset_name, self.work = name, self.setup.work_offsets_mm[name]
         self.used_offsets[name] = self.work
 
@@ -596,6 +606,7 @@ class Reader:
             return self._preset(axes)
         if "machine coordinates" in single or (self.dialect.pole and "M91" in self._text.upper()):
             return self._machine_move(axes)
+        self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
         if motion.startswith("cycle") or (self.cycle is not None and (moving or "R" in values)):
             return self._cycle(motion, axes, values)
         if self.dialect.pole:
@@ -633,7 +644,7 @@ class Reader:
         arc: tuple[float, ...] = (math.nan,) * 3,
         sweep: float = 0.0,
         at: list[float] | None = None,
-        corrected: tuple[int, int, int] = (1, 1, 1),
+        corrected: tuple[int, int, int] | None = None,
     ) -> None:
         if kind != RAPID and any(math.isnan(value) for value in (*self.position, *end)):
             missing = "XYZ"[next(k for k in range(3) if math.isnan(self.position[k]) or math.isnan(end[k]))]
@@ -641,7 +652,11 @@ class Reader:
                 f"moves at feed while the position of {missing} is not known; position it with G0 in absolute first"
             )
         head = (self._line, kind, self.plane, sweep)
-        self._rows.append((*head, *self.position, *end, *arc, *self._offset(), *self._tool(), *(at or end), *corrected))
+        allowed = corrected or self.named
+        if corrected == (0, 0, 0):
+            pairs = zip(self.named, self.position, end, strict=True)
+            self.named = [known and there == here for known, there, here in pairs]
+        self._rows.append((*head, *self.position, *end, *arc, *self._offset(), *self._tool(), *(at or end), *allowed))
         self.position = list(end)
         self.started = True
 
@@ -771,7 +786,12 @@ class Reader:
             sides = [x, y] if there else self.position[:2]
             end, depth = [*sides, z], kind == FEED and z == self.cycle_z
             if end != self.position:
-                self._move(kind, end, at=bottom, corrected=(int(there), int(there), int(depth)))
+                self._move(
+                    kind,
+                    end,
+                    at=bottom,
+                    corrected=(int(there and self.named[0]), int(there and self.named[1]), int(depth)),
+                )
 
         known_z = not math.isnan(self.position[2])
         if known_z and self.position[2] < self.cycle_r:

@@ -521,6 +521,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
     program.write_text("G21 G90 G17 G54\nG0 X0 Y0 Z-100\nG1 X50 F100\nM2\n")
     return {
         "correct": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
+        "part": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
         "init": ("new", "--chain", "WFYXZT", "--travel", "X=0..500,Y=0..500,Z=0..500", "--out", out),
         "run": (small_machine_file, small_lengths_file, *files, "--out", out),
         "identify": (small_machine_file, small_lengths_file, "--out", out),
@@ -552,6 +553,7 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
 
 WRITING = [
     "correct",
+    "part",
     "init",
     "run",
     "identify",

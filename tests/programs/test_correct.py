@@ -120,6 +120,34 @@ def test_work_offset_and_tool_length_say_where_the_machine_is(tmp_path):
     assert float(re.search(r"G1 X([\d.]+)", corrected)[1]) == pytest.approx(10.0 - 0.030 + 0.015, abs=1e-5)
 
 
+def test_no_word_is_added_for_an_axis_that_the_program_has_not_placed(tmp_path):
+    """At the reference point, after another work offset, or with another tool, Z at the control may not be what is assumed."""
+    ends = np.array([-600.0, 600.0])
+    errors = ErrorTable(
+        {"EZX": Curve(ends, 1e-4 * ends, np.zeros(2)), "EXX": Curve(ends, np.full(2, 0.01), np.zeros(2))}
+    )
+    text = """G21 G90 G17 G54
+G0 X10. Y0. Z5.
+G0 X90.
+G91 G28 Z0.
+G90 G0 X10.
+X200.
+G43 H1
+X300.
+Z5.
+X10.
+G55
+X20.
+Z3.
+X200.
+M2
+"""
+    setup = Setup({"G54": (0.0, 0.0, -100.0), "G55": (0.0, 0.0, -90.0)}, {"1": (0.0, 0.0, 7.0)})
+    _, corrected = run(tmp_path, text, errors, setup=setup)
+    words = [re.sub(r"-?[\d.]+", "", line) for line in corrected.splitlines()[-14:-1]]
+    assert "|".join(words).replace(" ", "") == "GXYZ|GXZ|GGZ|GGX|X|GH|X|Z|XZ|G|X|Z|XZ"
+
+
 def test_a_reversal_is_taken_up_at_once(tmp_path):
     """Backlash of 20 um in X, with the mean of both directions in the curves: -10 um going up, +10 um going down."""
     reversal = ReversalCurves({(0, 0): Curve(np.zeros(1), np.array([-20e-3]), np.zeros(1))})

@@ -1,0 +1,104 @@
+"""Correcting long NC programs: processor time and peak memory of ``volcomp correct`` (python benchmarks/nc_programs.py).
+
+    python benchmarks/nc_programs.py [--blocks 1000000] [--rounds 3]
+
+Programs like those of CAM: a surface finished in lines of 0.4 mm (FANUC, LinuxCNC), the same with block numbers and
+blanks (SINUMERIK), and pockets of arcs and lines (LinuxCNC, a tenth of the blocks). The machine is the example with its
+true errors. Least of several rounds of whole processes, one thread; processor time, which other programs disturb little.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from timing import machine_line, print_table
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def surface(blocks: int, numbered: bool) -> Iterator[str]:
+    """Lines along X in rows over Y, with waves in Z; the file is written in parts."""
+    yield (
+        "N1 G71 G90 G54 G17\nN2 G0 X0 Y0 Z50\nN3 G1 F1000\n"
+        if numbered
+        else "G21 G90 G54 G17\nG0 X0. Y0. Z50.\nG1 F1000\n"
+    )
+    form = "N%d X%.3f Y%.3f Z%.3f\n" if numbered else "X%.3fY%.3fZ%.3f\n"
+    for first in range(0, blocks, 10_000):
+        i = np.arange(first, min(first + 10_000, blocks))
+        x, y = np.abs((i * 0.4) % 800 - 400) - 200, np.minimum(-150 + (i * 0.4 // 400) * 0.05, 300)
+        z = -20 + 10 * np.sin(x / 30) * np.cos(y / 40)
+        rows = zip(i + 4, x, y, z, strict=True) if numbered else zip(x, y, z, strict=True)
+        yield "".join(form % row for row in rows)
+    yield "G0 Z50.\nM30\n"
+
+
+def pockets(blocks: int) -> Iterator[str]:
+    """Rounded rectangles in passes over Z."""
+    yield "G21 G90 G54 G17\nG0 X0 Y0 Z50\n"
+    for k in range(blocks // 10):
+        x, y, z = 30.0 * (k % 10), 30.0 * (k // 10 % 10), -0.01 * (k // 100)
+        yield f"G0 Z5\nX{x + 4:.3f} Y{y:.3f}\nG1 Z{z:.3f} F200\nX{x + 20:.3f}\nG3 X{x + 24:.3f} Y{y + 4:.3f} J4\n"
+        yield f"G1 Y{y + 20:.3f}\nG3 X{x + 20:.3f} Y{y + 24:.3f} I-4\nG1 X{x + 4:.3f}\n"
+        yield f"G3 X{x:.3f} Y{y + 20:.3f} R4\nG1 Y{y + 4:.3f}\nG3 X{x + 4:.3f} Y{y:.3f} I4\n"
+    yield "G0 Z50\nM2\n"
+
+
+def measured(program: Path, dialect: str, offset: str) -> tuple[float, float, float, float]:
+    """Processor time in s, peak memory in MB, largest deviation before and after in um of one run."""
+    words = [sys.executable, "-m", "compgen", "correct", "zha-gantry", str(program), "--dialect", dialect, "--json"]
+    words += ["--errors", str(ROOT / "examples" / "zha-gantry.truth.errors.csv"), "--wcs", f"G54={offset}"]
+    with tempfile.TemporaryFile() as output:
+        child = subprocess.Popen(
+            [*words, "--out", str(program.parent / "out")],
+            stdout=output,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )
+        _, status, used = os.wait4(child.pid, 0)
+        output.seek(0)
+        found = json.loads(output.read())
+    if status:
+        raise RuntimeError(f"volcomp correct failed: {found}")
+    return used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, found["before"]["max_um"], found["after"]["max_um"]
+
+
+def main() -> None:
+    """Write the programs, correct each several times, print the least of each."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--blocks", type=int, default=1_000_000)
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    cases = {
+        "surface, fanuc": ("fanuc", lambda: surface(given.blocks, numbered=False)),
+        "surface, linuxcnc": ("linuxcnc", lambda: surface(given.blocks, numbered=False)),
+        "surface with block numbers, siemens": ("siemens", lambda: surface(given.blocks, numbered=True)),
+        "pockets of arcs, linuxcnc": ("linuxcnc", lambda: pockets(given.blocks // 10)),
+    }
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, (dialect, text) in cases.items():
+            program = Path(folder) / "program.nc"
+            with program.open("w") as stream:
+                stream.writelines(text())
+            with program.open("rb") as stream:
+                blocks = sum(1 for _ in stream)
+            runs = [measured(program, dialect, "-400,-500,-200") for _ in range(given.rounds)]
+            time_s, peak = min(run[0] for run in runs), min(run[1] for run in runs)
+            rows.append(
+                [name, f"{blocks}", f"{time_s:.1f} s", f"{1e6 * time_s / blocks:.1f} us", f"{peak:.0f} MB",
+                 f"{runs[0][2]:.1f} um", f"{runs[0][3]:.2f} um"]
+            )  # fmt: skip
+    print(machine_line())
+    print_table([["program", "blocks", "processor time", "a block", "peak memory", "largest before", "after"], *rows])
+
+
+if __name__ == "__main__":
+    main()
