@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import PATH, Command, json_option, options_of, out_option
-from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option
+from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option, tool_offset
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
 from compgen.data.files import OutputFolder, json_text, sha256_of_file
@@ -56,11 +56,12 @@ def program_options(command: Command) -> Command:
         tools: Path | None,
         block_delete: bool,
         keep_unknown: tuple[str, ...],
+        gauge: str,
         only: str | None = None,
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
-        setup = Setup(_wcs(wcs), read_tools(tools) if tools else {}, block_delete, codes)
+        setup = Setup(_wcs(wcs), read_tools(tools) if tools else {}, block_delete, codes, tool_offset("--gauge", gauge))
         both = read_reversal(reversal) if reversal else effects_reversal(machine)
         model = model_of(machine, open_errors(errors), both, only)
         return command(*args, model=model, setup=setup, errors=errors, **options)
@@ -70,6 +71,10 @@ def program_options(command: Command) -> Command:
     decorated = click.option("--keep-unknown", multiple=True, metavar="CODE", help=text)(decorated)
     text = "Blocks with / are skipped at the control; they stay as they are. Default: they are executed."
     decorated = click.option("--block-delete", is_flag=True, help=text)(decorated)
+    text = (
+        "Tool offset of the model for a tool of length 0: from the origin of the tool carriage to the gauge point, mm."
+    )
+    decorated = click.option("--gauge", metavar="X,Y,Z", default="0,0,0", show_default=True, help=text)(decorated)
     decorated = path_option("--tools", TOOLS_HELP)(decorated)
     decorated = click.option("--wcs", multiple=True, metavar="NAME=X,Y,Z", help=WCS_HELP)(decorated)
     text = (

@@ -44,12 +44,14 @@ class Setup:
     """What a program needs beside its text: work offsets and tools (mm), blocks with ``/``, codes that move nothing.
 
     ``work_offsets_mm`` by name (``G54``), ``tools_mm`` the offsets that the control adds for a tool, by its number or name.
+    ``gauge_mm`` is the tool offset of the model for a tool of length 0: from the origin of the tool carriage to the gauge point.
     """
 
     work_offsets_mm: Mapping[str, Vector3] = field(default_factory=dict)
     tools_mm: Mapping[str, Vector3] = field(default_factory=dict)
     skip_deleted: bool = False
     keep_unknown: frozenset[str] = frozenset()
+    gauge_mm: Vector3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ class Reader:
         self._unit_known = False
         self.work, self.preset, self.length = (0.0,) * 3, (0.0,) * 3, (0.0,) * 3
         self.selected = self.loaded = ""
-        self.length_on = False
+        self.length_on = self.tool_on = False
         self.pole: list[float] = [math.nan] * 3
         self.position: list[float] = [math.nan] * 3
         #: Which axes blocks have named since their offset changed or they went to a machine position: only these are corrected,
@@ -502,7 +504,7 @@ class Reader:
         elif meaning in ("initial level", "R level"):
             self.to_r_level = meaning == "R level"
         elif meaning == "no tool":
-            self._set_length((0.0,) * 3)
+            self._set_length((0.0,) * 3, on=False)
             self.length_on = False
         elif meaning == "tool":
             self.length_on = True
@@ -550,7 +552,7 @@ class Reader:
 
     def _use_tool(self, key: str) -> None:
         if key == "0":
-            self._set_length((0.0,) * 3)
+            self._set_length((0.0,) * 3, on=False)
             return
         if key not in self._tools:
             known = f"; the table has {', '.join(sorted(self._tools))}" if self._tools else ""
@@ -558,7 +560,8 @@ class Reader:
         self._set_length(self._tools[key])
         self.used_tools[key] = self.length
 
-    def _set_length(self, length: Vector3) -> None:
+    def _set_length(self, length: Vector3, *, on: bool = True) -> None:
+        self.tool_on = on
         self.named = [n and a == b for n, a, b in zip(self.named, self.length, length, strict=True)]
         self.length = length
 
@@ -576,7 +579,9 @@ class Reader:
         return x, y, z
 
     def _tool(self) -> Vector3:
-        x, y, z = (a - b for a, b in zip(self.machine.tool_offset_mm, self.length, strict=True))
+        if not self.tool_on:
+            return self.machine.tool_offset_mm
+        x, y, z = (a - b for a, b in zip(self.setup.gauge_mm, self.length, strict=True))
         return x, y, z
 
     # Moves of a block.
@@ -593,6 +598,8 @@ class Reader:
             if not self.offset_name:
                 self._use_offset(self.dialect.work_offset)
                 self.assumed[f"the work offset {self.dialect.work_offset} is active at the start"] = None
+            if not self.tool_on and any(self.machine.tool_offset_mm):
+                self.assumed["without a tool length the tool is that of the machine file"] = None
             if not self._unit_known:
                 self._unit_known = True
                 self.assumed["lengths are in mm"] = None

@@ -6,6 +6,7 @@ installs it on Debian where it may) these tests are skipped by name.
 """
 
 import fcntl
+import io
 import json
 import os
 import re
@@ -21,12 +22,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 import compgen
 from compgen.controls import SourceFile, controller_named
 from compgen.controls.linuxcnc_comp import standstill_outcome
 from compgen.data.error_table import Curve, ReversalCurves
 from compgen.kinematics.exact_chain import exact_error
+from compgen.programs import DIALECTS, CorrectOptions, Reader, Setup, correct_program, model_of
+from compgen.programs.path import lengths_of, points_of
 from compgen.resources import data_folder
 
 HELPERS = Path(__file__).resolve().parents[1] / "linuxcnc"
@@ -482,6 +486,60 @@ def test_volkins_agrees_with_the_emulator_in_every_cycle_and_the_error_shrinks(
     after = (joints + exact_error(machine, small_errors, joints, tool) - command)[with_tool]
     assert np.max(np.abs(reached)) > 0.02
     assert np.max(np.abs(reached)) > SHRINKS_BY * np.max(np.abs(after))
+
+
+def test_a_corrected_program_does_without_tables_what_volkins_does_with_them(
+    tmp_path, workshop, small_machine, small_errors
+):
+    """The same control runs the program of the CAM with volkins, and the corrected program without: the tool is on the path."""
+    text = "".join(line + "\n" for line in PROGRAM.splitlines() if line != "G49")
+    text = text.replace("G43.1 Z80\n", "").replace("G0 X-250", "G43.1 Z80\nG0 X-250")
+    source = tmp_path / "part.ngc"
+    source.write_text(text)
+    setup = Setup({"G54": (0.0, 0.0, 0.0)})
+    model = model_of(small_machine, small_errors, None)
+    # decimals enough that the tolerance is what remains
+    options = CorrectOptions("linuxcnc", tolerance_um=0.5, decimals=6)
+    result = correct_program(model, source, tmp_path / "out", options, setup)
+    reader = Reader(small_machine, DIALECTS["linuxcnc"], setup, source)
+    (batch,) = reader.batches(io.BytesIO(text.encode()))
+    cut = batch.moves.part(np.flatnonzero(batch.moves.cutting))
+    count = np.ceil(lengths_of(cut) / 0.05).astype(int)
+    own = np.repeat(np.arange(len(cut)), count)
+    share = (np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)) / (count[own] - 1)
+    path = points_of(cut.part(own), share)
+    near = cKDTree(path)
+
+    def largest(program, kinematics, files):
+        done = session(workshop, [{"program": "part.ngc"}], [*VOLKINS_PINS], kinematics=kinematics,
+                       files={**files, "part.ngc": program})  # fmt: skip
+        assert done.messages == []
+        _, joints, tool = moved_samples(done)
+        tool = np.broadcast_to([0.0, 0.0, -80.0], tool.shape)
+        tip = joints + exact_error(small_machine, small_errors, joints, tool)
+        begin = int(np.argmin(np.linalg.norm(tip[: len(tip) // 2] - cut.start_mm[0], axis=1)))
+        tip = tip[begin + 1 :]
+        first = near.query(tip)[1].clip(1, len(path) - 2)
+        best = np.full(len(tip), np.inf)
+        for k in (first - 1, first):
+            way = path[k + 1] - path[k]
+            along = np.einsum("ij,ij->i", tip - path[k], way) / np.maximum(np.einsum("ij,ij->i", way, way), 1e-30)
+            best = np.minimum(best, np.linalg.norm(tip - path[k] - along.clip(0, 1)[:, None] * way, axis=1))
+        assert len(best) > 1000
+        return best.max()
+
+    made = compgen.export(small_machine, small_errors, "linuxcnc-volumetric")
+    corrected = (tmp_path / "out" / result.file).read_text()
+    before = largest(text, "trivkins coordinates=XYZ", {})
+    with_tables = largest(text, "volkins file=volcomp.tab", made.files)
+    by_program = largest(corrected, "trivkins coordinates=XYZ", {})
+    assert before > 15e-3
+    assert with_tables < 0.1e-3
+    assert by_program < 0.6e-3
+    stopped = session(
+        workshop, [{"mdi": "G10 L2 P1 X1"}, {"program": "part.ngc"}], [*VOLKINS_PINS], files={"part.ngc": corrected}
+    )
+    assert any("is not that of the correction" in message for message in stopped.messages)
 
 
 def damaged(text, how):

@@ -109,15 +109,20 @@ def test_a_constant_error_is_taken_off_with_its_sign(tmp_path):
 
 
 def test_work_offset_and_tool_length_say_where_the_machine_is(tmp_path):
-    """EXX = 0.1 um/mm at 300 mm of the machine is 30 um; EBZ = 100 urad turns a tool of 50 + 100 mm by -15 um in X."""
+    """EXX = 0.1 um/mm at 300 mm of the machine is 30 um; EBZ = 100 urad turns a tool of 100 + 50 mm by -15 um in X.
+
+    The tool offset of the machine file, 50 mm too, is that of a program without a tool length.
+    """
     ends = np.array([-400.0, 200.0])
     errors = shift(slope=0.1).replace(
         curves={**shift(slope=0.1).curves, "EBZ": Curve(ends, np.full(2, 100e-6), np.zeros(2))}
     )
-    setup = Setup({"G55": (290.0, 0.0, -150.0)}, {"7": (0.0, 0.0, 100.0)})
-    text = "G21 G90 G17 G55\nG0 X0. Y0.\nG43 H7 Z60.\nG1 X10. F100\nM2\n"
+    setup = Setup({"G55": (290.0, 0.0, -150.0)}, {"7": (0.0, 0.0, 100.0)}, gauge_mm=(0.0, 0.0, -50.0))
+    text = "G21 G90 G17 G55\nG0 X0. Y0.\nG43 H7 Z60.\nG1 X10. F100\nG49\nG0 Z60.\nG1 X9. F100\nM2\n"
     _, corrected = run(tmp_path, text, errors, setup=setup)
-    assert float(re.search(r"G1 X([\d.]+)", corrected)[1]) == pytest.approx(10.0 - 0.030 + 0.015, abs=1e-5)
+    first, second = (float(x) for x in re.findall(r"G1 X([\d.]+)", corrected))
+    assert first == pytest.approx(10.0 - 0.030 + 0.015, abs=1e-5)
+    assert second == pytest.approx(9.0 - 0.0299 + 0.005, abs=1e-5)
 
 
 def test_no_word_is_added_for_an_axis_that_the_program_has_not_placed(tmp_path):

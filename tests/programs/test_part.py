@@ -15,7 +15,7 @@ from compgen.identify.covariance import covariance_or_independent
 from compgen.kinematics import exact_error
 from compgen.programs import Setup, model_of, part_page, predict_part
 
-SETUP = Setup({"G54": (100.0, 100.0, -80.0)}, {"1": (0.0, 0.0, 20.0)})
+SETUP = Setup({"G54": (100.0, 100.0, -80.0)}, {"1": (0.0, 0.0, 20.0)}, gauge_mm=(0.0, 0.0, -50.0))
 PART = """%
 O1
 G21 G90 G17 G40 G80 G54 T1 M6
