@@ -105,7 +105,7 @@ class SkewControl(Controller[Settings, SkewFactors]):
         for part in coefficients(self.machine.chain, self.machine.squareness_reference):
             key = part.output, part.lever
             if part.error in SQUARENESS_NAMES and part.error in errors.squareness and key in starts:
-                starts[key] -= part.sign * errors.squareness[part.error][0]  # type: ignore[index]
+                starts[key] -= part.sign * errors.squareness[part.error][0]
         return [
             Term(shear_name(*key), None, np.zeros(1), (Monomial(key[0], 1, key[1]),), np.array([start]))
             for key, start in starts.items()
@@ -114,7 +114,8 @@ class SkewControl(Controller[Settings, SkewFactors]):
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> SkewFactors:
         """Return the factors, rounded as written."""
         factors = self.factors_for({key: float(values[shear_name(*key)][0]) for key in self.shears})
-        return replace(factors, **{key: float(fixed(getattr(factors, key), DECIMALS)) for key in ("xy", "xz", "yz")})
+        xy, xz, yz = (float(fixed(value, DECIMALS)) for value in (factors.xy, factors.xz, factors.yz))
+        return replace(factors, xy=xy, xz=xz, yz=yz)
 
     def context(self, tables: SkewFactors) -> dict[str, Any]:
         """Return the numbers as written, the sign with a worked position, and the range that the axes need."""
@@ -343,7 +344,8 @@ class GcodeSkew(SkewControl[Settings]):
     """A firmware whose factors are the words of one G-code command, with other commands around it."""
 
     #: The command, its words by key, and commands that may stand in our own file besides.
-    command, letters, besides = "", {"xy": "", "xz": "", "yz": ""}, ()
+    command, letters = "", {"xy": "", "xz": "", "yz": ""}
+    besides: Sequence[str] = ()
 
     def words_of(self, source: SourceFile, strict: bool) -> Iterator[tuple[int, str, str]]:
         """Yield the words of the command; each has a letter and a number."""

@@ -54,7 +54,7 @@ class PlanarGrid:
 
     def nodes_mm(self, axis: int) -> FloatArray:
         """Return the positions of the columns (axis 0) or rows (axis 1)."""
-        return self.start_mm[axis] + self.step_mm[axis] * np.arange(self.added_mm.shape[axis])
+        return np.asarray(self.start_mm[axis] + self.step_mm[axis] * np.arange(self.added_mm.shape[axis]))
 
     def at(self, position_mm: FloatArray, *, extrapolate: bool) -> FloatArray:
         """Return what is added at positions (n, 3): bilinear; outside the nearest cell goes on, or its edge is kept."""
@@ -73,7 +73,8 @@ class PlanarControl(Controller[Settings, PlanarGrid]):
     """What the two have in common: a correction that depends on X and Y, whatever Z is."""
 
     #: Axes that are corrected; decimals of a number of the file in mm.
-    outputs, digits = (0, 1), 6
+    outputs: Sequence[int] = (0, 1)
+    digits = 6
     extrapolates = False
 
     @abstractmethod

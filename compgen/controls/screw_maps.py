@@ -679,7 +679,7 @@ class Smoothieware(ScrewMapControl[SmoothiewareSettings]):
             nodes = np.union1d(nodes, [0.0])
         apart = np.concatenate([[True], np.diff(nodes) > 4.0 * self.BEND_MM])
         apart[-1] = True
-        return nodes[apart]
+        return np.asarray(nodes[apart])
 
     def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
         """Return the multipliers: constant between two nodes, changing linearly over a bend at each node between.

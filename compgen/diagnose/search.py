@@ -219,9 +219,9 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
     space = np.empty((2, len(residual) * max(widths, default=0)))
     for chunk, width in zip(chunks, widths, strict=True):
         # less the mean on each channel, which a dead length would absorb
-        own, products = products[:width], products[width:]
-        mean = own[:, size + 1 :].T
-        seen = own[:, : size + 1].T - constants @ mean
+        first, products = products[:width], products[width:]
+        mean = first[:, size + 1 :].T
+        seen = first[:, : size + 1].T - constants @ mean
         seen, score, at = seen[:-1], seen[-1], 0
         columns, tall = space[:, : len(residual) * width].reshape(2, -1, width)
         for of in chunk:
