@@ -865,10 +865,13 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.autoescape = True
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
-    app.jinja_env.filters.update(word=str, figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable)
+    app.jinja_env.filters.update(
+        word=str, drawn=lambda svg: svg, figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable
+    )
     app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
     if workbench.language != LANGUAGES[0]:
-        texts_of(workbench.language).translate(app.jinja_env, html=True)
+        texts = texts_of(workbench.language)
+        texts.translate(app.jinja_env, html=True).filters["drawn"] = lambda svg: Markup(texts.drawn(svg))
     app.url_map.converters["number"] = StepNumber
     app.extensions["compgen"] = workbench
     app.before_request(_begin_request)

@@ -19,7 +19,8 @@ CATALOGUES = ROOT / "templates" / "_language"
 
 #: Modules whose sentences are shown on a page or in a preflight list.
 MODULES = (
-    "accuracy/*.py", "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py",
+    "accuracy/*.py", "app/contents.py", "app/pages.py",
+    "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py",
     "fleet/history_page.py", "identify/*.py", "identify/adjust/*.py", "report/html/*.py", "report/sheets.py",
     "tables/active.py", "tables/entries.py", "tables/export.py", "tables/judge.py", "tables/signs.py",
     "tables/verification.py",
@@ -40,11 +41,17 @@ WORDS = (
     "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
     "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um", "urad",
     "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness", "Temperature",
-    "The", "Volume", "accepted", "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day",
+    "The", "Volume", "no table", "full volumetric", "+ straightness", "+ squareness", "+ direction-dependent",
+    "+ angles, as products of tables", "confirmed", "tentative", "not separated",
+    "accepted", "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day",
     "days", "exceeded", "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning",
     "positive", "readings", "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
     "within", "without", "worse",
 )  # fmt: skip
+
+
+#: Policies and headers of answers, comments of scripts, messages of the terminal.
+NO_TEXT = re.compile(r"-src '|-ancestors|^; script-src|filename=|^# |^\[controllers|^error: internal")
 
 
 def place_name(node):
@@ -93,6 +100,7 @@ def is_sentence(text):
     words = re.findall(r"[^\W\d_]{2,}", literal)
     if (
         not words
+        or NO_TEXT.search(text)
         or "<" in text
         or " | " in text
         or "\n" in text
