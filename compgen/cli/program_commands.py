@@ -96,10 +96,24 @@ def program_options(command: Command) -> Command:
 @program_options
 @options_of(CorrectOptions, "options")
 @click.option("--only", metavar="AXES", help="Correct only these axes, e.g. X,Y; the others stay as they are.")
+@path_option(
+    "--active",
+    "Table that is active on the control while the program runs (several times): the program then corrects only what it leaves.",
+    multiple=True,
+)
+@click.option("--active-controller", metavar="NAME", help="Name of the control that the active tables belong to.")
 @out_option
 @json_option
 def correct_command(
-    model: Any, setup: Setup, errors: Path, program: Path, options: CorrectOptions, out: Path, as_json: bool
+    model: Any,
+    setup: Setup,
+    errors: Path,
+    program: Path,
+    options: CorrectOptions,
+    active: tuple[Path, ...],
+    active_controller: str | None,
+    out: Path,
+    as_json: bool,
 ) -> int:
     """Correct an NC program for the errors of one machine: the tool then follows the programmed path.
 
@@ -107,15 +121,26 @@ def correct_command(
     the tool where the program wants it. Moves are divided where the correction bends by more than the tolerance. The
     corrected program is read again and compared with the path of the original; if that is not closer to it, the file is
     named NOT-ACCEPTED-... (exit code 1). Variables, subprograms, cutter radius compensation, turned coordinates and rotary
-    axes are refused with their line. DIR gets the program, correction.json and preflight.md.
+    axes are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may be corrected twice:
+    tables that are active while the program runs are given with --active, unless ERRORS were measured with them on.
 
     \b
     Example:
       volcomp correct zha-gantry part.nc --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350 --out corrected/
     """
+    if bool(active) != (active_controller is not None):
+        raise InputError("--active and --active-controller belong together; give both")
+    name = errors.name
+    if active:
+        from compgen.programs.part import CompensatedModel
+        from compgen.tables import read_tables
+
+        tables = read_tables(model.machine, active, str(active_controller), foreign=True)
+        model = CompensatedModel(model.machine, model.errors, model.reversal, model.only, tables)
+        name += f" with the active tables of {active_controller}"
     with progress(quiet=as_json) as show:
         result = correct_program(
-            model, program, out, options, setup, errors_file=(errors.name, sha256_of_file(errors)), show=show
+            model, program, out, options, setup, errors_file=(name, sha256_of_file(errors)), show=show
         )
     for reason in result.reasons:
         complain(f"not acceptable: {reason}", "red")

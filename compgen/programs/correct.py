@@ -688,7 +688,8 @@ def preflight(result: ProgramCorrection) -> str:
         f"This program is for the machine {result.machine} and this clamping position only.",
         f"Work offsets at the control are those of the correction: {'; '.join(offsets) or 'none was used'}.",
         f"Tool lengths at the control are those of the correction: {'; '.join(tools) or 'none was used'}.",
-        "Tables of the control that correct the same errors are switched off, or were active during the measurement.",
+        "Tables of the control that correct the same errors are switched off, were active during the measurement, or were "
+        "given with --active.",
         "The machine is warm, as it was during the measurement.",
         *(f"It was assumed that {text}." for text in result.assumed),
         "Compare with the original by `diff`, and let the program run in the air first.",

@@ -18,6 +18,7 @@ from compgen.data.files import read_bytes
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.identify.covariance import Covariance, error_design
+from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import dialect_named
 from compgen.programs.path import (
     ExactModel,
@@ -31,6 +32,8 @@ from compgen.programs.path import (
 from compgen.programs.reader import PLANE_AXES, RAPID, Moves, Reader, Setup, SingleBlock
 from compgen.tables import ReadTables
 
+#: Samples along an axis for the slope of tables, besides their nodes.
+BEND_SAMPLES = 101
 #: Distance of samples along the path, mm; samples of a circle and of a side; the shortest side.
 STEP_MM, ON_CIRCLE, ON_SIDE, SHORTEST_SIDE_MM = 2.0, 36, 9, 5.0
 #: Features that are evaluated, and the points of the picture; a picture with more shows no more.
@@ -52,6 +55,26 @@ class CompensatedModel(ExactModel):
         tool = np.broadcast_to(tool_mm, position_mm.shape)
         added = self.tables.correction(self.machine, Points(position_mm, tool_mm=tool, approach=direction))
         return np.asarray(added + super().error(position_mm + added, tool_mm, direction))
+
+    def bend(self) -> float:
+        """Add half the range of the slope of the tables, on nine lines along each axis."""
+        total = super().bend()
+        if self.tables is None:
+            return total
+        ends = [np.array(axis.range_mm) for axis in self.machine.axes]
+        nodes_mm = self.tables.controller.table_nodes_mm(self.tables.tables)
+        for axis, (low, high) in enumerate(ends):
+            inside = nodes_mm[axis][(nodes_mm[axis] >= low) & (nodes_mm[axis] <= high)]
+            levels = [np.array([part[0], part.mean(), part[1]]) for part in ends]
+            levels[axis] = np.unique(np.concatenate([np.linspace(low, high, BEND_SAMPLES), inside]))
+            points = np.moveaxis(full_grid(levels), axis, 0)
+            flat = points.reshape(-1, 3)
+            added = self.tables.correction(self.machine, Points(flat, approach=np.ones_like(flat))).reshape(
+                points.shape
+            )
+            slopes = np.diff(added, axis=0) / np.diff(levels[axis])[:, None, None, None]
+            total += 0.5 * float(np.linalg.norm(np.ptp(slopes, axis=0), axis=-1).max())
+        return total
 
 
 @dataclass(frozen=True)

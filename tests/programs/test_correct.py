@@ -9,9 +9,9 @@ from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
 from scipy.spatial import cKDTree
 
 import compgen
-from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.error_table import Curve, ErrorTable, ReversalCurves, format_errors
 from compgen.errors import InputError
-from compgen.kinematics.exact_chain import tip_position
+from compgen.kinematics.exact_chain import exact_error, tip_position
 from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of, read_tools
 from compgen.programs.dialects import DIALECTS
 from compgen.programs.path import lengths_of, points_of
@@ -493,3 +493,47 @@ def test_wrong_usage_writes_nothing(shop, call, words, message):
     )
     assert (code, (shop / "o").exists()) == (2, False)
     assert message in error
+
+
+# --- a table that is active while the program runs ---------------------------------------------------------------------
+
+
+SQUARE = "G21 G90 G54\nG0 X0 Y0 Z5\nG1 Z-10 F500\nG1 X180\nG1 Y140\nG1 X0\nG1 Y0\nG0 Z5\nM2\n"
+
+
+def test_a_program_corrects_only_what_the_active_table_leaves(
+    tmp_path, call, small_machine, small_machine_file, small_errors
+):
+    """A COMP_FILE for each joint; the exact machine with it is at the programmed corners. Without --active it would not be."""
+    made = compgen.export(small_machine, small_errors, "linuxcnc-comp")
+    paths = made.write(tmp_path / "comp")
+    (tmp_path / "e.errors.csv").write_text(format_errors(small_errors))
+    (tmp_path / "p.ngc").write_text(SQUARE)
+    words = ["correct", small_machine_file, tmp_path / "p.ngc", "--errors", tmp_path / "e.errors.csv"]
+    words += ["--wcs", "G54=-150,20,-100", "--gauge", "0,0,-80"]
+    tables = compgen.read_tables(small_machine, paths, "linuxcnc-comp")
+
+    def missed_um(text):
+        """Distance of the tool from the corners, with the table on."""
+        place = {"X": -150.0, "Y": 20.0, "Z": -95.0}
+        offset, corners = {"X": -150.0, "Y": 20.0, "Z": -100.0}, []
+        for line in re.sub(r"\(.*\)", "", text).splitlines():
+            found = re.findall(r"([XYZ])(-?[\d.]+)", line)
+            place |= {letter: float(number) + offset[letter] for letter, number in found}
+            if found and not line.startswith("G0"):
+                corners.append([place[letter] for letter in "XYZ"])
+        commands = np.array(corners)
+        added = tables.correction(small_machine, compgen.Points(commands))
+        tip = commands + added + exact_error(small_machine, small_errors, commands + added)
+        wanted = np.array([[x, y, -10.0] for x in (0.0, 180.0) for y in (0.0, 140.0)]) + list(offset.values())
+        return [1e3 * np.linalg.norm(tip - corner, axis=1).min() for corner in wanted]
+
+    active = [word for path in paths for word in ("--active", path)] + ["--active-controller", "linuxcnc-comp"]
+    for more, most_um in ((active, 0.2), ([], None)):
+        code, out, err = call(*words, *more, "--out", tmp_path / f"out{len(more)}")
+        assert code == 0, (out, err)
+        missed = missed_um((tmp_path / f"out{len(more)}" / "p.ngc").read_text())
+        assert max(missed) < most_um if most_um else max(missed) > 5.0
+    assert "ACTIVE TABLES OF LINUXCNC-COMP" in (tmp_path / f"out{len(active)}" / "p.ngc").read_text().upper()
+    code, _, err = call(*words, *active[:2], "--out", tmp_path / "no")
+    assert code == 2 and "--active-controller" in err
