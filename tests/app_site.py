@@ -5,9 +5,7 @@ import threading
 import time
 from pathlib import Path
 
-import waitress
-
-from compgen.app.pages import Workbench, make_app
+from compgen.app.pages import Workbench, make_app, make_server
 from compgen.fleet.dashboard.settings import DashboardSettings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -64,12 +62,10 @@ class Served:
         self.workbench.open(folder)
         self.runner = self.workbench.projects[0]
         self.project = self.runner.project
-        self.server = waitress.create_server(
-            make_app(self.workbench), host="127.0.0.1", port=0, threads=4, ident=None, asyncore_use_poll=True
-        )
+        self.server = make_server(self.workbench)
         port = int(self.server.effective_port)
         self.workbench.settings = DashboardSettings("", port=port)
-        self.url = f"http://127.0.0.1:{port}"
+        self.address, self.url = ("127.0.0.1", port), f"http://127.0.0.1:{port}"
         self.start = f"{self.url}/start?token={self.workbench.ticket}"
         self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()

@@ -53,6 +53,7 @@ from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
 from compgen.errors import CompgenError, InputError
 from compgen.fleet.dashboard.guard import HEADERS, check_host, check_method, check_origin, cookie_name, same, set_cookie
+from compgen.fleet.dashboard.server import bounded
 from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
@@ -60,7 +61,7 @@ from compgen.report.html.write import markdown
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
 #: Largest request (files that are dropped together), largest part of a form that is not a file, bytes; parts of a form.
-LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 500_000_000, 2_000_000, 400
+LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 200_000_000, 2_000_000, 400
 #: A page that has not been heard of for this long is closed; background windows are slowed to one call a minute, s.
 SILENT_S = 200.0
 #: The program ends this long after the last page was closed, s.
@@ -958,6 +959,21 @@ def _readable(value: Any) -> str:
     return "\N{EN DASH}" if value is None else str(value)
 
 
+def make_server(workbench: Workbench) -> Any:
+    """Return a server on 127.0.0.1; connections that send their request slowly do not keep others out."""
+    import waitress  # type: ignore[import-untyped]  # shipped without type information
+
+    port = workbench.settings.port
+    try:
+        server = waitress.create_server(
+            make_app(workbench), host="127.0.0.1", port=port, threads=8, ident=None, connection_limit=300,
+            max_request_body_size=LARGEST_UPLOAD, asyncore_use_poll=True, channel_timeout=60,
+        )  # fmt: skip
+    except OSError as error:
+        raise InputError(f"port {port} cannot be used: {error.strerror or error}", field="--port") from error
+    return bounded(server)
+
+
 def serve(
     folder: Path | None,
     port: int,
@@ -975,19 +991,10 @@ def serve(
     """
     import _thread
 
-    import waitress  # type: ignore[import-untyped]  # shipped without type information
-
     workbench = Workbench(DashboardSettings("", port=port), language)
     if folder is not None:
         workbench.open(folder)
-    app = make_app(workbench)
-    try:
-        server = waitress.create_server(
-            app, host="127.0.0.1", port=port, threads=8, ident=None, max_request_body_size=LARGEST_UPLOAD,
-            connection_limit=300, asyncore_use_poll=True, channel_timeout=60,
-        )  # fmt: skip
-    except OSError as error:
-        raise InputError(f"port {port} cannot be used: {error.strerror or error}", field="--port") from error
+    server = make_server(workbench)
     workbench.settings = DashboardSettings("", port=int(server.effective_port))
 
     def watch() -> None:

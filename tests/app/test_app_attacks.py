@@ -2,6 +2,7 @@
 
 import io
 import re
+import socket
 import time
 from pathlib import Path
 
@@ -15,6 +16,7 @@ import app_site as helper
 from compgen.app import pages
 from compgen.app.pages import OpenPages
 from compgen.app.project import Step
+from compgen.fleet.dashboard import server
 
 IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
 #: Every address that changes something.
@@ -271,6 +273,24 @@ def test_a_job_that_runs_is_alone_and_can_be_stopped(site):
     assert site.project.state() == before
     assert "Stopped: looking for missing effects" in site.get("/projects/1/result").text
     assert not any("diagnose" in path.name for path in site.project.folder.iterdir())
+
+
+def test_who_sends_byte_by_byte_does_not_keep_others_out(tmp_path, monkeypatch):
+    """Slow loris: more connections than the server takes, each with the beginning of a request."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(server, "CROWDED_S", 0.5)
+    served, slow = helper.Served(tmp_path / "project"), []
+    try:
+        for _ in range(330):
+            slow.append(socket.create_connection(served.address, timeout=helper.PATIENCE_S))
+            slow[-1].sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nX-A: ")
+        with socket.create_connection(served.address, timeout=helper.PATIENCE_S) as connection:
+            connection.sendall(b"GET /app.css HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n")
+            assert connection.recv(20).startswith(b"HTTP/1.1 200")
+    finally:
+        for connection in slow:
+            connection.close()
+        served.close()
 
 
 def test_the_program_ends_after_the_last_page_was_closed(monkeypatch):

@@ -12,7 +12,6 @@ from waitress.channel import HTTPChannel  # type: ignore[import-untyped]  # ship
 
 from compgen.errors import InputError
 from compgen.fleet import logs
-from compgen.fleet.dashboard.app import make_app
 from compgen.fleet.dashboard.settings import DashboardSettings
 
 #: A request must be complete within this time after its first byte, s.
@@ -60,6 +59,8 @@ WAITING_BYTES = 2**30
 def make_server(settings: DashboardSettings) -> Any:
     """Return a listening server; InputError if the address cannot be used."""
     import waitress  # type: ignore[import-untyped]  # shipped without type information
+
+    from compgen.fleet.dashboard.app import make_app
 
     app = make_app(settings)
     try:
