@@ -148,11 +148,11 @@ def correct_command(
     rows = [
         (name, f"{found['before'][key]:.2f}", f"{found['after'][key]:.2f}")
         for name, key in (
-            ("largest", "max_um"),
-            ("rms", "rms_um"),
-            ("largest, normal to the path", "normal_max_um"),
-            ("rms, normal to the path", "normal_rms_um"),
+            ("largest distance from the path", "normal_max_um"),
+            ("rms", "normal_rms_um"),
             ("largest at ends of moves", "ends_max_um"),
+            ("largest with what is along the path", "max_um"),
+            ("rms", "rms_um"),
         )
     ]
     table = table_of(("tool from the path, moves at feed (um)", "before", "after"), rows)
@@ -239,14 +239,14 @@ def part_command(
         paths = list(folder.commit().values())
     titles = (
         "tool from the path, moves at feed (um)",
-        "largest",
+        "from the path",
         "rms",
-        "largest, normal",
-        "rms, normal",
-        "ends",
+        "at ends",
+        "with along it",
+        "rms",
         "line",
     )
-    keys = ("max_um", "rms_um", "normal_max_um", "normal_rms_um", "ends_max_um")
+    keys = ("normal_max_um", "normal_rms_um", "ends_max_um", "max_um", "rms_um")
     lines = [(item.machine, item.figures.as_dict()) for item in ranked]
     if found.after is not None:
         lines.append((f"{found.machine}, {controller}", found.after.as_dict()))

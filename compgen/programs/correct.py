@@ -632,15 +632,21 @@ def correct_program(
         unchanged = not writer.changed and not writer.added
         reasons = []
         before, after = check.before, check.after
+        enough_mm = max(options.tolerance_um * MM_PER_UM, resolution_mm)
         if check.broken:
             reasons.append(check.broken)
         elif unchanged:
-            if before.largest_mm > max(options.tolerance_um * MM_PER_UM, resolution_mm):
+            if before.worst_mm > enough_mm:
                 reasons.append("nothing was changed although the program deviates by more than the tolerance")
-        elif not (after.largest_mm < before.largest_mm and after.rms_mm < before.rms_mm):
+        elif after.worst_mm >= before.worst_mm:
             reasons.append(
-                f"the deviation is not smaller: {before.largest_mm / MM_PER_UM:.2f} um before, "
-                f"{after.largest_mm / MM_PER_UM:.2f} um after"
+                f"the deviation is not smaller: {before.worst_mm / MM_PER_UM:.2f} um before, "
+                f"{after.worst_mm / MM_PER_UM:.2f} um after"
+            )
+        elif after.normal_rms_mm >= before.normal_rms_mm and after.normal_mm > enough_mm:
+            reasons.append(
+                f"the deviation is not smaller: {before.normal_rms_mm / MM_PER_UM:.2f} um rms before, "
+                f"{after.normal_rms_mm / MM_PER_UM:.2f} um rms after"
             )
         result = ProgramCorrection(
             model.machine.name,
@@ -696,7 +702,9 @@ def preflight(result: ProgramCorrection) -> str:
     ]
     before, after = result.before.as_dict(), result.after.as_dict()
     figures = (
-        f"Deviation of the tool from the path: {before['max_um']:.2f} um before, {after['max_um']:.2f} um after (max)."
+        f"Largest distance of the tool from the path: {before['normal_max_um']:.2f} um before, "
+        f"{after['normal_max_um']:.2f} um after; at the ends of moves {before['ends_max_um']:.2f} and "
+        f"{after['ends_max_um']:.2f} um."
     )
     return "\n".join([f"# Before you run {result.file}", "", figures, "", *(f"- [ ] {text}" for text in points), ""])
 

@@ -413,11 +413,11 @@ class _Thinned:
 # The page with a picture that is turned with the mouse.
 
 _SHOWN = {
-    "max_um": "largest",
+    "normal_max_um": "largest distance from the path",
+    "normal_rms_um": "rms",
+    "ends_max_um": "largest at ends of moves",
+    "max_um": "largest with what is along the path",
     "rms_um": "rms",
-    "normal_max_um": "largest, normal",
-    "normal_rms_um": "rms, normal",
-    "ends_max_um": "ends",
 }
 
 

@@ -426,14 +426,23 @@ class PathFigures:
         """Root mean square of the deviation over the length."""
         return float(np.sqrt(self._square / self.length_mm)) if self.length_mm else 0.0
 
+    @property
+    def worst_mm(self) -> float:
+        """Largest distance from the path or from the end of a move; shift along a move on the way does not count."""
+        return max(self.normal_mm, self.ends_mm)
+
+    @property
+    def normal_rms_mm(self) -> float:
+        """Root mean square of the distance from the path over the length."""
+        return float(np.sqrt(self._normal_square / self.length_mm)) if self.length_mm else 0.0
+
     def as_dict(self) -> dict[str, Any]:
         """Return the figures in um."""
-        normal = float(np.sqrt(self._normal_square / self.length_mm)) if self.length_mm else 0.0
         return {
             "max_um": self.largest_mm / MM_PER_UM,
             "rms_um": self.rms_mm / MM_PER_UM,
             "normal_max_um": self.normal_mm / MM_PER_UM,
-            "normal_rms_um": normal / MM_PER_UM,
+            "normal_rms_um": self.normal_rms_mm / MM_PER_UM,
             "ends_max_um": self.ends_mm / MM_PER_UM,
             "worst_line": self.line,
         }
