@@ -728,7 +728,9 @@ def compare(runner: Runner, state: ProjectState) -> None:
         pair.append(item)
     folder = runner.project.new_folder("compare")
     before, after = (item.used[0] for item in pair)
-    commands = [["compare", _machine_of(state), before, after, "--out", folder], ["report", folder, *_language()]]
+    certificate = [f"--dcc={path}" for path in _uploaded(runner.project, folder, "certificate")[:1]]
+    report = ["report", folder, *certificate, *_language()]
+    commands = [["compare", _machine_of(state), before, after, "--out", folder], report]
     step = Step(0, "compare", f"{pair[0].name} against {pair[1].name}", commands, folder)
     runner.start("comparing before and after", "after", [StepTask(step)])
 

@@ -447,18 +447,19 @@ class Runner:
 
     def _run(self, job: Progress, task: StepTask) -> None:
         """Run the commands of a task and record its step, unless it was stopped or failed."""
-        began, output, messages, code = time.monotonic(), "", [], 0
+        began, output, messages, worst = time.monotonic(), "", [], 0
         for words in task.step.commands:
             output, said, code = self._command(job, words)
             messages += said
             if job.stopped:
                 return
+            worst = max(worst, code)
             if code not in task.codes:
                 errors = [line.removeprefix("error: ") for line in said if line.startswith("error: ")]
                 job.problems.append("\n".join(errors) or f"volcomp {words[0]} ended with exit code {code}")
                 return
         told = [line.partition(": ")[2] for line in messages if line.startswith(("warning: ", "question: "))]
-        found = {"exit_code": code, "seconds": round(time.monotonic() - began, 2), "warnings": told}
+        found = {"exit_code": worst, "seconds": round(time.monotonic() - began, 2), "warnings": told}
         step = Step(**{**asdict(task.step), **found})
         self.project.add(step if task.finish is None else task.finish(step, output))
 

@@ -162,7 +162,14 @@ def test_a_second_measurement_is_compared_with_the_first(site, tmp_path):
     assert [item.after for item in state.measurements] == [False, True]
     assert state.used_files() == [first]
     before, later = state.measurements
-    state = site.do("compare", {"before": str(before.number), "after": str(later.number)})
+    certificate = upload(ROOT / "examples" / "certificate.toml")["files"]
+    form = {"before": str(before.number), "after": str(later.number), "certificate": certificate}
+    state = site.do("compare", form)
+    assert b"digitalCalibrationCertificate" in site.project.files_of(state.last("compare"))["dcc.xml"].read_bytes()
+    turned = {**form, "before": form["after"], "after": form["before"], "certificate": []}
+    assert site.do("compare", turned).last("compare").exit_code == 1
+    assert f"|| [ $? -eq 1 ]\nvolcomp report {site.project.state().last('compare').folder}" in site.project.script()
+    site.do("undo")
     compared = json.loads(site.project.files_of(state.last("compare"))["compare.json"].read_text())
     assert compared["verdict"] == "better"
     assert compared["figures"]["X"]["A"]["factor"] == pytest.approx(20.0, rel=0.05)

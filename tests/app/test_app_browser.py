@@ -137,6 +137,10 @@ def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, b
     assert "volcomp run 01-machine/my-mill.toml" in page.text()
     look("project")
     page.visit("/projects/1/after")
+    page.files("#files-after", IMPORTS / "linear.rtl")
+    page.press("Add")
+    page.press("Compare")
+    assert "not separated" in page.text()
     look("after")
     assert len(seen) == 8
 
