@@ -30,7 +30,7 @@ from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
-from compgen.report.html.pictures import draw_curve
+from compgen.report.html.pictures import describe_error, draw_curve
 from compgen.tables import load_format
 
 #: Files larger than this are not drawn, bytes; so many pictures of one file at most.
@@ -203,18 +203,20 @@ _WORDS = {
 }
 
 
-def questions_of(path: Path, doubts: Sequence[str], answers: Sequence[str], key: str) -> list[Question]:
+def questions_of(
+    path: Path, doubts: Sequence[str], answers: Sequence[str], key: str, axis: str | None = None
+) -> list[Question]:
     """Return what a file leaves open as questions, each with the picture that every answer would give."""
     found: dict[str, Question] = {}
     for number, doubt in enumerate(doubts):
         match = _OPTION.search(doubt)
         if match is None:
             continue
-        option, words = match[1], list(_answers(match[1], doubt))
+        option, words = match[1], list(_answers(match[1], doubt, axis))
         choices = [
             AnswerChoice(
                 f"--{option}={word}",
-                _WORDS.get(word, word.partition("=")[2] or word),
+                _label(word),
                 measurement_pictures(path, (*answers, f"--{option}={word}"), f"{key}-{number}-{k}"),
             )
             for k, word in enumerate(words)
@@ -225,7 +227,14 @@ def questions_of(path: Path, doubts: Sequence[str], answers: Sequence[str], key:
     return list(found.values())
 
 
-def _answers(option: str, doubt: str) -> Sequence[str]:
+def _label(word: str) -> str:
+    """Return an answer in words."""
+    if word in CURVE_NAMES:
+        return f"{word}: {describe_error(word)}"
+    return _WORDS.get(word, word.partition("=")[2] or word)
+
+
+def _answers(option: str, doubt: str, axis: str | None) -> Sequence[str]:
     """Return the answers that a question allows, none for free text."""
     if option in _FIXED:
         said = [word for word in _FIXED[option] if re.search(rf"\b{word}\b", doubt.partition("--")[2])]
@@ -239,7 +248,8 @@ def _answers(option: str, doubt: str) -> Sequence[str]:
         return [f"{field[1]}={unit}" if field else unit for unit in units]
     if option == "error":
         angular = "EA" in doubt
-        return [name for name in CURVE_NAMES if (error_named(name).kind == "angular") == angular]
+        names = [name for name in CURVE_NAMES if (error_named(name).kind == "angular") == angular]
+        return [name for name in names if axis not in AXES or name.endswith(axis or "")]
     return ()
 
 
@@ -511,7 +521,13 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
                 "sheet": next(
                     (step for step in reversed(state.steps) if step.data.get("sheet_of") == item.step.number), None
                 ),
-                "questions": questions_of(path, item.questions, answers, f"q{item.number}"),
+                "questions": questions_of(
+                    path,
+                    item.questions,
+                    answers,
+                    f"q{item.number}",
+                    item.step.data["summary"]["understood"].get("axis"),
+                ),
             }
         )
     return shown

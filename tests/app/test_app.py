@@ -205,6 +205,23 @@ def test_a_hidden_effect_is_named_and_added_and_the_residual_shrinks(site, tmp_p
     assert ("Add it to the machine" in page) == ("extended.toml" in site.project.files_of(state.last("diagnose")))
 
 
+def test_which_angle_a_file_contains_is_asked_with_its_picture(site):
+    """Two one-way runs in mrad whose means are 1, 5, 11, 13, 21 urad; the file names its axis, not the angle."""
+    site.do("machine/describe", MILL)
+    state = site.do("measurement/add", upload(IMPORTS / "angular.rta"))
+    page = site.get("/projects/1/measurement").text
+    assert [f'value="--error={name}"' in page for name in ("EAX", "EBX", "ECX", "EAY", "EXX")] == [True] * 3 + [
+        False
+    ] * 2
+    assert "EAX: Roll of X" in page
+    assert page.count("<figure") == 3
+    site.do(f"measurement/{state.measurements[0].number}/answer", {"answer-1": "--error=EBX"})
+    state = site.do("identify")
+    found = values(site.project, state.last("identify"))
+    expected = {0.0: 0.0, 100.0: 4.0, 200.0: 10.0, 300.0: 12.0, 400.0: 20.0}
+    assert {place: found["EBX", place] for place in expected} == pytest.approx(expected, abs=1e-6)
+
+
 def test_a_file_that_cannot_be_read_is_refused_in_words_and_the_others_are_taken(site, tmp_path):
     (tmp_path / "bad.axis.csv").write_text("axis,position_mm,direction,run,deviation_um\nX,0,1,1,ten\n")
     (tmp_path / "noise.bin").write_bytes(bytes(range(256)) * 40)
@@ -329,3 +346,18 @@ def test_german_pages_are_german_and_their_reports_too(tmp_path, monkeypatch):
         assert '<html lang="de">' in page
         assert not re.search(r">(Next|Add|Calculate|Choose|Save|Undo|Compare|Verify)\b", page), path
     site.workbench.close()
+
+
+def test_a_project_is_begun_and_opened_again_from_the_first_page(site, tmp_path):
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters" / "a.txt").write_text("dear")
+    refused = site.post("/open", {"folder": str(tmp_path / "letters")})
+    assert refused.status_code == 409
+    assert "other files" in refused.text
+    opened = site.post("/open", {"folder": str(tmp_path / "new" / "mill")})
+    assert opened.headers["Location"] == "/projects/2/machine"
+    assert site.get("/projects/2/machine").status_code == 200
+    page = site.get("/").text
+    assert str(tmp_path / "new" / "mill") in page
+    assert str(site.project.folder) in page
+    assert site.post("/open", {"folder": str(site.project.folder)}).headers["Location"].startswith("/projects/1/")
