@@ -126,6 +126,7 @@ class ProgramWriter:
     wanted_mm: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     shift_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     depth: float = np.nan
+    level: float = np.nan
     pole_mm: list[float] = field(default_factory=lambda: [np.nan] * 3)
     changed: int = 0
     added: int = 0
@@ -243,7 +244,8 @@ class ProgramWriter:
         if block.kind == "no preset":
             self.shift_mm = np.zeros(3)
         if block.kind == "store":
-            self.depth = next((float(text) for letter, text, *_ in block.words if letter == "Z"), self.depth)
+            values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
+            self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
         if block.kind not in ("line", "arc", "cycle"):
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
@@ -259,7 +261,11 @@ class ProgramWriter:
             # the stroke to the depth may be several pieces; the hole is where the last ends
             stroke = np.flatnonzero(pieces.move[rows] == block.first + depth[0])
             target, allowed = pieces.command_mm[rows][stroke[-1]], move.corrected[int(depth[0])]
-            return [self._cycle(block, target, offset, pieces.command_mm[rows][-1], allowed)]
+            at_level = np.flatnonzero((move.end_mm[:, 2] == move.start_mm[move.kind != 0][0, 2]) & move.corrected[:, 2])
+            level = pieces.command_mm[rows][np.isin(pieces.move[rows] - block.first, at_level)]
+            ends_there = move.end_mm[-1, 2] == move.start_mm[move.kind != 0][0, 2]
+            level_z = float(level[-1, 2]) if len(level) else np.nan
+            return [self._cycle(block, target, offset, level_z, bool(ends_there), allowed)]
         count = rows.stop - rows.start
         texts = []
         total = share_before[rows]
@@ -407,36 +413,45 @@ class ProgramWriter:
                 self.pole_mm[k] = got * block.scale + base
 
     def _cycle(
-        self, block: SingleBlock, target: FloatArray, offset: FloatArray, last: FloatArray, allowed: NDArray[np.bool_]
+        self,
+        block: SingleBlock,
+        target: FloatArray,
+        offset: FloatArray,
+        level_z: float,
+        ends_there: bool,
+        allowed: NDArray[np.bool_],
     ) -> str:
-        """Rewrite a drilling block: place and depth of the hole; the R level is in the air and stays."""
+        """Rewrite a drilling block: place, depth and R level of the hole; ``ends_there``: the tool stays at the R level."""
         scale, digits = block.scale, self.digits(block.scale)
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
         changes: list[tuple[int, int, str]] = []
         more: list[str] = []
-        before = (self.target_mm - offset) / scale
-        before[2] = self.depth
-        for k, letter in enumerate(AXES):
-            value = float((target[k] - offset[k]) / scale)
+        before = [*((self.target_mm[:2] - offset[:2]) / scale), self.depth, self.level]
+        wanted = [*((target - offset) / scale), (level_z - offset[2]) / scale]
+        found = list(before)
+        for k, letter in enumerate("XYZR"):
+            value, may = float(wanted[k]), bool(allowed[min(k, 2)])
+            if np.isnan(value):
+                continue
             if letter in words:
                 text, first, stop = words[letter]
                 given, own = float(text.replace(" ", "")), max(digits, len(text.partition(".")[2].strip()))
-                if abs(value - given) > _HALF * 10.0**-own:
+                if abs(value - given) > _HALF * 10.0**-own and may:
                     changes.append((first, stop, self._number(value, own, text)))
+                    found[k] = round(value, own)
                 else:
-                    value = given
-            elif (
-                np.rint(value * 10**digits) != np.rint(before[k] * 10**digits) and np.isfinite(before[k]) and allowed[k]
-            ):
+                    found[k] = given
+            elif may and np.isfinite(before[k]) and np.rint(value * 10**digits) != np.rint(before[k] * 10**digits):
                 more.append(f"{letter}{self._number(value, digits)}")
-            else:
-                continue
-            if k == 2:
-                self.depth = value
-            else:
-                self.written_mm[k] = round(value, 12) * scale + offset[k]
-        self.target_mm = np.array([target[0], target[1], last[2]])
-        self.written_mm[2] = last[2]
+                found[k] = round(value, digits)
+        self.depth, self.level = found[2], found[3]
+        for k in range(2):
+            if AXES[k] in words or any(word[0] == AXES[k] for word in more):
+                self.written_mm[k] = found[k] * scale + offset[k]
+        self.target_mm[:2] = target[:2]
+        if ends_there:
+            self.target_mm[2] = level_z
+            self.written_mm[2] = found[3] * scale + offset[2]
         self.changed += bool(changes or more)
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)
         return _spliced(block.text, changes, end or max(w[3] for w in block.words), more)
@@ -635,6 +650,8 @@ def correct_program(
         enough_mm = max(options.tolerance_um * MM_PER_UM, resolution_mm)
         if check.broken:
             reasons.append(check.broken)
+        elif not before.length_mm:
+            reasons.append("the program has no moves at feed, so that nothing can be judged")
         elif unchanged:
             if before.worst_mm > enough_mm:
                 reasons.append("nothing was changed although the program deviates by more than the tolerance")

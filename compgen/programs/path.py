@@ -383,11 +383,14 @@ def path_deviations(
             direction = np.where((sampled.sweep_rad != 0)[:, None] & (now != 0), now, direction)
         actual = at + model.error(at, path.tool_mm, direction)
         where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
+        whole, normal = actual - points_of(path, where), closest_offset(path, actual, where)
+        # on a steep helix the point at the same angle may be farther away than that at the same share
+        nearer = np.linalg.norm(whole, axis=1) < np.linalg.norm(normal, axis=1)
         yield PathDeviations(
             path.line,
             at,
-            actual - points_of(path, where),
-            closest_offset(path, actual, where),
+            whole,
+            np.where(nearer[:, None], whole, normal),
             length[own] / count[own],
             (share == 1.0) & (high[own] == 1.0),
         )

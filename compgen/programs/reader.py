@@ -590,6 +590,9 @@ class Reader:
         motion = next((action for action in actions if action.startswith(("motion", "cycle"))), "")
         if motion.startswith("motion"):
             self.motion, self.cycle = int(motion[7:]), None
+        named = any(axis is not None for axis in axes)
+        if named and self.feed == "inverse" and self.motion in (FEED, CW, CCW) and "F" not in values:
+            self._fail("a move in inverse time (G93) needs F in its block")
         single = [action for action in actions if not action.startswith(("motion", "cycle"))]
         if sum(action.startswith(("motion", "cycle")) for action in actions) > 1:
             self._fail("two motion codes in a block")
@@ -791,14 +794,14 @@ class Reader:
 
         def go(kind: int, z: float, *, there: bool = True) -> None:
             sides = [x, y] if there else self.position[:2]
-            end, depth = [*sides, z], kind == FEED and z == self.cycle_z
+            # place and depth are corrected at the bottom, the R level where it is, what is between by neither
+            end, level = [*sides, z], z == self.cycle_r
             if end != self.position:
-                self._move(
-                    kind,
-                    end,
-                    at=bottom,
-                    corrected=(int(there and self.named[0]), int(there and self.named[1]), int(depth)),
+                depth = level or (kind == FEED and z == self.cycle_z)
+                x_too, y_too, z_too = (
+                    int(o and known) for o, known in zip((there, there, depth), self.named, strict=True)
                 )
+                self._move(kind, end, at=[x, y, z] if level else bottom, corrected=(x_too, y_too, z_too))
 
         known_z = not math.isnan(self.position[2])
         if known_z and self.position[2] < self.cycle_r:

@@ -264,6 +264,24 @@ def test_a_hole_is_drilled_to_its_depth_where_the_correction_bends_on_the_way(tm
     assert result.accepted
 
 
+def test_the_r_level_of_a_hole_is_corrected_where_it_is(tmp_path):
+    """EZZ is 1 um/mm of Z: 5 um at the R level 5, -20 um at the depth; two depths, one R level."""
+    ends = np.array([-400.0, 200.0])
+    errors = ErrorTable({"EZZ": Curve(ends, 1e-3 * ends, np.zeros(2))})
+    text = "%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z9.\nG99 G81 X10. Z-20. R5. F90\nX20.\nX30. Z-10.\nG80\nM30\n%\n"
+    result, corrected = run(tmp_path, text, errors, "fanuc", PLAIN)
+    assert "G99 G81 X10. Z-19.98 R4.995 F90\nX20.\nX30. Z-9.99\nG80" in corrected
+    assert result.after.largest_mm < 1e-3 < result.before.largest_mm
+
+
+def test_inverse_time_needs_its_feed_and_rapids_alone_cannot_be_judged(tmp_path):
+    with pytest.raises(InputError, match="G93") as caught:
+        run(tmp_path, START + "G93 G1 X5. F2\nX9.\nM2\n", shift(x=10.0), setup=PLAIN)
+    assert caught.value.line == 4
+    result, _ = run(tmp_path, START + "G0 X5.\nM2\n", shift(x=10.0), setup=PLAIN)
+    assert result.reasons == ("the program has no moves at feed, so that nothing can be judged",)
+
+
 def test_inches(tmp_path):
     text = "G20 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X1. F4\nM2\n"
     _, corrected = run(tmp_path, text, shift(x=25.4), setup=PLAIN)
