@@ -644,6 +644,7 @@ def correct_program(
                 check.add(batch.moves, texts, origins)
                 blocks += len(batch.lines)
                 show(f"{blocks} blocks corrected and read back")
+        model.errors.warn_outside(reader.reached_mm)
         unchanged = not writer.changed and not writer.added
         reasons = []
         before, after = check.before, check.after

@@ -358,6 +358,7 @@ def predict_part(
             drilled = {item.number for item in batch.segments if isinstance(item, SingleBlock) and item.kind == "cycle"}
             features.add(moves, drilled, ended)
             show(f"{batch.first_line + len(batch.lines) - 1} blocks")
+    model.errors.warn_outside(reader.reached_mm)
     quantities = features.quantities()
     evaluated = [_feature(item, model, with_tables, covariance) for item in quantities[:MOST_FEATURES]]
     return PartPrediction(

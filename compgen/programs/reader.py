@@ -29,7 +29,7 @@ RAPID, FEED, CW, CCW = range(4)
 #: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
 PLANE_AXES = ((1, 2), (2, 0), (0, 1))
 #: Bytes that are read at a time, the longest block, and the fewest plain blocks in a row that are read together.
-BATCH_BYTES, LONGEST_BLOCK, LEAST_PLAIN = 1 << 20, 4096, 32
+BATCH_BYTES, LONGEST_BLOCK, LEAST_PLAIN = 1 << 18, 4096, 32
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: Distances of start and end of an arc from its centre may differ by this much, mm.
 RADIUS_TOLERANCE_MM = 0.02
@@ -178,6 +178,8 @@ class Reader:
         #: Which axes blocks have named since their offset changed or they went to a machine position: only these are corrected,
         #: so that no word is added for an axis whose place at the control depends on numbers that were not used yet.
         self.named = [False] * 3
+        #: Least and largest machine positions of moves that are corrected, (2, 3); nan before there are any.
+        self.reached_mm = np.full((2, 3), np.nan)
         self.ended = self.seen_percent = self.started = False
         self.closed_by_percent = False
         self._line, self._text = 0, ""
@@ -827,6 +829,8 @@ class Reader:
     def _check(self, moves: Moves) -> None:
         """Refuse positions outside the travel: usually the work offset is wrong."""
         used = moves.corrected.any(axis=1)
+        ends = np.vstack([self.reached_mm, moves.end_mm[used]])
+        self.reached_mm = np.stack([np.fmin.reduce(ends), np.fmax.reduce(ends)])
         for k, axis in enumerate(self.machine.axes):
             low, high = axis.range_mm
             end = moves.end_mm[:, k]

@@ -282,6 +282,14 @@ def test_inverse_time_needs_its_feed_and_rapids_alone_cannot_be_judged(tmp_path)
     assert result.reasons == ("the program has no moves at feed, so that nothing can be judged",)
 
 
+def test_positions_beyond_the_curves_are_warned_of(tmp_path):
+    short = ErrorTable({"EXX": Curve(np.array([-50.0, 50.0]), np.array([0.01, 0.02]), np.zeros(2))})
+    with pytest.warns(
+        compgen.CompgenWarning, match="EXX is known from -50 to 50 mm, but positions range from 0 to 70 mm"
+    ):
+        run(tmp_path, START + "G1 X70. F9\nM2\n", short, setup=PLAIN)
+
+
 def test_inches(tmp_path):
     text = "G20 G90 G17 G54\nG0 X0. Y0. Z0.\nG1 X1. F4\nM2\n"
     _, corrected = run(tmp_path, text, shift(x=25.4), setup=PLAIN)
