@@ -193,6 +193,7 @@ _PARTS = Schema(
         TOOL,
         replace(LABELS, columns=("setup",)),
         replace(COVARIATES, columns=()),
+        Field("feature", ("feature",), CsvTable.words, presence="optional"),  # a name for people, not evaluated
     )
 )
 
@@ -237,6 +238,7 @@ def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
 def _part(table: CsvTable) -> Deviations:
     """Return measured minus nominal coordinates of one file at the nominal positions in the machine."""
     values = _PARTS.values(table)
+    del values["feature"]
     nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
     values["metadata"]["measured"] = PART
     return Deviations(nominal_mm + _origin(table), values.pop("measured_mm") - nominal_mm, **values)

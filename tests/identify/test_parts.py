@@ -178,6 +178,18 @@ def test_temperatures_in_the_file_do_what_the_thermometer_says(mill, tmp_path):
         identify_measurement(mill, read_measurement([path]))
 
 
+def test_names_of_features_are_for_people(tmp_path):
+    """A report of a coordinate measuring machine names its features: neither refused nor warned of."""
+    rows = ["1,1,1.1,1", "9,1,9.1,1", "1,9,1.1,9"]
+    (tmp_path / "plain.part.csv").write_text("x_mm,y_mm,mx_mm,my_mm\n" + "\n".join(rows) + "\n")
+    named = "\n".join(f"{name},{row}" for name, row in zip(("H1", "", "H=3"), rows, strict=True))
+    (tmp_path / "named.part.csv").write_text(f"feature,x_mm,y_mm,mx_mm,my_mm\n{named}\n")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        plain, found = read_parts(tmp_path / "plain.part.csv"), read_parts(tmp_path / "named.part.csv")
+    np.testing.assert_array_equal(found.deviation_mm, plain.deviation_mm)
+
+
 def test_two_set_ups_have_a_pose_each(mill, tmp_path):
     points, _ = drilled(5, 300)
     made = displaced(*points.T)
