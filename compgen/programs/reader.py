@@ -806,9 +806,10 @@ class Reader:
                 self._move(kind, end, at=[x, y, z] if level else bottom, corrected=(x_too, y_too, z_too))
 
         known_z = not math.isnan(self.position[2])
-        if known_z and self.position[2] < self.cycle_r:
+        # from below the R level up at first; LinuxCNC asks where the series of holes began, not where the tool is
+        if known_z and (self.initial_z if self.dialect.name == "linuxcnc" else self.position[2]) < self.cycle_r:
             go(RAPID, self.cycle_r, there=False)
-        go(RAPID, self.position[2])
+        go(RAPID, max(self.position[2], self.cycle_r) if known_z else math.nan)
         go(RAPID, self.cycle_r)
         pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
         depth = self.cycle_r

@@ -121,3 +121,12 @@ def test_original_and_corrected_programs_are_read_as_the_interpreter_reads_them(
     )
     assert_same(ours(body), truth)
     assert result.after.largest_mm < result.before.largest_mm
+
+
+def test_the_way_to_a_hole_whose_r_level_is_higher(tmp_path):
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X0 Y0 Z-9\nG1 Z-8 F9\nG99 G81 X1 Y1 Z-5 R-2\nX5 R-1.5\n"
+        "G82 X9 Z-5 R3 P0.1\nX9.5 R-3\nG98 X10 Y3 R-2.9995\nX3 R4\nG80\nM2\n%\n"
+    )
+    assert_same(ours(program), canonical(program, tmp_path))
