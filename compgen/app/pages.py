@@ -92,20 +92,23 @@ class OpenPages:
     """Which pages are open in browsers: the program ends when the last one is closed."""
 
     seen: dict[str, float] = field(default_factory=dict)
+    gone: dict[str, float] = field(default_factory=dict)
     last: float | None = None
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def alive(self, page: str) -> None:
-        """Note that a page is open."""
+        """Note that a page is open; not if it has said that it was left, because messages overtake each other."""
         with self.lock:
-            if len(self.seen) < 1000 or page in self.seen:
+            if page not in self.gone and (len(self.seen) < 1000 or page in self.seen):
                 self.seen[page] = self.last = time.monotonic()
 
     def left(self, page: str) -> None:
         """Note that a page was closed or follows a link."""
+        now = time.monotonic()
         with self.lock:
-            if self.seen.pop(page, None) is not None:
-                self.last = time.monotonic()
+            self.gone = {name: at for name, at in self.gone.items() if now - at < SILENT_S}
+            if self.seen.pop(page, None) is not None or len(self.gone) < 1000:
+                self.gone[page] = self.last = now
 
     def over(self) -> bool:
         """Whether the last page was closed a while ago; False if there never was one."""

@@ -26,11 +26,12 @@
   nameTheme();
 
   // the program ends when the last page is closed
-  var page = Array.from(crypto.getRandomValues(new Uint32Array(3))).join("-");
+  function newName() { return Array.from(crypto.getRandomValues(new Uint32Array(3))).join("-"); }
+  var page = newName();
   function alive() { send("/alive", { page: page }); }
   alive();
   setInterval(alive, 20000);
-  window.addEventListener("pageshow", function (event) { if (event.persisted) { alive(); } });
+  window.addEventListener("pageshow", function (event) { if (event.persisted) { page = newName(); alive(); } });
   window.addEventListener("pagehide", function () { send("/alive", { page: page, left: "yes" }, true); });
 
   // progress, and changes by another window

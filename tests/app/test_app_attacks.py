@@ -308,6 +308,10 @@ def test_the_program_ends_after_the_last_page_was_closed(monkeypatch):
     assert not open_pages.over()  # it may follow a link
     now[0] += pages.GRACE_S + 0.1
     assert open_pages.over()
+    open_pages.left("quick")
+    open_pages.alive("quick")  # sent first, came second: the page is closed
+    now[0] += pages.GRACE_S + 0.1
+    assert open_pages.over()
     open_pages.alive("c")
     now[0] += pages.SILENT_S - 1.0
     assert not open_pages.over()
