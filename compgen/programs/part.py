@@ -147,6 +147,7 @@ class _Features:
 
     def __init__(self) -> None:
         self.holes: dict[tuple[float, ...], tuple[int, FloatArray, FloatArray, FloatArray]] = {}
+        self.offsets: dict[tuple[float, ...], FloatArray] = {}
         self.circles: dict[tuple[float, ...], tuple[Moves, FloatArray]] = {}
         self.sides: dict[tuple[float, ...], tuple[Moves, FloatArray]] = {}
         self.chains: dict[tuple[tuple[float, ...], tuple[float, ...]], None] = {}
@@ -166,6 +167,7 @@ class _Features:
                 at = row.end_mm[0]
                 key = tuple(np.round(at[:2], 3).tolist())
                 if row.start_mm[0, 2] > at[2]:
+                    self.offsets[key] = row.offset_mm[0]
                     self.holes[key] = (int(row.line[0]), at, row.tool_mm[0], ended[k])
             elif row.sweep_rad[0] and is_closed(float(row.sweep_rad[0])):
                 radius = float(np.nanmax(np.abs(row.start_mm[0] - row.centre_mm[0])))
@@ -194,13 +196,12 @@ class _Features:
 
     def _holes(self) -> list[_Sampled]:
         found, items = [], list(self.holes.values())
-        for number, (line, at, tool, direction) in enumerate(items, 1):
+        for number, ((line, at, tool, direction), offset) in enumerate(
+            zip(items, self.offsets.values(), strict=True), 1
+        ):
+            name, where = f"hole {number}", ([at], [tool], [direction])
             for k in range(2):
-                found.append(
-                    _sampled(
-                        f"hole {number}", f"position {AXES[k]}", line, at[k], [at], [tool], [direction], np.eye(3)[[k]]
-                    )
-                )
+                found.append(_sampled(name, f"position {AXES[k]}", line, at[k] - offset[k], *where, np.eye(3)[[k]]))
         return found + _distances("hole", [(number, *item) for number, item in enumerate(items, 1)])
 
     def _circles(self) -> list[_Sampled]:
@@ -219,14 +220,15 @@ class _Features:
             found.append(_sampled(name, "diameter", line, 2.0 * radius, *where, 2.0 * outward / ON_CIRCLE))
             for k in (a, b):
                 weight = 2.0 * outward[:, [k]] * outward / ON_CIRCLE
-                found.append(_sampled(name, f"position {AXES[k]}", line, float(row.centre_mm[0, k]), *where, weight))
+                nominal = float(row.centre_mm[0, k] - row.offset_mm[0, k])
+                found.append(_sampled(name, f"position {AXES[k]}", line, nominal, *where, weight))
             middle = np.where(np.isnan(row.centre_mm[0]), row.end_mm[0], row.centre_mm[0])
             centres.append((number, line, middle, row.tool_mm[0], direction))
         return found + _distances("circle", centres)
 
     def _sides(self) -> list[_Sampled]:
         """Angles between sides that follow each other at a right angle, distances of parallel ones next but one."""
-        found = []
+        found, paired = [], set[frozenset[tuple[float, ...]]]()
         after = {first: second for first, second in self.chains}
         for number, (first, second) in enumerate(self.chains, 1):
             third = after.get(second)
@@ -238,7 +240,8 @@ class _Features:
                 sign = 1.0 if cross > 0 else -1.0
                 weight = np.concatenate([sign * one.turn, -sign * two.turn])
                 found.append(_sampled(f"corner {number}", "angle", line, 90.0, *_both(one, two), weight, unit="urad"))
-            if third is not None:
+            if third is not None and frozenset((first, third)) not in paired:
+                paired.add(frozenset((first, third)))
                 three = _side(*self.sides[third])
                 gap = float((three.middle - one.middle) @ one.normal)
                 if abs(float(one.along @ three.normal)) < _SQUARE_RAD and abs(gap) > 1e-3:
@@ -445,13 +448,16 @@ def part_page(found: PartPrediction) -> str:
         for f in found.features
     )
     titles = "".join(f"<th>{name}</th>" for name in _SHOWN.values())
+    features = f"""<table><tr><th>feature</th><th>quantity</th><th>line</th><th>nominal (mm, deg)</th><th>error</th>
+<th>with tables</th><th>u (k = 1)</th><th>unit</th></tr>{rows}</table>"""
     body = f"""<h1>{escape(found.program)} on {escape(found.machine)}</h1>
 <table><tr><th>tool from the path (um)</th>{titles}</tr>{lines}</table>
-<p>Deviation normal to the path, enlarged: turn with the mouse, zoom with the wheel.
-<label>enlarged <input id="scale" type="range" min="0" max="100" value="50"></label> <span id="says"></span></p>
-<canvas id="part" width="1000" height="620"></canvas>
-<table><tr><th>feature</th><th>quantity</th><th>line</th><th>nominal (mm, deg)</th><th>error</th><th>with tables</th>
-<th>u (k = 1)</th><th>unit</th></tr>{rows}</table>
+<p>Grey: the path as programmed. Colours and arrows: the deviation normal to it, as the machine is. Turn with the mouse or
+the arrow keys, zoom with the wheel or + and -.
+<label>Enlarged <input id="scale" type="range" min="0" max="100" value="50"></label> <span id="says"></span></p>
+<canvas id="part" width="1000" height="620" tabindex="0" role="img" aria-label="path of the tool with its deviation"
+style="max-width: 100%"></canvas>
+{features if rows else "<p>The program has no holes, full circles or sides whose size could be given.</p>"}
 <script type="application/json" id="data">{json.dumps(data)}</script>"""
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n<script>{script}</script></body></html>\n'
