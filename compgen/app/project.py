@@ -478,12 +478,13 @@ class Runner:
 
         def listen() -> None:
             assert process.stderr is not None
-            for line in process.stderr:
-                text = line.rstrip()
-                if found := re.match(r"\s*[\d.]+ s  (.+)", text):
-                    job.line = found[1]
-                elif text and len(messages) < MOST_LINES:
-                    messages.append(text)
+            with contextlib.suppress(ValueError):  # closed: a process of the command has kept it open after its end
+                for line in process.stderr:
+                    text = line.rstrip()
+                    if found := re.match(r"\s*[\d.]+ s  (.+)", text):
+                        job.line = found[1]
+                    elif text and len(messages) < MOST_LINES:
+                        messages.append(text)
 
         listener = threading.Thread(target=listen, daemon=True)
         listener.start()
@@ -491,7 +492,7 @@ class Runner:
             assert process.stdout is not None
             output = process.stdout.read()
             code = process.wait()
-        listener.join(STOP_S)
+            listener.join(STOP_S)  # before the streams are closed, or its last messages would be lost
         return output, messages, code
 
 

@@ -186,7 +186,7 @@ def test_a_diagnosis_shows_its_progress_and_can_be_stopped(page, site, browser):
     until = time.monotonic() + app_site.PATIENCE_S
     while not any("candidate" in line or "noise" in line for line in lines):
         assert time.monotonic() < until, lines
-        lines.add(browser.ask("document.getElementById('job-line').textContent"))
+        lines.add(browser.ask("document.getElementById('job-line')?.textContent ?? ''"))
         time.sleep(0.1)
     page.press("Stop")
     assert "Stopped: looking for missing effects" in page.text()
