@@ -46,7 +46,7 @@ from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.pipeline import RunResult, identified_reversal, run
-from compgen.tables import ReadTables, parse_tables, program_version, read_tables, verify
+from compgen.tables import ReadTables, parse_tables, program_version, verify
 from compgen.tables.active import ActiveTables
 from compgen.tables.diff import difference
 from compgen.tables.judge import SafetyLimits
@@ -623,9 +623,8 @@ def _judged(case: Case, result: RunResult) -> Judgement:
     new: dict[str, ReadTables] = {}
     for item in result.results:
         if item.verification.accepted:
-            control = item.verification.controller
-            names = {path.name: path for path in item.paths}
-            new[control] = read_tables(case.machine, [names[Path(name).name] for name in item.export.files], control)
+            assert item.read is not None
+            new[item.verification.controller] = item.read
     if active is not None and result.accepted and shows_all(judgement, case.store, result, active):
         judge_change(judgement, case, result, active)
         judge_tables(judgement, case.machine, result, new, active)
