@@ -70,6 +70,16 @@ class Browser:
                 return answer["result"]
             self.events.append(answer)
 
+    def next_page(self, action, patience_s=PATIENCE_S):
+        """Do something that leads to another page, and wait until that has loaded."""
+        self.events.clear()
+        action()
+        until = time.monotonic() + patience_s
+        while not any(event.get("method") == "Page.loadEventFired" for event in self.events):
+            assert time.monotonic() < until, "no page was loaded"
+            self.ask("1")
+            time.sleep(0.02)
+
     def open(self, path):
         """Open a file and wait until it is loaded; return the events from its beginning on."""
         self.events = []

@@ -52,7 +52,16 @@ from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
 from compgen.errors import CompgenError, InputError
-from compgen.fleet.dashboard.guard import HEADERS, check_host, check_method, check_origin, cookie_name, same, set_cookie
+from compgen.fleet.dashboard.guard import (
+    HEADERS,
+    check_host,
+    check_method,
+    check_origin,
+    cookie_name,
+    error_response,
+    same,
+    set_cookie,
+)
 from compgen.fleet.dashboard.server import bounded
 from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
@@ -924,11 +933,7 @@ def _http_error(error: HTTPException) -> Response | HTTPException:
     if code == 413:
         text = f"These files are too large: at most {LARGEST_UPLOAD // 1_000_000} MB at once."
     page = render_template("error.html", title=error.name, text=text, number=0)
-    response = Response(page, code)
-    for name, value in error.get_headers():
-        if name.lower() in ("allow", "retry-after"):
-            response.headers[name] = value
-    return response
+    return error_response(page, error)
 
 
 def _program_error(error: CompgenError) -> tuple[str, int]:

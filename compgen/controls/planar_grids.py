@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from compgen.controls.screw_maps import AerotechSettings
 from compgen.controls.shared.base import (
     Controller,
     SourceFile,
@@ -22,12 +23,11 @@ from compgen.controls.shared.base import (
 from compgen.controls.shared.grids import equidistant_grid, loss_setting
 from compgen.controls.shared.scanner import check_size, content_lines, fixed_point, floating
 from compgen.controls.shared.terms import one_dimensional_terms, product_terms
-from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.names import AXES
-from compgen.data.toml_files import axis_setting, choice, setting, whole
+from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid
@@ -287,20 +287,10 @@ class Kmotion(PlanarControl[KmotionSettings]):
 
 
 @dataclass(frozen=True)
-class Aerotech2dSettings:
-    """Settings ``[controllers.aerotech-2d]``."""
+class Aerotech2dSettings(AerotechSettings):
+    """Settings ``[controllers.aerotech-2d]``: those of the axes, as for one-dimensional tables, and the size of the table."""
 
-    axis_numbers: tuple[int, int, int] = axis_setting(
-        whole(1, 32),
-        (1, 2, 3),
-        differ="the three axis numbers must differ, got {}",
-        meaning="numbers of the axes in the file, from 1",
-    )
-    reversed_axes: tuple[bool, bool, bool] = axis_setting(
-        toml_files.flag, (False, False, False), meaning="ReverseMotionDirection of the axis: tables follow the encoder"
-    )
     most_points: int = setting(whole(2, 1000), 100, meaning="largest number of rows and of columns")
-    loss_mm: float = loss_setting()
 
 
 class Aerotech2d(PlanarControl[Aerotech2dSettings]):
@@ -312,7 +302,7 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
     @property
     def ways(self) -> FloatArray:
         """Return +1 for X and Y, or -1 where the encoder counts against the axis, shape (2,)."""
-        return np.array([-1.0 if turned else 1.0 for turned in self.settings.reversed_axes[:2]])
+        return np.array([self.settings.way(axis) for axis in range(2)])
 
     def context(self, tables: PlanarGrid) -> dict[str, Any]:
         """Return the header and, for each row of Y, the pairs of each column, in the direction of the encoders."""

@@ -560,6 +560,10 @@ class AerotechSettings:
     )
     loss_mm: float = loss_setting()
 
+    def way(self, axis: int) -> float:
+        """Return +1, or -1 where the encoder counts against the axis."""
+        return -1.0 if self.reversed_axes[axis] else 1.0
+
 
 class Aerotech(ScrewMapControl[AerotechSettings]):
     """``aerotech``: one-dimensional axis calibration of A3200 and Automation1."""
@@ -572,7 +576,7 @@ class Aerotech(ScrewMapControl[AerotechSettings]):
         """Return the tables as in the file: in the direction of the encoder, six values a line."""
         shown = []
         for axis, table in sorted(tables.maps.items()):
-            way = self.way(axis)
+            way = self.settings.way(axis)
             step = (table.position_mm[-1] - table.position_mm[0]) / (len(table.position_mm) - 1)
             values = [way * value for value in table.positive.tolist()]
             shown.append(
@@ -585,10 +589,6 @@ class Aerotech(ScrewMapControl[AerotechSettings]):
                 }
             )
         return {**super().context(tables), "tables": shown}
-
-    def way(self, axis: int) -> float:
-        """Return +1, or -1 where the encoder counts against the axis."""
-        return -1.0 if self.settings.reversed_axes[axis] else 1.0
 
     def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
         """Read all tables ``:START`` ... ``:END``."""
@@ -624,7 +624,7 @@ class Aerotech(ScrewMapControl[AerotechSettings]):
                     raise source.fail("the table needs an axis number, SAMPLEDIST and OFFSET", line)
                 if axis in found:
                     raise source.fail(f"is a second table of axis {self.settings.axis_numbers[axis]}", line)
-                way = self.way(axis)
+                way = self.settings.way(axis)
                 step, first = way * keys["SAMPLEDIST"], -way * keys["OFFSET"]
                 if step <= 0.0:
                     raise source.fail(

@@ -68,14 +68,7 @@ class Page:
         self._then(lambda: self.browser.ask("document.querySelector('main button').click()"))
 
     def _then(self, action):
-        """Do something and wait until the page after it has loaded."""
-        self.browser.events.clear()
-        action()
-        until = time.monotonic() + PATIENCE_S
-        while not any(event.get("method") == "Page.loadEventFired" for event in self.browser.events):
-            assert time.monotonic() < until, "no page was loaded"
-            self.browser.ask("1")
-            time.sleep(0.02)
+        self.browser.next_page(action, PATIENCE_S)
 
 
 @pytest.fixture(scope="module")

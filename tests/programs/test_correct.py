@@ -454,17 +454,14 @@ def shop(tmp_path, small_machine_file, small_errors):
     return tmp_path
 
 
+def setup_of(shop):
+    """What the program of the shop needs beside its text."""
+    files = ["--errors", shop / "e.errors.csv", "--tools", shop / "tools.csv"]
+    return [*files, "--dialect", "fanuc", "--wcs", "G54=0,0,-150"]
+
+
 def test_the_command_writes_the_program_its_figures_and_what_to_check(shop, call):
-    words = [
-        "--errors",
-        shop / "e.errors.csv",
-        "--dialect",
-        "fanuc",
-        "--tools",
-        shop / "tools.csv",
-        "--wcs",
-        "G54=0,0,-150",
-    ]
+    words = setup_of(shop)
     code, out, _ = call("correct", shop / "mill.toml", shop / "p.nc", *words, "--out", shop / "o")
     assert code == 0, out
     assert "before" in out
@@ -479,16 +476,7 @@ def test_the_command_writes_the_program_its_figures_and_what_to_check(shop, call
 
 def test_a_result_that_is_not_smaller_is_named_so(shop, call):
     """With one decimal the rounding, up to 50 um, is more than the errors."""
-    words = [
-        "--errors",
-        shop / "e.errors.csv",
-        "--dialect",
-        "fanuc",
-        "--tools",
-        shop / "tools.csv",
-        "--wcs",
-        "G54=0,0,-150",
-    ]
+    words = setup_of(shop)
     text = (shop / "p.nc").read_text().replace("X50.", "X50.049")
     (shop / "p.nc").write_text(text.replace("X50.049", "X1.").replace("Y50.", "Y1."))
     code, _, error = call("correct", shop / "mill.toml", shop / "p.nc", *words, "--decimals", 1, "--out", shop / "o")

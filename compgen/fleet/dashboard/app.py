@@ -55,6 +55,7 @@ from compgen.fleet.dashboard.guard import (
     check_method,
     check_origin,
     cookie_name,
+    error_response,
     same,
     set_cookie,
 )
@@ -589,11 +590,7 @@ def _http_error(error: HTTPException) -> Response | tuple[str, int] | HTTPExcept
         the_service().metrics.refused.labels({403: "forbidden", 421: "host", 413: "size", 429: "rate"}[code]).inc()
     text = error.description or ""
     page = render_template("error.html", code=code, title=error.name, text=text)
-    response = Response(page, code)
-    for name, value in error.get_headers():
-        if name.lower() in ("allow", "retry-after"):
-            response.headers[name] = value
-    return response
+    return error_response(page, error)
 
 
 def _program_error(error: CompgenError) -> tuple[str, int]:

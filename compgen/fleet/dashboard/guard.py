@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from flask import Request
+from flask import Response as FlaskResponse
 from werkzeug.exceptions import Forbidden, HTTPException, MethodNotAllowed
 from werkzeug.wrappers import Response
 
@@ -240,3 +241,12 @@ class LoginLimit:
 def _keys(address: str, name: str) -> dict[tuple[str, ...], int]:
     name = name.lower()
     return {("pair", address, name): PAIR, ("address", address): ADDRESS, ("name", name): NAME, ("all",): ALL}
+
+
+def error_response(page: str, error: HTTPException) -> FlaskResponse:
+    """Return the page of an HTTP error with its code, and what it tells the browser: allowed methods, when to come again."""
+    response = FlaskResponse(page, error.code or 500)
+    for name, value in error.get_headers():
+        if name.lower() in ("allow", "retry-after"):
+            response.headers[name] = value
+    return response
