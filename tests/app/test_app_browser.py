@@ -200,7 +200,8 @@ def test_of_two_windows_on_one_project_the_second_is_told(page, site, browser, t
     revision = site.project.state().revision
     other = app_site.Site(site.project.folder)
     other.do("measurement/add", {"files": [((IMPORTS / "linear.rtl").open("rb"), "linear.rtl")]})
-    browser.ask("document.querySelector('form[action$=choose] button').closest('form').requestSubmit()")
+    submit = "document.querySelector('form[action$=choose] button').closest('form').requestSubmit()"
+    page._then(lambda: browser.ask(submit))
     until = time.monotonic() + app_site.PATIENCE_S
     while "changed in another window" not in page.text():
         assert time.monotonic() < until
