@@ -17,7 +17,7 @@ from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation
 
 
 #: The row of a corrected NC program among the levels.
-PROGRAM = "any or none, and the NC program corrected"
+PROGRAM = "none, and the NC program corrected"
 #: What three skew factors correct: this is none of the levels.
 SQUARENESS_ALONE = "squareness alone"
 #: Errors that leave less than this at every tool and level are not listed, um.
@@ -29,8 +29,9 @@ LEGEND = (
     "workpiece removed; gain: reduction of rms* compared with the level above, with the tool of the machine file: full "
     "volumetric compensation pays off with other tools. A level may contain a constant shift of "
     "an axis, which a workpiece offset can do as well; controls whose tables are zero at the reference point do not. "
-    "A program corrected by `volcomp correct` leaves the last decimal of its coordinates and the uncertainty of the errors, "
-    "with the errors of the machine as it runs: with its tables active, those measured with them."
+    "A program corrected by `volcomp correct` leaves the last decimal of its coordinates and the uncertainty of the errors; "
+    "with program*: the control adds its table, and a program made with `--active` corrects what that leaves (rigid motion "
+    "removed, in the decimals of the control's programs)."
 )
 
 
@@ -68,12 +69,13 @@ def _gain(before_um: float | None, after_um: float) -> str:
 
 
 def control_rows(result: Capability) -> list[list[str]]:
-    """Return rows of control, level, left, left*, remark."""
+    """Return rows of control, level, left, left*, what table and program leave together, remark."""
     rows = []
     for item in result.controls:
         directional = f", {LABELS['directional'].lstrip('+ ')}" if item.directional else ""
         level = "-" if item.level is None else LABELS.get(item.level, SQUARENESS_ALONE) + directional
         left = ["-", "-"] if item.left is None else [_three(item.left.after), _three(item.left.rigid_removed)]
+        left.append("-" if item.both is None else _three(item.both.left.rigid_removed))
         broken = [f"{len(item.broken)} limits exceeded, first: {item.broken[0]}"] if item.broken else []
         other = [] if item.own else ["not as in the machine file"]
         remark = f"cannot be exported: {item.problem}" if item.problem else "; ".join([*broken, *other, *item.notes])
@@ -119,8 +121,8 @@ def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -
 def options_tables(result: Capability) -> Group:
     """Return the tables for the terminal: levels, controls, errors that remain with the machine's tool, other tools."""
     own = tool_name(result.tools_mm[0])
-    levels = ["tables contain", "left", "left*", "buys"]
-    controls = ["control", "level", "left", "left*", "remark"]
+    levels = ["tables contain", "left", "left*", "gain"]
+    controls = ["control", "level", "left", "left*", "with program*", "remark"]
     return Group(
         _table(f"{result.machine}: what each level of option leaves (max / rms / p95, um)", levels, level_rows(result)),
         _table("what the file of each control leaves, read back (max / rms / p95, um)", controls, control_rows(result)),
@@ -156,7 +158,8 @@ def options_markdown(result: Capability) -> str:
         LEGEND + "\n",
         "## What the file of each control leaves\n\n"
         + markdown_table(
-            ["control", "level", "left, um (max / rms / p95)", "left*, um", "remark"], control_rows(result)
+            ["control", "level", "left, um (max / rms / p95)", "left*, um", "with program*, um", "remark"],
+            control_rows(result),
         ),
         "## Largest error with other tool offsets, um\n\n"
         + markdown_table(["tool offset, mm", *_level_headings(result)], tool_rows(result)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -218,8 +218,15 @@ def level_key(basis: Sequence[Term]) -> str:
 
 #: Tool lengths that are evaluated in addition to the tool of the machine file, along Z, mm.
 TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
-#: Coordinates of a corrected NC program are written in steps of this length.
-PROGRAM_STEP_MM = 0.001
+#: Coordinates of a corrected NC program are written in steps of this length, mm; of controls whose programs have more decimals.
+PROGRAM_STEP_MM = 1e-3
+PROGRAM_STEPS_MM: Mapping[str, float] = {
+    **dict.fromkeys(("heidenhain-com", "heidenhain-kinematics"), 1e-4),
+    **dict.fromkeys(("linuxcnc-comp", "linuxcnc-volumetric"), 1e-5),
+}
+#: The commands of a program are repeated until they change by less, mm; no more often than this: a table with steps may have
+#: no command for a point.
+_CONVERGED_MM, _MOST_PASSES = 1e-9, 30
 #: Options of a control that are evaluated in addition to the machine file: their description and settings.
 VARIANTS: Mapping[str, Sequence[tuple[str, Mapping[str, Any]]]] = {
     "siemens-cec": (("without products", {"products": False}), ("with products", {"products": True})),
@@ -268,6 +275,23 @@ class LevelResult:
 
 
 @dataclass(frozen=True)
+class ProgramResult:
+    """What a corrected NC program leaves (``volcomp correct``), without tables or with those of a control active.
+
+    ``left`` comes from the rounding of its coordinates to ``step_mm``, ``u_um`` is the largest standard uncertainty that the
+    errors give the tool tip, None if it is not known.
+    """
+
+    left: Left
+    step_mm: float
+    u_um: float | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the residuals, step and uncertainty by name."""
+        return {**self.left.as_dict(), "step_um": self.step_mm / MM_PER_UM, "u_um": self.u_um}
+
+
+@dataclass(frozen=True)
 class ControlResult:
     """What the exported file of one control leaves; ``problem`` says why there is no file.
 
@@ -282,6 +306,7 @@ class ControlResult:
     level: str | None = None
     directional: bool = False
     left: Left | None = None
+    both: ProgramResult | None = None
     broken: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     problem: str = ""
@@ -290,19 +315,6 @@ class ControlResult:
     def label(self) -> str:
         """Name with the variant."""
         return f"{self.name}, {self.variant}" if self.variant else self.name
-
-
-@dataclass(frozen=True)
-class ProgramResult:
-    """What a corrected NC program leaves (``volcomp correct``), without tables or with any of them active.
-
-    ``left`` is the rounding of its coordinates to ``step_mm``, ``u_um`` the largest standard uncertainty that the errors
-    give the tool tip, None if it is not known.
-    """
-
-    left: Left
-    step_mm: float
-    u_um: float | None
 
 
 @dataclass(frozen=True)
@@ -357,19 +369,14 @@ class Capability:
                     "level": item.level,
                     "direction_dependent": item.directional,
                     **({} if item.left is None else item.left.as_dict()),
+                    "with_program": None if item.both is None else item.both.as_dict(),
                     "limits_broken": list(item.broken),
                     "notes": list(item.notes),
                     "problem": item.problem or None,
                 }
                 for item in self.controls
             ],
-            "program": None
-            if self.program is None
-            else {
-                **self.program.left.as_dict(),
-                "step_um": self.program.step_mm / MM_PER_UM,
-                "u_um": self.program.u_um,
-            },
+            "program": None if self.program is None else self.program.as_dict(),
             "notes": list(self.notes),
         }
 
@@ -420,15 +427,10 @@ def capability(
             left = _left(zone, errors, points, correction, reversal, tool)
             by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
         levels.append(LevelResult(level.key, by_tool[0][0], tuple(by_tool)))
-    # the exact inverse at each point, as a program states it; the direction of travel is known there
-    wanted = wanted_correction(zone, errors, points.position_mm)
-    if reversal is not None:
-        wanted = wanted - reversal.displacement(points.position_mm, approach)
-    written = PROGRAM_STEP_MM * np.round((points.position_mm + wanted) / PROGRAM_STEP_MM) - points.position_mm
-    u_um = float(np.linalg.norm(displacement_uncertainty(zone, errors, points.position_mm))) / MM_PER_UM
-    program = _left(zone, errors, points, written, reversal, tool_of(machine, None))
+    u_um = float(np.linalg.norm(displacement_uncertainty(zone, errors, points.position_mm))) / MM_PER_UM or None
+    program = _left_by_program(zone, errors, points, reversal, PROGRAM_STEP_MM)
     controls = [
-        _control_result(variant, changed, errors, points, reversal, templates)
+        _control_result(variant, changed, errors, points, reversal, templates, u_um)
         for name in (CONTROLLERS if controllers is None else controllers)
         for variant, changed in _variants(machine, name)
     ]
@@ -441,7 +443,7 @@ def capability(
         levels=tuple(levels),
         controls=tuple(controls),
         notes=tuple(_notes(errors, reversal)),
-        program=ProgramResult(program, PROGRAM_STEP_MM, u_um or None),
+        program=ProgramResult(program, PROGRAM_STEP_MM, u_um),
     )
 
 
@@ -459,6 +461,33 @@ def _left(
         error = error + reversal.displacement(points.position_mm, points.approach)
     nominal = points.position_mm + tool_mm
     return Left(*residuals_twice(nominal, error))
+
+
+def _left_by_program(
+    machine: Machine,
+    errors: ErrorTable,
+    points: Points,
+    reversal: ReversalCurves | None,
+    step_mm: float,
+    tables: Callable[[Points], FloatArray] = lambda points: np.zeros_like(points.position_mm),
+) -> Left:
+    """Residuals with commands c that solve c + T(c) + E(c + T(c)) = p, rounded to ``step_mm``; T are active tables."""
+    tool = tool_of(machine, None)
+
+    def off(command: FloatArray) -> FloatArray:
+        added = tables(replace(points, position_mm=command))
+        error = exact_error(machine, errors, command + added, tool)
+        if reversal is not None and points.approach is not None:
+            error = error + reversal.displacement(command + added, points.approach)
+        return np.asarray(command + added + error - points.position_mm)
+
+    command = points.position_mm
+    for _ in range(_MOST_PASSES):
+        change = off(command)
+        command = command - change
+        if np.abs(change).max() < _CONVERGED_MM:
+            break
+    return Left(*residuals_twice(points.position_mm + tool, off(step_mm * np.round(command / step_mm))))
 
 
 def _settings(machine: Machine, name: str) -> Any:
@@ -501,8 +530,12 @@ def _control_result(
     points: Points,
     reversal: ReversalCurves | None,
     templates: Path | None,
+    u_um: float | None,
 ) -> ControlResult:
-    """Export, read the text back, emulate it at the points; if a control cannot be exported, say why."""
+    """Export, read the text back, emulate it at the points; if a control cannot be exported, say why.
+
+    A program of the control is then made for the errors that these tables leave, so that nothing is corrected twice.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CompgenWarning)
@@ -512,11 +545,17 @@ def _control_result(
             tables = control.parse(texts)
             correction = np.asarray(control.emulate(tables, points))
             level = level_key(control.basis(errors))
+            step_mm = PROGRAM_STEPS_MM.get(variant.name, PROGRAM_STEP_MM)
+            both = _left_by_program(
+                machine, errors, points, reversal, step_mm, lambda at: np.asarray(control.emulate(tables, at))
+            )
     except CompgenError as error:
         return replace(variant, problem=str(error))
     left = _left(machine, errors, points, correction, reversal, tool_of(machine, None))
     directional = reversal is not None and bool(control.reversal_in_tables(reversal).curves)
-    return replace(variant, level=level, directional=directional, left=left, broken=tuple(made.violations))
+    program = ProgramResult(both, step_mm, u_um)
+    broken = tuple(made.violations)
+    return replace(variant, level=level, directional=directional, left=left, both=program, broken=broken)
 
 
 def missing_notes(errors: ErrorTable) -> list[str]:

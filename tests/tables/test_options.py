@@ -8,16 +8,29 @@ import numpy as np
 import pytest
 
 import compgen
-from compgen.controls import SourceFile, controller_named
+from compgen.controls import CONTROLLERS, SourceFile, controller_named
+from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves, format_errors, format_reversal, read_reversal
 from compgen.data.lengths import Points
 from compgen.data.machine import zone_of
 from compgen.errors import InputError
+from compgen.kinematics.many_points import volume_grid
 from compgen.pipeline import export_and_verify, identified_reversal
+from compgen.programs.dialects import DIALECTS
+from compgen.programs.part import CompensatedModel
+from compgen.programs.path import ExactModel
 from compgen.report.options_text import options_markdown
 from compgen.tables import ReadTables, export, read_tables, verify
-from compgen.tables.options import LABELS, capability, explain, levels_of
+from compgen.tables.judge import in_both_directions
+from compgen.tables.options import (
+    LABELS,
+    PROGRAM_STEP_MM,
+    PROGRAM_STEPS_MM,
+    capability,
+    explain,
+    levels_of,
+)
 from compgen.tables.signs import check_program
 
 NANOMETRE = 1e-6  # mm
@@ -478,7 +491,7 @@ def test_options_prints_one_object_and_writes_both_files(call, small_machine_fil
 def test_options_shows_a_table_and_refuses_a_wrong_tool_and_zone(call, small_machine_file, errors_file):
     code, stdout, _ = call("options", small_machine_file, errors_file)
     assert code == 0
-    assert all(word in stdout for word in ("full volumetric", "siemens-cec", "Z -200", "buys"))
+    assert all(word in stdout for word in ("full volumetric", "siemens-cec", "Z -200", "gain"))
     for option, value in (("--tool", "1,2"), ("--tool", "0,0,x"), ("--zone", "X=5:1"), ("--zone", "X=-900:0")):
         code, _, stderr = call("options", small_machine_file, errors_file, option, value)
         assert code == 2
@@ -534,3 +547,40 @@ def test_a_corrected_program_leaves_half_a_step_and_the_uncertainty(small_machin
     assert (found.program.u_um is None) == bool(np.all(np.isnan(u)))
     assert found.as_dict()["program"]["after"]["max_um"] == left.max_um
     assert "NC program corrected" in options_markdown(found)
+
+
+def test_table_and_program_leave_what_the_model_of_correct_leaves(small_machine, small_errors, tmp_path):
+    """The commands of `correct --active` at the same points, with the same table as its files say, in the same steps."""
+    reversal = reversal_of(X=-8.0, YX=3.0)
+    names = ("siemens-eec", "heidenhain-com", "klipper", "linuxcnc-comp")
+    found = capability(small_machine, small_errors, controllers=names, reversal=reversal)
+    nodes = [curve_nodes_mm(small_machine, small_errors, axis) for axis in range(3)]
+    points = in_both_directions(Points(volume_grid(small_machine, nodes).position_mm))
+    tool = np.array(small_machine.tool_offset_mm)
+    for name in names:
+        made = export(small_machine, small_errors, name, allow_unverified=True, reversal=reversal)
+        for file, text in made.files.items():
+            (tmp_path / file).write_text(text)
+        tables = read_tables(small_machine, [tmp_path / file for file in made.files], name)
+        model = CompensatedModel(small_machine, small_errors, reversal, tables=tables)
+        both = next(item for item in found.controls if item.name == name and item.own).both
+        command = model.command(points.position_mm, tool, points.approach)
+        written = both.step_mm * np.round(command / both.step_mm)
+        left = np.linalg.norm(written + model.error(written, tool, points.approach) - points.position_mm, axis=1)
+        assert both.left.after.max_um == pytest.approx(1e3 * left.max(), abs=1e-6)
+        assert both.left.after.max_um <= 0.5 * np.sqrt(3) * both.step_mm * 1e3 * 1.001
+        # a program for the bare machine with the table active corrects part of the errors twice
+        twice = ExactModel(small_machine, small_errors, reversal).command(points.position_mm, tool, points.approach)
+        assert np.abs(twice + model.error(twice, tool, points.approach) - points.position_mm).max() > 5 * UM
+        item = next(row for row in found.as_dict()["controls"] if row["controller"] == name)
+        assert item["with_program"]["after"]["max_um"] == both.left.after.max_um
+    assert "with program*, um" in options_markdown(found)
+
+
+def test_programs_have_the_decimals_of_their_dialect():
+    for name, dialect in (("siemens-cec", "siemens"), ("heidenhain-com", "heidenhain-iso"), ("fanuc-3d", "fanuc"),
+                          ("heidenhain-kinematics", "heidenhain-iso"), ("linuxcnc-comp", "linuxcnc"),
+                          ("linuxcnc-volumetric", "linuxcnc"), ("ucnc", "grbl")):  # fmt: skip
+        step_mm = PROGRAM_STEPS_MM.get(name, PROGRAM_STEP_MM)
+        assert step_mm == pytest.approx(10.0 ** -DIALECTS[dialect].decimals[0])
+    assert set(PROGRAM_STEPS_MM) < set(CONTROLLERS)
