@@ -21,8 +21,11 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.programs.dialects import AT_THE_END, Dialect, dialect_named
 from compgen.programs.path import (
+    PLANE_AXES,
     Corrector,
     ExactModel,
+    IntArray,
+    Moves,
     PathFigures,
     Pieces,
     directions_at,
@@ -31,18 +34,8 @@ from compgen.programs.path import (
     lengths_of,
     path_deviations,
 )
-from compgen.programs.reader import (
-    MARK,
-    MM_PER_INCH,
-    PLANE_AXES,
-    Batch,
-    IntArray,
-    Moves,
-    PlainRun,
-    Reader,
-    Setup,
-    SingleBlock,
-)
+from compgen.programs.reader import MARK, MM_PER_INCH, Batch, Reader, Setup, SingleBlock
+from compgen.programs.runs import PlainRun
 from compgen.resources import program_version
 
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.

@@ -21,7 +21,10 @@ from compgen.identify.covariance import Covariance, error_design
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import dialect_named
 from compgen.programs.path import (
+    PLANE_AXES,
+    RAPID,
     ExactModel,
+    Moves,
     PathFigures,
     directions_at,
     is_closed,
@@ -29,7 +32,7 @@ from compgen.programs.path import (
     path_deviations,
     points_of,
 )
-from compgen.programs.reader import PLANE_AXES, RAPID, Moves, Reader, Setup, SingleBlock
+from compgen.programs.reader import Reader, Setup, SingleBlock
 from compgen.tables import ReadTables
 
 #: Samples along an axis for the slope of tables, besides their nodes.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,12 +15,65 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, error_named
 from compgen.errors import ConvergenceError
 from compgen.kinematics import exact_error
-from compgen.programs.reader import PLANE_AXES, IntArray, Moves
 
+IntArray = NDArray[np.int64]
+RAPID, FEED, CW, CCW = range(4)
+#: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
+PLANE_AXES = ((1, 2), (2, 0), (0, 1))
 #: The inverse is repeated until commands change by less, mm.
 CONVERGED_MM = 1e-9
 _MOST_STEPS = 30
 _FIRST, _SECOND = np.array(PLANE_AXES).T
+
+
+@dataclass(frozen=True)
+class Moves:
+    """Moves of a batch, all of shape (n, ...), in mm of the machine axes.
+
+    ``kind`` is RAPID, FEED, CW or CCW; ``sweep_rad`` the signed angle of an arc about ``centre_mm`` in the plane normal to
+    axis ``plane``. ``offset_mm`` is machine position minus program position, ``tool_mm`` the tool vector of the model.
+    The end of a move is corrected along the axes ``corrected`` by what the model says at ``at_mm``.
+    """
+
+    line: IntArray
+    kind: IntArray
+    start_mm: FloatArray
+    end_mm: FloatArray
+    centre_mm: FloatArray
+    plane: IntArray
+    sweep_rad: FloatArray
+    offset_mm: FloatArray
+    tool_mm: FloatArray
+    at_mm: FloatArray
+    corrected: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.line)
+
+    @property
+    def cutting(self) -> NDArray[np.bool_]:
+        """Which moves are at feed."""
+        return np.asarray(self.kind != RAPID)
+
+    def part(self, rows: Any) -> Moves:
+        """Return the moves of ``rows``."""
+        return Moves(*(getattr(self, name)[rows] for name in Moves.__dataclass_fields__))
+
+    @staticmethod
+    def joined(parts: Iterable[Moves]) -> Moves:
+        """Return the moves of several parts in their order."""
+        known = list(parts) or [Moves.of_rows([])]
+        return Moves(*(np.concatenate([getattr(p, name) for p in known]) for name in Moves.__dataclass_fields__))
+
+    @staticmethod
+    def of_rows(rows: list[tuple[float, ...]]) -> Moves:
+        """Return the moves of rows with line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected."""
+        data = np.array(rows, dtype=np.float64).reshape(len(rows), 25)
+        whole = data[:, :3].astype(np.int64)
+        start, end, centre, offset, tool, at, corrected = (data[:, k : k + 3] for k in range(4, 25, 3))
+        return Moves(
+            whole[:, 0], whole[:, 1], start, end, centre, whole[:, 2], data[:, 3], offset, tool, at, corrected > 0
+        )
 
 
 @dataclass(frozen=True)

@@ -9,27 +9,25 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import BinaryIO, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
-from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.data.messages import visible_line
 from compgen.errors import InputError
 from compgen.programs.dialects import REFUSED, Dialect
+from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
+from compgen.programs.runs import PlainRun, PlainWords
 
-IntArray = NDArray[np.int64]
 MM_PER_INCH = 25.4
-RAPID, FEED, CW, CCW = range(4)
-#: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
-PLANE_AXES = ((1, 2), (2, 0), (0, 1))
-#: Bytes that are read at a time, the longest block, and the fewest plain blocks in a row that are read together.
-BATCH_BYTES, LONGEST_BLOCK, LEAST_PLAIN = 1 << 18, 4096, 32
+#: Bytes that are read at a time, and the longest block.
+BATCH_BYTES, LONGEST_BLOCK = 1 << 18, 4096
+#: The fewest plain blocks in a row that are read together.
+LEAST_PLAIN = 32
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: Distances of start and end of an arc from its centre may differ by this much, mm.
 RADIUS_TOLERANCE_MM = 0.02
@@ -55,56 +53,6 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Moves:
-    """Moves of a batch, all of shape (n, ...), in mm of the machine axes.
-
-    ``kind`` is RAPID, FEED, CW or CCW; ``sweep_rad`` the signed angle of an arc about ``centre_mm`` in the plane normal to
-    axis ``plane``. ``offset_mm`` is machine position minus program position, ``tool_mm`` the tool vector of the model.
-    The end of a move is corrected along the axes ``corrected`` by what the model says at ``at_mm``.
-    """
-
-    line: IntArray
-    kind: IntArray
-    start_mm: FloatArray
-    end_mm: FloatArray
-    centre_mm: FloatArray
-    plane: IntArray
-    sweep_rad: FloatArray
-    offset_mm: FloatArray
-    tool_mm: FloatArray
-    at_mm: FloatArray
-    corrected: NDArray[np.bool_]
-
-    def __len__(self) -> int:
-        return len(self.line)
-
-    @property
-    def cutting(self) -> NDArray[np.bool_]:
-        """Which moves are at feed."""
-        return np.asarray(self.kind != RAPID)
-
-    def part(self, rows: Any) -> Moves:
-        """Return the moves of ``rows``."""
-        return Moves(*(getattr(self, name)[rows] for name in Moves.__dataclass_fields__))
-
-    @staticmethod
-    def joined(parts: Iterable[Moves]) -> Moves:
-        """Return the moves of several parts in their order."""
-        known = list(parts) or [Moves.of_rows([])]
-        return Moves(*(np.concatenate([getattr(p, name) for p in known]) for name in Moves.__dataclass_fields__))
-
-    @staticmethod
-    def of_rows(rows: list[tuple[float, ...]]) -> Moves:
-        """Return the moves of rows with line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected."""
-        data = np.array(rows, dtype=np.float64).reshape(len(rows), 25)
-        whole = data[:, :3].astype(np.int64)
-        start, end, centre, offset, tool, at, corrected = (data[:, k : k + 3] for k in range(4, 25, 3))
-        return Moves(
-            whole[:, 0], whole[:, 1], start, end, centre, whole[:, 2], data[:, 3], offset, tool, at, corrected > 0
-        )
-
-
-@dataclass(frozen=True)
 class SingleBlock:
     """A block that was read by itself: its words (address, value text, first and last column), moves and modal state.
 
@@ -122,22 +70,6 @@ class SingleBlock:
     scale: float
     centre_absolute: bool
     inverse_time: bool
-
-
-@dataclass(frozen=True)
-class PlainRun:
-    """Plain blocks in a row: their lines in the batch, and for each move its line, values, decimals and columns of values.
-
-    ``value`` (n, 3) is nan where a block does not name the axis; ``span`` (n, 3, 2) are columns in the line.
-    """
-
-    lines: range
-    first: int
-    row: IntArray
-    value: FloatArray
-    decimals: IntArray
-    span: IntArray
-    scale: float
 
 
 @dataclass(frozen=True)
@@ -213,7 +145,7 @@ class Reader:
         last = texts.pop()[:-1]
         if last:
             texts.append(last)
-        tokens = _PlainWords(content, len(texts), self.dialect)
+        tokens = PlainWords(content, len(texts), self.dialect)
         self._rows = []
         parts: list[Moves] = []
         count, k = 0, 0
@@ -282,7 +214,7 @@ class Reader:
         modal = self.motion in (RAPID, FEED) and self.cycle is None and self.absolute and self.feed != "inverse"
         return known and modal and all(self.named) and not self.ended and self._unit_known and bool(self.offset_name)
 
-    def _plain(self, tokens: _PlainWords, lines: range, first_line: int, first: int) -> tuple[PlainRun, Moves]:
+    def _plain(self, tokens: PlainWords, lines: range, first_line: int, first: int) -> tuple[PlainRun, Moves]:
         rows = slice(lines.start, lines.stop)
         value, g = tokens.value[rows], tokens.g[rows]
         offset = np.array(self._offset())
@@ -842,75 +774,3 @@ class Reader:
                     f"{'XYZ'[k]} goes to {end[bad[0]]:.3f} mm of the machine, outside its travel {low:g} to {high:g} mm"
                 )
                 self._fail(f"{where}; check --wcs and --tools")
-
-
-class _PlainWords:
-    """Words of the blocks of a batch that have nothing but N, G0, G1, X, Y, Z, F and S, found by numpy.
-
-    ``run_end`` (n,) is the end of the run of plain blocks that each line is part of (its own number if it is not plain);
-    ``g`` (n,) is 0, 1, or -1 without a G code; ``value``, ``decimals`` (n, 3) and ``span`` (n, 3, 2) belong to X, Y, Z.
-    """
-
-    _OTHER, _DIGIT, _POINT, _SIGN, _LETTER, _BLANK = range(6)
-
-    def __init__(self, content: bytes, count: int, dialect: Dialect) -> None:
-        table = np.zeros(256, dtype=np.uint8)
-        table[list(b"0123456789")], table[list(b".")], table[list(b"+-")] = self._DIGIT, self._POINT, self._SIGN
-        table[list(b"NGXYZFSngxyzfs")] = self._LETTER
-        table[list(b" \t\r\n" + (b"*" if dialect.pole else b""))] = self._BLANK
-        code = np.frombuffer(content, dtype=np.uint8)
-        what = table[code]
-        starts = np.concatenate([[0], np.flatnonzero(code == ord("\n")) + 1])[:count]
-        plain = np.ones(count, dtype=bool)
-
-        def spoil(positions: IntArray) -> None:
-            plain[np.searchsorted(starts, positions, side="right") - 1] = False
-
-        spoil(np.flatnonzero(what == self._OTHER))
-        letter = np.flatnonzero(what == self._LETTER)
-        token = np.cumsum(what == self._LETTER) - 1
-        tokens = len(letter)
-        digit, point, sign = (np.flatnonzero(what == kind) for kind in (self._DIGIT, self._POINT, self._SIGN))
-        for positions in (digit, point, sign):
-            spoil(positions[token[positions] < 0])
-        digit, point, sign = (p[token[p] >= 0] for p in (digit, point, sign))
-        digits, points, signs = (np.bincount(token[p], minlength=tokens) for p in (digit, point, sign))
-        length = digits + points + signs
-        for positions in (digit, point, sign):  # a number follows its letter without a gap, in the same line
-            own = token[positions]
-            far = positions - letter[own] > (1 if positions is sign else length[own])
-            spoil(positions[far])
-            spoil(letter[own[far]])
-        spoil(letter[(digits == 0) | (digits > 15) | (points > 1) | (signs > 1)])
-        own = token[digit]
-        first = np.cumsum(digits) - digits
-        rank = digits[own] - 1 - (np.arange(len(digit)) - first[own])
-        weight = 10.0 ** np.arange(16)
-        whole = np.bincount(own, (code[digit] - 48.0) * weight[np.clip(rank, 0, 15)], minlength=tokens)
-        dot = np.full(tokens, len(code) + 1)
-        dot[token[point]] = point
-        decimals = np.bincount(own, digit > dot[own], minlength=tokens).astype(np.int64)
-        value = whole / weight[np.clip(decimals, 0, 15)]
-        value[token[sign][code[sign] == ord("-")]] *= -1.0
-        address, line = code[letter] & 0xDF, np.searchsorted(starts, letter, side="right") - 1
-        self.g = np.full(count, -1)
-        is_g = np.flatnonzero(address == ord("G"))
-        spoil(letter[is_g[(points[is_g] + signs[is_g] > 0) | (whole[is_g] > 1)]])
-        self.g[line[is_g]] = whole[is_g]
-        plain[np.bincount(line[is_g], minlength=count) > 1] = False
-        self.value = np.full((count, 3), np.nan)
-        self.decimals = np.zeros((count, 3), dtype=np.int64)
-        self.span = np.zeros((count, 3, 2), dtype=np.int64)
-        for axis, name in enumerate(b"XYZ"):
-            at = np.flatnonzero(address == name)
-            rows = line[at]
-            if dialect.point_needed:
-                spoil(letter[at[(points[at] == 0) & (whole[at] != 0)]])
-            plain[np.bincount(rows, minlength=count) > 1] = False
-            self.value[rows, axis], self.decimals[rows, axis] = value[at], decimals[at]
-            self.span[rows, axis] = (
-                np.stack([letter[at] + 1, letter[at] + 1 + length[at]], axis=1) - starts[rows][:, None]
-            )
-        # the end of each run of plain lines, found backwards
-        stops = np.where(plain, count, np.arange(count))
-        self.run_end = np.minimum.accumulate(stops[::-1])[::-1]

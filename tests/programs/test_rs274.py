@@ -10,7 +10,7 @@ from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
 
 from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of
 from compgen.programs.dialects import DIALECTS
-from compgen.programs.reader import CCW, PLANE_AXES, RAPID
+from compgen.programs.path import CCW, PLANE_AXES, RAPID
 
 pytestmark = pytest.mark.skipif(
     shutil.which("rs274") is None,
