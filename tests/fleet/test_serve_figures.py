@@ -14,6 +14,7 @@ pytest.importorskip("argon2", reason="the extra compgen[serve] is not installed:
 
 import serve_site as helper
 import sqlalchemy as sa
+from steps import steps
 
 from compgen.data.lengths import read_points
 from compgen.errors import InputError
@@ -32,8 +33,6 @@ from compgen.plan import planned_stations
 factory = helper.factory
 STATIONS = {"LT1": [-300.0, -400.0, 100.0], "LT2": [800.0, -300.0, 50.0], "LT3": [-200.0, 700.0, -250.0]}
 STATIONS |= {"LT4": [700.0, 600.0, 150.0]}
-#: Processor time of a page with a large fleet, s; twice what it may take at most.
-PAGE_S = 1.0
 
 
 @pytest.fixture
@@ -65,10 +64,8 @@ def test_whoever_asks_is_not_kept_waiting_and_finds_the_result_later():
         go_on.wait(30.0)
         return "done"
 
-    started = time.monotonic()
     with pytest.raises(NotReadyError):
-        beside.get("key", work, 0.05)
-    assert time.monotonic() - started < 5.0
+        beside.get("key", work, 0.05)  # while the work still waits
     go_on.set()
     assert beside.get("key", work, 20.0) == "done"
 
@@ -322,23 +319,19 @@ def copied(store, machine, number):
 
 
 def cost_of(site, path):
-    """Status, number of statements and processor time in s of a page; the better of two."""
-    count, times = [], []
+    """Status, number of statements and steps (tests/steps.py) of a page that was asked for before."""
+    answers, count = [site.get(path)], []
 
     def seen(connection, cursor, statement, *rest):
         count.append(statement)
 
-    for _ in range(2):
-        count.clear()
-        sa.event.listen(site.store.engine, "before_cursor_execute", seen)
-        started = time.process_time()
-        status = site.get(path).status_code
-        times.append(time.process_time() - started)
-        sa.event.remove(site.store.engine, "before_cursor_execute", seen)
-    return status, len(count), min(times)
+    sa.event.listen(site.store.engine, "before_cursor_execute", seen)
+    needed = steps(lambda: answers.append(site.get(path)))
+    sa.event.remove(site.store.engine, "before_cursor_execute", seen)
+    return answers[-1].status_code, len(count), needed
 
 
-def test_pages_of_500_machines_with_a_year_of_history_stay_quick_with_as_many_queries(tracked_site):
+def test_pages_of_500_machines_with_a_year_of_history_take_as_many_queries_and_a_few_steps_a_machine(tracked_site):
     site, _, _ = tracked_site
     year = tracked(site.store, "year", months=12)
     paths = ("/", "/?q=copy&status=pending&page=2", f"/machines/{year.id}", f"/machines/{year.id}/tables/12")
@@ -347,10 +340,10 @@ def test_pages_of_500_machines_with_a_year_of_history_stay_quick_with_as_many_qu
     copied(site.store, year, 500)
     assert f"{len(site.store.machines())} machines" in re.sub(r"<[^>]+>", "", site.get("/").text)
     for path in paths:
-        status, queries, seconds = cost_of(site, path)
+        status, queries, needed = cost_of(site, path)
         assert (status, queries) == (200, few[path][1]), path
         assert queries <= 40, path
-        assert seconds < PAGE_S, path
+        assert needed - few[path][2] <= 100 * 500, path  # a machine more adds what it takes to show it
 
 
 def test_a_longer_history_needs_no_more_queries(tracked_site):
