@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from compgen.app.project import INPUTS, Project, ProjectState, command_line
+from compgen.app.project import Project, ProjectState, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -30,6 +30,7 @@ from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.programs.dialects import DIALECTS
 from compgen.report.html.pictures import describe_error, draw_curve
 from compgen.tables import load_format
 
@@ -567,10 +568,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
     results = [
         {
             "step": step, "result": project.facts(step, "result.json"), "files": project.files_of(step),
-            "current": not any(
-                other.number > step.number and other.kind in INPUTS
-                and not other.data.get("after") for other in state.steps
-            ),
+            "current": state.is_current(step),
             "views": list(project.pages_of(step)), "control": step.data["control"],
         }
         for step in reversed(runs)
@@ -589,6 +587,41 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "identified": state.current("identify"),
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
+    }  # fmt: skip
+
+
+#: What one types for an NC program, and which of it only its correction takes: options of ``volcomp correct``.
+CORRECT_FIELDS = ("tolerance-um", "shortest-mm", "decimals", "only")
+PROGRAM_FIELDS = ("dialect", "wcs", "gauge", "keep-unknown", "tables", *CORRECT_FIELDS)
+
+
+def control_files(project: Project, step: Step) -> list[str]:
+    """Return the files that a step wrote for the control, as paths in the project."""
+    listed = [str(item.get("name")) for item in project.facts(step, "result.json").get("files", ())]
+    return [f"{step.folder}/{name}" for name in project.files_of(step) if name in listed]
+
+
+def program_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the NC program with its set-up, and what was predicted and corrected with it, the latest first."""
+    step = state.last("program")
+    found = [
+        {
+            "step": other, "current": state.is_current(other), "views": list(project.pages_of(other)),
+            "part": project.facts(other, "part.json"), "correction": project.facts(other, "correction.json"),
+            "files": project.files_of(other),
+        }
+        for other in reversed(state.steps)
+        if other.kind in ("part", "correct")
+    ]  # fmt: skip
+    tables = [
+        other
+        for other in state.steps
+        if other.kind == "run" and project.facts(other, "result.json").get("accepted") and state.is_current(other)
+    ]
+    return {
+        "identified": state.current("identify"), "results": found, "tables": tables, "dialects": list(DIALECTS),
+        "typed": {name: "" for name in PROGRAM_FIELDS} | ({} if step is None else dict(step.data["typed"])),
+        "kept": {} if step is None else step.data,
     }  # fmt: skip
 
 
@@ -619,5 +652,5 @@ def project_page(project: Project, state: ProjectState) -> dict[str, Any]:
 #: What each page of a project shows, by its name.
 SHOWN: dict[str, Callable[[Project, ProjectState], dict[str, Any]]] = {
     "machine": machine_page, "measurement": measurement_page, "result": result_page, "tables": tables_page,
-    "after": after_page, "project": project_page,
+    "program": program_page, "after": after_page, "project": project_page,
 }  # fmt: skip

@@ -66,6 +66,7 @@ from compgen.fleet.dashboard.server import bounded
 from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
+from compgen.programs.dialects import DIALECTS
 from compgen.report.html.write import markdown
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
@@ -84,7 +85,7 @@ POLICY = (
 #: Pages of a project, in the order of the work.
 PAGES = {
     "machine": "Machine", "measurement": "Measurement", "result": "Result", "tables": "Tables",
-    "after": "Before and after", "project": "Project",
+    "program": "NC program", "after": "Before and after", "project": "Project",
 }  # fmt: skip
 _NUMBER = "number(max=99999)"
 pages = Blueprint("pages", __name__)
@@ -202,6 +203,7 @@ def _page(number: int, name: str, code: int = 200, **more: Any) -> tuple[str, in
         "problem": "", "number": number, "project": runner.project, "state": state, "page": name, "job": runner.job,
         "done": {"machine": state.machine is not None, "measurement": bool(state.used_files()),
                  "result": state.current("identify") is not None, "tables": state.current("run") is not None,
+                 "program": any(state.is_current(step) for step in state.steps if step.kind == "correct"),
                  "after": state.last("compare") is not None, "project": False},
     }  # fmt: skip
     shown |= contents.SHOWN[name](runner.project, state)
@@ -728,6 +730,63 @@ def verify_backup(runner: Runner, state: ProjectState) -> None:
     runner.start("verifying the backup", "tables", [StepTask(verified)])
 
 
+@action("program", "program/use")
+def use_program(runner: Runner, state: ProjectState) -> None:
+    """Predict the part of an NC program, or correct the program, with the errors that were identified."""
+    step, project, machine = _identified(state), runner.project, _machine_of(state)
+    setup = _program_setup(project, state)
+    typed, name = setup["typed"], Path(setup["program"]).name
+    words = [f"--{option}={typed[option]}" for option in ("dialect", "gauge", "keep-unknown") if typed[option]]
+    words += [f"--wcs={text.strip()}" for text in typed["wcs"].split(";") if text.strip()]
+    words += [f"--tools={setup['tools']}"] * bool(setup["tools"]) + ["--block-delete"] * setup["block-delete"]
+    reversal, errors = f"{step.folder}/identified.reversal.csv", f"{step.folder}/identified.errors.csv"
+    words += [f"--reversal={reversal}"] * project.path(reversal).is_file()
+    corrects = _field("what") == "correct"
+    if typed["tables"]:
+        tables = next(item for item in state.steps if str(item.number) == typed["tables"])
+        file, control = ("--active", "--active-controller") if corrects else ("--tables", "--controller")
+        words += [f"{file}={path}" for path in contents.control_files(project, tables)]
+        words.append(f"{control}={tables.data['control']}")
+    folder = project.new_folder("correct" if corrects else "part")
+    commands = [["part", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
+    if corrects:
+        words += [f"--{option}={typed[option]}" for option in contents.CORRECT_FIELDS if typed[option]]
+        fit = ["fit", machine, errors, "--out", f"{folder}/fit"]
+        errors = f"{folder}/fit/fitted.errors.csv"
+        commands = [fit, ["correct", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
+    title = f"{name} corrected" if corrects else f"Part of {name}"
+    done = Step(0, "correct" if corrects else "part", title, commands, folder)
+    runner.start("correcting the program" if corrects else "predicting the part", "program", [StepTask(done)])
+
+
+def _program_setup(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return NC program, tool table and what was typed; a step keeps them if they are new."""
+    known = {} if (last := state.last("program")) is None else dict(last.data)
+    typed = {name: _field(name) for name in contents.PROGRAM_FIELDS}
+    if typed["dialect"] not in DIALECTS:
+        raise InputError("choose the dialect of the program")
+    if typed["tables"] and typed["tables"] not in [str(step.number) for step in state.steps if step.kind == "run"]:
+        raise InputError("these tables are not in the project any more")
+    setup = {"program": known.get("program", ""), "tools": known.get("tools", ""), "typed": typed}
+    setup["block-delete"] = bool(request.form.get("block-delete"))
+    if request.form.get("no-tools"):
+        setup["tools"] = ""
+    given = {name: file for name in ("program", "tools") for file in request.files.getlist(name)[:1] if file.filename}
+    if not setup["program"] and "program" not in given:
+        raise InputError("choose the NC program")
+    folder = project.new_folder("program") if given else ""
+    for name, file in given.items():
+        path = f"{folder}/{GIVEN}/{name}/{file_name(file.filename or '')}"
+        project.path(path).parent.mkdir(parents=True)
+        file.save(project.path(path))
+        setup[name] = path
+    if setup != {key: value for key, value in known.items() if key != "by_hand"}:
+        data = {**setup, "by_hand": [f"# {setup[name]}: uploaded" for name in given]}
+        title = f"NC program {Path(setup['program']).name}"
+        project.add(Step(0, "program", title, folder=folder, data=data), state.revision)
+    return setup
+
+
 @action("after", "compare")
 def compare(runner: Runner, state: ProjectState) -> None:
     """Compare a measurement after the correction with one before it."""
@@ -836,6 +895,7 @@ def preflight_page(path: Path) -> str:
     parts = re.split(r"(<ol[^>]*>.*?</ol>)", str(markdown(read_text(path))), flags=re.DOTALL)
     ticked = [part.replace("<li>", f'<li class="tick">{box}') if part.startswith("<ol") else part for part in parts]
     html = re.sub(r"<(/?)h([4-6])>", lambda tag: f"<{tag[1]}h{int(tag[2]) - 3}>", "".join(ticked))
+    html = html.replace("<li class='check'>", f'<li class="tick">{box}')
     html = re.sub(r"<h2>(?=\d)", f'<h2 class="tick">{box}', html)
     html = html.replace("<table>", '<div class="scroll" tabindex="0"><table>').replace("</table>", "</table></div>")
     return render_template("preflight.html", body=Markup(html))

@@ -38,10 +38,12 @@ STOP_S = 5.0
 #: Lines of a command's messages that are kept.
 MOST_LINES = 500
 #: Sub-folder of a step for the files that a user gave it, and steps whose command writes pages.
-GIVEN, WITH_PAGES = "given", ("identify", "diagnose", "run", "compare", "accuracy")
+GIVEN, WITH_PAGES = "given", ("identify", "diagnose", "run", "part", "compare", "accuracy")
 #: Steps that a result depends on.
 INPUTS = ("machine", "instrument", "numbers", "removed", "measurement")
-MAIN_PAGES = ("report.html", "index.html", "sheet.html")
+#: Steps that take the errors that were identified before them.
+OF_ERRORS = ("part", "correct")
+MAIN_PAGES = ("report.html", "index.html", "sheet.html", "part.html")
 #: Exit codes of a command that has written its result: accepted or not.
 DONE = (0, 1)
 
@@ -136,12 +138,14 @@ class ProjectState:
     def current(self, kind: str) -> Step | None:
         """Return the latest step of a kind if nothing that it depends on has changed since, otherwise None."""
         step = self.last(kind)
-        if step is None or any(
-            other.number > step.number and other.kind in INPUTS
-            and not other.data.get("after") for other in self.steps
-        ):  # fmt: skip
-            return None
-        return step
+        return step if step is not None and self.is_current(step) else None
+
+    def is_current(self, step: Step) -> bool:
+        """Whether nothing that a step depends on has changed since; what is made of errors depends on them, too."""
+        inputs = (*INPUTS, "identify") if step.kind in OF_ERRORS else INPUTS
+        return not any(
+            other.number > step.number and other.kind in inputs and not other.data.get("after") for other in self.steps
+        )
 
 
 def file_name(given: str) -> str:

@@ -361,3 +361,79 @@ def test_a_project_is_begun_and_opened_again_from_the_first_page(site, tmp_path)
     assert str(tmp_path / "new" / "mill") in page
     assert str(site.project.folder) in page
     assert site.post("/open", {"folder": str(site.project.folder)}).headers["Location"].startswith("/projects/1/")
+
+
+PROGRAM = """G21 G90 G17 G54
+G0 X0. Y0. Z0.
+G1 X100. F500
+G1 X400. Y50.
+M30
+"""
+TYPED = {
+    **dict.fromkeys(("gauge", "keep-unknown", "tables", "tolerance-um", "shortest-mm", "decimals", "only"), ""),
+    "dialect": "fanuc", "wcs": "G54=0,0,-100",
+}  # fmt: skip
+
+
+def test_an_nc_program_is_predicted_and_corrected_for_a_scale_error(site):
+    """X is 100 um/m too long and Y 200 um/m too short: every number of part and corrected program follows by division."""
+    site.do("machine/describe", MILL)
+    site.do("numbers", {"scale-X": "100", "scale-Y": "-200"})
+    assert "Calculate the result" in site.get("/projects/1/program").text
+    site.do("identify")
+    refused = site.post("/projects/1/program/use", {**TYPED, "what": "part"})
+    assert (refused.status_code, "choose the NC program" in refused.text) == (409, True)
+    sent = {**TYPED, "program": (io.BytesIO(PROGRAM.encode()), "../part one.nc"), "what": "part"}
+    state = site.do("program/use", sent)
+    found = json.loads(site.project.files_of(state.last("part"))["part.json"].read_text())["path"]
+    far = (100e-6 * 400e3, -200e-6 * 50e3)  # X 400, Y 50: 40 and -10 um
+    assert found["ends_max_um"] == pytest.approx((far[0] ** 2 + far[1] ** 2) ** 0.5, rel=1e-3)
+    assert site.get(f"/projects/1/steps/{state.last('part').number}/view/part.html").status_code == 200
+    state = site.do("program/use", {**TYPED, "what": "correct"})  # the program is kept
+    step = state.last("correct")
+    text = site.project.files_of(step)["part_one.nc"].read_text()
+    assert re.search(rf"^G1 X{round(100 / 1.0001, 3)} F500$", text, flags=re.MULTILINE)
+    assert re.search(rf"^G1 X{round(400 / 1.0001, 3)} Y{round(50 / 0.9998, 3)}$", text, flags=re.MULTILINE)
+    page = site.get("/projects/1/program").text
+    assert page.count('class="card top') == 2
+    assert "part_one.nc corrected" in page
+    ticked = site.get(f"/projects/1/steps/{step.number}/preflight.html").text
+    assert ticked.count('type="checkbox"') >= 5
+    packed = zipfile.ZipFile(io.BytesIO(site.get(f"/projects/1/steps/{step.number}/files.zip").data))
+    assert packed.read(f"{step.folder}/part_one.nc").decode() == text
+
+    state = site.do("run", {"control": "siemens-cec", "allow-misfit": "on"})
+    with_tables = {**TYPED, "tables": str(state.last("run").number)}
+    state = site.do("program/use", {**with_tables, "what": "part"})
+    figures = json.loads(site.project.files_of(state.last("part"))["part.json"].read_text())
+    assert figures["path"]["ends_max_um"] == pytest.approx(found["ends_max_um"])
+    assert figures["path_after"]["ends_max_um"] < 0.1
+    site.post("/projects/1/program/use", {**with_tables, "what": "correct"})
+    text = site.project.files_of(site.project.state().last("correct"))
+    assert "G1 X100. F500\n" in next(path for name, path in text.items() if name.endswith("part_one.nc")).read_text()
+    assert "G54=0,0,-100" in site.get("/projects/1/program").text
+
+    site.do("numbers", {"scale-X": "50"})
+    page = site.get("/projects/1/program").text
+    assert page.count("were changed after this") == page.count('class="card top')
+
+
+def test_a_program_that_cannot_be_followed_is_refused_with_its_line_and_its_set_up_is_kept(site):
+    site.do("machine/describe", MILL)
+    site.do("numbers", {"scale-X": "100"})
+    site.do("identify")
+    program = PROGRAM.replace("G1 X100. F500", "#1=4")
+    site.post(
+        "/projects/1/program/use", {**TYPED, "program": (io.BytesIO(program.encode()), "bad.nc"), "what": "correct"}
+    )
+    page = site.get("/projects/1/program").text
+    assert "bad.nc:3" in page
+    assert "present one: bad.nc" in page
+    assert 'value="G54=0,0,-100"' in page
+    kinds = [step.kind for step in site.project.state().steps]
+    assert kinds[-1] == "program"
+    answer = site.post("/projects/1/program/use", {**TYPED, "dialect": "--help", "what": "part"})
+    assert "choose the dialect" in answer.text
+    answer = site.post("/projects/1/program/use", {**TYPED, "tables": "1", "what": "part"})
+    assert "not in the project any more" in answer.text
+    assert [step.kind for step in site.project.state().steps] == kinds

@@ -26,11 +26,12 @@ CHANGES = (
     "/projects/1/measurement/1/answer", "/projects/1/measurement/1/remove", "/projects/1/measurement/1/sheet",
     "/projects/1/numbers", "/projects/1/identify",
     "/projects/1/diagnose", "/projects/1/apply", "/projects/1/options", "/projects/1/run", "/projects/1/verify",
-    "/projects/1/compare", "/projects/1/recal", "/projects/1/undo", "/projects/1/stop", "/alive",
+    "/projects/1/program/use", "/projects/1/compare", "/projects/1/recal", "/projects/1/undo", "/projects/1/stop", "/alive",
 )  # fmt: skip
 SHOWN = (
     "/", "/projects/1/", "/projects/1/machine", "/projects/1/measurement", "/projects/1/result", "/projects/1/tables",
-    "/projects/1/after", "/projects/1/project", "/projects/1/status", "/projects/1/commands.sh", "/chain.svg?words=WXYFZT",
+    "/projects/1/program", "/projects/1/after", "/projects/1/project", "/projects/1/status", "/projects/1/commands.sh",
+    "/chain.svg?words=WXYFZT",
     "/projects/1/steps/1/files/1", "/projects/1/steps/1/files.zip", "/projects/1/steps/1/view/report.html",
     "/projects/1/steps/1/preflight.html",
 )  # fmt: skip
