@@ -21,7 +21,7 @@ from compgen.controls.shared.base import (
     parameter_row,
 )
 from compgen.controls.shared.grids import equidistant_grid, loss_setting
-from compgen.controls.shared.scanner import check_size, content_lines, fixed_point, floating
+from compgen.controls.shared.scanner import check_complete, check_size, content_lines, fixed_point, floating
 from compgen.controls.shared.terms import one_dimensional_terms, product_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
@@ -323,6 +323,7 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
             "warnings": [],
             "numbers": numbers,
             "columns": tables.added_mm.shape[0],
+            "records": tables.added_mm[..., 0].size,
             "sample": sample.tolist(),
             "offset": offset.tolist(),
             "lines": [[part for pair in line for part in pair] for line in pairs.transpose(1, 0, 2).tolist()],
@@ -371,6 +372,7 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
             raise source.fail(
                 f"{len(values)} values do not fill rows of {columns} pairs; is the file truncated?", begun
             )
+        check_complete(source, len(values) // 2)
         step = self.ways * np.array([header[5], header[4]])
         if np.any(step <= 0.0):
             raise source.fail("the signs of the sample distances do not fit reversed_axes of the machine file", begun)

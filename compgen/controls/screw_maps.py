@@ -314,6 +314,11 @@ class SheetControl(StatedSign[Settings]):
             position, positive, negative = (
                 float(fixed_point(source, line, cell, "a value in mm")) for cell in cells[1:]
             )
+            if positive != negative and not self.bidirectional:
+                message = (
+                    f"{positive:g} and {negative:g} differ, but the machine file says that one value holds for both"
+                )
+                raise source.fail(f"{message} directions (both_directions)", line)
             found.setdefault(axis_named(source, line, cells[0]), []).append((position, positive, negative))
         check_complete(source, len(lines) - 1)
         return found
@@ -641,6 +646,7 @@ class Aerotech(ScrewMapControl[AerotechSettings]):
                 raise source.fail(f"expected :START, got {text[:40]!r}", line)
         if begun:
             raise source.fail("the table that begins here has no :END; is the file truncated?", begun)
+        check_complete(source, sum(map(len, found.values())))
         return found
 
     def sign_words(self) -> str:

@@ -358,6 +358,17 @@ def test_a_reversed_axis_changes_the_file_and_not_what_it_does(name, make_errors
     assert np.allclose(moved[0], moved[1], rtol=0, atol=NANOMETRE)
 
 
+@pytest.mark.parametrize("name", ["aerotech", "aerotech-2d"])
+def test_a_line_of_values_that_is_there_twice_is_noticed(name, make_errors):
+    machine = machine_with()
+    made = compgen.export(machine, make_errors(machine), name, allow_unverified=True)
+    (file, text), control = next(iter(made.files.items())), CONTROLLERS[name](machine)
+    lines = text.splitlines(keepends=True)
+    values = next(k for k, line in enumerate(lines) if line[0] in "-0123456789")
+    with pytest.raises(InputError, match="declares"):
+        control.parse([SourceFile(Path(file), "".join([*lines[: values + 1], *lines[values:]]))])
+
+
 def test_kmotion_moves_to_what_its_source_says():
     machine = machine_with(kmotion={"units": "mm"})
     control, tables = read("kmotion", machine, GOLDEN / "kmotion" / "geo.txt")
@@ -424,6 +435,12 @@ def test_the_machine_with_the_table_comes_closer(name, chain):
         ("weihong", {"sign": "error"}, "[X]\n0, 1, 2\n", "unit = mm"),
         ("weihong", {"sign": "error"}, "unit = mm\n[X]\n0, 1\n", "2 columns"),
         ("mach4", {"sign": "error"}, "# records: 2\naxis,position_mm,positive_mm,negative_mm\nX,0,0,0\n", "declares 2"),
+        (
+            "mach4",
+            {"sign": "error"},
+            "axis,position_mm,positive_mm,negative_mm\nX,0,0,0\nX,1,0.002,0.003\n",
+            "one value holds for both",
+        ),
         ("aerotech", {}, ":START 1 SAMPLEDIST=1 NEGCOR\n", "NEGCOR"),
         ("aerotech", {}, ":START 1 SAMPLEDIST=-1\n:START OFFSET=0\n1 2\n:END\n", "reversed_axes"),
         ("aerotech-2d", {}, ":START2D 1 2 1 2 1 1 2\n:START2D OFFSETROW=0 OFFSETCOL=0\n:END\n", "axis_numbers"),

@@ -56,7 +56,7 @@ def number_pattern(before: int = 40, after: int = 40, exponent: int = 0) -> re.P
 
 FLOATING, FIXED_POINT = number_pattern(exponent=3), number_pattern(15, 15)
 _WITH_EXPONENT = re.compile(r"[+-]?[0-9.]{1,30} ?EX?[ +-]{0,2}[0-9]{1,10}", re.IGNORECASE)
-_DECLARED = re.compile(r"(?://|#|;)\s{0,9}(?:records|entries|tables):\s{0,9}([0-9]{1,9})\s*$")
+_DECLARED = re.compile(r"(?://|#|;|')\s{0,9}(?:records|entries|tables):\s{0,9}([0-9]{1,9})\s*$")
 
 
 def check_size(source: SourceFile, most: int) -> None:
