@@ -25,17 +25,22 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_text
-from compgen.data.machine import CHAINS, Chain, machine_files
+from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.kinematics import exact_error
+from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import DIALECTS
-from compgen.report.html.pictures import describe_error, draw_curve
+from compgen.report.html.folder import read_volume
+from compgen.report.html.pictures import VolumeOnGrid, describe_error, draw_curve, draw_slices, draw_space, grid_of
 from compgen.tables import load_format
 
 #: Files larger than this are not drawn, bytes; so many pictures of one file at most.
 LARGEST_DRAWN, MOST_PICTURES = 40_000_000, 12
+#: Levels of each axis at which the error in the volume is calculated for its picture.
+VOLUME_LEVELS = 9
 
 # Measurements: pictures, and questions with what each answer would mean.
 
@@ -422,6 +427,38 @@ def error_pictures(path: Path, fitted: Path | None = None) -> list[Picture]:
     return [draw_curve(name, errors, smooth, {}) for name in errors.curves]
 
 
+def volume_pictures(step: Step, folder: Path) -> Sequence[Picture]:
+    """Return the error in the volume, in space and in slices: of tables before and after, otherwise of errors.
+
+    ``folder`` is that of the step, or contains the folders ``before`` and ``after`` of two identifications; without
+    machine and errors there is no picture.
+    """
+    sides = [side for side in (folder / "before", folder / "after") if side.is_dir()] or [folder]
+    paths = [path for path in (folder / "volume.csv",) if path.is_file()]
+    paths = paths or [path for side in sides for path in (side / "machine.toml", side / "identified.errors.csv")]
+    try:
+        stats = [path.stat() for path in paths]
+        return _volume_drawn(tuple(paths), tuple((stat.st_mtime_ns, stat.st_size) for stat in stats), step.number)
+    except (OSError, CompgenError):
+        return ()
+
+
+@lru_cache(maxsize=16)
+def _volume_drawn(paths: Sequence[Path], _stamps: tuple[tuple[int, int], ...], number: int) -> Sequence[Picture]:
+    if paths[0].name == "volume.csv":
+        grid = grid_of(read_volume(paths[0]))
+    else:
+        machine = read_machine(paths[0])
+        levels_mm = [np.linspace(*axis.range_mm, VOLUME_LEVELS) for axis in machine.axes]
+        points_mm = full_grid(levels_mm)
+        sides = [
+            exact_error(machine, read_errors(path), points_mm.reshape(-1, 3)).reshape(points_mm.shape)
+            for path in paths[1::2]
+        ]
+        grid = VolumeOnGrid((levels_mm[0], levels_mm[1], levels_mm[2]), *sides)
+    return () if grid is None else (draw_space(grid, number), *draw_slices(grid, number, {}))
+
+
 def squareness_rows(path: Path) -> list[tuple[str, float, float]]:
     """Return name, value and standard uncertainty (urad, nan if unknown) of the squareness errors of a file."""
     return [(name, 1e6 * value, 1e6 * u) for name, (value, u) in read_errors(path).squareness.items()]
@@ -545,12 +582,15 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     found, diagnosis = state.last("diagnose"), {}
     if found is not None:
         diagnosis = project.facts(found, "diagnosis.json")
+    shown = state.current("run") or step
+    volume = () if shown is None else volume_pictures(shown, project.path(shown.folder))
     applied = found is not None and state.machine == f"{found.folder}/extended.toml"
     earlier = project.facts(before[-1], "identify.json") if before and applied else {}
     return {
         "step": step, "facts": project.facts(step, "identify.json"), "errors": errors, "earlier": earlier,
         "pictures": (drawn := error_pictures(errors) if errors else []),
-        "values": {picture.key: picture.data for picture in drawn},
+        "volume": volume, "volume_tables": None if shown is step else shown,
+        "values": {picture.key: picture.data for picture in (*drawn, *volume)},
         "squareness": squareness_rows(errors) if errors else [],
         "current": state.current("identify") is not None, "views": list(project.pages_of(step)),
         "found": found, "diagnosis": diagnosis, "diagnosed_views": list(project.pages_of(found)),
@@ -570,6 +610,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
             "step": step, "result": project.facts(step, "result.json"), "files": project.files_of(step),
             "current": state.is_current(step),
             "views": list(project.pages_of(step)), "control": step.data["control"],
+            "volume": volume_pictures(step, project.path(step.folder)) if step is runs[-1] else (),
         }
         for step in reversed(runs)
     ]  # fmt: skip
@@ -581,6 +622,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
     step = state.last("options")
     controls = list(parsed.get("controllers", {}))
     return {
+        "values": {picture.key: picture.data for item in results for picture in item["volume"]},
         "options": project.facts(step, "options.json"), "options_step": step, "results": results, "verified": verified,
         "options_current": state.current("options") is not None,
         "controls": controls, "chosen": results[0]["control"] if results else next(iter(controls), ""),

@@ -67,6 +67,7 @@ from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
 from compgen.programs.dialects import DIALECTS
+from compgen.report.html.pictures import thousands
 from compgen.report.html.write import markdown
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
@@ -941,7 +942,12 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.undefined = StrictUndefined
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
     app.jinja_env.filters.update(
-        word=str, drawn=lambda svg: svg, figure=_figure, unit=lambda text: LABEL.get(text, text), readable=_readable
+        word=str,
+        drawn=lambda svg: svg,
+        figure=_figure,
+        unit=lambda text: LABEL.get(text, text),
+        readable=_readable,
+        thousands=thousands,
     )
     app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
     if workbench.language != LANGUAGES[0]:

@@ -222,4 +222,12 @@
     });
   };
   document.querySelectorAll("figure.picture").forEach(function (figure) { new Picture(figure).listen(); });
+
+  // layers of the picture in space
+  document.querySelectorAll("[data-views] button[data-layer]").forEach(function (button) {
+    button.addEventListener("click", function () {
+      var shown = button.closest("[data-views]").classList.toggle("show-" + button.dataset.layer);
+      button.setAttribute("aria-pressed", String(shown));
+    });
+  });
 })();

@@ -23,16 +23,6 @@
   }
   if (chooser) { chooser.addEventListener("change", function () { showControl(chooser.value); }); showControl(chooser.value); }
 
-  // layers of the picture in space
-  all("[data-views]").forEach(function (views) {
-    all("button[data-layer]", views).forEach(function (button) {
-      button.addEventListener("click", function () {
-        var shown = views.classList.toggle("show-" + button.dataset.layer);
-        button.setAttribute("aria-pressed", String(shown));
-      });
-    });
-  });
-
   // one picture across the whole page
   var error = document.getElementById("error");
   function enlarge(key) {

@@ -437,3 +437,25 @@ def test_a_program_that_cannot_be_followed_is_refused_with_its_line_and_its_set_
     answer = site.post("/projects/1/program/use", {**TYPED, "tables": "1", "what": "part"})
     assert "not in the project any more" in answer.text
     assert [step.kind for step in site.project.state().steps] == kinds
+
+
+def test_the_error_in_the_volume_is_drawn_before_any_tables_and_with_them(site):
+    """X is 100 um/m too long: the middles of 24 cells over 400 mm reach 40 um times 23.5/24."""
+    site.do("machine/describe", MILL)
+    site.do("numbers", {"scale-X": "100"})
+    site.do("identify")
+    page = site.get("/projects/1/result").text
+    largest = re.findall(r"at most ([\d.]+) µm", page)
+    assert [float(value) for value in largest] == pytest.approx(
+        [40 * 23.5 / 24, 40 * 23.5 / 24, 20.0], abs=0.05
+    )  # one decimal is shown
+    assert "enlarged 1000 times" in page.replace("\N{NARROW NO-BREAK SPACE}", "")  # 40 mm are a tenth of 400 mm
+    site.do("run", {"control": "siemens-cec", "allow-misfit": "on"})
+    for name in ("result", "tables"):
+        page = site.get(f"/projects/1/{name}").text
+        shown = [float(value) for value in re.findall(r"at most ([\d.]+) µm", page)]
+        assert shown[:3] == pytest.approx([40 * 23.5 / 24, 40 * 23.5 / 24, 20.0], abs=0.05)  # one decimal is shown
+        assert len(shown) == 6
+        assert max(shown[3:]) < 0.1
+        assert page.count('data-layer="') == 3
+    assert "before and after the tables for siemens-cec" in site.get("/projects/1/result").text

@@ -236,7 +236,8 @@ def _residuals(path: Path) -> ReadingResiduals | None:
     return ReadingResiduals(residual_mm, used, tuple(table.text("station")), position_mm, stated)
 
 
-def _volume(path: Path) -> Volume | None:
+def read_volume(path: Path) -> Volume | None:
+    """Return the contents of ``volume.csv``, None if there is no such file."""
     if not path.is_file():
         return None
     names = [f"{when}_{axis}_um" for when in ("before", "after") for axis in "xyz"]
@@ -258,7 +259,7 @@ def _control(folder: Path, machine: Machine | None, known: KnownTables) -> Contr
     preflight = folder / "preflight.md"
     text = read_text(preflight) if preflight.is_file() else ""
     files, name = tuple(_files(folder, result)), str(result.get("controller", folder.name))
-    volume = _as_written(known[name][1]) if name in known else _volume(folder / "volume.csv")
+    volume = _as_written(known[name][1]) if name in known else read_volume(folder / "volume.csv")
     found = ControlFolder(name, folder, result, manifest, text, files, volume)
     if machine is None or not files or name not in CONTROLLERS:
         return found

@@ -158,11 +158,19 @@ WIDE = (420.0, 250.0)
 
 @dataclass(frozen=True)
 class VolumeOnGrid:
-    """A volume whose points fill a grid: levels of X, Y, Z in mm, and errors (nx, ny, nz, 3) before and after, mm."""
+    """A volume whose points fill a grid: levels of X, Y, Z in mm, and errors (nx, ny, nz, 3) before and after, mm.
+
+    ``after_mm`` is None as long as there is no correction.
+    """
 
     levels_mm: tuple[FloatArray, FloatArray, FloatArray]
     before_mm: FloatArray
-    after_mm: FloatArray
+    after_mm: FloatArray | None = None
+
+    @property
+    def sides(self) -> tuple[FloatArray, ...]:
+        """The errors before, and after if they are known."""
+        return (self.before_mm,) if self.after_mm is None else (self.before_mm, self.after_mm)
 
 
 def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
@@ -191,14 +199,14 @@ def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
     return VolumeOnGrid((levels[0], levels[1], levels[2]), before, after)
 
 
-def resampled(grid: VolumeOnGrid, places_mm: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Interpolate both errors (nx, ny, nz, 3) linearly to another grid, given by its positions along X, Y and Z."""
-    found = np.concatenate([grid.before_mm, grid.after_mm], axis=-1)
+def resampled(grid: VolumeOnGrid, places_mm: Sequence[FloatArray]) -> list[FloatArray]:
+    """Interpolate the errors of each side linearly to another grid (nx, ny, nz, 3), given by its positions along X, Y and Z."""
+    found = np.concatenate(grid.sides, axis=-1)
     shrinking = sorted(range(3), key=lambda axis: len(places_mm[axis]) / len(grid.levels_mm[axis]))
     for axis in shrinking:  # the numbers of points that are left are the smallest in this order
         weights = hat_matrix(grid.levels_mm[axis], places_mm[axis])
         found = np.moveaxis(np.tensordot(weights, found, axes=(1, axis)), 0, axis)
-    return found[..., :3], found[..., 3:]
+    return np.split(found, len(grid.sides), axis=-1)
 
 
 def projected(position_mm: FloatArray) -> FloatArray:
@@ -232,23 +240,25 @@ def thousands(value: float) -> str:
 def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
     """Return the volume as a grid of lines, enlarged: before, after at the same scale, after at its own scale."""
     longest = max(float(np.ptp(level)) for level in grid.levels_mm)
-    before_scale, after_scale = (
+    scales = [
         min(nice(DRAWN_SHARE * longest / max(float(np.linalg.norm(part, axis=-1).max()), 1e-9)), MOST_ENLARGED)
-        for part in (grid.before_mm, grid.after_mm)
-    )
-    straight, before, after = (list[FloatArray]() for _ in range(3))
+        for part in grid.sides
+    ]
+    before_scale, after_scale = scales[0], scales[-1]
+    drawn = [list[FloatArray]() for _ in (None, *grid.sides)]
     for axis in range(3):
         places = [
             np.linspace(level[0], level[-1], ALONG if k == axis else LINES) for k, level in enumerate(grid.levels_mm)
         ]
-        for found, lines in zip((straight, before, after), (full_grid(places), *resampled(grid, places)), strict=True):
+        for found, lines in zip(drawn, (full_grid(places), *resampled(grid, places)), strict=True):
             found.append(np.moveaxis(lines, axis, 2).reshape(-1, ALONG, 3))
-    commanded, moved_before, moved_after = (np.concatenate(part) for part in (straight, before, after))
-    layers = (
-        ("before", "before", projected(commanded + before_scale * moved_before)),
-        ("after", "after", projected(commanded + before_scale * moved_after)),
-        ("own", "c3", projected(commanded + after_scale * moved_after)),
-    )
+    commanded, *moved = (np.concatenate(part) for part in drawn)
+    layers = [
+        (name, role, projected(commanded + scale * moved[side]))
+        for name, role, side, scale in (
+            ("before", "before", 0, before_scale), ("after", "after", -1, before_scale), ("own", "c3", -1, after_scale)
+        )[: 1 if grid.after_mm is None else 3]
+    ]  # fmt: skip
     plot = _space([projected(commanded), *(lines for _, _, lines in layers)])
     grey = projected(commanded[:, [0, -1]])
     plot.line(grey[..., 0], grey[..., 1], "grid", width=0.8)
@@ -266,10 +276,12 @@ def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
         text = f"{AXES[axis]} {low[axis]:g} … {high[axis]:g} mm".replace("-", "−")
         x, y = projected(place).tolist()
         plot.text(x, y, text, anchor=anchor, shift=shift)
-    title = (
-        f"The working volume, errors enlarged {thousands(before_scale)} times: before and after; after once more "
-        f"{thousands(after_scale)} times"
-    )
+    title = f"The working volume, errors enlarged {thousands(before_scale)} times"
+    if grid.after_mm is not None:
+        title = (
+            f"The working volume, errors enlarged {thousands(before_scale)} times: before and after; after once more "
+            f"{thousands(after_scale)} times"
+        )
     data = {"before_scale": before_scale, "after_scale": after_scale}
     key = f"space-{number}"
     return Picture(key, "The volume in space", svg(key, title, [plot], WIDE), data, title)
@@ -293,7 +305,7 @@ def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> lis
     """
     pictures = []
     cut = [(axis, *_plane(grid, axis)) for axis in (2, 1, 0)]
-    for side, when in enumerate(("before", "after")):
+    for side, when in zip(range(len(grid.sides)), ("before", "after"), strict=False):
         planes = [(axis, edges, both_um[side]) for axis, edges, both_um in cut]
         top_um = max(float(np.linalg.norm(errors_um, axis=-1).max()) for *_, errors_um in planes) or 1.0
         for axis, edges, errors_um in planes:
@@ -320,7 +332,7 @@ def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> lis
 
 
 def _plane(grid: VolumeOnGrid, axis: int) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the middle plane across ``axis``: edges of its cells along each axis, mm, and both errors (up, across, 3), um."""
+    """Return the middle plane across ``axis``: edges of its cells along each axis, mm, and errors (up, across, 3), um."""
     edges = [np.linspace(level[0], level[-1], 2 if k == axis else CELLS + 1) for k, level in enumerate(grid.levels_mm)]
     centres = [0.5 * (part[:-1] + part[1:]) for part in edges]
     return edges, [part.squeeze(axis).swapaxes(0, 1) * 1e3 for part in resampled(grid, centres)]
