@@ -297,6 +297,7 @@ class ProgramWriter:
         scale, digits = block.scale, self.digits(block.scale)
         unit = 10.0**-digits
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words} if piece == 0 else {}
+        modes = block.modes if piece == 0 else {}
         changes: list[tuple[int, int, str]] = []
         more: list[str] = []
         start_mm = np.array(self.written_mm)
@@ -327,7 +328,7 @@ class ProgramWriter:
             if closed and in_arc and not np.isnan(start_mm[k]):
                 value = (start_mm[k] - offset[k]) / scale
                 before = value
-            if block.absolute:
+            if modes.get(letter, block.absolute):
                 differs = bool(np.rint(value / unit) != np.rint(before / unit))
                 got = put(letter, value, differs, always=piece > 0 and in_arc)
                 if got is not None:
@@ -338,7 +339,7 @@ class ProgramWriter:
                 if got is not None:
                     self.written_mm[k] = start_mm[k] + got * scale
         if block.kind == "arc":
-            self._arc_words(block, plane, centre, sweep, offset, start_mm, put, move.centre_mm[0])
+            self._arc_words(block, plane, centre, sweep, offset, start_mm, put, modes, move.centre_mm[0])
             if count > 1:
                 for letter in ("P", "TURN"):
                     if letter in words:
@@ -380,6 +381,7 @@ class ProgramWriter:
         offset: FloatArray,
         start_mm: FloatArray,
         put: Callable[..., float | None],
+        modes: Mapping[str, bool],
         wanted: FloatArray,
     ) -> None:
         a, b = PLANE_AXES[plane]
@@ -395,7 +397,7 @@ class ProgramWriter:
             return
         for k in (a, b):
             letter = "IJK"[k]
-            base = offset[k] if block.centre_absolute else start_mm[k]
+            base = offset[k] if modes.get(letter, block.centre_absolute) else start_mm[k]
             value = (centre[k] - base) / block.scale
             differs = value
             if self.dialect.pole:

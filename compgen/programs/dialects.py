@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from compgen.data.csv_files import csv_table
@@ -13,6 +13,7 @@ from compgen.data.machine import Vector3
 from compgen.errors import InputError
 
 #: What a G code does, in words that the reader knows; codes that only change how the control moves do "nothing".
+#: A "setting" takes all words of its block as its own; "setting P0" is one with P0 only.
 _COMMON = {
     **{f"G{k}": f"motion {k}" for k in range(4)},
     "G4": "dwell",
@@ -26,6 +27,7 @@ _CYCLES = {f"G{k}": f"cycle {k}" for k in (81, 82, 83, 85, 86, 89)}
 _GRBL = {
     **_COMMON,
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
+    **{"G28.1": "store home", "G30.1": "store home"},
     **{"G43.1": "tool offset", "G49": "no tool", "G92": "preset", "G92.1": "no preset", "G91.1": "centre incremental"},
 }
 _LENGTH = {"G43": "tool", "G49": "no tool", "G98": "initial level", "G99": "R level", "G73": "cycle 73"}
@@ -34,56 +36,131 @@ _LINUXCNC = {
     **_CYCLES,
     **_LENGTH,
     **{"G90.1": "centre absolute", "G92.2": "no preset", "G43.1": "tool offset", "G8": "nothing"},
+    **{"G52": "preset shift"},
     **dict.fromkeys(("G59.1", "G59.2", "G59.3"), "work offset"),
-    **dict.fromkeys(("G7", "G61.1"), "nothing"),
+    **dict.fromkeys(("G61.1",), "nothing"),
 }
-del _LINUXCNC["G7"]  # lathe diameter mode
 _FANUC = {
     **_COMMON,
     **_CYCLES,
     **_LENGTH,
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
-    **{"G54.1": "work offset", "G84": "cycle 84", "G74": "cycle 84", "G92": "preset", "G92.1": "no preset"},
+    **{"G54.1": "work offset", "G92": "preset", "G92.1": "no preset", "G52": "shift"},
+    # left-hand and right-hand tapping feed out, fine boring and boring by hand do not; Q of G76 is a way aside at the bottom
+    **{"G74": "cycle 84", "G84": "cycle 84", "G76": "cycle 86", "G88": "cycle 86"},
+    # Haas: offsets G110 to G129 and G154 P1 to P99
+    **{f"G{k}": "work offset" for k in (*range(110, 130), 154)},
+    # smoothing and look-ahead (G5, G5.1, G8; Haas G103, G187), supervision of travel and spindle, error of the workpiece off
+    **{"G5": "setting P0 P10000", "G54.2": "setting P0", "G54.4": "setting P0"},
+    **dict.fromkeys(("G5.1", "G8", "G103", "G187", "G22", "G23", "G25", "G26"), "setting"),
     # G50, G50.1, G69, G15, G67: scaling, mirror image, rotation, polar coordinates, macro calls off; G60: from one side
-    **dict.fromkeys(("G8", "G15", "G50", "G50.1", "G60", "G61.1", "G62", "G63", "G67", "G69", "G13.1"), "nothing"),
+    **dict.fromkeys(("G11", "G15", "G50", "G50.1", "G60", "G61.1", "G62", "G63", "G67", "G69", "G13.1"), "nothing"),
 }
 _SIEMENS = {
     **_COMMON,
     **{"G70": "inch", "G700": "inch", "G71": "mm", "G710": "mm", "G500": "no work offset", "G93": "feed inverse"},
     **{"G53": "machine coordinates", "G153": "machine coordinates", "SUPA": "machine coordinates"},
-    **{"G74": "unknown position", "G75": "unknown position"},
+    **{"G74": "unknown position", "G75": "unknown position", "TRANS": "shift all", "ATRANS": "shift more"},
+    **{"ROT": "shift off", "SCALE": "shift off", "MIRROR": "shift off"},
     **{f"G{k}": "work offset" for k in range(505, 600)},
-    **dict.fromkeys(("G60", "G601", "G602", "G603", "G641", "G642", "G643", "G644", "G645"), "nothing"),
+    **dict.fromkeys(("G60", "G601", "G602", "G603", "G641", "G642", "G643", "G644", "G645", "G290"), "nothing"),
     **dict.fromkeys(
-        ("FFWON", "FFWOF", "SOFT", "BRISK", "DRIVE", "COMPOF", "CFC", "CFTCP", "CFIN", "STOPRE"), "nothing"
+        ("FFWON", "FFWOF", "SOFT", "SOFTA", "BRISK", "BRISKA", "DRIVE", "COMPON", "COMPOF", "COMPCAD"), "nothing"
     ),
     **dict.fromkeys(
-        ("NORM", "ROTOF", "TRAFOOF", "DIAMOF", "CDOF", "KONT", "KONTC", "KONTT", "G450", "G451"), "nothing"
+        ("COMPCURV", "COMPSURF", "CFC", "CFTCP", "CFIN", "STOPRE", "UPATH", "SPATH", "FNORM", "FLIN"), "nothing"
     ),
+    **dict.fromkeys(("DYNNORM", "DYNPOS", "DYNROUGH", "DYNSEMIFIN", "DYNFINISH", "DYNPREC"), "nothing"),
+    **dict.fromkeys(("G25", "G26"), "setting"),
+    **dict.fromkeys(("ORIAXES", "ORIVECT", "ORIMKS", "ORIWKS", "ORIEULER", "ORIRPY", "OSOF", "OSC", "OST"), "nothing"),
+    **dict.fromkeys(("NORM", "TRAFOOF", "DIAMOF", "CDOF", "KONT", "KONTC", "KONTT", "G450", "G451"), "nothing"),
 }
 for _code in ("G20", "G21"):
     del _SIEMENS[_code]
 _HEIDENHAIN = {
     **_COMMON,
     **{"G70": "inch", "G71": "mm", "G29": "pole here", "G30": "blank", "G31": "blank", "G99": "tool definition"},
-    **dict.fromkeys(("G51",), "nothing"),
+    **{"G5": "last arc", "G54": "shift", "G79": "drill here", "G98": "label", "FMAX": "rapid once"},
+    # G62 is the tolerance (cycle 32), G36 turns the spindle, G38 stops, G51 names the next tool
+    **{"G62": "setting", "G36": "setting", "G38": "nothing", "G51": "setting"},
 }
-for _code in ("G20", "G21", "G94", "G95", "G61", "G64", "G97", "G9", *(f"G{k}" for k in range(54, 60))):
+for _code in ("G20", "G21", "G94", "G95", "G61", "G64", "G97", "G9", *(f"G{k}" for k in range(55, 60))):
     del _HEIDENHAIN[_code]
 
 _CAM = "post the path of the tool centre from CAM and correct that"
+_TURNED = "turned, scaled or mirrored coordinates are not followed; post the program without them"
+_CALLED = "post one program without calls"
+_MACRO = f"subprograms and macros are not followed; {_CALLED}"
+_MILLED = "milling cycles are not followed; post their moves"
+_POLAR = "polar coordinates are not followed; post X and Y"
+_ROUNDED = "chamfers and roundings that the control makes are not followed; post their lines and arcs"
+_PROBED = "where a probe stops is not known; take probing out of the program"
+_ROTARY = "moves of rotary axes and a turned plane are not followed; post a program with X, Y and Z"
+_SPLINE = "splines are not followed; post lines and arcs"
+_PATTERN = "patterns of holes are not followed; post X and Y of each hole"
+_TURNING = "belongs to turning; correct programs for milling"
+_TABLES = "writes offsets while the program runs, so that they are not known; set them at the control"
 #: Why a code is refused, and what to do; the same in all dialects unless a dialect gives the code a meaning.
 REFUSED = {
     **dict.fromkeys(("G41", "G42", "G41.1", "G42.1"), f"cutter radius compensation is not followed; {_CAM}"),
-    **dict.fromkeys(("G68", "G68.2", "G16", "G51", "G51.1", "G24", "G52"), "turned, scaled, mirrored or shifted coordinates "
-                    "are not followed; post the program without them"),
-    **dict.fromkeys(("G5", "G5.1", "G5.2", "G5.3", "G6", "G6.1", "G6.2"), "splines are not followed; post lines and arcs"),
-    **dict.fromkeys(("G65", "G66", "M98", "M97", "M198"), "subprograms and macros are not followed; post one program "
-                    "without calls"),
-    "G10": "writes offsets while the program runs, so that they are not known; set them at the control",
+    **dict.fromkeys(("G68", "G68.2", "G51", "G51.1", "G24"), _TURNED),
+    ",": _ROUNDED,
+    "G52": "shifts of coordinates are not known in this dialect; post the program without them",
+    "G16": _POLAR,
+    **dict.fromkeys(("G5", "G5.1", "G5.2", "G5.3", "G6", "G6.1", "G6.2"), _SPLINE),
+    **dict.fromkeys(("G65", "G66", "M98", "M97", "M198"), _MACRO),
+    "G10": _TABLES,
     "G44": "negative tool length is not followed; use G43",
+    **dict.fromkeys(("G43.4", "G43.5", "G12.1", "G7.1", "G107", "G143", "G53.1"), _ROTARY),
+    **dict.fromkeys(("G54.2", "G54.4"), "the offset of a table or of a workpiece is not known; post the program without it"),
+    **dict.fromkeys(("G12", "G13", "G47", "G150"), _MILLED),
+    **dict.fromkeys(("G70", "G71", "G72"), _PATTERN),
+    **dict.fromkeys(("G27", "G31", "G35", "G36", "G37", "G136", *(f"G38.{k}" for k in range(2, 8))), _PROBED),
+    **dict.fromkeys(("G33", "G33.1", "G34", "G76"), "threads by a moving spindle are not followed; post a tapping cycle"),
+    "G87": "back boring moves aside within the hole and is not followed; post its moves",
+    "G92.3": "restores an offset of another program, which is not known; post G92",
     "M99": "a program that repeats itself is not followed; end it with M30",
-    "G96": "constant surface speed belongs to turning",
+    **dict.fromkeys(("M70", "M71", "M72", "M73"), "modal states that are kept and restored are not followed; "
+                    "post the codes themselves"),
+    **dict.fromkeys(("G7", "G96"), f"constant surface speed and diameters: {_TURNING}"),
+}  # fmt: skip
+_HEIDENHAIN_REFUSED = {
+    **dict.fromkeys(("G10", "G11", "G12", "G13", "G15", "G16"), _POLAR),
+    **dict.fromkeys(("G24", "G25"), _ROUNDED),
+    **dict.fromkeys(("G26", "G27"), "an approach on a tangent arc needs cutter radius compensation; post its lines and arcs"),
+    **dict.fromkeys(("G43", "G44"), f"compensation along an axis is not followed; {_CAM}"),
+    **dict.fromkeys(("G28", "G72", "G73", "G80"), _TURNED),
+    "G6": "an arc on a tangent has no centre; post G2 or G3",
+    "G7": "moves along single axes by G7 are not followed; post G1",
+    "G39": _MACRO,
+    "G53": "datums of a table are not known; post G54 with X, Y and Z",
+    "G247": "the datum that the program chooses is not known; choose it at the control",
+    **dict.fromkeys((f"G{k}" for k in (37, *range(56, 60), *range(74, 79), *range(120, 126), 127)), _MILLED),
+    **dict.fromkeys((f"G{k}" for k in (204, 208, *range(210, 240), *range(251, 300))), _MILLED),
+    **dict.fromkeys((f"G{k}" for k in (55, *range(400, 500))), _PROBED),
+    "M92": "positions from a point of the maker are not known; use M91",
+    **dict.fromkeys(("M128", "M130", "M144"), _ROTARY),
+    "M140": "how far the tool goes back is not known; post the move",
+}  # fmt: skip
+_SIEMENS_REFUSED = {
+    **dict.fromkeys(("G58", "G59"), "G58 and G59 with X, Y, Z shift coordinates on some controls and choose offsets on others; "
+                    "post TRANS and ATRANS, or G505"),
+    **dict.fromkeys(("ROT", "AROT", "ROTS", "AROTS", "CROTS", "RPL", "SCALE", "ASCALE", "MIRROR", "AMIRROR"), _TURNED),
+    **dict.fromkeys(("TRAORI", "TRANSMIT", "TRACYL", "TRAANG", "CYCLE800", "TOFRAME", "TOROT", "TCARR"), _ROTARY),
+    **dict.fromkeys(("G110", "G111", "G112", "AP", "RP"), _POLAR),
+    **dict.fromkeys(("CHF", "CHR", "RND", "RNDM"), _ROUNDED),
+    **dict.fromkeys(("CIP", "CT", "AR", "I1", "J1", "K1"), "arcs through a point, on a tangent or by an angle are not followed; "
+                    "post G2 and G3 with I, J, K or CR="),
+    **dict.fromkeys(("ASPLINE", "BSPLINE", "CSPLINE", "POLY", "INVCW", "INVCCW"), _SPLINE),
+    **dict.fromkeys(("G331", "G332"), "threads by a moving spindle are not followed; post CYCLE84"),
+    **dict.fromkeys(("IF", "ELSE", "ENDIF", "GOTO", "GOTOF", "GOTOB", "GOTOC", "FOR", "WHILE", "LOOP", "REPEAT", "CASE", "DEF"),
+                    "variables, conditions and loops are not followed; post the program with numbers"),
+    **dict.fromkeys(("CALL", "PCALL", "EXTERN", "EXTCALL", "PROC", "EXECTAB", "SAVE", "MCALL"), _MACRO),
+    **dict.fromkeys(("HOLES1", "HOLES2", "CYCLE801", "CYCLE802"), _PATTERN),
+    **dict.fromkeys(("LONGHOLE", "SLOT1", "SLOT2", "POCKET1", "POCKET2", "POCKET3", "POCKET4"), _MILLED),
+    **dict.fromkeys((f"CYCLE{k}" for k in (*range(60, 65), *range(70, 80), 90, 899)), _MILLED),
+    **dict.fromkeys((f"CYCLE{k}" for k in range(971, 998)), _PROBED),
+    "G291": "programs in the ISO dialect are read with --dialect fanuc",
 }  # fmt: skip
 _M_CODES = (*range(10), 10, 11, 13, 14, 19, 29, 30, *range(40, 46), 48, 49, 60)
 #: The M codes that act when the block ends, so that they follow the last piece of a divided block.
@@ -91,14 +168,16 @@ AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "G9"}
 
 _VALUE = r"[+-]?\s*(?:\d+\.?\d*|\.\d+)"
 _PARENTHESES = r"\([^()\n]*\)"
+_WORDS = rf"(?P<address>[A-Z])\s*(?P<value>{_VALUE})"
 
 
 @dataclass(frozen=True)
 class Dialect:
     """How programs of a control are written.
 
-    ``codes`` gives the meaning of G codes (and of words in letters), ``end`` the codes that end a program; ``decimals``
-    those of mm and inch. ``point_needed``: whole numbers without a decimal point may be increments.
+    ``codes`` gives the meaning of G codes (and of words in letters), ``refused`` says why others are not followed, ``end``
+    names the codes that end a program; ``decimals`` are those of mm and inch. ``comments`` is the pattern of comments and of
+    settings in words, which move nothing. ``point_needed``: whole numbers without a decimal point may be increments.
     """
 
     name: str
@@ -106,7 +185,8 @@ class Dialect:
     comments: str
     comment: str
     decimals: tuple[int, int] = (3, 4)
-    words: str = rf"([A-Z])\s*({_VALUE})"
+    refused: Mapping[str, str] = field(default_factory=lambda: REFUSED)
+    words: str = _WORDS
     m_codes: frozenset[str] = frozenset(f"M{k}" for k in _M_CODES)
     end: frozenset[str] = frozenset(("M2", "M30"))
     end_needed: bool = True
@@ -118,7 +198,7 @@ class Dialect:
 
     def word_pattern(self) -> re.Pattern[str]:
         """Return the pattern of one word: its address and value, or a comment."""
-        return re.compile(rf"\s*(?:{self.words}|({self.comments}))", re.IGNORECASE)
+        return re.compile(rf"\s*(?:{self.words}|(?P<comment>{self.comments}))", re.IGNORECASE)
 
     def said(self, text: str) -> str:
         """Return ``text`` as a comment block."""
@@ -126,15 +206,26 @@ class Dialect:
         return self.comment.format(clean.replace(";", ",").upper())
 
 
-#: An address of more than one letter needs its equals sign; CR5 is none.
-_SIEMENS_WORDS = rf"((?:CR|TURN)(?=\s*=)|[A-Z])\s*=?\s*({_VALUE}|\"[^\"]*\")"
+#: An address of more than one letter needs its equals sign; CR5 is none. X=IC(5) is 5 from where X is, X=AC(5) from its zero.
+_SIEMENS_WORDS = (
+    r"(?P<address>(?:CR|TURN|[XYZ]1)(?=\s*=)|(?![SM]\d+\s*=)[A-Z])\s*(?:=\s*(?P<mode>AC|IC|DC|ACP|ACN)\s*\(\s*|=?\s*)"
+    rf"(?P<value>{_VALUE}|\"[^\"]*\")(?(mode)\s*\))"
+)
+_CALLS = "MSG|GROUP_BEGIN|GROUP_END|GROUP_ADDEND|WORKPIECE|CYCLE832|SETMS|FGROUP|PROTS"
+_ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|JERKLIM|FA|SCC|SVC|S\d|M\d+)"
+#: Calls, axis functions and labels of SINUMERIK that move nothing of X, Y and Z.
+_SIEMENS_SETTINGS = (
+    r"\bMSG\s*\([^\n]*\)|;[^\n]*"
+    rf"|\b(?:{_CALLS})\s*\((?:\"[^\"\n]*\"|[^()\"\n])*\)|\bCYCLE800\s*\(\s*\)|\bCYCLE832\b(?!\s*\()"
+    rf"|\b{_ASSIGNED}\s*(?:\[\s*\w+\s*\])?\s*=\s*(?:(?:AC|IC|DC|ACP|ACN)\s*\(\s*{_VALUE}\s*\)|{_VALUE})"
+)
 DIALECTS = {
     item.name: item
     for item in (
         Dialect(
             "fanuc",
             _FANUC,
-            _PARENTHESES,
+            _PARENTHESES + r"|;(?=[;\s]*$)",
             "({})",
             point_needed=True,
             # custom macro: system variables 5221 ... are the offsets of G54
@@ -147,8 +238,9 @@ DIALECTS = {
         Dialect(
             "siemens",
             _SIEMENS,
-            r"\bMSG\s*\([^\n]*\)|;[^\n]*",
+            _SIEMENS_SETTINGS,
             "; {}",
+            refused={**REFUSED, **_SIEMENS_REFUSED},
             words=_SIEMENS_WORDS,
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 17, 70)),
             end=frozenset(("M2", "M17", "M30")),
@@ -166,7 +258,10 @@ DIALECTS = {
             r";[^\n]*",
             "; {}",
             decimals=(4, 5),
-            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 90)),
+            refused={**REFUSED, **_HEIDENHAIN_REFUSED},
+            words=rf"(?P<address>D[LR](?=\s*[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*(?P<value>{_VALUE}|\"[^\"]*\")",
+            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 91, 94, 101, 102, 103, 107, 108, 116, 117, 118,
+                                                120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
             end=frozenset(("M2", "M30", "%")),
             work_offset="PRESET",
             pole=True,
@@ -178,6 +273,7 @@ DIALECTS = {
             _PARENTHESES + r"|;[^\n]*",
             "({})",
             decimals=(5, 6),
+            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, *range(50, 54), *range(61, 69))),
             end=frozenset(("M2", "M30", "%")),
             check=(
                 "o<volcomp{label}> if [ABS[#{variable}-[{value}]] GT 0.001]",

@@ -19,7 +19,7 @@ import numpy as np
 from compgen.data.machine import Machine, Vector3
 from compgen.data.messages import visible_line
 from compgen.errors import InputError
-from compgen.programs.dialects import REFUSED, Dialect
+from compgen.programs.dialects import Dialect
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
 from compgen.programs.runs import PlainRun, PlainWords
 
@@ -70,6 +70,8 @@ class SingleBlock:
     scale: float
     centre_absolute: bool
     inverse_time: bool
+    #: Addresses that say for themselves whether they are absolute: X=IC(5), I=AC(5).
+    modes: Mapping[str, bool] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,11 @@ class Batch:
     lines: list[str]
     moves: Moves
     segments: list[SingleBlock | PlainRun]
+
+
+def number_of(text: str) -> float:
+    """Return the value of a word; blanks between its sign and its digits do not count."""
+    return float(text.replace(" ", "").replace("\t", ""))
 
 
 class Reader:
@@ -103,6 +110,14 @@ class Reader:
         self.feed, self.offset_name = "minute", ""
         self._unit_known = False
         self.work, self.preset, self.length = (0.0,) * 3, (0.0,) * 3, (0.0,) * 3
+        #: Shift of the coordinates by the program: G52, TRANS, G54 of HEIDENHAIN.
+        self.shift: Vector3 = (0.0,) * 3
+        #: Where the reference points are, mm of the machine: the second is not known; G28.1 and G30.1 store others.
+        self.home = {"G28": [0.0] * 3, "G30": [math.nan] * 3}
+        #: Rotary axes that the program names, with their only position.
+        self.rotary: dict[str, float] = {}
+        self.last_arc: int | None = None
+        self._modes: dict[str, str] = {}
         self.selected = self.loaded = ""
         self.length_on = self.tool_on = False
         self.pole: list[float] = [math.nan] * 3
@@ -251,6 +266,7 @@ class Reader:
 
     def _block(self, number: int, text: str, first: int) -> SingleBlock:
         self._line, self._text = number, text
+        self._modes = {}
         before, words = len(self._rows), self._words(text)
         kind = self._act(words) if words else "keep"
         return SingleBlock(
@@ -264,6 +280,7 @@ class Reader:
             self.scale,
             self.centre_absolute or (self.dialect.pole and self.absolute),
             self.feed == "inverse",
+            {letter: mode == "AC" for letter, mode in self._modes.items()},
         )
 
     def _words(self, text: str) -> list[tuple[str, str, int, int]]:
@@ -281,33 +298,44 @@ class Reader:
         percent = re.match(r"\s*(?:N\d+\s*)?%(.*)", body)
         if percent:
             return self._percent(percent[1])
-        if dialect.name in ("fanuc", "siemens") and re.match(r"\s*[O:]\d", body, re.IGNORECASE):
+        named = re.match(r"\s*(?:[O:]\d+|<[^<>]*>)", body, re.IGNORECASE)
+        if named and dialect.name in ("fanuc", "siemens"):
             if self.started:
                 self._fail("a second program begins here; give one program at a time")
-            at = re.match(r"\s*[O:]\d+", body, re.IGNORECASE).end()  # type: ignore[union-attr]
+            at = named.end()
         if dialect.pole:
             body = body.rstrip("*").rstrip()
+            if re.match(r"\s*(?:N\d+\s*)?\*", body):  # a heading within the program
+                return []
+        label = re.match(r"\s*(?:N\d+\s*)?[A-Z_]{2}\w*\s*:(?!=)", body, re.IGNORECASE)
+        if label and dialect.name == "siemens":
+            at = label.end()
         words: list[tuple[str, str, int, int]] = []
         while at < len(body):
             found = self._pattern.match(body, at)
             if found is None:
                 at = self._unread(body, at, words)
                 continue
-            if found[3] is not None:
-                if MARK in found[3]:
+            if found["comment"] is not None:
+                if MARK in found["comment"]:
                     self._fail("the program has been corrected before; give the program as it comes from CAM")
             else:
-                if found[1] in "oO":
+                address = found["address"].upper()
+                if address == "O":
                     self._fail(
                         "subprograms and loops are not followed; post one program without calls (O1234: --dialect fanuc)"
                     )
-                words.append((found[1].upper(), found[2], found.start(2), found.end(2)))
+                words.append((address, found["value"], found.start("value"), found.end("value")))
+                if mode := found.groupdict().get("mode"):
+                    self._modes[address] = mode.upper()
             at = found.end()
             if not body[at:].strip():
                 break
         return words
 
     def _percent(self, rest: str) -> list[tuple[str, str, int, int]]:
+        if self.dialect.name == "siemens" and self.started and rest.strip():
+            self._fail("a second program begins here; give one program at a time")
         if self.dialect.pole and re.search(r"\bG7[01]\b", rest):  # name of the program, with its unit of length
             self.scale = MM_PER_INCH if re.search(r"\bG70\b", rest) else 1.0
             self._unit_known = True
@@ -319,90 +347,132 @@ class Reader:
 
     def _unread(self, body: str, at: int, words: list[tuple[str, str, int, int]]) -> int:
         """Refuse what is no word, or take a code in letters; returns where the block goes on."""
-        rest = body[at:].strip()
+        rest, dialect = body[at:].strip(), self.dialect
         name = self._name.match(body, at)
         if name:
             code = name[1].upper()
             if code in self.setup.keep_unknown:
                 return name.end()
-            meaning = self.dialect.codes.get(code)
-            if meaning and not name[2]:
+            if code in dialect.codes and not name[2]:
                 words.append((code, "", at, at))
                 return name.end(1)
-        if rest[0] in "#[" or re.match(r"[A-Z]+\d*\s*=?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[A-Z]|=", rest, re.IGNORECASE):
+            if code in dialect.refused:
+                self._fail(f"{code}: {dialect.refused[code]}")
+        if rest[0] == ",":
+            self._fail(f"{rest[:20]!r}: {dialect.refused['M98' if dialect.pole else ',']}")
+        if rest[0] == "$":
+            self._fail(f"{rest[:20]!r} is a command for the control, none of a program; give the program alone")
+        variable = r"[A-Z]+\d*\s*=?\s*[-+]?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[-+]?[A-Z(]|="
+        if dialect.pole:
+            variable += r"|[A-Z]+\s*[-+]?Q\d|Q\d+\s*=|D\d+\s*Q"
+        if rest[0] in "#[" or re.match(variable, rest, re.IGNORECASE):
             self._fail(f"{rest[:20]!r}: variables and expressions are not followed; post the program with numbers")
         if rest[0] in "oO":
             self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")
         if name:
             advice = f"; if it moves nothing, add --keep-unknown {name[1].upper()}"
-            self._fail(f"{name[1]} is not known in the dialect {self.dialect.name}{advice}")
+            self._fail(f"{name[1]} is not known in the dialect {dialect.name}{advice}")
         self._fail(f"{rest[:20]!r} cannot be read; expected words such as X10.5")
 
     def _act(self, words: list[tuple[str, str, int, int]]) -> str:
         """Change the modal state, then move; returns how the block is rewritten."""
         dialect, values = self.dialect, dict[str, float]()
         codes: list[str] = []
-        kept = False
         name = ""
         for letter, text, _, _ in words:
             if not text:
                 codes.append(letter)
-                continue
-            if text[0] == '"':
+            elif text[0] == '"':
                 if letter != "T":
                     self._fail(f"{letter}={text} cannot be read; expected a number")
                 name = text.strip('"').upper()
+            elif letter in "GM":
+                codes.append(f"{letter}{number_of(text):g}")
+        setting = [code for code in codes if self._is_setting(code)]
+        cycles = self.cycle is not None or any(dialect.codes.get(code, "").startswith("cycle") for code in codes)
+        lengths = "XYZIJKRQ" if cycles else "XYZIJKR"
+        for letter, text, _, _ in words:
+            if not text or text[0] == '"' or letter in "GM":
                 continue
-            value = float(text.replace(" ", "").replace("\t", ""))
-            if letter in "GM" and len(letter) == 1:
-                codes.append(f"{letter}{value:g}")
+            value = number_of(text)
+            if letter in ("X1", "Y1", "Z1"):
+                if not {"G74", "G75"} & set(codes):
+                    self._fail(f"{letter}: machine axes are not followed; post X, Y and Z")
+                letter = letter[0]
+            if letter in "ABCUVWE" and not setting:
+                self._further_axis(letter, text, value, codes)
                 continue
-            if letter == "O":
-                self._fail(
-                    "subprograms and loops are not followed; post one program without calls (--dialect fanuc: O1234)"
-                )
-            if letter in "ABCUVWE":
-                self._fail(
-                    f"{letter}{text}: rotary and further axes are not followed; correct a program with X, Y and Z"
-                )
             if letter in values:
                 self._fail(f"{letter} is given twice in a block")
-            cycles = self.cycle is not None or any(dialect.codes.get(code, "").startswith("cycle") for code in codes)
-            lengths = "XYZIJKRQ" if cycles else "XYZIJKR"
-            if letter in lengths and dialect.point_needed and "." not in text and value != 0.0:
+            if letter in lengths and dialect.point_needed and not setting and "." not in text and value != 0.0:
                 self._fail(
                     f"{letter}{text} has no decimal point: mm or increments; post it with a decimal point", letter
                 )
             values[letter] = value
         if self.ended and (values.keys() - {"N"} or any(code not in dialect.end for code in codes)):
             self._fail("blocks after the end of the program; give one program without subprograms")
+        if {"G90", "G91"} <= set(codes):
+            self._fail("G90 and G91 in one block: which coordinates are incremental is not clear; divide the block")
         actions: list[str] = []
-        for code in codes:
+        first = ("absolute", "incremental", "inch", "mm")  # before what they are about
+        for code in sorted(codes, key=lambda code: dialect.codes.get(code) not in first):
             if code[0] == "M" and code[1:].isdigit():
                 self._m_code(code)
+                if code == "M91":
+                    actions.append("machine coordinates")
                 continue
             meaning = dialect.codes.get(code)
-            if code in self.setup.keep_unknown:
-                kept = True
+            if code in setting:
+                _, *needed = (meaning or "").split()
+                if needed and not any(f"{letter}{value:g}" in needed for letter, value in values.items()):
+                    self._fail(f"{code} is followed with {' or '.join(needed)} only; post the program without it")
             elif meaning is None:
                 advice = f"if it moves nothing, add --keep-unknown {code}"
-                reason = REFUSED.get(code, f"is not known in the dialect {dialect.name}; {advice}")
-                self._fail(f"{code}: {reason}" if code in REFUSED else f"{code} {reason}")
+                reason = dialect.refused.get(code, f"is not known in the dialect {dialect.name}; {advice}")
+                self._fail(f"{code}: {reason}" if code in dialect.refused else f"{code} {reason}")
             elif meaning.startswith(("motion", "cycle")):
                 actions.insert(0, meaning)
             else:
                 self._modal(code, meaning, values, actions)
+        if setting:
+            motions = [int(action[7:]) for action in actions if action.startswith("motion")]
+            if len(motions) != len(actions) or (motions and values.keys() & set("XYZ")):
+                self._fail(
+                    f"{setting[0]} and a move are in one block, so that the words are ambiguous; divide the block"
+                )
+            if motions:
+                self.motion, self.cycle = motions[0], None
+            if not dialect.pole:  # there T is a tolerance (G62) or the next tool (G51)
+                self._tool_words(values, codes, name)
+            return "keep"
         self._tool_words(values, codes, name)
         if "R" in values and dialect.name == "siemens":
             self._fail("R is a variable; write a radius as CR=")
-        axes = [values.get(letter) for letter in "XYZ"]
-        if kept and any(axis is not None for axis in axes):
-            if any(action.startswith(("motion", "cycle")) for action in actions):
-                self._fail(
-                    "a kept code and a move are in one block, so that the axis words are ambiguous; divide the block"
-                )
-            return "keep"
-        return self._execute(actions, axes, values)
+        return self._execute(actions, [values.get(letter) for letter in "XYZ"], values)
+
+    def _is_setting(self, code: str) -> bool:
+        """Whether the words of a block with ``code`` belong to it and move nothing."""
+        kept = code in self.setup.keep_unknown and code[0] != "M"
+        return kept or self.dialect.codes.get(code, "").startswith("setting")
+
+    def _further_axis(self, letter: str, text: str, value: float, codes: list[str]) -> None:
+        """Take a rotary axis that stays where it is; refuse what moves."""
+        if letter == "E" and {"M67", "M68"} & set(codes):
+            return
+        incremental = not self.absolute if letter not in self._modes else self._modes[letter] == "IC"
+        if "G90" in codes or "G91" in codes:
+            incremental = "G91" in codes
+        if letter in "UVWE":
+            self._fail(f"{letter}{text}: further axes are not followed; correct a program with X, Y and Z")
+        moving = next((code for code in codes if code in ("G0", "G1", "G2", "G3", "G28")), f"G{self.motion}")
+        if letter not in self.rotary and not incremental and moving in ("G1", "G2", "G3"):
+            self._fail(f"{letter}{text}: the rotary axis may turn while the tool cuts; position it with G0 before")
+        place = self.rotary.setdefault(letter, 0.0 if incremental else value)
+        if value != (0.0 if incremental else place):
+            self._fail(
+                f"{letter}{text}: the rotary axis turns, from {place:g}; correct a program for each of its positions"
+            )
+        self.assumed[f"the rotary axis {letter} stays at {place:g} deg, where the errors were measured"] = None
 
     def _m_code(self, code: str) -> None:
         if code in self.dialect.end:
@@ -410,11 +480,10 @@ class Reader:
         elif code in self.dialect.m_codes or code in self.setup.keep_unknown:
             if code == "M6":
                 self.loaded = self.selected
-        elif self.dialect.pole and code in ("M91",):
-            pass
         else:
             advice = f"is not known; if it moves nothing, add --keep-unknown {code}"
-            self._fail(f"{code}: {REFUSED[code]}" if code in REFUSED else f"{code} {advice}")
+            refused = self.dialect.refused
+            self._fail(f"{code}: {refused[code]}" if code in refused else f"{code} {advice}")
 
     def _modal(self, code: str, meaning: str, values: dict[str, float], actions: list[str]) -> None:
         """Take over a code that is no motion; what acts in this block only is added to ``actions``."""
@@ -430,8 +499,10 @@ class Reader:
         elif what == "feed":
             self.feed = argument
         elif meaning == "work offset":
-            if code in ("G54", "G54.1") and "P" in values and self.dialect.name == "fanuc":
-                code = f"G54.1P{values['P']:g}"
+            if code in ("G54", "G54.1", "G154") and "P" in values and self.dialect.name == "fanuc":
+                code = f"{'G154' if code == 'G154' else 'G54.1'}P{values['P']:g}"
+            if code in self.dialect.refused and values.keys() & set("XYZ"):
+                self._fail(f"{code}: {self.dialect.refused[code]}")
             self._use_offset(code)
         elif meaning == "no work offset":
             self.offset_name, self.work, self.named = "none", (0.0,) * 3, [False] * 3
@@ -455,6 +526,19 @@ class Reader:
         elif meaning == "no preset":
             self.preset = (0.0,) * 3
             actions.append(meaning)
+        elif what in ("shift", "preset") and argument:
+            self._shift(code, argument, values)
+            actions.append("done")
+        elif meaning == "shift":
+            self._shift(code, "more" if self.dialect.pole and not self.absolute else "", values)
+            actions.append("done")
+        elif meaning == "store home":
+            self.home[code[:-2]] = list(self.position)
+            actions.append("done")
+        elif meaning == "last arc":
+            if self.last_arc is None:
+                self._fail(f"{code} goes on in the direction of the last arc, and there is none before; post G2 or G3")
+            actions.insert(0, f"motion {self.last_arc}")
         elif meaning == "no motion":
             if self.dialect.name != "fanuc":
                 self.motion = None
@@ -462,8 +546,27 @@ class Reader:
         elif meaning == "tool definition":
             self._tools[f"{values.get('T', 0):g}"] = (0.0, 0.0, values.get("L", 0.0) * self.scale)
             actions.append("done")
+        elif meaning == "home":
+            actions.append(f"home {code}")
         elif meaning != "nothing":
             actions.append(meaning)
+
+    def _shift(self, code: str, how: str, values: dict[str, float]) -> None:
+        """Shift the coordinates: the axes that are named, all (``all``), further (``more``), or not at all (``off``)."""
+        given = [values[letter] * self.scale if letter in values else None for letter in "XYZ"]
+        if how == "off" and any(value is not None for value in given):
+            self._fail(f"{code}: {self.dialect.refused[code]}")
+        if how == "shift":  # G52 of LinuxCNC is kept where G92 is
+            x, y, z = (old if new is None else new for new, old in zip(given, self.preset, strict=True))
+            self.preset = (x, y, z)
+            return
+        if how == "" and not self.absolute:
+            self._fail(f"{code} in incremental blocks is not followed; post G90 before it")
+        kept = [0.0 if how in ("all", "off") else old for old in self.shift]
+        x, y, z = (
+            old if new is None else new + (old if how == "more" else 0.0) for new, old in zip(given, kept, strict=True)
+        )
+        self.shift = (x, y, z)
 
     def _tool_words(self, values: dict[str, float], codes: list[str], name: str) -> None:
         """Follow T, D and H: which tool's length the control adds."""
@@ -477,21 +580,22 @@ class Reader:
                 self._use_tool(f"{values['H']:g}")
         elif self.dialect.pole:
             if number and "G99" not in codes:
-                self._use_tool(number)
+                self._use_tool(number, values.get("DL", 0.0) * self.scale)
         elif "D" in values and values["D"] != 1.0:
             key = f"{self.loaded or self.selected}D{values['D']:g}"
             self._use_tool("0" if values["D"] == 0.0 else key)
         elif "D" in values or ("M6" in codes and self.loaded):
             self._use_tool(self.loaded or self.selected)
 
-    def _use_tool(self, key: str) -> None:
+    def _use_tool(self, key: str, longer_mm: float = 0.0) -> None:
         if key == "0":
             self._set_length((0.0,) * 3, on=False)
             return
         if key not in self._tools:
             known = f"; the table has {', '.join(sorted(self._tools))}" if self._tools else ""
             self._fail(f"the length of tool {key} is not known{known}; give it with --tools FILE (tool, length_mm)")
-        self._set_length(self._tools[key])
+        x, y, z = self._tools[key]
+        self._set_length((x, y, z + longer_mm))
         self.used_tools[key] = self.length
 
     def _set_length(self, length: Vector3, *, on: bool = True) -> None:
@@ -509,8 +613,15 @@ class Reader:
         self.used_offsets[name] = self.work
 
     def _offset(self) -> Vector3:
-        x, y, z = (a + b + c for a, b, c in zip(self.work, self.preset, self.length, strict=True))
+        x, y, z = map(sum, zip(self.work, self.shift, self.preset, self.length, strict=True))
         return x, y, z
+
+    def _incremental(self, letter: str) -> bool:
+        """Whether the word of an axis in this block is a distance, by the block or by itself (X=IC(5))."""
+        mode = self._modes.get(letter)
+        if mode not in (None, "AC", "IC"):
+            self._fail(f"{letter}={mode}(...) is for rotary axes; expected AC or IC")
+        return not self.absolute if mode is None else mode == "IC"
 
     def _tool(self) -> Vector3:
         if not self.tool_on:
@@ -524,6 +635,7 @@ class Reader:
         motion = next((action for action in actions if action.startswith(("motion", "cycle"))), "")
         if motion.startswith("motion"):
             self.motion, self.cycle = int(motion[7:]), None
+            self.last_arc = self.motion if self.motion in (CW, CCW) else self.last_arc
         named = any(axis is not None for axis in axes)
         if named and self.feed == "inverse" and self.motion in (FEED, CW, CCW) and "F" not in values:
             self._fail("a move in inverse time (G93) needs F in its block")
@@ -540,22 +652,29 @@ class Reader:
             if not self._unit_known:
                 self._unit_known = True
                 self.assumed["lengths are in mm"] = None
-        if "done" in single or "dwell" in single or "blank" in single:
+        if {"done", "dwell", "blank"} & set(single):
             return "keep"
+        if self.dialect.pole and "L" in values and not {"label", "tool definition"} & set(single):
+            self._fail(f"L{values['L']:g}: {self.dialect.refused['M98']}")
         if "no preset" in single:
             return "no preset"
-        if "home" in single or "unknown position" in single:
-            return self._home(axes, "home" in single)
+        for action in single:
+            if action.startswith("home ") or action == "unknown position":
+                return self._home(axes, self.home.get(action[5:]))
         if "preset" in single:
             return self._preset(axes)
-        if "machine coordinates" in single or (self.dialect.pole and "M91" in self._text.upper()):
+        if "machine coordinates" in single:
             return self._machine_move(axes)
         self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
         if motion.startswith("cycle") or (self.cycle is not None and (moving or "R" in values)):
             return self._cycle(motion, axes, values)
         if self.dialect.pole:
             self._set_pole(values, "pole here" in single)
-        arc = self.motion in (CW, CCW) and (moving or (any(c in values for c in "IJK") and not self.dialect.pole))
+        arc = (
+            self.motion in (CW, CCW)
+            and "rapid once" not in single
+            and (moving or (any(c in values for c in "IJK") and not self.dialect.pole))
+        )
         if not moving and not arc:
             return "keep"
         if self.motion is None:
@@ -564,16 +683,15 @@ class Reader:
         if arc:
             self._arc(end, values)
             return "arc"
-        self._move(self.motion, end)
+        self._move(RAPID if "rapid once" in single else self.motion, end)
         return "line"
 
     def _target(self, axes: list[float | None]) -> list[float]:
         """Machine position that axis words ask for."""
-        base = self._offset() if self.absolute else self.position
-        end = list(self.position)
+        offset, end = self._offset(), list(self.position)
         for k, value in enumerate(axes):
             if value is not None:
-                end[k] = base[k] + value * self.scale
+                end[k] = (end[k] if self._incremental("XYZ"[k]) else offset[k]) + value * self.scale
                 if math.isnan(end[k]):
                     self._fail(
                         f"{'XYZ'[k]} moves by an increment from a position that is not known; post it in absolute"
@@ -613,8 +731,9 @@ class Reader:
         self._move(RAPID, [p if v is None else v * self.scale for v, p in pairs], corrected=(0, 0, 0))
         return "keep"
 
-    def _home(self, axes: list[float | None], known: bool) -> str:
-        """Go through an intermediate point to the reference point, which is taken as machine zero."""
+    def _home(self, axes: list[float | None], home: list[float] | None) -> str:
+        """Go through an intermediate point to the reference point ``home``, which is machine zero if nothing else is stored."""
+        known = home is not None
         named = [axis is not None for axis in axes]
         if not any(named):
             if self.dialect.name == "fanuc" or not known:
@@ -625,20 +744,21 @@ class Reader:
             pairs = zip(axes, self.position, strict=True)
             moving = [axis if self.absolute or not math.isnan(place) else None for axis, place in pairs]
             self._move(RAPID, self._target(moving), corrected=(0, 0, 0))
-        home = 0.0 if known else math.nan
-        self._move(RAPID, [home if n else p for n, p in zip(named, self.position, strict=True)], corrected=(0, 0, 0))
-        if known:
-            self.assumed["the reference point of G28 and G30 is machine zero"] = None
+        places = zip(named, home or [math.nan] * 3, self.position, strict=True)
+        self._move(RAPID, [there if name else here for name, there, here in places], corrected=(0, 0, 0))
+        if home == [0.0] * 3:
+            self.assumed["the reference point of G28 is machine zero"] = None
         return "keep"
 
     def _preset(self, axes: list[float | None]) -> str:
-        work, preset = self._offset(), list(self.preset)
+        work, preset, shift = self._offset(), list(self.preset), list(self.shift)
         for k, value in enumerate(axes):
             if value is not None:
                 if math.isnan(self.position[k]):
                     self._fail(f"G92 {'XYZ'[k]} at a position that is not known; position it in absolute first")
-                preset[k] += self.position[k] - work[k] - value * self.scale
-        self.preset = (preset[0], preset[1], preset[2])
+                preset[k] += self.position[k] - work[k] - value * self.scale + shift[k]
+                shift[k] = 0.0  # G92 ends the shift of its axes
+        self.preset, self.shift = (preset[0], preset[1], preset[2]), (shift[0], shift[1], shift[2])
         return "preset" if any(axis is not None for axis in axes) else "keep"
 
     def _set_pole(self, values: dict[str, float], here: bool) -> None:
@@ -691,7 +811,7 @@ class Reader:
         others = {"IJK"[k] for k in PLANE_AXES[self.plane]}
         if not others & values.keys():
             self._fail(f"an arc without centre or radius; expected {' and '.join(sorted(others))}, or a radius")
-        if self.centre_absolute:
+        if self.centre_absolute if letter not in self._modes else not self._incremental(letter):
             if letter not in values:
                 self._fail(f"an arc with its centre in absolute needs {letter}")
             return self._offset()[axis] + values[letter] * self.scale

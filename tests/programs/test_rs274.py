@@ -130,3 +130,13 @@ def test_the_way_to_a_hole_whose_r_level_is_higher(tmp_path):
         "G82 X9 Z-5 R3 P0.1\nX9.5 R-3\nG98 X10 Y3 R-2.9995\nX3 R4\nG80\nM2\n%\n"
     )
     assert_same(ours(program), canonical(program, tmp_path))
+
+
+def test_local_shifts_and_stored_reference_points(tmp_path):
+    """G52 is kept where G92 is; G28.1 stores a point that G28 returns to, on the way through a point of the program."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X1 Y2 Z3\nG28.1\nG52 X10 Y-5\nG0 X0 Y0\nG1 X4 F100\nG52 X20\nX5 Y1\nG92 X0\n"
+        "X1\nG52 X0 Y0 Z0\nX2 Y2\nG28 Z9\nG1 X3 Y3 Z3\nG91\nG52 X7\nG90 X1\nM2\n%\n"
+    )
+    assert_same(ours(program), canonical(program, tmp_path))
