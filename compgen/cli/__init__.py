@@ -31,8 +31,6 @@ _COMMANDS = {
     },
     "identify_commands": {
         "identify": "Identify error curves, squareness and stations from a measurement.",
-    },
-    "fit_commands": {
         "fit": "Fit smooth curves to identified errors, within bounds.",
     },
     "diagnose_commands": {

@@ -20,8 +20,7 @@ from compgen.diagnose.diagnose import SixDofDiagnosis, diagnose_sixdof, sixdof_t
 from compgen.diagnose.observed import read_diagnosed
 from compgen.diagnose.page import diagnosis_files, next_steps, summary
 from compgen.errors import CompgenError, InputError
-from compgen.instruments.sixdof_instrument import read_instrument
-from compgen.instruments.sixdof_readings import read_sixdof
+from compgen.instruments.sixdof_instrument import read_instrument, read_sixdof
 from compgen.kinematics.kernel_switch import one_thread
 
 # ``volcomp diagnose --each``: every measurement separately, in this process, in several, or on a cluster.

@@ -357,7 +357,7 @@ def _asked(store: Store, name: str, *, may_ask: bool) -> tuple[int, int]:
     InputError
         without a terminal: the version that waits now may not be the one that somebody checked before.
     """
-    from compgen.data.messages import visible
+    from compgen.errors import visible
     from compgen.fleet import decisions
 
     machine = store.machine(name)

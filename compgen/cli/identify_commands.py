@@ -1,4 +1,4 @@
-"""``volcomp identify``: from a measurement to errors."""
+"""``volcomp identify`` and ``fit``: from a measurement to errors, and from errors to smooth curves."""
 
 from __future__ import annotations
 
@@ -38,6 +38,19 @@ from compgen.report.terminal import identification_table
 
 if TYPE_CHECKING:
     from compgen.tables.active import ActiveTables
+
+
+from compgen.cli.shared_options import (
+    covariance_of,
+    covariance_options,
+    errors_argument,
+    fitting_options,
+)
+from compgen.cli.terminal import answer
+from compgen.fit import FitOptions, fit
+from compgen.foreign.source import open_errors
+from compgen.pipeline import fit_files, write_all
+from compgen.report.terminal import fit_table
 
 
 @click.command("identify")
@@ -127,3 +140,38 @@ def identify_command(
             text += f"{checked.ratio_median:.2f} ({checked.ratio_min:.2f} ... {checked.ratio_max:.2f}): "
             stdout.print(text + ("agrees" if checked.agrees else "DOES NOT AGREE"))
     return 1 if result.details.get("disagree") else 0
+
+
+@click.command("fit")
+@machine_argument
+@errors_argument
+@out_option
+@fitting_options
+@covariance_options
+@json_option
+def fit_command(
+    machine: Machine,
+    errors: Path,
+    out: Path,
+    fitting: FitOptions,
+    covariance: Path | None,
+    independent: bool,
+    as_json: bool,
+) -> int:
+    """Fit smooth curves: straightness zero at both ends, positioning and angles zero at the reference point.
+
+    ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant
+    Vendor; mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that volcomp identify wrote is in
+    the folder of ERRORS, its correlations are used; otherwise nodes are independent.
+
+    \b
+    Example:
+      volcomp fit zha-gantry identified/identified.errors.csv --max-abs linear=20 --out fitted/
+    """
+    OutputFolder(out)
+    table = open_errors(errors)
+    known = covariance_of(errors, table, covariance, independent=independent)
+    result = fit(machine, table, fitting, covariance=known)
+    write_all(out, fit_files(result))
+    answer(as_json, result.to_dict(), fit_table(result))
+    return 0

@@ -25,12 +25,11 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, read_text
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, machine_files
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, error_named
 from compgen.data.registry import Kind
 from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
 from compgen.effects.active import STATION_NAME
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.kinematics import modelled_errors
 from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS

@@ -14,9 +14,8 @@ from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
 from compgen.data.files import OutputFolder, json_text, sha256_of_file
 from compgen.data.machine import Machine, Vector3
-from compgen.data.messages import number_text
 from compgen.effects import effects_reversal
-from compgen.errors import InputError
+from compgen.errors import InputError, number_text
 from compgen.foreign import open_errors
 from compgen.identify.covariance import covariance_or_independent
 from compgen.programs import CorrectOptions, Setup, correct_program, model_of, read_tools

@@ -17,8 +17,7 @@ from compgen.cli.common import PATH, Command, options_of
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
-from compgen.data.messages import nearest
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.identify.covariance import covariance_named_by
 from compgen.identify.options import StatedNumbers

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.cli.common import VERBOSE, print_json
-from compgen.data.messages import visible
+from compgen.errors import visible
 
 #: Tables in a pipe or a file get the width they need, not the width of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from compgen.data.files import read_text
-from compgen.data.messages import nearest
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.resources import data_folder, load_on_first_use
 
 if TYPE_CHECKING:

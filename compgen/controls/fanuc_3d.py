@@ -42,10 +42,9 @@ from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
-from compgen.errors import InputError
+from compgen.errors import InputError, one_line
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid
 

@@ -14,9 +14,8 @@ from compgen.controls.shared.scanner import check_size
 from compgen.data import toml_files
 from compgen.data.files import read_bytes
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.toml_files import axis_setting, choice, file_setting, setting, whole, word_for
-from compgen.errors import InputError
+from compgen.errors import InputError, one_line
 
 # Records of FANUC parameter and pitch data files: ``%``, blocks ``N... A... P...``, ``%``.
 #

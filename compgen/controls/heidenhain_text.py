@@ -17,8 +17,7 @@ from pathlib import Path
 from compgen.controls.shared.base import SourceFile
 from compgen.controls.shared.scanner import fixed_point, plain_lines
 from compgen.data.files import read_bytes
-from compgen.data.messages import doubled, one_line
-from compgen.errors import InputError
+from compgen.errors import InputError, doubled, one_line
 
 #: Limits far above any real table: length of the file, length of a line, lines before the header.
 MOST_CHARACTERS, MOST_IN_LINE, MOST_BEFORE_HEADER = 2_000_000, 1000, 200

@@ -22,7 +22,6 @@ from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.lengths import Points
 from compgen.data.machine import Chain, Machine
-from compgen.data.messages import doubled, nearest
 from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import (
     Section,
@@ -34,7 +33,7 @@ from compgen.data.toml_files import (
     unless_stated,
     whole,
 )
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, doubled, nearest
 from compgen.kinematics.first_order import coefficients
 from compgen.kinematics.many_points import full_grid
 

@@ -25,7 +25,6 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import read_bytes
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import (
     accepts,
@@ -37,7 +36,7 @@ from compgen.data.toml_files import (
     whole,
     word_for,
 )
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, one_line
 
 # Rows of a set sheet and records of the control's parameter file, and what that file shows about all axes.
 #

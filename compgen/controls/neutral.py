@@ -16,10 +16,9 @@ from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, csv_table, fixed
 from compgen.data.error_table import ERROR_COLUMNS, Curve, ErrorTable, errors_of_table
 from compgen.data.lengths import Points
-from compgen.data.messages import doubled, nearest, one_line
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.toml_files import setting, whole
-from compgen.errors import InputError
+from compgen.errors import InputError, doubled, nearest, one_line
 from compgen.kinematics.many_points import full_grid, volumetric_error
 
 # The neutral formats as data: the correction field on a grid, and the 21 error curves from which it is calculated.

@@ -21,7 +21,6 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import (
     accepted,
@@ -32,7 +31,7 @@ from compgen.data.toml_files import (
     whole,
     word_for,
 )
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, one_line
 
 # Compensation tables of PMAC and Turbo PMAC as stored in the control: whole 1/16 counts that roll over.
 #

@@ -17,8 +17,7 @@ from compgen.controls.shared.base import SourceFile, coverage_violations
 from compgen.controls.shared.scanner import Findings, fixed_point, number_pattern, plain_lines
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest, one_line
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest, one_line
 
 # Shared by both kinds of SINUMERIK tables: reading assignments from text, and equidistant tables.
 #

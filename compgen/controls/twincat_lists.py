@@ -19,7 +19,6 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import (
     accepts,
@@ -32,7 +31,7 @@ from compgen.data.toml_files import (
     whole,
     word_for,
 )
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest
 
 # Axis lists of the TwinCAT CNC (TF5200): leadscrew, cross and plane tables as stored on the control, and their lookup.
 #

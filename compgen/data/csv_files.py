@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.files import decoded, read_text
-from compgen.data.messages import doubled, nearest, visible_line
 from compgen.data.names import LARGEST, SMALLEST
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, doubled, nearest, visible_line
 
 #: How much of a large file is in memory at a time, bytes; also the longest line of such a file.
 PART_BYTES = 1 << 22

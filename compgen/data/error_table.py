@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
 from compgen.data.files import read_text
-from compgen.data.messages import nearest, repeated
 from compgen.data.names import AXES, CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.records import axes_of, within
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest, repeated
 
 K = TypeVar("K", bound=Hashable)
 

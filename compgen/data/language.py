@@ -19,8 +19,7 @@ from gettext import GNUTranslations
 from html import escape, unescape
 from typing import TYPE_CHECKING, Any
 
-from compgen.data.messages import nearest
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.resources import LANGUAGES, data_folder
 
 if TYPE_CHECKING:

@@ -18,9 +18,8 @@ import numpy as np
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_NAMES
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.resources import data_folder
 
 # Where tables must be most accurate if they cannot be accurate everywhere: a work zone, and tools of several lengths.

@@ -16,9 +16,8 @@ import numpy as np
 
 from compgen.data.csv_files import CsvTable, FloatArray, format_csv, names_in_header, read_csv
 from compgen.data.files import read_bytes, read_text
-from compgen.data.messages import repeated
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import InputError
+from compgen.errors import InputError, repeated
 
 R = TypeVar("R")
 #: Reads one column of a table, shape (rows,).

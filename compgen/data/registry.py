@@ -22,8 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from compgen.data.messages import one_line
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

@@ -23,9 +23,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast, overload
 
 from compgen.data.files import read_text
-from compgen.data.messages import nearest, visible_line
 from compgen.data.names import AXES, LARGEST, SMALLEST
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, nearest, visible_line
 
 
 def option(

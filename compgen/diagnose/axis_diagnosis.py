@@ -21,8 +21,17 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
-from compgen.diagnose.axis_candidates import candidates_of, invisible_of
-from compgen.diagnose.axis_model import DRIFTS, LEAST_GAIN, LEAST_MM, OF_RUNS, Candidate, NoiseGrid, Search
+from compgen.diagnose.axis_model import (
+    DRIFTS,
+    LEAST_GAIN,
+    LEAST_MM,
+    OF_RUNS,
+    Candidate,
+    NoiseGrid,
+    Search,
+    candidates_of,
+    invisible_of,
+)
 from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.verdict import DisplayedDiagnosis

@@ -11,8 +11,8 @@ coefficients of several columns have a normal prior of variance lambda sigma^2; 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -22,7 +22,7 @@ from scipy.special import logsumexp
 from compgen.data.csv_files import FloatArray
 from compgen.diagnose.axis_session import AxisSession
 from compgen.diagnose.layout import IntArray
-from compgen.effects import Effect
+from compgen.effects import Effect, catalogue
 from compgen.kinematics.kernel_switch import lapack
 
 Tier = Literal["named", "generic"]
@@ -584,3 +584,211 @@ def _ridged(value: FloatArray, right: FloatArray, price: float) -> tuple[FloatAr
     determinant = np.sum(np.log1p(grown), axis=1)
     determinant[:, -1] = price * value.shape[1]
     return np.asarray(taken), np.asarray(determinant)
+
+
+# Candidates: what may change within a session of axis runs; effects of the catalogue, and smooth terms without a name.
+
+
+#: Scan positions charged for the time constant of a warm-up (the columns are nearly alike), and for a drift at a
+#: constant rate: in sessions this slow, most drifts are the beginning or the end of a warm-up.
+WARMUP_SCANS, LINEAR_SCANS = 2.0, 4.0
+#: Numbers of waves per session that are tried, and the scan positions charged for them (neighbours are nearly alike).
+WAVES, WAVE_SCANS = np.concatenate([np.arange(0.5, 4.1, 0.25), np.arange(4.5, 10.1, 0.5)]), 10.0
+#: Waves per run from which a swing can be confused with a reversal, and the share of a swing that must remain visible.
+RUN_LIKE, LEAST_WAVE = 0.6, 0.3
+#: Time constants of a fading jump, as shares of the session, and the maximum number of readings at which it may begin.
+FADING, MOST_ONSETS = (0.07, 0.2), 150
+#: Most columns of "every target of every run has a separate value", and the degree of the curve of a run.
+MOST_OF_RUNS, CURVE = 60, 4
+#: Windows of disturbed readings that are tried; if there are k times as many, only every k-th.
+MOST_WINDOWS = 800
+#: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
+BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
+
+
+def candidates_of(session: AxisSession, only: Sequence[str] = ()) -> list[Candidate]:
+    """Return all candidates to compare; ``only`` limits the names."""
+    known = catalogue()
+    warm = known["warmup_drift"]
+    slow = [_candidate(session, warm.at(tau), WARMUP_SCANS) for tau in warm.positions(session.readings)]
+    slow.append(_candidate(session, known["linear_drift"], LINEAR_SCANS))
+    drifts = [item for item in slow if item is not None]
+    found = [*drifts, *_disturbed(session, known), *_steps(session, known), *_logged(session, known)]
+    found = [c for c in found if not only or c.name in only]
+    return [*found, *_generic(session)]
+
+
+def invisible_of(session: AxisSession) -> tuple[str, ...]:
+    """Names that these runs cannot show: whatever is the same in every run is part of the curve of the axis."""
+    letter = session.letter
+    hidden = [f"periodic_{letter}"]
+    seen = {candidate.name for candidate in _logged(session, catalogue())}
+    hidden += [name for name in _logged_names(letter) if name not in seen]
+    if not len(session.both):
+        hidden += [f"backlash_{letter}", f"lost_motion_{letter}"]
+    return tuple(hidden)
+
+
+def _logged_names(letter: str) -> tuple[str, ...]:
+    return (f"thermal_scale_{letter}", f"spindle_growth_{letter}", f"settling_{letter}", f"servo_lag_{letter}")
+
+
+def _candidate(session: AxisSession, effect: Effect, scans: float, text: str = "") -> Candidate | None:
+    columns = effect.columns(session.readings)
+    if columns is None or not np.isfinite(columns).all():
+        return None
+    first, last = (int(effect.settings.get(key, -1)) for key in ("first", "last"))
+    card = effect.card
+    return Candidate(card.name, "named", columns, scans, text or card.title, card.covariates, effect, first, last)
+
+
+def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
+    if not session.in_runs:
+        return []
+    step = known["step_between_runs"]
+    at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
+    found = []
+    for k in at:
+        end = int(np.flatnonzero(session.leg == session.leg[k])[-1])
+        found.append(_candidate(session, step.at(float(k)), _runs(session), f"step before {session.window(k, end)}"))
+    return [item for item in found if item is not None]
+
+
+def _runs(session: AxisSession) -> float:
+    """Scan positions charged for a step or a bad run: equal, so a bad first run and a step after it weigh the same."""
+    return float(session.leg.max()) + 1.0
+
+
+def _disturbed(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
+    """One run that is off, in one or both directions, and shorter bursts."""
+    bad, burst = known["bad_run"], known["disturbed_readings"]
+    runs = set() if not session.in_runs else {_ends(session.leg == k) for k in range(int(session.leg.max()) + 1)}
+    runs |= {_ends(session.cycle == k) for k in range(int(session.cycle.max()) + 1)} if runs else set()
+    runs = runs if len(runs) > 1 else set()
+    found = []
+    for first, last in sorted(runs):
+        chosen = bad.with_settings({"first": float(first), "last": float(last)})
+        item = _candidate(session, chosen, _runs(session), session.window(first, last))
+        assert item is not None
+        found.append(item)
+        found.append(_free(item, len(session)))
+    n, longest = len(session), max(int(np.bincount(session.leg).max()), len(session) // 10) - 1
+    windows = [(k, k + size - 1) for size in BURSTS if size <= longest for k in range(n - size + 1)]
+    windows = windows[:: max(1, len(windows) // MOST_WINDOWS)] if len(windows) > MOST_WINDOWS else windows
+    windows = [window for window in windows if window not in runs]
+    for first, last in windows:
+        item = _candidate(
+            session, burst.with_settings({"first": float(first), "last": float(last)}), len(windows),
+            session.window(first, last),
+        )  # fmt: skip
+        assert item is not None
+        found.append(item)
+        if 1 < last - first + 1 <= LONGEST_FREE:
+            found.append(_free(item, n))
+    return found
+
+
+def _free(item: Candidate, count: int) -> Candidate:
+    """The same readings, each with a separate value; the session has ``count`` readings."""
+    return replace(item, columns=np.eye(count, item.last - item.first + 1, -item.first), free=True)
+
+
+def _ends(chosen: NDArray[np.bool_]) -> tuple[int, int]:
+    rows = np.flatnonzero(chosen)
+    return int(rows[0]), int(rows[-1])
+
+
+def _logged(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]:
+    """Effects that need a logged temperature or dwell that changed between repeats."""
+    found = []
+    for name in _logged_names(session.letter):
+        effect = known[name]
+        positions = effect.positions(session.readings)
+        every = [effect.at(p) for p in positions] if positions else [effect]
+        for item in (_candidate(session, one, max(len(every), 1)) for one in every):
+            if item is not None and _varies(session, item.columns):
+                found.append(item)
+    return found
+
+
+def _varies(session: AxisSession, columns: FloatArray, least: float = 1e-3) -> bool:
+    """Whether anything is left of the columns after subtracting the means of the cells."""
+    count = np.bincount(session.cell)[:, None]
+    means = np.stack([np.bincount(session.cell, column) for column in columns.T], axis=1) / count
+    return bool(np.linalg.norm(columns - means[session.cell]) > least * np.linalg.norm(columns))
+
+
+def _generic(session: AxisSession) -> list[Candidate]:
+    t = session.time - session.time[0]
+    t = 2.0 * t / t[-1] - 1.0
+    s, way = session.s, session.direction.astype(np.float64)
+    found = []
+
+    def add(
+        text: str,
+        covariates: tuple[str, ...],
+        columns: FloatArray,
+        scans: float = 1.0,
+        least: float = 1e-3,
+    ) -> None:
+        columns = columns.reshape(len(session), -1)
+        columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-12)
+        if columns.shape[1] and columns.shape[1] <= len(session) // 2 and _varies(session, columns, least):
+            found.append(Candidate(text, "generic", columns, scans, text, covariates))
+
+    add("the readings drift smoothly with time", ("time",), np.column_stack([t, t**2, t**3]))
+    add("the readings drift smoothly with time", ("time",), np.column_stack([t, t**2]))
+    for waves in WAVES.tolist():
+        angle = np.pi * (t + 1) * waves
+        text = f"the readings oscillate with time, about {waves:.3g} periods in the session"
+        # a wave about as long as a run looks like a reversal; one of exactly that length is part of the axis curve
+        as_run = waves > RUN_LIKE * (int(session.cycle.max()) + 1)
+        columns = np.column_stack([np.sin(angle), np.cos(angle)])
+        add(text, ("time", "approach") if as_run else ("time",), columns, WAVE_SCANS, LEAST_WAVE)
+    saturating = [-np.expm1(-(t + 1) / 2 / tau) for tau in (0.2, 0.6)]
+    for shape in (t, *saturating):
+        add("the scale of the axis changes with time", ("time", "x"), shape * s, 3)
+        add("the reversal changes with time", ("time", "approach"), shape * way, 3)
+        own = _indicators(session.target)
+        own = own - own.mean(axis=1, keepdims=True)
+        add("each target drifts in its own way", ("time", "x"), shape[:, None] * own, 3)
+    cycles, legs = _indicators(session.cycle), _indicators(session.leg)
+    if cycles.shape[1] > 2 and session.in_runs:
+        add("every run has a separate level", ("run",), cycles[:, 1:])
+        add("every run has a separate slope", ("run", "x"), cycles * s[:, None])
+        curve = np.polynomial.legendre.legvander(s, min(CURVE, len(session.targets_mm) - 1))[:, 1:]
+        add("every run has a separate curve", ("run", "x"), _products(cycles, np.asarray(curve, dtype=np.float64)))
+        if cycles.shape[1] * len(session.targets_mm) <= MOST_OF_RUNS:
+            text = "both directions of a run agree, and differ from the other runs"
+            add(text, ("run", "x"), _products(cycles, _indicators(session.target)))
+    if legs.shape[1] > cycles.shape[1] and session.in_runs:
+        add("every direction of every run has a separate level", ("run", "approach"), legs[:, 1:])
+    inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
+    for k in inside:
+        way_text = f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"
+        add(f"jump within {way_text}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
+    number = np.arange(len(session), dtype=np.float64)
+    onsets = range(1, len(session) - 1, max(1, len(session) // MOST_ONSETS))
+    for k in onsets:
+        for fades in FADING:
+            shape = np.where(number >= k, np.exp(-np.maximum(number - k, 0.0) / (fades * len(session))), 0.0)
+            text = f"a jump before {session.place(k)} that fades"
+            add(text, ("time",), shape, len(FADING) * len(onsets))
+    for k in (np.flatnonzero(np.diff(session.leg)) + 1).tolist():
+        legs_count = int(session.leg.max())
+        add(f"the scale changes at {session.place(k)}", ("time", "x"), _from(session, k) * s, legs_count)
+        add(f"the reversal changes at {session.place(k)}", ("time", "approach"), _from(session, k) * way, legs_count)
+    return found
+
+
+def _products(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Every column of ``first`` times every column of ``second``."""
+    return np.asarray((first[:, :, None] * second[:, None, :]).reshape(len(first), -1))
+
+
+def _from(session: AxisSession, k: int) -> FloatArray:
+    return (np.arange(len(session)) >= k).astype(np.float64)
+
+
+def _indicators(number: IntArray) -> FloatArray:
+    return np.asarray(np.eye(int(number.max()) + 1)[number])

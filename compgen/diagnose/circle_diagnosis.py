@@ -29,10 +29,9 @@ import numpy as np
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
 from compgen.diagnose.verdict import DisplayedDiagnosis
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.identify.axis_tests import SQUARENESS_OF, circle_positions, correlated
 from compgen.kinematics.first_order import c_matrix
 

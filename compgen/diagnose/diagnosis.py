@@ -12,7 +12,6 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.names import MM_PER_UM
 from compgen.diagnose.analysis import Analysis
 from compgen.diagnose.base_fit import BaseFit, fit_base
@@ -24,6 +23,7 @@ from compgen.diagnose.verdict import DisplayedDiagnosis, Named, Unknown, Verdict
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.active import section_text
 from compgen.effects.catalogue import what_to_do
+from compgen.errors import one_line
 
 # The full nonlinear model including the effects: their parameters with uncertainty, and the extended machine file.
 

@@ -14,10 +14,9 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Drawable, Overview, Panel, shortened
 from compgen.data.error_table import ErrorTable
-from compgen.data.messages import nearest
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.data.toml_files import option
-from compgen.errors import ConvergenceError, InputError
+from compgen.errors import ConvergenceError, InputError, nearest
 from compgen.fit.smoother import Method, Smoother
 from compgen.fit.zeroing import FrameChange
 

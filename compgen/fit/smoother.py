@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
-from compgen.data.messages import nearest
 from compgen.data.names import CURVE_NAMES
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.fit.zeroing import SAME_POSITION_MM, FixedCurve, Row
 from compgen.identify.covariance import Covariance
 from compgen.kinematics.kernel_switch import lapack

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from compgen.data.csv_files import MOST_COLUMNS
 from compgen.data.files import sha256_of
-from compgen.data.messages import visible
-from compgen.errors import InputError
+from compgen.errors import InputError, visible
 from compgen.fleet.job import MachineJob, OtherInbox
 from compgen.fleet.records import NewMeasurement
 

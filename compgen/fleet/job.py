@@ -21,10 +21,9 @@ from typing import Any, Literal
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.files import read_bytes, read_text, sha256_of, write_file
-from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
 from compgen.data.toml_files import Section, accepted, accepts, part_setting, setting, table_setting, take_settings
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.resources import LANGUAGES
 
 # --- schedules -----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import structlog
 
-from compgen.data.messages import visible
+from compgen.errors import visible
 
 Format = Literal["auto", "json", "text"]
 _FORM: list[Format] = []

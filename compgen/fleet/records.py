@@ -10,10 +10,9 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES, error_named
 from compgen.data.toml_files import option
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 
 #: State of a set of tables, from the last decision about it.
 TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]

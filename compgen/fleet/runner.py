@@ -18,8 +18,7 @@ from typing import Any
 
 from compgen.data.files import FOLDERS, read_bytes, remove_abandoned_folders, working_folder
 from compgen.data.machine import load_machine
-from compgen.data.messages import visible
-from compgen.errors import CompgenError, InputError
+from compgen.errors import CompgenError, InputError, visible
 from compgen.fleet import claims, inbox, logs
 from compgen.fleet.claims import Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path

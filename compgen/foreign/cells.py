@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from compgen.data.messages import nearest
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.foreign.column_names import (
     FIELDS,
     covariate_unit,

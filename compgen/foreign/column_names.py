@@ -9,9 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from compgen.data.messages import nearest
 from compgen.data.names import ERROR_NAMES
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 
 # Names of runs, directions and statistics as laboratories of several countries write them.
 #

@@ -39,7 +39,7 @@ from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
 from compgen.identify.identification import metadata_of, without_adjustment
-from compgen.instruments.sixdof_readings import read_sixdof
+from compgen.instruments.sixdof_instrument import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns | Artefact
 #: Number of labels of a column that are shown.

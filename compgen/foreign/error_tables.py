@@ -9,9 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from compgen.data.error_table import Curve, ErrorTable
-from compgen.data.messages import nearest
 from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, RAD_PER_URAD, SQUARENESS_NAMES, error_named
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.foreign.cells import SQUARENESS_WORDS, CellGrid, plain_decimals
 from compgen.foreign.column_names import (
     FIELDS,

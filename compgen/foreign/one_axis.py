@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.identify.axis_tests import SAME_TARGET_MM, two_way_mean, worth_a_table
 
 IntArray = NDArray[np.int64]

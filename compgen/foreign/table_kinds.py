@@ -19,10 +19,9 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Lengths
-from compgen.data.messages import doubled
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM
 from compgen.data.records import LARGEST_DEVIATION_UM
-from compgen.errors import InputError
+from compgen.errors import InputError, doubled
 from compgen.foreign.cells import CellGrid, find_table
 from compgen.foreign.column_names import (
     FIELDS,

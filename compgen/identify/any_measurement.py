@@ -110,8 +110,7 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
     }
     if instrument is not None:
         from compgen.identify.six_dof import SixDofMeasurement
-        from compgen.instruments.sixdof_instrument import read_instrument
-        from compgen.instruments.sixdof_readings import read_sixdof
+        from compgen.instruments.sixdof_instrument import read_instrument, read_sixdof
 
         constants = read_instrument(str(instrument))
         readers["sixdof"] = lambda files: SixDofMeasurement(read_sixdof(files), constants)
@@ -242,9 +241,8 @@ def identify_mixed(
     """
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Artefact, Deviations
-    from compgen.identify.merging import merge
     from compgen.identify.six_dof import SixDofMeasurement
-    from compgen.identify.together import Source, identify_together
+    from compgen.identify.together import Source, identify_together, merge
     from compgen.identify.tracer_lengths import MIN_STATIONS
 
     parts, plain = [], IdentifyOptions()

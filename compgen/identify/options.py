@@ -14,10 +14,9 @@ from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
 from compgen.data.toml_files import flag, not_negative, option
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.adjust.starts import station_start
 from compgen.identify.adjust.unknowns import IntArray, KnownPositions, State

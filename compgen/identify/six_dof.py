@@ -32,11 +32,11 @@ from compgen.instruments.sixdof_instrument import (
     RAD_PER_ARCSEC,
     SIGNALS,
     SetUp,
+    SixDof,
     SixDofInstrument,
     cross_talk_arm_mm,
     systematic_columns,
 )
-from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import WARNING, AxisRun, RelativeRun, drift_of, expected_away, reduce_runs
 from compgen.instruments.sixdof_uncertainty import SixDofBudget, scatter_of, uncertainty_budget
 

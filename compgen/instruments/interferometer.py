@@ -14,8 +14,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 
 if TYPE_CHECKING:
-    from compgen.instruments.sixdof_instrument import SixDofInstrument
-    from compgen.instruments.sixdof_readings import SixDof
+    from compgen.instruments.sixdof_instrument import SixDof, SixDofInstrument
 
 # Refractive index of air, for interferometers that did not compensate the wavelength.
 

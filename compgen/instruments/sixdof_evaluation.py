@@ -13,8 +13,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import InputError
 from compgen.instruments.interferometer import growth_mm
-from compgen.instruments.sixdof_instrument import ERRORS_OF_AXIS, RAD_PER_ARCSEC, SixDofInstrument
-from compgen.instruments.sixdof_readings import SixDof
+from compgen.instruments.sixdof_instrument import ERRORS_OF_AXIS, RAD_PER_ARCSEC, SixDof, SixDofInstrument
 from compgen.instruments.sixdof_reduction import (
     AxisRun,
     along,

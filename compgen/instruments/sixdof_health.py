@@ -16,11 +16,11 @@ from compgen.instruments.sixdof_instrument import (
     RAD_PER_ARCSEC,
     ROTATIONS,
     SetUp,
+    SixDof,
     SixDofInstrument,
     cross_talk_arm_mm,
     path_mm,
 )
-from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import RelativeRun, drift_of, errors_of_run, expected_away, reduce_runs
 
 #: A regression counts if its slope is at least this many standard errors and it explains this share of the variance.

@@ -25,12 +25,12 @@ from compgen.instruments.sixdof_instrument import (
     AxisSetUp,
     Optics,
     SetUp,
+    SixDof,
     SixDofInstrument,
     drift_matrix,
     solve_errors,
     systematic_signals,
 )
-from compgen.instruments.sixdof_readings import SixDof
 
 # Raw signals of one run to the motion of the target relative to the unit.
 #

@@ -35,10 +35,10 @@ from compgen.instruments.sixdof_instrument import (
     ROTATIONS,
     U_CONSTANTS,
     Optics,
+    SixDof,
     SixDofInstrument,
     known_systematics,
 )
-from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import (
     RelativeRun,
     errors_of_run,

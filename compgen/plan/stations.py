@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray, format_csv, read_csv
 from compgen.data.lengths import POSITION_COLUMNS
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest, one_line
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest, one_line
 
 #: Columns of the ``stations.csv`` of ``volcomp identify`` that a plan does not need.
 _OF_IDENTIFY = (

@@ -17,8 +17,7 @@ from typing import BinaryIO, NoReturn
 import numpy as np
 
 from compgen.data.machine import Machine, Vector3
-from compgen.data.messages import visible_line
-from compgen.errors import InputError
+from compgen.errors import InputError, visible_line
 from compgen.programs.dialects import Dialect
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
 from compgen.programs.runs import PlainRun, PlainWords

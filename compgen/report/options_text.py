@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.data.comparison import Residuals
-from compgen.data.messages import um_text
+from compgen.errors import um_text
 from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation, LevelResult
 
 # What the options of a control would gain: tables for the terminal, and ``options.md``.

@@ -12,8 +12,8 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, error_named
+from compgen.errors import number_text, one_line, um_text
 
 if TYPE_CHECKING:
     from compgen.accuracy.compare import Comparison

@@ -1,6 +1,7 @@
 """A virtual machine and virtual instruments: measurement files whose truth is known."""
 
-from compgen.simulate.effects import EFFECTS, Effect
+from compgen.simulate.effects import EFFECTS
+from compgen.simulate.effects import Displacement as Effect
 from compgen.simulate.gauges import Ballbar, TouchProbe
 from compgen.simulate.lasers import AxisLaser, DiagonalLaser, LaserTracer, Station
 from compgen.simulate.run import (

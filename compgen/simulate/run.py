@@ -33,10 +33,10 @@ from compgen.data.records import ARCHIVE
 from compgen.data.registry import call_problem
 from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
-from compgen.instruments.sixdof_readings import SixDof, format_sixdof
+from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
 from compgen.simulate.effects import (
-    Effect,
+    Displacement,
     LengthEffect,
     RunEffect,
     Sights,
@@ -302,7 +302,7 @@ class SimulatedReadings:
     truth: ErrorTable
 
 
-def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Effect] = ()) -> FloatArray:
+def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Displacement] = ()) -> FloatArray:
     """Return the true tool tip in the workpiece frame: exact chain plus ``effects``, shape (n, 3), mm."""
     tip_mm = tip_position(machine, truth.at(stops.position_mm), stops.position_mm, stops.tool_mm)
     for effect in effects:
@@ -320,7 +320,7 @@ def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequ
 
 
 def simulate(
-    machine: Machine, scenario: Scenario, seed: int | None = None, effects: Sequence[Effect] = ()
+    machine: Machine, scenario: Scenario, seed: int | None = None, effects: Sequence[Displacement] = ()
 ) -> Simulation:
     """Measure a virtual machine.
 

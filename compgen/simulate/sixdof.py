@@ -22,13 +22,13 @@ from compgen.instruments.sixdof_instrument import (
     ROTATIONS,
     SIGNALS,
     Optics,
+    SixDof,
     SixDofInstrument,
     known_systematics,
     read_instrument,
     read_systematics,
     systematics_schema,
 )
-from compgen.instruments.sixdof_readings import SixDof
 from compgen.instruments.sixdof_reduction import expected_away
 from compgen.kinematics.exact_chain import tip_position
 

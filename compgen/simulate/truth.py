@@ -12,7 +12,6 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest
 from compgen.data.names import (
     CURVE_NAMES,
     ERROR_INDEX,
@@ -22,6 +21,7 @@ from compgen.data.names import (
     ErrorName,
     error_named,
 )
+from compgen.errors import nearest
 from compgen.kinematics import modelled_errors
 
 #: Number of harmonics in a drawn curve; harmonic k has k half-waves over the travel.

@@ -29,9 +29,8 @@ from compgen.data import toml_files
 from compgen.data.csv_files import fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line
 from compgen.data.names import AXES, ERRORS
-from compgen.errors import InputError
+from compgen.errors import InputError, one_line
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
 # Controller files through Jinja2: strict about missing values, sandboxed; text of a user is never executed.

@@ -21,9 +21,8 @@ from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import one_line, um_text
 from compgen.data.names import COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, one_line, um_text
 from compgen.identify.covariance import Covariance, covariance_or_independent, error_design
 from compgen.identify.identification import Identification
 from compgen.kinematics.exact_chain import exact_error

@@ -74,7 +74,7 @@ def test_completion_of_a_command_loads_no_command(tmp_path):
 def test_completion_of_an_option_knows_the_options_and_loads_that_command_alone(tmp_path):
     libraries, commands, output = completed(tmp_path, "volcomp fit --max")
     assert output.split() == ["plain,--max-abs", "plain,--max-slope", "plain,--max-curvature"]
-    assert commands == {"fit_commands"}
+    assert commands == {"identify_commands"}
     assert libraries <= TABLES
 
 
@@ -82,7 +82,7 @@ def test_a_second_completion_of_an_option_loads_no_command_unless_the_program_ha
     first = completed(tmp_path, "volcomp fit --max")
     assert completed(tmp_path, "volcomp fit --max") == (set(), set(), first[2])
     # a value belongs to the command, which must then be loaded
-    assert completed(tmp_path, "volcomp fit --smoothness ")[1] == {"fit_commands"}
+    assert completed(tmp_path, "volcomp fit --smoothness ")[1] == {"identify_commands"}
     (note,) = (tmp_path / "cache" / "compgen" / "completion").glob("fit-*.json")
     content = json.loads(note.read_text())
     assert any(path.endswith("fit/bounds.py") for path, *_ in content["files"])
@@ -127,7 +127,7 @@ def test_the_note_of_a_command_has_its_options_and_their_help(tmp_path, monkeypa
         (["recal", "add", "--help"], "fleet_commands", {"rich"}),
         (["serve", "--help"], "fleet_commands", {"rich"}),
         (["identify", "zha-gantry", "L", "--out", "o"], "identify_commands", {"numpy", "rich"}),
-        (["fit", "zha-gantry", "E", "--out", "o"], "fit_commands", {"numpy", "rich"}),
+        (["fit", "zha-gantry", "E", "--out", "o"], "identify_commands", {"numpy", "rich"}),
         (["predict", "zha-gantry", "E", "--points", "P", "--out", "o"], "plan_commands", TABLES),
         (
             ["correct", "zha-gantry", "N", "--errors", "E", "--wcs", "G54=-400,-500,-200", "--out", "o"],

@@ -18,9 +18,14 @@ from compgen.cli.common import run_command  # noqa: E402
 from compgen.data.axis_runs import AxisRuns, format_axis_runs, read_axis_runs  # noqa: E402
 from compgen.data.machine import load_machine, read_machine  # noqa: E402
 from compgen.diagnose import DiagnoseOptions, axis_model, diagnose
-from compgen.diagnose.axis_candidates import candidates_of  # noqa: E402
 from compgen.diagnose.axis_diagnosis import _levels_off  # noqa: E402
-from compgen.diagnose.axis_model import LAMBDA, LEAST_MM, NoiseGrid, Search  # noqa: E402
+from compgen.diagnose.axis_model import (  # noqa: E402
+    LAMBDA,
+    LEAST_MM,
+    NoiseGrid,
+    Search,
+    candidates_of,  # noqa: E402
+)
 from compgen.diagnose.axis_session import sessions_of  # noqa: E402
 from compgen.effects import active_effects, listed  # noqa: E402
 from compgen.effects.catalogue import WHAT_TO_DO, what_to_do  # noqa: E402

@@ -15,10 +15,9 @@ from compgen.data.machine import load_machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import identify_measurement, joint_covariance, read_measurement
 from compgen.identify.adjust.unknowns import error_parameters
-from compgen.identify.merging import projected
 from compgen.identify.six_dof import SixDofMeasurement, identify_sixdof
-from compgen.instruments.sixdof_instrument import read_instrument
-from compgen.instruments.sixdof_readings import format_sixdof, read_sixdof
+from compgen.identify.together import projected
+from compgen.instruments.sixdof_instrument import format_sixdof, read_instrument, read_sixdof
 from compgen.kinematics import modelled_errors, volumetric_error
 from compgen.simulate import SimulatedSixDof, read_scenario, simulate_sixdof, write_simulation
 

@@ -21,12 +21,13 @@ from compgen.instruments.sixdof_instrument import (
     AxisSetUp,
     Optics,
     SetUp,
+    SixDof,
     SixDofInstrument,
     error_matrix,
+    read_sixdof,
     solve_errors,
     systematic_signals,
 )
-from compgen.instruments.sixdof_readings import SixDof, read_sixdof
 from compgen.instruments.sixdof_reduction import expected_away, printed_run, reduce_runs
 from compgen.simulate import SimulatedSixDof
 from compgen.simulate.sixdof import Tracer

@@ -11,8 +11,15 @@ from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import ERRORS, error_named
 from compgen.errors import CompgenWarning
 from compgen.instruments.sixdof_evaluation import evaluate
-from compgen.instruments.sixdof_instrument import SIGNALS, AxisSetUp, Optics, SetUp, SixDofInstrument, known_systematics
-from compgen.instruments.sixdof_readings import SixDof
+from compgen.instruments.sixdof_instrument import (
+    SIGNALS,
+    AxisSetUp,
+    Optics,
+    SetUp,
+    SixDof,
+    SixDofInstrument,
+    known_systematics,
+)
 from compgen.instruments.sixdof_reduction import errors_of_run, expected_away, reduce_runs
 from compgen.simulate.sixdof import Tracer, run_signals
 

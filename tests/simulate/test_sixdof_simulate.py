@@ -12,8 +12,7 @@ from compgen.cli.common import run_command
 from compgen.data.error_table import read_errors
 from compgen.data.machine import load_machine
 from compgen.errors import InputError
-from compgen.instruments.sixdof_instrument import SIGNALS, read_instrument
-from compgen.instruments.sixdof_readings import format_sixdof, read_sixdof
+from compgen.instruments.sixdof_instrument import SIGNALS, format_sixdof, read_instrument, read_sixdof
 from compgen.simulate import read_scenario, simulate, simulate_sixdof
 from compgen.simulate.sixdof import run_signals
 

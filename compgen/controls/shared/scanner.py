@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from compgen.controls.shared.base import SourceFile
-from compgen.data.messages import one_line
+from compgen.errors import one_line
 
 MOST_LINES = 200_000
 #: Number of characters quoted from a wrong word.

@@ -19,9 +19,8 @@ from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_bytes, read_text, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, read_machine
-from compgen.data.messages import one_line
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
-from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.errors import CompgenError, CompgenWarning, InputError, one_line
 from compgen.identify.any_measurement import MEASURED_WITH
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector

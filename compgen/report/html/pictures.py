@@ -24,8 +24,8 @@ from compgen.data.charts import (
 )
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
-from compgen.data.messages import um_text
 from compgen.data.names import AXES, COVERAGE, error_named
+from compgen.errors import um_text
 from compgen.kinematics.many_points import full_grid
 from compgen.report.html.folder import ReadingResiduals, TableCurve, Volume
 

@@ -24,9 +24,8 @@ from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, json_text, json_values
 from compgen.data.machine import Machine
-from compgen.data.messages import number_text, one_line, um_text
 from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
-from compgen.errors import CompgenError
+from compgen.errors import CompgenError, number_text, one_line, um_text
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (

@@ -1,4 +1,4 @@
-"""Forward formulas of simulated effects, and their sections in a scenario."""
+"""What acts on a simulated machine and its tracers beyond the geometric errors: forward formulas, sections of a scenario."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.messages import nearest
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
 from compgen.data.registry import Registry, call_problem, why_missing
 from compgen.effects import ANY_STATION, DisplacementEffect, Effect, catalogue, listed, readings_of_points
 from compgen.effects.active import STATION_NAME, dead_path_stations, keys_schema, read_values, station_pattern
-from compgen.errors import InputError
+from compgen.errors import InputError, nearest
 from compgen.kinematics.exact_chain import tip_position
 from compgen.simulate.trajectory import Stops
 
