@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from compgen.app.project import Project, ProjectState, Step, command_line
+from compgen.app.project import Measurement, Project, ProjectState, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -667,13 +667,62 @@ def program_page(project: Project, state: ProjectState) -> dict[str, Any]:
     }  # fmt: skip
 
 
+#: What to do where the points of two measurements differ: the word that ``volcomp compare`` takes, and what it means.
+ALIGN = {
+    "": "refuse, and say which",
+    "common": "only what both have",
+    "interpolate": "interpolate both within the common range",
+    "model": "compare the errors identified from each",
+}
+
+
+#: Kinds of files that are compared with the same axes only.
+BY_AXIS = ("axis", "diagonals")
+
+
+def kind_of(item: Measurement) -> str:
+    """Return the kind of a measurement file as ``volcomp import`` names it."""
+    return str(item.step.data["summary"]["kind"])
+
+
+def pairs_of(before: Sequence[Measurement], after: Sequence[Measurement]) -> list[tuple[Measurement, Measurement]]:
+    """Return the axis runs and diagonals that both sides have once: of one kind, along the same axes."""
+
+    def key(item: Measurement) -> tuple[str, str]:
+        found = item.step.data["summary"]["understood"]
+        along = [found.get(name, found.get("columns", {}).get(name)) for name in ("axis", "diagonal")]
+        return kind_of(item), json.dumps(along)
+
+    sides = [[key(item) for item in side] for side in (before, after)]
+    return [
+        (item, after[sides[1].index(own)])
+        for item, own in zip(before, sides[0], strict=True)
+        if own[0] in BY_AXIS and [side.count(own) for side in sides] == [1, 1]
+    ]
+
+
 def after_page(project: Project, state: ProjectState) -> dict[str, Any]:
-    """Return the measurements of after the correction, and the last comparison."""
-    step = state.last("compare")
+    """Return the measurements of after the correction, and the comparisons, the latest first."""
+    found: list[dict[str, Any]] = [
+        {
+            "step": step, "facts": project.facts(step, "compare.json"), "views": list(project.pages_of(step)),
+            "current": (current := state.is_current(step)),
+            "volume": volume_pictures(step, project.path(step.folder)) if current else (),
+        }
+        for step in reversed(state.steps)
+        if step.kind == "compare"
+    ]  # fmt: skip
+    before, after = (
+        [item for item in state.measurements if item.after == side and item.used] for side in (False, True)
+    )
+    pairs = pairs_of(before, after)
+    paired = [item.number for pair in pairs for item in pair]
     return {
-        "items": shown_measurements(project, state, after=True), "step": step,
-        "before": [item for item in state.measurements if not item.after and item.used],
-        "facts": project.facts(step, "compare.json"), "views": list(project.pages_of(step)),
+        "items": shown_measurements(project, state, after=True), "results": found, "align": ALIGN,
+        "before": before, "after": after,
+        # an axis that the other side does not have is left out unless the user chooses it
+        "alone": [item.number for item in (*before, *after) if pairs and kind_of(item) in BY_AXIS and item.number not in paired],
+        "values": {picture.key: picture.data for item in found for picture in item["volume"]},
     }  # fmt: skip
 
 

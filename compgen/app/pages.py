@@ -34,7 +34,9 @@ from werkzeug.wrappers import Response as BaseResponse
 from compgen.app import contents
 from compgen.app.project import (
     GIVEN,
+    JOB,
     PROJECT,
+    Measurement,
     Progress,
     Project,
     ProjectState,
@@ -705,6 +707,7 @@ def _uploaded(project: Project, folder: str, name: str) -> list[str]:
     paths = [f"{folder}/{GIVEN}/{name}-{k}-{file_name(item.filename or '')}" for k, item in enumerate(files, start=1)]
     for item, path in zip(files, paths, strict=True):
         project.path(path).parent.mkdir(exist_ok=True)
+        item.stream.seek(0)  # several steps may take the same file
         item.save(project.path(path))
     return paths
 
@@ -790,21 +793,47 @@ def _program_setup(project: Project, state: ProjectState) -> dict[str, Any]:
 
 @action("after", "compare")
 def compare(runner: Runner, state: ProjectState) -> None:
-    """Compare a measurement after the correction with one before it."""
-    pair = []
+    """Compare measurements after the correction with those before it.
+
+    One file on each side is compared as it is. Several are identified together, then their errors are compared; axis runs
+    and diagonals that both sides have once are compared by themselves, too, with the figures of their standard.
+    """
+    sides: list[list[Measurement]] = []
+    align = _field("align")
+    if align not in contents.ALIGN:
+        raise InputError("choose what to do where the points differ")
     for name, what in (("before", "a measurement before"), ("after", "a measurement after")):
-        text = _field(name)
-        item = next((item for item in state.measurements if str(item.number) == text and item.used), None)
-        if item is None:
+        chosen = request.form.getlist(name)
+        items = [item for item in state.measurements if str(item.number) in chosen]
+        if not items or not all(item.used for item in items):
             raise InputError(f"choose {what} the correction")
-        pair.append(item)
-    folder = runner.project.new_folder("compare")
-    before, after = (item.used[0] for item in pair)
-    certificate = [f"--dcc={path}" for path in _uploaded(runner.project, folder, "certificate")[:1]]
-    report = ["report", folder, *certificate, *_language()]
-    commands = [["compare", _machine_of(state), before, after, "--out", folder], report]
-    step = Step(0, "compare", f"{pair[0].name} against {pair[1].name}", commands, folder)
-    runner.start("comparing before and after", "after", [StepTask(step)])
+        sides.append(items)
+    machine, instrument, language = _machine_of(state), _instrument(state), _language()
+    aligned = [f"--align={align}"] * bool(align)
+
+    def task(*sides: Sequence[Measurement]) -> StepTask:
+        folder = runner.project.new_folder("compare")
+        certificate = [f"--dcc={path}" for path in _uploaded(runner.project, folder, "certificate")[:1]]
+        files = [[file for item in side for file in item.used] for side in sides]
+        kinds = [{contents.kind_of(item) for item in side} for side in sides]
+        own, commands = instrument if {"sixdof"} in kinds else [], []
+        if max(map(len, files)) > 1 or kinds[0] != kinds[1]:
+            for side, name in zip(files, ("before", "after"), strict=True):
+                words = instrument if "sixdof" in kinds[name == "after"] else []
+                commands.append(["identify", machine, *side, *words, "--out", f"{folder}/{name}"])
+            files, own = [[f"{folder}/before"], [f"{folder}/after"]], []
+        words = ["compare", machine, files[0][0], files[1][0], *own, *aligned, "--out", folder]
+        title = " against ".join(", ".join(item.name for item in side) for side in sides)
+        commands += [words, ["report", folder, *certificate, *language]]
+        return StepTask(Step(0, "compare", title, commands, folder))
+
+    joint = [[item for item in side if contents.kind_of(item) != "diagonals"] for side in sides]
+    pairs = [([first], [second]) for first, second in contents.pairs_of(*sides)]
+    if all(joint) and tuple(sides) not in pairs:
+        pairs.append((joint[0], joint[1]))
+    if not pairs:
+        raise InputError("diagonals are compared with the same diagonals only; choose those of the other side, too")
+    runner.start("comparing before and after", "after", [task(*pair) for pair in pairs])
 
 
 @action("project", "recal")
@@ -818,14 +847,26 @@ def hand_over(runner: Runner, state: ProjectState) -> None:
     if measured not in ("bare", "active"):
         raise InputError("say whether the compensation is on while the machine is measured", field="measured")
     words = ["recal", "add", name, "--machine", _machine_of(state), "--inbox", "inbox", "--controller", control]
-    words += ["--out", "recalibration", "--measured-with", measured, "--job", "recal.toml"]
-    runner.start("writing the job file", "project", [StepTask(Step(0, "recal", f"Recalibration of {name}", [words]))])
+    words += ["--out", "recalibration", "--measured-with", measured, "--job", JOB]
+    path = runner.project.path(JOB)
+    before = read_text(path) if path.exists() else ""
+
+    def finish(step: Step, output: str) -> Step:
+        """Keep what was appended to the job file, so that it can be taken back."""
+        text = read_text(path)
+        added = text.removeprefix(before) if text.startswith(before) else ""
+        return Step(**{**step.__dict__, "data": {"added": added, "machine_there": name}})
+
+    task = StepTask(Step(0, "recal", f"Recalibration of {name}", [words]), finish)
+    runner.start("writing the job file", "project", [task])
 
 
 @action("project", "undo")
 def undo(runner: Runner, state: ProjectState) -> None:
-    """Take back the last step."""
-    runner.project.undo(state.revision)
+    """Take back the last step, and say what of it stays."""
+    step, stays = runner.project.undo(state.revision)
+    if stays:
+        runner.job = Progress(f"taken back: {step.title}", "project", ended=time.monotonic(), problems=stays)
 
 
 @pages.post(f"/projects/<{_NUMBER}:number>/stop")

@@ -25,10 +25,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from compgen.data.files import json_text, read_bytes, write_file
+from compgen.data.files import json_text, read_bytes, read_text, write_file
 from compgen.errors import InputError
 
 PROJECT, UNDONE, LOCK = "project.json", "undone", ".project.lock"
+#: The job file of the hand-over to ``recal``, and what ``recal`` itself writes beside it.
+JOB, OF_RECAL = "recal.toml", ("inbox", "recalibration", "recal.sqlite")
 #: A project file of another program version with another form is refused.
 FORM = 1
 #: Longest list of steps, bytes.
@@ -144,8 +146,9 @@ class ProjectState:
         """Whether nothing that a step depends on has changed since; what is made of errors depends on them, too."""
         inputs = (*INPUTS, "identify") if step.kind in OF_ERRORS else INPUTS
         return not any(
-            other.number > step.number and other.kind in inputs and not other.data.get("after") for other in self.steps
-        )
+            other.number > step.number and other.kind in inputs
+            and (step.kind == "compare" or not other.data.get("after")) for other in self.steps
+        )  # fmt: skip
 
 
 def file_name(given: str) -> str:
@@ -264,8 +267,11 @@ class Project:
             self._write(state)
             return state
 
-    def undo(self, revision: int) -> Step:
-        """Remove the last step from the list and move its folder to ``undone/``."""
+    def undo(self, revision: int) -> tuple[Step, list[str]]:
+        """Remove the last step from the list and move its folder to ``undone/``; return it, and in words what of it stays.
+
+        Of a hand-over to ``recal`` the entry in the job file is removed; the file itself with its last entry.
+        """
         with self._alone() as state:
             if revision != state.revision:
                 raise StaleError("the project was changed in another window; reload this page, then do it again")
@@ -275,12 +281,29 @@ class Project:
             self._write(ProjectState(state.revision + 1, state.steps[:-1]))
             if step.folder:
                 self.set_aside(step.folder)
-            return step
+            return step, self._take_back_job(step) if step.kind == "recal" else []
+
+    def _take_back_job(self, step: Step) -> list[str]:
+        """Remove the entry of a hand-over from the job file; return in words what stays."""
+        path, added, name = self.folder / JOB, str(step.data.get("added", "")), step.data.get("machine_there", "")
+        stays = []
+        if path.is_file():
+            text = read_text(path)
+            if not added or text.count(added) != 1:
+                stays.append(f"{JOB} was edited after the hand-over: its entry of {name} stays; delete it there")
+            elif rest := text.replace(added, "").strip("\n"):
+                write_file(path, f"{rest}\n")
+            else:
+                self.set_aside(JOB)
+        written = [item for item in OF_RECAL if (self.folder / item).exists()]
+        if written:
+            stays.append(f"{', '.join(written)} in the folder of the project stay: measurements and tables of recal")
+        return stays
 
     def set_aside(self, name: str) -> None:
-        """Move the folder of a step to ``undone/``, under a name that is free; an empty one is removed."""
+        """Move a file, or the folder of a step, to ``undone/``, under a name that is free; an empty folder is removed."""
         folder, count = self.folder / name, 1
-        if not folder.is_dir():
+        if not folder.exists():
             return
         with contextlib.suppress(OSError):
             folder.rmdir()
@@ -333,7 +356,7 @@ class Project:
         for step in self.state().steps:
             lines += ["", f"# {step.number}. {' '.join(step.title.split())}", *step.data.get("by_hand", ())]
             for words in step.commands:
-                ends = f" || [ $? -eq {step.exit_code} ]" if step.exit_code and words is step.commands[0] else ""
+                ends = f" || [ $? -eq {step.exit_code} ]" if step.exit_code else ""
                 lines.append(command_line(words) + ends)
         return "\n".join(lines) + "\n"
 

@@ -4,6 +4,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import re
 import shlex
 import shutil
@@ -163,7 +164,7 @@ def test_a_second_measurement_is_compared_with_the_first(site, tmp_path):
     assert state.used_files() == [first]
     before, later = state.measurements
     certificate = upload(ROOT / "examples" / "certificate.toml")["files"]
-    form = {"before": str(before.number), "after": str(later.number), "certificate": certificate}
+    form = {"before": str(before.number), "after": str(later.number), "align": "", "certificate": certificate}
     state = site.do("compare", form)
     assert b"digitalCalibrationCertificate" in site.project.files_of(state.last("compare"))["dcc.xml"].read_bytes()
     turned = {**form, "before": form["after"], "after": form["before"], "certificate": []}
@@ -291,6 +292,35 @@ def test_the_job_file_of_recalibration_can_be_read(site):
     assert list(job.machines) == ["mill-1"]
     assert job.machines["mill-1"].measured_with == "bare"
     assert "volcomp recal run --job recal.toml" in site.get("/projects/1/project").text
+
+
+def test_a_hand_over_is_undone_with_its_entry_and_what_stays_is_said(site):
+    from compgen.fleet.job import add_machine, read_job
+
+    path, form = site.project.folder / "recal.toml", {"name": "mill-1", "control": "siemens-cec", "measured": "bare"}
+    state = site.do("machine/describe", MILL)
+    other = {"machine": state.machine, "inbox": "other", "controllers": ["siemens-cec"], "out": "of-other"}
+    state = site.do("recal", form)
+    first = path.read_text()
+    assert "Recalibration of mill-1; its folder" in site.get("/projects/1/project").text
+    site.do("undo")
+    assert not path.exists()
+    assert (site.project.folder / "undone" / "recal.toml").read_text() == first
+
+    site.do("recal", form)
+    add_machine(path, "mill-2", {**other, "measured_with": "bare"})  # by somebody else, afterwards
+    site.do("undo")
+    assert list(read_job(path).machines) == ["mill-2"]
+
+    site.do("recal", form)
+    path.write_text(path.read_text().replace('measured_with = "bare"', 'measured_with = "active"'))
+    (site.project.folder / "inbox").mkdir()
+    site.post("/projects/1/undo")
+    page = site.get("/projects/1/project").text
+    assert "recal.toml was edited after the hand-over: its entry of mill-1 stays" in page
+    assert "inbox in the folder of the project stay" in page
+    assert list(read_job(path).machines) == ["mill-2", "mill-1"]
+    assert site.project.state().last("recal") is None
 
 
 def test_six_dof_readings_are_read_with_their_instrument(site):
@@ -459,3 +489,38 @@ def test_the_error_in_the_volume_is_drawn_before_any_tables_and_with_them(site):
         assert max(shown[3:]) < 0.1
         assert page.count('data-layer="') == 3
     assert "before and after the tables for siemens-cec" in site.get("/projects/1/result").text
+
+
+def test_several_files_before_and_after_are_identified_together_and_axis_runs_by_themselves_too(site, tmp_path):
+    """A tracer of circles (squareness 100, then 20 urad) and an axis run (then a twentieth) on either side."""
+    runs = "axis,position_mm,direction,run,deviation_um\n"
+    runs += "".join(f"X,{x},{d},{k},{{{x}}}\n" for k in (1, 2) for x in range(0, 401, 50) for d in (1, -1))
+    for name, share in (("before", 1.0), ("after", 0.2)):
+        circle = ["plane,angle_deg,radius_mm,deviation_um,direction,centre_x_mm,centre_y_mm,centre_z_mm,u_deviation_um"]
+        for angle in range(0, 360, 4):
+            off_um = 100e3 * 100e-6 * share * math.sin(math.radians(2 * angle)) / 2
+            circle += [f"XY,{angle},100,{off_um:.5f},{way},200,200,-100,0.1" for way in (1, -1)]
+        (tmp_path / f"{name}.circle.csv").write_text("\n".join(circle) + "\n")
+        deviations = {str(x): f"{share * 0.1 * x + 0.1 * (-1) ** (x // 50):.5f}" for x in range(0, 401, 50)}
+        text = re.sub(r"\{(\d+)\}", lambda found: deviations[found[1]], runs)  # noqa: B023  # used at once
+        (tmp_path / f"{name}.axis.csv").write_text(text)
+    site.do("machine/describe", MILL)
+    site.do("measurement/add", upload(tmp_path / "before.axis.csv", tmp_path / "before.circle.csv"))
+    state = site.do("measurement/add", upload(tmp_path / "after.circle.csv", tmp_path / "after.axis.csv", after="yes"))
+    numbers = {when: [str(item.number) for item in state.measurements if item.after == (when == "after")] for when in
+               ("before", "after")}  # fmt: skip
+    state = site.do("compare", {**numbers, "align": ""})
+    axis, joint = (step for step in state.steps if step.kind == "compare")
+    assert axis.title == "before.axis.csv against after.axis.csv"
+    assert "A" in json.loads(site.project.files_of(axis)["compare.json"].read_text())["figures"]["X"]
+    figures = json.loads(site.project.files_of(joint)["compare.json"].read_text())["figures"]["errors"]
+    assert figures["EC0Y"]["before"]["value"] == pytest.approx(-100.0, rel=0.01)
+    assert figures["EC0Y"]["factor"] == pytest.approx(5.0, rel=0.01)
+    assert figures["EXX"]["before"]["value"] == pytest.approx(40.0, abs=0.5)
+    page = site.get("/projects/1/after").text
+    assert page.index(joint.title) < page.index(axis.title)
+    assert page.count("volume in space") == 1
+    assert site.post("/projects/1/compare", {"before": numbers["before"], "align": ""}).status_code == 409
+    assert site.post("/projects/1/compare", {**numbers, "align": "--help"}).status_code == 409
+    site.do(f"measurement/{numbers['after'][0]}/remove")
+    assert site.get("/projects/1/after").text.count("changed after this comparison") == 2
