@@ -334,6 +334,8 @@ class Corrector:
             wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
             short = (high - low) * length[move] < 2.0 * self.shortest_mm
             fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
+            # only the block as a whole says how many turns it has
+            fine &= (np.abs(sweep) < 2.0 * np.pi + 1e-9) | (high - low == 1.0)
             done.append((move[fine], high[fine], ends[fine, 1], centre[fine]))
             again, half = ~fine, 0.5 * (low + high)
             work = np.concatenate(

@@ -231,6 +231,20 @@ def test_arcs_stay_arcs(tmp_path):
     assert 4 <= result.counts["added_blocks"] <= 20
 
 
+@pytest.mark.parametrize(("dialect", "turns"), [("linuxcnc", "P4"), ("siemens", "TURN=3")])
+def test_a_divided_helix_keeps_its_turns(tmp_path, dialect, turns):
+    """From (10, 0) to (0, 10) counterclockwise with three full turns more: 3.25 turns in all."""
+    ends, middle = np.array([-9.0, 0.0, 9.0]), 20e-3
+    bend = ErrorTable({"EXZ": Curve(ends, np.array([0.0, middle, 0.0]), np.zeros(3))})
+    text = f"G54 G71 G90 G17\nG0 X10 Y0 Z-9\nG3 X0 Y10 Z9 I-10 J0 {turns} F100\nM30\n"
+    text = text.replace("G71", "G21") if dialect == "linuxcnc" else text
+    result, written = run(tmp_path, text, bend, dialect, PLAIN)
+    pieces = moves_of(written[written.index("G54 G") :], dialect, PLAIN)
+    assert result.accepted
+    assert len(pieces) > 2
+    assert pieces.sweep_rad.sum() == pytest.approx(3.25 * 2.0 * np.pi, abs=1e-3)
+
+
 def test_the_radius_of_siemens_keeps_its_equals_sign_in_divided_arcs(tmp_path):
     text = "G71 G90 G17 G54\nG0 X50 Y20 Z0\nG1 F100 Z-1\nG3 X-50 Y20 CR=-53\nM30\n"
     result, corrected = run(tmp_path, text, shift(slope=0.2), "siemens", PLAIN)
