@@ -19,10 +19,11 @@ from compgen.app.project import Measurement, Project, ProjectState, Step, comman
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.charts import CYCLE, Picture, Plot, limits_of, svg
+from compgen.data.charts import BOX, CYCLE, Picture, Plot, limits_of, svg
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
+from compgen.data.deviations import Artefact, Deviations
+from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
@@ -35,12 +36,16 @@ from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.folder import read_volume
 from compgen.report.html.pictures import VolumeOnGrid, describe_error, draw_curve, draw_slices, draw_space, grid_of
+from compgen.report.html.write import judged
 from compgen.tables import load_format
+from compgen.tables.verification import MISFIT_CODES
 
 #: Files larger than this are not drawn, bytes; so many pictures of one file at most.
 LARGEST_DRAWN, MOST_PICTURES = 40_000_000, 12
 #: Levels of each axis at which the error in the volume is calculated for its picture.
 VOLUME_LEVELS = 9
+#: More positions than this are drawn without arrows.
+MOST_ARROWS = 2000
 
 # Measurements: pictures, and questions with what each answer would mean.
 
@@ -54,6 +59,8 @@ def pictures_of(data: object, key: str) -> list[Picture]:
     if isinstance(data, ErrorTable):
         names = list(data.curves)[:MOST_PICTURES]
         return [replace(draw_curve(name, data, None, {}), key=f"{key}-{name}") for name in names]
+    if isinstance(data, Artefact):
+        return _artefact_pictures(data, key)
     position_mm = getattr(data, "position_mm", None)
     if position_mm is None or np.ndim(position_mm) != 2:
         return []
@@ -86,8 +93,9 @@ def _runs_picture(data: AxisRuns, axis: int, key: str) -> Picture:
             plot.line(x[part][order], y[part][order], role, width=0.6)
         targets = np.unique(x[chosen])
         plot.line(targets, [y[chosen & (x == target)].mean() for target in targets], role, width=2.0)
-    title = f"{AXES[axis]}: deviation over target; blue upwards, orange downwards; thick: means"
-    return Picture(key, f"Runs along {AXES[axis]}", svg(key, title, [plot]), note="blue: upwards, orange: downwards")
+    title = f"{AXES[axis]}: deviation over target; blue: positive direction, orange: negative; thick: means"
+    note = f"blue: +{AXES[axis]}, orange: \N{MINUS SIGN}{AXES[axis]}"
+    return Picture(key, f"Runs along {AXES[axis]}", svg(key, title, [plot]), note=note)
 
 
 def _circle_picture(data: Circles, plane: str, key: str) -> Picture:
@@ -106,14 +114,25 @@ def _circle_picture(data: Circles, plane: str, key: str) -> Picture:
             radius = 1.0 + deviation_um[rows] / (3.0 * largest)
             angle = part.angle_rad[rows]
             plot.line(radius * np.cos(angle), radius * np.sin(angle), role)
-    note = f"outer and inner circle: ±{largest:.3g} µm; blue counter-clockwise"
+    note = f"grey circles: ±{largest:.3g} µm; blue: counter-clockwise, orange: clockwise"
     return Picture(key, f"Circle {plane}", svg(key, f"Circle in {plane}, radial deviation", [plot]), note=note)
 
 
 def _deviation_pictures(data: Deviations, key: str) -> list[Picture]:
-    """Each measured component over the axis along which the points extend farthest."""
+    """Arrows in the plane, and each measured component over the axis along which the points extend farthest."""
     axis = int(np.argmax(np.ptp(data.position_mm, axis=0)))
     pictures = []
+    if np.isfinite(data.deviation_mm[:, :2]).all() and len(data.position_mm) <= MOST_ARROWS:
+        x, y = data.position_mm[:, 0], data.position_mm[:, 1]
+        largest = float(np.hypot(*data.deviation_mm[:, :2].T).max()) or 1.0
+        times = 10.0 ** np.floor(np.log10(0.15 * max(np.ptp(x), np.ptp(y), 1.0) / largest))
+        tip = data.position_mm[:, :2] + times * data.deviation_mm[:, :2]
+        plot = _in_plane(np.concatenate([x, tip[:, 0]]), np.concatenate([y, tip[:, 1]]))
+        plot.line(np.column_stack([x, tip[:, 0]]), np.column_stack([y, tip[:, 1]]), "c0", width=1.2)
+        plot.dots(x, y, "line", size=3.0)
+        note = f"enlarged {times:g} times; the largest {1e3 * largest:.3g} µm"
+        picture = svg(f"{key}-plane", "Deviations in X and Y", [plot])
+        pictures.append(Picture(f"{key}-plane", "Deviations in X and Y", picture, note=note))
     for component in range(3):
         y = 1e3 * data.deviation_mm[:, component]
         if not np.isfinite(y).any():
@@ -128,24 +147,60 @@ def _deviation_pictures(data: Deviations, key: str) -> list[Picture]:
     return pictures
 
 
+def _in_plane(x: FloatArray, y: FloatArray) -> Plot:
+    """Axes X and Y with the same scale that show all points."""
+    (left, right), (low, high) = limits_of(x), limits_of(y)
+    spare = 0.5 * ((high - low) * (BOX[2] - BOX[0]) / (BOX[3] - BOX[1]) - (right - left))
+    across, up = max(spare, 0.0), max(-spare, 0.0) * (BOX[3] - BOX[1]) / (BOX[2] - BOX[0])
+    return Plot((left - across, right + across), (low - up, high + up), x_label="X (mm)", y_label="Y (mm)")
+
+
+def _artefact_pictures(data: Artefact, key: str) -> list[Picture]:
+    """Where the probe found the features in the machine, in a colour for each set-up."""
+    x, y = data.measured_mm[:, 0], data.measured_mm[:, 1]
+    if not np.isfinite(x + y).any():
+        return []
+    plot = _in_plane(x, y)
+    for number, setup in enumerate(np.unique(data.setup)):
+        rows = data.setup == setup
+        plot.dots(x[rows], y[rows], CYCLE[number % len(CYCLE)], size=3.0)
+    picture = svg(f"{key}-XY", "Measured positions in X and Y", [plot])
+    return [Picture(f"{key}-XY", "Measured positions", picture, note="one colour for each set-up")]
+
+
 @lru_cache(maxsize=64)
-def _drawn(path: Path, _stamp: tuple[int, int], answers: tuple[str, ...], key: str) -> tuple[Picture, ...]:
+def _drawn(
+    path: Path, _stamp: tuple[int, int], answers: tuple[str, ...], key: str
+) -> tuple[Sequence[Picture], Overview | None]:
     with warnings.catch_warnings():  # the command that reads the file shows them
         warnings.simplefilter("ignore", CompgenWarning)
         kind = native_format(path)
         data = describe_native(path, kind)[1] if kind else import_file(path, options_from(answers)).data
-    return tuple(pictures_of(data, key))
+    seen = _overview_of_runs(data) if isinstance(data, AxisRuns) else None
+    return pictures_of(data, key), data.overview() if isinstance(data, Displayed) else seen
 
 
-def measurement_pictures(path: Path, answers: Sequence[str], key: str) -> Sequence[Picture]:
-    """Return pictures of a measurement file; none for one that is too large or cannot be read."""
+def _overview_of_runs(data: AxisRuns) -> Overview:
+    """What was measured along each axis."""
+    rows = []
+    for axis in data.axes:
+        part = data.axis == axis
+        targets, runs = np.unique(data.position_mm[part]), len(np.unique(data.run[part]))
+        both = "both" if len(np.unique(data.direction[part])) == 2 else "one"
+        rows.append((AXES[axis], str(len(targets)), f"{targets[0]:g}", f"{targets[-1]:g}", str(runs), both))
+    header = ("axis", "targets", "from (mm)", "to (mm)", "runs", "directions")
+    return Overview(f"{len(data)} readings along {', '.join(AXES[axis] for axis in data.axes)}", header, tuple(rows))
+
+
+def measurement_shown(path: Path, answers: Sequence[str], key: str) -> tuple[Sequence[Picture], Overview | None]:
+    """Return pictures of a measurement file and what was measured; nothing of one that is too large or cannot be read."""
     try:
         stat = path.stat()
         if stat.st_size > LARGEST_DRAWN:
-            return ()
+            return (), None
         return _drawn(path, (stat.st_mtime_ns, stat.st_size), tuple(answers), key)
     except (OSError, CompgenError):
-        return ()
+        return (), None
 
 
 def options_from(answers: Sequence[str]) -> ImportOptions:
@@ -196,6 +251,9 @@ _FIXED = {
 }
 _SIGNS = ("error", "correction", "angle-above-90", "angle-below-90", "rotation")
 _WORDS = {
+    "angle-above-90": "positive: the angle between the positive axes is above 90°",
+    "angle-below-90": "positive: the angle between the positive axes is below 90°",
+    "rotation": "the numbers are EC0Y, EB0Z, EA0Z of ISO 230-1",
     "error": "error: measured minus commanded",
     "correction": "correction: what has to be added",
     "dmy": "day, month, year",
@@ -209,27 +267,61 @@ _WORDS = {
 }
 
 
+def _angle_picture(word: str, lean: float) -> Picture:
+    """Two axes whose angle is not 90 degrees, much enlarged."""
+    plot = Plot((-0.9, 1.5), (-0.25, 1.2), (5.0, 5.0, 243.0, 145.0), bare=True)
+    turn = np.linspace(0.0, np.pi / 2 + lean, 30)
+    tip = np.array([np.cos(turn[-1]), np.sin(turn[-1])])
+    plot.line([0.0, 1.0], [0.0, 0.0], "ink")
+    plot.line([0.0, 0.0], [0.0, 1.0], "grid", dash="4 3")
+    plot.line([0.0, tip[0]], [0.0, tip[1]], "ink")
+    plot.line(0.3 * np.cos(turn), 0.3 * np.sin(turn), "c0")
+    for x, y, text in (
+        (1.1, 0.0, "+"),
+        (1.1 * tip[0], 1.1 * tip[1], "+"),
+        (0.55, 0.35, "> 90°" if lean > 0 else "< 90°"),
+    ):
+        plot.text(x, y, text)
+    return Picture(f"sign-{word}", "Positive number", svg(f"sign-{word}", "Angle of the axes", [plot]))
+
+
+#: Signs of squareness whose meaning is drawn.
+SIGNS_DRAWN = {
+    "angle-above-90": (_angle_picture("above", 0.2),),
+    "angle-below-90": (_angle_picture("below", -0.2),),
+    "rotation": (),
+}
+
+
 def questions_of(
     path: Path, doubts: Sequence[str], answers: Sequence[str], key: str, axis: str | None = None
 ) -> list[Question]:
     """Return what a file leaves open as questions, each with the picture that every answer would give."""
     found: dict[str, Question] = {}
+    before: list[str] = []  # what is open, if the next text says how all of it is answered
     for number, doubt in enumerate(doubts):
         match = _OPTION.search(doubt)
         if match is None:
+            before.append(doubt)
             continue
         option, words = match[1], list(_answers(match[1], doubt, axis))
         choices = [
             AnswerChoice(
                 f"--{option}={word}",
                 _label(word),
-                measurement_pictures(path, (*answers, f"--{option}={word}"), f"{key}-{number}-{k}"),
+                SIGNS_DRAWN[word]
+                if word in SIGNS_DRAWN
+                else measurement_shown(path, (*answers, f"--{option}={word}"), f"{key}-{number}-{k}")[0],
             )
             for k, word in enumerate(words)
         ]
-        found.setdefault(f"{option} {match.end()}" if option in ("map", "ignore") else option, Question(
-            doubt[: match.start()].rstrip(" ;,").removesuffix("give").rstrip(" ;,") or doubt, option, choices
-        ))  # fmt: skip
+        text = doubt[: match.start()].rstrip(" ;,").removesuffix("give").rstrip(" ;,") or doubt
+        if text.startswith("or answer") and before:
+            text = "; ".join(re.sub(r"; write .*", "", part) for part in before)
+        before.clear()
+        found.setdefault(
+            f"{option} {match.end()}" if option in ("map", "ignore") else option, Question(text, option, choices)
+        )
     return list(found.values())
 
 
@@ -322,7 +414,10 @@ def chain_picture(chain: Chain) -> Markup:
 
 @dataclass(frozen=True)
 class SettingField:
-    """A key of a control as a field of a form: how it is given, its choices, meaning, present value and default."""
+    """A key of a control as a field of a form: how it is given, its choices, meaning, present value and default.
+
+    ``first`` are the keys that are set, and those that the open points of the control name.
+    """
 
     key: str
     choices: Sequence[str]
@@ -330,13 +425,14 @@ class SettingField:
     value: str
     default: str
     kind: str
+    first: bool
 
 
 def settings_of(text: str, control: str) -> list[SettingField]:
     """Return the settings that a control declares, with the values of a machine file."""
     present = tomllib.loads(text).get("controllers", {}).get(control, {})
     declared = toml_files.section_schema(getattr(CONTROLLERS[control], "settings_class", object)).get("properties", {})
-    found = []
+    found, points = [], " ".join(open_points(control))
     for key, about in declared.items():
         kind, choices = str(about.get("type", "")), [str(item) for item in about.get("enum", ())]
         if kind == "boolean":
@@ -346,7 +442,8 @@ def settings_of(text: str, control: str) -> list[SettingField]:
         shown = "text" if all(isinstance(item, str) for item in about.get("enum", ("",))) and (
             choices or kind == "string"
         ) and kind != "boolean" else "toml"  # fmt: skip
-        found.append(SettingField(key, choices, str(about.get("description", "")), value, default, shown))
+        first = bool(value) or re.search(rf"\b{re.escape(key)}\b", points) is not None
+        found.append(SettingField(key, choices, str(about.get("description", "")), value, default, shown, first))
     return found
 
 
@@ -523,7 +620,7 @@ def machine_page(project: Project, state: ProjectState) -> dict[str, Any]:
     return {
         "machine": machine, "text": text, "parsed": parsed,
         "chain": Chain(chain) if chain in CHAINS else None, "in_words": in_words, "picture": chain_picture,
-        "shipped": sorted(machine_files(())), "chains": [Chain(name) for name in CHAINS],
+        "shipped": sorted(machine_files(())), "example": Chain("WXYFZT"), "chains": [Chain(name) for name in CHAINS],
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
         "controls": [(load_format(name), settings_of(text, name), open_points(name))
                      for name in controls],
@@ -541,7 +638,11 @@ def machine_file(project: Project, state: ProjectState) -> Path | None:
 
 def measurement_page(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return the measurements of before the correction."""
-    return {"items": shown_measurements(project, state, after=False), "names": SQUARENESS_NAMES, "axes": AXES}
+    open_files = [item for item in state.measurements if not item.after and not item.used]
+    return {
+        "items": shown_measurements(project, state, after=False), "names": SQUARENESS_NAMES, "axes": AXES,
+        "ready": state.machine is not None and not open_files, "current": state.current("identify") is not None,
+    }  # fmt: skip
 
 
 def shown_measurements(project: Project, state: ProjectState, *, after: bool) -> list[dict[str, Any]]:
@@ -551,11 +652,13 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
         if item.after != after:
             continue
         path, key, answers = project.path(item.file), f"m{item.number}", item.step.data["answers"]
+        pictures, overview = ((), None) if item.questions else measurement_shown(path, answers, key)
         shown.append(
             {
                 "item": item,
                 "summary": item.step.data["summary"],
-                "pictures": () if item.questions else measurement_pictures(path, answers, key),
+                "pictures": pictures,
+                "overview": overview,
                 "sheet": next(
                     (step for step in reversed(state.steps) if step.data.get("sheet_of") == item.step.number), None
                 ),
@@ -611,14 +714,16 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
             "current": state.is_current(step),
             "views": list(project.pages_of(step)), "control": step.data["control"],
             "volume": volume_pictures(step, project.path(step.folder)) if step is runs[-1] else (),
+            "judged": judged(step.data["control"], project.facts(step, "result.json")),
         }
         for step in reversed(runs)
     ]  # fmt: skip
     verified = [
-        {"step": step, "result": project.facts(step, "result.json"), "control": step.data["control"]}
+        {"step": step, "result": project.facts(step, "result.json"), "control": step.data["control"],
+         "judged": judged(step.data["control"], project.facts(step, "result.json"))}
         for step in reversed(state.steps)
         if step.kind == "verify"
-    ]
+    ]  # fmt: skip
     step = state.last("options")
     controls = list(parsed.get("controllers", {}))
     return {
@@ -627,6 +732,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "options_current": state.current("options") is not None,
         "controls": controls, "chosen": results[0]["control"] if results else next(iter(controls), ""),
         "identified": state.current("identify"),
+        "misfit_codes": MISFIT_CODES,
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
     }  # fmt: skip

@@ -24,7 +24,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from flask import Blueprint, Flask, Response, abort, current_app, g, redirect, render_template, request, send_file
+from flask import (
+    Blueprint,
+    Flask,
+    Response,
+    abort,
+    current_app,
+    g,
+    jsonify,
+    redirect,
+    render_template,
+    request,
+    send_file,
+)
 from jinja2 import StrictUndefined
 from markupsafe import Markup
 from werkzeug.exceptions import Forbidden, HTTPException
@@ -53,7 +65,7 @@ from compgen.data.language import texts_of
 from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
-from compgen.errors import CompgenError, InputError
+from compgen.errors import CompgenError, InputError, number_text
 from compgen.fleet.dashboard.guard import (
     HEADERS,
     check_host,
@@ -69,7 +81,7 @@ from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
 from compgen.programs.dialects import DIALECTS
-from compgen.report.html.pictures import thousands
+from compgen.report.html.pictures import describe_error, thousands
 from compgen.report.html.write import markdown
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
@@ -302,19 +314,19 @@ def asset(name: str) -> Response:
     return Response((data_folder("templates") / folder / name).read_text(encoding="utf-8"), mimetype=kind)
 
 
-@pages.get("/chain.svg")
-def chain_drawing() -> Response | tuple[str, int]:
-    """Draw the chain that words mean, while they are typed; 204 without any."""
+@pages.get("/chain")
+def chain_meaning() -> Response | tuple[str, int]:
+    """Return what the words for a chain can mean, with the drawing of the likeliest, while they are typed; 204 without any."""
     try:
         fits = chains_of(request.args.get("words", "")[:200])
     except InputError:
         return "", 204
     if not fits:
         return "", 204
-    words = "; ".join(f"{chain.name}: {in_words(chain)}" for chain in fits[:3])
-    response = Response(contents.chain_picture(fits[0]), mimetype="image/svg+xml")
-    response.headers["X-Meaning"] = words.encode("ascii", "replace").decode()
-    return response
+    language = the_workbench().language
+    said = str if language == LANGUAGES[0] else texts_of(language).text
+    words = [[chain.name, said(in_words(chain))] for chain in fits[:6]]
+    return jsonify(fits=words, drawing=contents.chain_picture(fits[0]))
 
 
 # What the buttons do.
@@ -398,6 +410,9 @@ def describe_machine(runner: Runner, state: ProjectState) -> None:
         )
     if not chain:
         raise InputError("say which body carries which axis", field="chain")
+    fit = _field("fit")
+    if fit in (found.name for found in chains_of(chain)):  # which of several meanings of the words
+        chain = fit
     words = ["init", name, f"--chain={chain}"]
     for letter in AXES:
         low, high = _number(f"{letter}-low"), _number(f"{letter}-high")
@@ -694,9 +709,12 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     folder = runner.project.new_folder("tables")
     words = ["run", *words, "--controller", control, *_language(), "--out", folder]
     words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
-    words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active")]
     kind = (CONTROLLERS[control].sample_setting or "style_from").replace("_", "-")
+    words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active")]
     words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample")]
+    again = next((step for step in state.steps if str(step.number) == _field("again") and step.kind == "run"), None)
+    if again is not None:  # with the files that were given then
+        words += [word for word in again.commands[0] if word.startswith(("--active=", f"--{kind}="))]
     step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control})
     runner.start(f"tables for {control}", "tables", [StepTask(step)])
 
@@ -989,6 +1007,8 @@ def make_app(workbench: Workbench) -> Flask:
         unit=lambda text: LABEL.get(text, text),
         readable=_readable,
         thousands=thousands,
+        um=lambda value: number_text(value, 2).replace("-", "\N{MINUS SIGN}"),
+        described=describe_error,
     )
     app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
     if workbench.language != LANGUAGES[0]:

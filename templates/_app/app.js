@@ -83,20 +83,39 @@
     document.querySelectorAll("button[disabled]").forEach(function (button) { button.disabled = false; });
   });
 
-  // the chain, while it is typed
+  // the chain, while it is typed: its drawing, and what the words can mean
   var chain = document.getElementById("chain"), drawing = document.getElementById("drawing"), waiting = 0;
-  function draw() {
-    fetch("/chain.svg?words=" + encodeURIComponent(chain.value)).then(function (answer) {
-      if (answer.status !== 200) { return; }
-      document.getElementById("meaning").textContent = answer.headers.get("X-Meaning");
-      answer.text().then(function (text) {
-        var found = new DOMParser().parseFromString(text, "text/html").querySelector("svg");
-        drawing.replaceChildren(document.importNode(found, true));
-      });
+  function draw(words, fits) {
+    fetch("/chain?words=" + encodeURIComponent(words)).then(function (answer) {
+      return answer.status === 200 ? answer.json() : null;
+    }).then(function (found) {
+      if (!found) { return; }
+      var svg = new DOMParser().parseFromString(found.drawing, "text/html").querySelector("svg");
+      drawing.replaceChildren(document.importNode(svg, true));
+      drawing.classList.remove("example");
+      if (fits) { fits(found.fits); }
     }).catch(function () {});
   }
+  function list(fits) {
+    var meaning = document.getElementById("meaning");
+    document.getElementById("which").hidden = fits.length < 2;
+    meaning.replaceChildren.apply(meaning, fits.map(function (fit, k) {
+      var label = document.createElement("label"), input = document.createElement("input");
+      label.className = "check";
+      if (fits.length > 1) {
+        input.type = "radio"; input.name = "fit"; input.value = fit[0]; input.checked = k === 0;
+        input.addEventListener("change", function () { draw(fit[0]); });
+        label.append(input);
+      }
+      label.append(fit[1] + " (" + fit[0] + ")");
+      return label;
+    }));
+  }
   if (chain) {
-    chain.addEventListener("input", function () { clearTimeout(waiting); waiting = setTimeout(draw, 150); });
-    if (chain.value) { draw(); }
+    chain.addEventListener("input", function () {
+      clearTimeout(waiting);
+      waiting = setTimeout(function () { draw(chain.value, list); }, 150);
+    });
+    if (chain.value) { draw(chain.value, list); }
   }
 })();

@@ -22,6 +22,7 @@ pytest.importorskip("waitress", reason="the extra compgen[serve] is not installe
 import app_site as helper
 
 from compgen.data.machine import load_machine
+from compgen.errors import um_text
 from compgen.kinematics import modelled_errors
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -93,7 +94,8 @@ def test_laser_files_and_a_square_become_tables_and_the_commands_shown_do_the_sa
     page = site.get("/projects/1/tables").text
     texts = [item["text"] for item in result["objections"]]
     assert texts
-    assert all(str(escape(text)) in page for text in [*texts, result["headline"].rpartition("; ")[2]])
+    assert all(str(escape(text)) in page for text in [*texts, *result["notes"]])
+    assert f"from {um_text(result['before']['rms_um'])} to {um_text(result['after']['rms_um'])} µm rms" in page
     assert result["measured"]["determined"] == 3
     packed = zipfile.ZipFile(io.BytesIO(site.get(f"/projects/1/steps/{step.number}/files.zip").data))
     assert f"{step.folder}/manifest.json" in packed.namelist()
@@ -359,7 +361,7 @@ def test_tables_that_were_active_are_taken_out_of_the_measurement(site):
 def test_german_pages_are_german_and_their_reports_too(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     site = helper.Site(tmp_path / "project", language="de")
-    assert "Zeichnung zeigt, welcher Körper welchen trägt" in site.get("/projects/1/machine").text
+    assert "Die Zeichnung folgt der Eingabe" in site.get("/projects/1/machine").text
     site.do("machine/describe", {**MILL, "chain": "Tisch in X und Y, Kopf in Z"})
     site.do("measurement/add", upload(IMPORTS / "linear.rtl"))
     state = site.do("identify")

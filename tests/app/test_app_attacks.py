@@ -31,7 +31,7 @@ CHANGES = (
 SHOWN = (
     "/", "/projects/1/", "/projects/1/machine", "/projects/1/measurement", "/projects/1/result", "/projects/1/tables",
     "/projects/1/program", "/projects/1/after", "/projects/1/project", "/projects/1/status", "/projects/1/commands.sh",
-    "/chain.svg?words=WXYFZT",
+    "/chain?words=WXYFZT",
     "/projects/1/steps/1/files/1", "/projects/1/steps/1/files.zip", "/projects/1/steps/1/view/report.html",
     "/projects/1/steps/1/preflight.html",
 )  # fmt: skip

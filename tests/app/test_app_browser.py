@@ -17,6 +17,8 @@ pytest.importorskip("waitress", reason="the extra compgen[serve] is not installe
 import app_site
 import browser as helper
 
+from compgen.data.machine import load_machine
+
 pytestmark = pytest.mark.skipif(
     helper.program() is None,
     reason="chromium is not installed (.ci/system-packages): the workbench is not opened in it",
@@ -68,9 +70,10 @@ def barriers(browser):
     return found
 
 
-def describe(page, control="siemens-cec"):
+def describe(page, control="siemens-cec", *, write_chain=True):
     page.write("#name", "my-mill")
-    page.write("#chain", "table moves in X and Y, head in Z")
+    if write_chain:
+        page.write("#chain", "table moves in X and Y, head in Z")
     for letter, low, high in (("X", "0", "400"), ("Y", "0", "400"), ("Z", "-240", "0")):
         page.write(f"[name={letter}-low]", low)
         page.write(f"[name={letter}-high]", high)
@@ -88,7 +91,7 @@ def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, b
             browser.picture(width=width, dark=dark)
             wide = browser.ask(
                 "[...document.querySelectorAll('main *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1 &&"
-                " !e.closest('.scroll, pre, .canvas')).map(e => e.outerHTML.slice(0, 100))"
+                " e.checkVisibility() && !e.closest('.scroll, pre, .canvas')).map(e => e.outerHTML.slice(0, 100))"
             )
             assert wide == [], (name, width)
             if width == 1280:
@@ -111,8 +114,7 @@ def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, b
     page.write("#squareness-EC0Y", "25±3")
     page.press("Save the numbers")
     look("measurement")
-    page.press("Next: the result")
-    page.press("Calculate")
+    page.press("Next: calculate the errors")
     assert "3 errors identified" in page.text()
     look("result")
     page.press("Next: the tables")
@@ -156,6 +158,23 @@ def test_the_drawing_follows_the_words_while_they_are_typed(page, browser):
         shown[words] = drawn
     assert "table does not move" in shown["Portal in Y, Kopf in X und Z"]
     assert "WZXYFT" in browser.ask("document.getElementById('meaning').textContent")
+
+
+def test_words_with_two_meanings_are_a_question_on_the_page(page, browser, site):
+    """Which carriage is below: the second one is chosen, and its drawing differs."""
+    page.write("#chain", "table moves in X and Y, head in Z")
+    until = time.monotonic() + app_site.PATIENCE_S
+    while browser.ask("document.querySelectorAll('[name=fit]').length") != 2:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    first = browser.ask("document.querySelector('#drawing svg').outerHTML")
+    browser.ask("document.querySelector('[name=fit][value=WYXFZT]').click()")
+    while browser.ask("document.querySelector('#drawing svg').outerHTML") == first:
+        assert time.monotonic() < until
+        time.sleep(0.05)
+    describe(page, write_chain=False)
+    machine = load_machine(str(site.project.folder / site.project.state().machine))
+    assert machine.chain.name == "WYXFZT"
 
 
 def test_a_refused_file_is_explained_where_it_was_dropped(page, browser, tmp_path):

@@ -47,6 +47,8 @@ WORDS = (
     "days", "exceeded", "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning",
     "positive", "readings", "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
     "within", "without", "worse",
+    "positioning runs", "circles", "part", "artefact", "lengths of a tracer", "deviations", "errors", "six-DOF readings",
+    "diagonals", "axis", "plane", "station", "targets", "runs", "directions", "both", "one", "both directions", "radius (mm)",
 )  # fmt: skip
 
 

@@ -264,26 +264,34 @@ def content(source: ResultFolder) -> dict[str, Any]:
     }
 
 
-def _control(item: ControlFolder) -> dict[str, Any]:
-    result = item.result
+def judged(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what ``result.json`` of a control says, and the verdict in words: ``said`` in short, ``text`` with figures."""
     state = _state(result)
-    return {
-        "name": item.name,
+    found = {
+        "name": name,
         "state": state,
         "verdict": VERDICTS[state],
         "headline": str(result.get("headline", "")),
         "volumetric": bool(result.get("volumetric", True)),
         "measured": str(_mapping(result.get("measured")).get("text", "")),
-        "objections": [str(_mapping(entry).get("text", "")) for entry in result.get("objections") or []],
         "uncertainty": dict(_mapping(result.get("after_uncertainty"))),
+        "before": _mapping(result.get("before")),
+        "after": _mapping(result.get("after")),
+        "before_rigid": _mapping(result.get("before_rigid_motion_removed")),
+        "after_rigid": _mapping(result.get("after_rigid_motion_removed")),
+    }
+    return {**found, "said": _headline(state, [found]), "text": _verdict_text([found])}
+
+
+def _control(item: ControlFolder) -> dict[str, Any]:
+    result = item.result
+    return {
+        **judged(item.name, result),
+        "objections": [str(_mapping(entry).get("text", "")) for entry in result.get("objections") or []],
         "next_command": str(result.get("next_command") or ""),
         "format": item.manifest.get("format", ""),
         "evidence": item.manifest.get("evidence", ""),
         "points": result.get("points"),
-        "before": result.get("before", {}),
-        "after": result.get("after", {}),
-        "before_rigid": result.get("before_rigid_motion_removed", {}),
-        "after_rigid": result.get("after_rigid_motion_removed", {}),
         "unrepresentable_um": result.get("unrepresentable_um"),
         "uncorrected": [
             {"error": name, "um": value, "why": why_uncorrected(name)}
