@@ -20,7 +20,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import load_for, output_options, plugin_option, run_command
+from compgen.cli.common import load_for, output_options, plugin_option, run_command, with_language
 from compgen.resources import LANGUAGES, cache_folder
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
@@ -93,7 +93,7 @@ class Unloaded(click.Command):
         module = import_module(f"compgen.cli.{self.module}")
         command = getattr(module, f"{str(self.name).replace('-', '_')}_command")
         assert isinstance(command, click.Command)
-        return output_options(plugin_option(command))  # type: ignore[no-any-return]
+        return with_language(output_options(plugin_option(command)))
 
 
 class Sketch(click.Command):

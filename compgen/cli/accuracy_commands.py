@@ -20,8 +20,8 @@ from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
-from compgen.cli.common import NUMBER, PATH, Command, json_option, options_of, out_option
-from compgen.cli.shared_options import instrument_option, language_option, machine_argument
+from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option
+from compgen.cli.shared_options import instrument_option, machine_argument
 from compgen.cli.terminal import answer, progress
 from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine

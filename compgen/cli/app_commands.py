@@ -7,8 +7,7 @@ from pathlib import Path
 
 import click
 
-from compgen.cli.common import PATH
-from compgen.cli.shared_options import language_option
+from compgen.cli.common import PATH, language_option
 from compgen.cli.terminal import say
 from compgen.errors import InputError
 

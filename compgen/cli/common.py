@@ -21,8 +21,10 @@ import click
 from compgen.data.files import json_text
 from compgen.data.names import AXES
 from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.resources import LANGUAGES
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+File = TypeVar("File", str, str | bytes)
 
 #: In bash, compgen is a builtin that prints nothing; hence the second name of the program.
 PROGRAM_NAMES = ("compgen", "volcomp")
@@ -109,6 +111,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
             place = traceback.extract_tb(error.__traceback__)[-1]
             text = f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})"
             return _fail(f"{text}; -v shows more", 3, words)
+        finally:
+            if terminal := sys.modules.get("compgen.cli.terminal"):
+                terminal.speak(LANGUAGES[0])
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:
@@ -173,6 +178,45 @@ def output_options(command: Any) -> Any:
     command = click.option("-q", "--quiet", help=text, **how)(command)
     text = "Print each step with the time since the start to stderr, and where an internal error occurred."
     return click.option("-v", "--verbose", help=text, **how)(command)
+
+
+def _set_language(context: click.Context, parameter: click.Parameter, value: str) -> str:
+    """Print in the language of the command at once, also what is wrong with its other words."""
+    if value != LANGUAGES[0] and not context.resilient_parsing:
+        from compgen.cli.terminal import speak
+
+        speak(value)
+    return value
+
+
+_LANGUAGE: dict[str, Any] = {"type": click.Choice(LANGUAGES), "default": LANGUAGES[0], "callback": _set_language}
+_PAGES = (
+    "Language of messages, pages and lists for the reader (default en); files for a control and JSON stay in English."
+)
+language_option = click.option("--language", is_eager=True, help=_PAGES, **_LANGUAGE)
+
+
+def with_language(command: click.Command) -> click.Command:
+    """Add ``--language`` for the messages of a command that does not take it for its pages."""
+    if isinstance(command, click.Group) or any(item.name == "language" for item in command.params):
+        return command
+    text = "Language of messages (default en); files and JSON stay in English."
+    return click.option("--language", is_eager=True, expose_value=False, help=text, **_LANGUAGE)(command)
+
+
+def for_readers(files: Mapping[str, File], language: str) -> dict[str, File]:
+    """Return files with the pages and lists for people (``*.html``, ``*.md``) in a language; the others are not changed."""
+    if language == LANGUAGES[0]:
+        return dict(files)
+    from compgen.data.language import texts_of, wrapped
+
+    texts, made = texts_of(language), dict(files)
+    for name, content in files.items():
+        if isinstance(content, str) and name.endswith(".html"):
+            made[name] = texts.page(content)
+        elif isinstance(content, str) and name.endswith(".md"):
+            made[name] = wrapped(texts.lines(content))
+    return made
 
 
 def fleet_options(command: Command) -> Command:

@@ -9,7 +9,15 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import fleet_options, json_option, options_of, out_option, print_json
+from compgen.cli.common import (
+    fleet_options,
+    for_readers,
+    json_option,
+    language_option,
+    options_of,
+    out_option,
+    print_json,
+)
 from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument
 from compgen.cli.terminal import progress, say
 from compgen.controls.isg_kernel import read_error_file
@@ -71,7 +79,13 @@ def diagnosed(
 
 
 def diagnose_each(
-    request: DiagnoseRequest, measurements: Sequence[Path], out: Path, spread: tuple[int, str | None], *, as_json: bool
+    request: DiagnoseRequest,
+    measurements: Sequence[Path],
+    out: Path,
+    spread: tuple[int, str | None],
+    language: str,
+    *,
+    as_json: bool,
 ) -> int:
     """Diagnose every measurement into its own folder; the exit code is 1 if any is not acceptable."""
     names = [path.name.split(".")[0] for path in measurements]
@@ -84,7 +98,7 @@ def diagnose_each(
     with mapper(*spread) as share:
         for name, path, found in zip(names, measurements, share(request, measurements), strict=True):
             files = OutputFolder(out / name)
-            for file, content in found.contents.items():
+            for file, content in for_readers(found.contents, language).items():
                 files.add(file, content)
             files.commit()
             results.append({"measurement": str(path), "acceptable": found.acceptable, **found.figures})
@@ -113,6 +127,7 @@ def _names(text: str) -> tuple[str, ...]:
     "--each", is_flag=True, help="Diagnose each measurement separately, into a folder of --out with its name."
 )
 @fleet_options
+@language_option
 @json_option
 def diagnose_command(
     machine: Machine,
@@ -123,6 +138,7 @@ def diagnose_command(
     each: bool,
     workers: int,
     cluster: str | None,
+    language: str,
     as_json: bool,
 ) -> int:
     """Find where model and measurement disagree, name the missing effect, add it, and check that the misfit shrinks.
@@ -143,14 +159,14 @@ def diagnose_command(
     OutputFolder(out)
     request = DiagnoseRequest(machine, options, instrument)
     if each:
-        return diagnose_each(request, measurements, out, (workers, cluster), as_json=as_json)
+        return diagnose_each(request, measurements, out, (workers, cluster), language, as_json=as_json)
     if workers > 1 or cluster is not None:
         raise InputError("--workers and --cluster need --each: they distribute its measurements")
     with progress(quiet=as_json) as show:
         show("reading the measurement")
         found, contents = diagnosed(request, measurements, show)
     files = OutputFolder(out)
-    for name, content in contents.items():
+    for name, content in for_readers(contents, language).items():
         files.add(name, content)
     files.commit()
     if as_json:

@@ -10,7 +10,16 @@ from typing import Any, cast
 
 import click
 
-from compgen.cli.common import NUMBER, PATH, json_option, options_of, out_option, print_json
+from compgen.cli.common import (
+    NUMBER,
+    PATH,
+    for_readers,
+    json_option,
+    language_option,
+    options_of,
+    out_option,
+    print_json,
+)
 from compgen.cli.shared_options import machine_argument
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray
@@ -120,6 +129,7 @@ Progress = Callable[[str], None]
 @click.option("--seed", type=click.IntRange(min=0), default=1, help="Seed of the search (default: 1).")
 @click.option("--target-um", type=NUMBER, help="Propose the smallest trajectory whose worst u of E is below this, um.")
 @out_option
+@language_option
 @json_option
 def plan_command(
     machine: Machine,
@@ -140,6 +150,7 @@ def plan_command(
     seed: int,
     target_um: float | None,
     out: Path,
+    language: str,
     as_json: bool,
 ) -> int:
     """Plan a measurement: what it will determine, and how well, before anything is measured.
@@ -177,6 +188,7 @@ def plan_command(
             points,
             readings,
             out,
+            language,
             grid=grid,
             as_json=as_json,
         )
@@ -229,6 +241,7 @@ def _plan_gauges(
     points: Path | None,
     readings: IdentifyOptions,
     out: Path,
+    language: str,
     *,
     grid: bool,
     as_json: bool,
@@ -256,7 +269,7 @@ def _plan_gauges(
     if program and isinstance(gauges[0], TouchProbe):
         folder.add(PROGRAM_NAME, probe_program(machine, gauges[0], read_probing(artefact[0]), program))
     folder.add("plan.errors.csv", format_errors(found.errors))
-    folder.add("plan.html", page)
+    folder.add("plan.html", for_readers({"plan.html": page}, language)["plan.html"])
     folder.add("plan.json", json.dumps(found.summary(), indent=2) + "\n")
     folder.commit()
     answer(as_json, found.summary(), gauge_plan_table(found))

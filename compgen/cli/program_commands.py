@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import PATH, Command, json_option, options_of, out_option
+from compgen.cli.common import PATH, Command, for_readers, json_option, language_option, options_of, out_option
 from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option, tool_offset
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
@@ -102,6 +102,7 @@ def program_options(command: Command) -> Command:
 )
 @click.option("--active-controller", metavar="NAME", help="Name of the control that the active tables belong to.")
 @out_option
+@language_option
 @json_option
 def correct_command(
     model: Any,
@@ -112,6 +113,7 @@ def correct_command(
     active: tuple[Path, ...],
     active_controller: str | None,
     out: Path,
+    language: str,
     as_json: bool,
 ) -> int:
     """Correct an NC program for the errors of one machine: the tool then follows the programmed path.
@@ -139,7 +141,14 @@ def correct_command(
         name += f" with the active tables of {active_controller}"
     with progress(quiet=as_json) as show:
         result = correct_program(
-            model, program, out, options, setup, errors_file=(name, sha256_of_file(errors)), show=show
+            model,
+            program,
+            out,
+            options,
+            setup,
+            errors_file=(name, sha256_of_file(errors)),
+            show=show,
+            language=language,
         )
     for reason in result.reasons:
         complain(f"not acceptable: {reason}", "red")
@@ -180,6 +189,7 @@ MOST_ROWS = 30
 @click.option("--controller", metavar="NAME", help="Name of the control that the tables belong to.")
 @click.option("--also", multiple=True, metavar="MACHINE=ERRORS", help=ALSO_HELP)
 @click.option("--out", metavar="DIR", type=PATH, help="Folder for part.json and part.html.")
+@language_option
 @json_option
 def part_command(
     model: Any,
@@ -192,6 +202,7 @@ def part_command(
     controller: str | None,
     also: tuple[str, ...],
     out: Path | None,
+    language: str,
     as_json: bool,
 ) -> int:
     """Predict what the errors of a machine leave on the part of an NC program.
@@ -234,7 +245,7 @@ def part_command(
         data["machines"] = [{"machine": item.machine, **item.figures.as_dict()} for item in ranked]
     if folder is not None:
         folder.add("part.json", json_text(data))
-        folder.add("part.html", part_page(found))
+        folder.add("part.html", for_readers({"part.html": part_page(found)}, language)["part.html"])
         paths = list(folder.commit().values())
     titles = (
         "tool from the path, moves at feed (um)",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from compgen.cli.common import PATH, json_option, out_option, print_json
+from compgen.cli.common import PATH, json_option, language_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     controller_option,
@@ -18,7 +18,6 @@ from compgen.cli.shared_options import (
     fitting_options,
     identify_options,
     instrument_option,
-    language_option,
     limits_option,
     machine_argument,
     measurements_argument,
@@ -207,7 +206,7 @@ def run_command(
     if explain:
         from compgen.cli.table_commands import explain_run
 
-        explain_run(machine, result, out, templates)
+        explain_run(machine, result, out, templates, language)
     if as_json:
         print_json({**result.summary(), "report": None if report is None else str(report)})
     else:

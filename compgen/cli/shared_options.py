@@ -21,7 +21,7 @@ from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.identify.covariance import covariance_named_by
 from compgen.identify.options import StatedNumbers
-from compgen.resources import LANGUAGES, data_folder
+from compgen.resources import data_folder
 
 if TYPE_CHECKING:
     from compgen.kinematics.parallel import Map
@@ -333,12 +333,6 @@ def with_samples(
 
 instrument_option = path_option(
     "--instrument", "Constants and set-up of a six-DOF laser instrument (TOML), for *.sixdof.csv files."
-)
-language_option = click.option(
-    "--language",
-    type=click.Choice(LANGUAGES),
-    default=LANGUAGES[0],
-    help="Language of pages and of the preflight list (default en); files for a control and JSON stay in English.",
 )
 templates_option = path_option("--templates", "Folder with your templates, searched first.", metavar="DIR")
 unverified_option = click.option(

@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import NUMBER, PATH, json_option, out_option, print_json
+from compgen.cli.common import NUMBER, PATH, for_readers, json_option, language_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     controller_option,
@@ -18,7 +18,6 @@ from compgen.cli.shared_options import (
     emphasis_options,
     errors_argument,
     explain_option,
-    language_option,
     limits_option,
     machine_argument,
     points_option,
@@ -68,7 +67,7 @@ ZONE_HELP = "Part of the travel to evaluate, mm, e.g. X=-400:0,Y=100:300; defaul
 OPTIONS_REVERSAL_HELP = "*.reversal.csv (um): the reversal value of each axis along its travel."
 
 
-def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path | None) -> None:
+def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path | None, language: str) -> None:
     """Write explain.md next to the tables of every control of a run."""
     reversal = identified_reversal(result.identification)
     several = len(result.results) > 1
@@ -77,7 +76,7 @@ def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path 
         found = explained(machine, result.fitted.errors, item.export, reversal=reversal, templates=templates)
         folder = f"{item.export.controller}/" if several else ""
         files[f"{folder}explain.md"] = explanation_markdown(found)
-    write_all(out, files)
+    write_all(out, for_readers(files, language))
 
 
 @click.command("options")
@@ -88,6 +87,7 @@ def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path 
 @click.option("--reversal", metavar="FILE", type=PATH, help=OPTIONS_REVERSAL_HELP)
 @templates_option
 @click.option("--out", metavar="DIR", type=PATH, help="Folder for options.json and options.md.")
+@language_option
 @json_option
 def options_command(
     machine: Machine,
@@ -97,6 +97,7 @@ def options_command(
     reversal: Path | None,
     templates: Path | None,
     out: Path | None,
+    language: str,
     as_json: bool,
 ) -> int:
     """Show what each option of a control would gain: the error that remains, by level and by control.
@@ -124,7 +125,7 @@ def options_command(
         )
     if out is not None:
         text = json.dumps(result.as_dict(), indent=2) + "\n"
-        write_all(out, {"options.json": text, "options.md": options_markdown(result)})
+        write_all(out, for_readers({"options.json": text, "options.md": options_markdown(result)}, language))
     answer(as_json, result.as_dict(), options_tables(result))
     return 0
 
@@ -194,7 +195,7 @@ def export_command(
     extra_files |= check_files(machine, exported, table, templates, both, language)
     explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
     if explanation is not None:
-        extra_files["explain.md"] = explanation_markdown(explanation)
+        extra_files |= for_readers({"explain.md": explanation_markdown(explanation)}, language)
     reasons: tuple[str, ...] = tuple(exported.violations)
     if not no_verify:
         _, verification = verified_export(machine, exported, table, both)

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich import box
-from rich.console import Console
+from rich.console import Console, Group
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
 from compgen.cli.common import VERBOSE, print_json
 from compgen.errors import visible
+from compgen.resources import LANGUAGES
+
+if TYPE_CHECKING:
+    from compgen.data.language import Texts
 
 #: Tables in a pipe or a file get the width they need, not the width of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
 
 
 class Terminal(Console):
-    """A console that escapes control characters in names, reasons and files: no text may control the terminal."""
+    """A console that escapes control characters in names, reasons and files: no text may control the terminal.
+
+    What it prints is shown in the language of ``texts``, in English without them.
+    """
+
+    texts: Texts | None = None
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print texts and tables in the language of the command."""
+        super().print(*(objects if self.texts is None else (_said(item, self.texts) for item in objects)), **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Convert text to what is shown; printing and the cells of tables use it."""
@@ -32,6 +47,34 @@ class Terminal(Console):
 # emoji=False: rich would turn the location file.csv:100: into a symbol
 stdout = Terminal(highlight=False, emoji=False, markup=False, width=PIPE_WIDTH)
 stderr = Terminal(stderr=True, highlight=False, emoji=False, markup=False)
+
+
+def _said(shown: Any, texts: Texts) -> Any:
+    """Return what is printed in another language; tables are changed in place, since each is made to be printed once."""
+    if isinstance(shown, str):
+        return texts.lines(shown)
+    if isinstance(shown, Text):
+        return Text(texts.lines(shown.plain), style=shown.style, overflow=shown.overflow)
+    if isinstance(shown, Group):
+        return Group(*(_said(item, texts) for item in shown.renderables))
+    if isinstance(shown, Padding):
+        shown.renderable = _said(shown.renderable, texts)
+    if isinstance(shown, Table):
+        shown.title = shown.title and _said(shown.title, texts)
+        for column in shown.columns:
+            column.header = _said(column.header, texts)
+            column._cells = [_said(cell, texts) for cell in column._cells]
+    return shown
+
+
+def speak(language: str) -> None:
+    """Print in a language from now on, unless COMPGEN_MESSAGES asks for English: a program reads the messages then."""
+    texts = None
+    if language != LANGUAGES[0] and os.environ.get("COMPGEN_MESSAGES") != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        texts = texts_of(language)
+    stdout.texts = stderr.texts = texts
 
 
 def say(*lines: str, style: str | None = None) -> None:
@@ -82,4 +125,4 @@ def progress(*, quiet: bool = False) -> Iterator[Callable[[str], None]]:
         yield lambda _: None
         return
     with stderr.status("starting") as status:
-        yield lambda text: status.update(text)
+        yield lambda text: status.update(text if stderr.texts is None else stderr.texts.lines(text))

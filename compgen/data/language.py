@@ -43,6 +43,8 @@ _INLINE = re.compile(r"</?(strong|em|b|i|code|span|br|small|sub|sup)\b")
 _BRANCH = re.compile(r"\{%-?\s*(if|elif|else|endif)\b")
 _ONLY_STATEMENTS = re.compile(r"\s*(\{%((?!%\}).)*%\}\s*|\{#.*?#\}\s*)+$")
 _MARKER = re.compile(r"\s*(#+ |\d+\. |[-*] (\[ \] )?|)")
+#: What begins a line of a text for the terminal or of a list.
+MARKER = re.compile(r"\s*(?:[-*#]+ (?:\[ \] )?)?")
 #: What is the same in every language: code, units, names of standards.
 _CODE = re.compile(r"`[^`]*`|<code>.*?</code>")
 _UNREAD = re.compile(r"\b(mm|um|µm|ISO|SHA|En|rms)\b")
@@ -200,6 +202,44 @@ class Texts:
             return None if shorter is None else shorter + english[-1]
         return found
 
+    def lines(self, english: str) -> str:
+        r"""Return lines of a list or of the terminal in this language, each by itself; what marks an item stays.
+
+        >>> Texts({"not used: {name}": "unbenutzt: {name}"}).lines("- not used: X.TAB\n  * a text of a user")
+        '- unbenutzt: X.TAB\n  * a text of a user'
+        """
+        found = []
+        for line in english.split("\n"):
+            marker = MARKER.match(line)
+            assert marker is not None
+            cells = re.split(r"(\||(?<=\S) {2,}(?=\S))", line[marker.end() :])
+            for k in range(0, len(cells), 2):
+                given, cells[k] = cells[k], self._named(cells[k])
+                if k + 1 < len(cells) and cells[k + 1] != "|":  # columns of a table stay where they are
+                    cells[k + 1] = " " * max(len(cells[k + 1]) + len(given) - len(cells[k]), 2)
+            found.append(marker[0] + "".join(cells))
+        return "\n".join(found)
+
+    def _named(self, english: str) -> str:
+        """Return a cell of a table, or a name and its value, in this language."""
+        name, colon, value = english.partition(":")
+        known = self._word(name.replace("_", " ")) if colon and " " not in name else None
+        return self.label(english) if known is None else f"{known}:{self.label(value)}"
+
+    def page(self, html: str) -> str:
+        """Return a finished page in this language: all texts between its tags, names of pictures, and its language."""
+        whole = re.split(
+            r"(<style.*?</style>|<script.*?</script>|<code.*?</code>|<pre.*?</pre>)", html, flags=re.DOTALL
+        )
+        for k in range(0, len(whole), 2):
+            whole[k] = re.sub(r"(?<=>)[^<>]*[^\W\d_][^<>]*(?=<)", self._spaced, whole[k])
+            whole[k] = re.sub(r'(?<=aria-label=")[^"]+', self._escaped, whole[k])
+        return "".join(whole).replace('<html lang="en">', f'<html lang="{self.language}">')
+
+    def _spaced(self, found: re.Match[str]) -> str:
+        text = " ".join(found[0].split())
+        return found[0].replace(found[0].strip(), escape(self.label(unescape(text)), quote=False))
+
     def picture(self, picture: Picture) -> Picture:
         """Return a picture with heading, note and texts in this language; names of series are for the script of its page."""
         from markupsafe import Markup
@@ -248,13 +288,23 @@ class Texts:
         return self.text(value, _WEAK) if type(value) is str and "\n" not in value else value
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=8192)
 def _patterns(message: str) -> list[re.Pattern[str]]:
     """Return what texts of a message look like; of two values side by side the first one has no blank, if possible."""
     literals = re.escape(message).replace(r"\{", "{").replace(r"\}", "}")
-    close = re.sub(r"\{(\w+)\}(?=\{)", lambda place: f"(?P<{place[1]}>[\\w.+-]*)", literals)
-    forms = dict.fromkeys(_PLACE.sub(lambda place: f"(?P<{place[1]}>.*?)", form) for form in (close, literals))
-    return [re.compile(form, re.DOTALL) for form in forms]
+    forms = []
+    for close in (True, False):
+        seen = set[str]()
+
+        def place(found: re.Match[str], seen: set[str] = seen, close: bool = close) -> str:
+            if found[1] in seen:  # the same value once more
+                return f"(?P={found[1]})"
+            seen.add(found[1])
+            beside = close and found.string[found.end() : found.end() + 1] == "{"
+            return rf"(?P<{found[1]}>[\w.+-]*)" if beside else f"(?P<{found[1]}>.*?)"
+
+        forms.append(_PLACE.sub(place, literals))
+    return [re.compile(form, re.DOTALL) for form in dict.fromkeys(forms)]
 
 
 def _loader(loader: BaseLoader, translate: Callable[[str], str]) -> BaseLoader:

@@ -180,6 +180,8 @@ IN_WORDS = {
     "heldout_stations": "stations left out",
     "heldout_times": "times left out",
     "beside_unknown": "confirmed, with an unknown effect",
+    "none": "none of the known effects",
+    "not_decidable": "not decidable",
 }
 
 
@@ -188,7 +190,7 @@ IN_WORDS = {
 
 def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html``; ``data`` is the content of ``diagnosis.json``."""
-    title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    title = f"Diagnosis of {found.machine.name}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
     ranked = suspects_of(found)
     rows = "".join(
         f"<tr><td>{escape(name)}</td><td>{chi2:.1f}</td><td>{100 * share:.1f} %</td></tr>"
@@ -198,7 +200,8 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
     parts = [
         _effects(data),
         _misfit(data),
-        f'<h2>Where model and measurement disagree</h2><p class="legend">Mean and scatter of the residuals: {legend}</p>',
+        "<h2>Where model and measurement disagree</h2>",
+        f'<p class="legend"><span>Mean and scatter of the residuals:</span> {legend}</p>',
         picture_grid(residual_pictures(found)),
         "<h2>Over the volume</h2>",
         picture_grid(volume_pictures(found)),
@@ -211,7 +214,7 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
 
 def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html`` for axis runs."""
-    title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    title = f"Diagnosis of {found.machine.name}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
     parts = [_effects(data), _figures(data), _misfit(data)]
     for part in found.axes:
         parts += [
@@ -226,7 +229,7 @@ def axis_page(found: AxisDiagnosis, data: dict[str, Any]) -> str:
 
 def circle_page(found: CircleDiagnosis, data: dict[str, Any]) -> str:
     """Return the text of ``index.html`` for circles."""
-    title = f"Diagnosis of {found.machine.name}: {data['verdict'].replace('_', ' ')}"
+    title = f"Diagnosis of {found.machine.name}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
     pictures, circles = [], found.circles
     angle = np.degrees(circles.angle_rad)
     for k, plane in enumerate(PLANES):
@@ -369,7 +372,7 @@ def next_steps(files: Container[str], machine: str, measurement: str, out: str) 
 
 def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
     """Return the report of a diagnosis (the content of ``diagnosis.json``), as Markdown or as plain text."""
-    title = f"Diagnosis of {machine}: {data['verdict'].replace('_', ' ')}"
+    title = f"Diagnosis of {machine}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
     lines = [f"# {title}" if markdown else title, ""]
     several = len(data.get("iso_230_2", {})) > 1
     for item in data["effects"]:

@@ -551,7 +551,7 @@ def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
         over = amount[amount > TOLERANCE]
         if over.size:
             entries = "" if amount.size == 1 else f" (largest of {over.size} of its {amount.size} entries)"
-            named.append(f"{name} by {math.ceil(over.max() * 1e6) / 1e6:.6g}{entries}")
+            named.append(f"{name} relaxed by {math.ceil(over.max() * 1e6) / 1e6:.6g}{entries}")
     return beginning + "the least relaxation that helps: " + "; ".join(named)
 
 

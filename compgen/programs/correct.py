@@ -36,7 +36,7 @@ from compgen.programs.path import (
 )
 from compgen.programs.reader import MARK, MM_PER_INCH, Batch, Reader, Setup, SingleBlock
 from compgen.programs.runs import PlainRun
-from compgen.resources import program_version
+from compgen.resources import LANGUAGES, program_version
 
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
@@ -588,6 +588,7 @@ def correct_program(
     *,
     errors_file: tuple[str, str] = ("", ""),
     show: Callable[[str], None] = lambda _: None,
+    language: str = LANGUAGES[0],
 ) -> ProgramCorrection:
     """Correct an NC program for one machine and write it to the folder ``out``, with ``correction.json``.
 
@@ -603,6 +604,7 @@ def correct_program(
     options, setup : how to correct; work offsets and tools that the program uses.
     errors_file : name and SHA-256 of the file of the errors, for the header.
     show : called with the step that is running.
+    language : of the preflight list, ``"en"`` or ``"de"``; program and JSON stay in English.
     """
     source, dialect = Path(program), dialect_named(options.dialect)
     decimals = dialect.decimals if options.decimals is None else (options.decimals, options.decimals)
@@ -694,7 +696,12 @@ def correct_program(
             shutil.copyfileobj(stream, target)
         folder.add_file(result.file, final)
         folder.add("correction.json", json_text({**result.as_dict(), "sha256": sha256_of_file(final)}))
-        folder.add("preflight.md", preflight(result))
+        listed = preflight(result)
+        if language != LANGUAGES[0]:
+            from compgen.data.language import texts_of, wrapped
+
+            listed = wrapped(texts_of(language).lines(listed))
+        folder.add("preflight.md", listed)
         folder.commit()
     return result
 

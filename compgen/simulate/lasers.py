@@ -109,7 +109,10 @@ class LaserTracer:
 
 
 def read_laser_tracer(section: toml_files.Section) -> LaserTracer:
-    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
+    """Laser tracers at stations, at stops or while the machine moves: *.lengths.csv, *.lengths.npz.
+
+    Read from the section ``[instrument]`` of a scenario, without its ``type``, strictly.
+    """
     stations = toml_files.read_each(Station, section, "stations")
     names = [station.name for station in stations]
     if len(set(names)) != len(names):
@@ -236,7 +239,10 @@ def logged_with(stops: Stops) -> dict[str, FloatArray]:
 
 
 def read_axis_laser(section: toml_files.Section) -> AxisLaser:
-    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
+    """An interferometer along one axis, run by run: *.axis.csv (ISO 230-2).
+
+    Read from the section ``[instrument]`` of a scenario, without its ``type``, strictly.
+    """
     laser = toml_files.take_settings(AxisLaser, section)
     if isinstance(laser.dwell_s, tuple) and len(laser.dwell_s) != laser.cycles:
         raise section.fail(
@@ -342,5 +348,8 @@ class DiagonalLaser:
 
 
 def read_diagonal_laser(section: toml_files.Section) -> DiagonalLaser:
-    """Read the ``[instrument]`` section of a scenario, without its ``type``, strictly."""
+    """An interferometer along diagonals of faces and of the volume: *.diagonals.csv (ISO 230-6).
+
+    Read from the section ``[instrument]`` of a scenario, without its ``type``, strictly.
+    """
     return toml_files.read_settings(DiagonalLaser, section)

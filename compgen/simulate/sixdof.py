@@ -498,7 +498,10 @@ class SimulatedSixDof:
 
 
 def read_sixdof_measurement(section: toml_files.Section) -> SimulatedSixDof:
-    """Read the ``[instrument]`` section of a scenario of type ``sixdof``, without its type, strictly."""
+    """A laser instrument that reads all six errors of an axis in one run: *.sixdof.csv.
+
+    Read from the section ``[instrument]`` of a scenario, without its ``type``, strictly.
+    """
     path = section.file("file")
     if path is None:
         raise section.fail("file", "is missing; give the instrument TOML, relative to the scenario")

@@ -630,10 +630,13 @@ def test_a_coupled_fit_weighs_curves_by_their_uncertainty():
 @pytest.mark.parametrize(
     ("constraints", "message"),
     [
-        (lambda c: {"end": c["EYX"][0] >= 1.5}, "least relaxation that helps: end by 1.5$"),
-        (lambda c: {"high": c["EXX"][3] >= 5, "fine": c["EAX"] <= 100}, "least relaxation that helps: high by 1$"),
-        (lambda c: [c["EYX"][0] + c["EYX"][10] == 2], r"constraint 1 \(EYX\[0\] \+ EYX\[10\] == 2.0\) by 2"),
-        (lambda c: {"all": c["EYX"] >= 0.5}, r"all by 0.5 \(largest of 2 of its 11 entries\)"),
+        (lambda c: {"end": c["EYX"][0] >= 1.5}, "least relaxation that helps: end relaxed by 1.5$"),
+        (
+            lambda c: {"high": c["EXX"][3] >= 5, "fine": c["EAX"] <= 100},
+            "least relaxation that helps: high relaxed by 1$",
+        ),
+        (lambda c: [c["EYX"][0] + c["EYX"][10] == 2], r"constraint 1 \(EYX\[0\] \+ EYX\[10\] == 2.0\) relaxed by 2"),
+        (lambda c: {"all": c["EYX"] >= 0.5}, r"all relaxed by 0.5 \(largest of 2 of its 11 entries\)"),
         (lambda c: 3, "the callable returned int; return a list"),
         (lambda c: [True], "constraint 1 .* is a bool; return cvxpy constraints"),
         (lambda c: {"bent": c["EXX"][0] ** 2 >= 1}, "bent is not convex"),

@@ -6,54 +6,93 @@ expressions.
 """
 
 import ast
+import html
+import inspect
 import re
 import sys
 import tomllib
 from datetime import UTC, datetime
 from pathlib import Path
 
-from compgen.data.language import PART, WORD, parts
+from compgen.controls import CONTROLLERS
+from compgen.data.language import MARKER, PART, WORD, parts
+from compgen.data.toml_files import section_schema
+from compgen.simulate import INSTRUMENTS
 
 ROOT = Path(__file__).parents[2]
 CATALOGUES = ROOT / "templates" / "_language"
 
-#: Modules whose sentences are shown on a page or in a preflight list.
+#: Modules whose sentences are shown on a page, in a list for the reader, or in the terminal.
 MODULES = (
-    "accuracy/*.py", "app/contents.py", "app/pages.py",
-    "controls/*.py", "controls/shared/base.py", "effects/active.py", "fleet/drift.py",
-    "fleet/history_page.py", "identify/*.py", "identify/adjust/*.py", "report/html/*.py", "report/sheets.py",
-    "tables/active.py", "tables/entries.py", "tables/export.py", "tables/judge.py", "tables/signs.py",
-    "tables/verification.py",
+    "accuracy/*.py", "app/*.py", "cli/common.py", "cli/accuracy_commands.py", "cli/diagnose_commands.py",
+    "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
+    "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
+    "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
+    "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py", "programs/part.py",
+    "report/cards.py",
+    "report/html/*.py", "report/options_text.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
-#: Readers of controls' files: their texts are messages of the terminal.
-READERS = ("heidenhain_text.py", "siemens_text.py")
-#: Calls whose texts are for the terminal, or are no texts.
-NOT_SHOWN = re.compile(
-    r"(Error|fail|warn|setting|option|choice|positive|number_of|compile|match|search|sub|split|startswith|endswith|strip|"
-    r"removeprefix|removesuffix|getattr|import_module|refused|column|take|section|sections|nearest|add_column|Text|read_csv)$"
+#: Those whose errors and warnings are shown, too.
+WITH_ERRORS = re.compile(
+    r"compgen/(accuracy|app|data|diagnose|fit|foreign|identify|instruments|plan|programs|tables)/|"
+    r"compgen/(cli/common|cli/\w+_commands|pipeline)\.py"
 )
-#: Functions whose texts are for the terminal: readers of files, and what a session shows.
+ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")
+#: Readers of controls' files, and modules with names of columns and keys: their texts are no sentences for people.
+READERS = ("heidenhain_text.py", "siemens_text.py", "registry.py", "language.py", "display.py", "new_machine.py")
+#: Calls whose texts are for help, or are no texts.
+NOT_SHOWN = re.compile(
+    r"(setting|option|choice|positive|number_of|compile|match|search|sub|split|startswith|endswith|strip|argument|"
+    r"removeprefix|removesuffix|getattr|import_module|column|take|section|sections|nearest|add_column|read_csv)$"
+)
+UNTRANSLATED = ("name", "equation", "source", "covariates", "scan")
+#: Functions whose texts are read by programs, or shown in a session alone.
 NOT_SHOWN_IN = re.compile(
-    r"^(overview|panels|summary|parse|remarks|_?read_|usage$|short_text|dossier|calibration|_verification$)"
+    r"^(overview|panels|parse|remarks|usage$|short_text|dossier|calibration|_verification$|machine_text$)"
 )
 #: Single words that pages show: no rule tells them from keys.
 WORDS = (
     "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
-    "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um", "urad",
-    "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness", "Temperature",
-    "The", "Volume", "no table", "full volumetric", "+ straightness", "+ squareness", "+ direction-dependent",
-    "+ angles, as products of tables", "confirmed", "tentative", "not separated",
-    "accepted", "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day",
-    "days", "exceeded", "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning",
-    "positive", "readings", "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with",
-    "within", "without", "worse",
-    "positioning runs", "circles", "part", "artefact", "lengths of a tracer", "deviations", "errors", "six-DOF readings",
-    "diagonals", "axis", "plane", "station", "targets", "runs", "directions", "both", "one", "both directions", "radius (mm)",
+    "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um",
+    "urad", "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness",
+    "Temperature", "The", "Volume", "no table", "full volumetric", "+ straightness", "+ squareness",
+    "+ direction-dependent", "+ angles, as products of tables", "confirmed", "tentative", "not separated", "accepted",
+    "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day", "days", "exceeded",
+    "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning", "positive", "readings",
+    "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with", "within", "without",
+    "worse", "positioning runs", "circles", "part", "artefact", "lengths of a tracer", "deviations", "errors",
+    "six-DOF readings", "diagonals", "axis", "plane", "station", "targets", "runs", "directions", "both", "one",
+    "both directions", "radius (mm)", "angle", "axes", "base length mm", "calibrated", "columns", "comments", "components",
+    "directions from", "duration s", "effective diameter mm", "encoding", "error", "expected diameter mm", "features",
+    "first", "from mm", "header", "highest", "instrument", "kind", "largest", "largest misfit um", "largest um",
+    "largest urad", "largest um urad", "last", "lowest", "machine", "measured at", "mm per unit by geometry", "notes",
+    "Notes", "not used", "offset mm", "position unit", "points", "poses", "radius mm", "ranges mm", "rms um", "rms urad",
+    "rows", "samples", "sheet", "sign", "sign of squareness", "slope of readings", "squareness urad", "stations", "step s",
+    "temperatures c", "time s", "to mm", "u urad", "unit", "unit angle", "unit length", "serial no", "date", "velocity",
+    "empty", "source", "control", "verdict", "reservations", "REJECTED", "before*", "after*", "figure", "max", "rms",
+    "difference", "length", "factor", "orientation", "volume", "Before", "After", "Suspects", "visible", "gain", "buys",
+    "nothing", "level", "remark", "left", "left*", "none", "from", "named", "unknown", "rise", "fall", "grows", "falls",
+    "rises", "up", "down", "stated", "estimated", "yes", "no", "required", "meaning", "allowed", "default", "key", "limit",
+    "used", "margin", "over", "correction", "parameters", "effect", "equation", "resembles", "chain", "format", "name",
+    "value", "position", "station drift", "smoothness", "free", "bias", "solver", "feature", "quantity", "line", "diameter",
+    "distance", "parallelism", "only", "share", "Errors", "Controls", "Properties", "Limits", "Sources", "Files", "Remarks",
+    "Points", "Scatter", "Without", "nodes", "agrees", "disagrees",
 )  # fmt: skip
 
 
-#: Policies and headers of answers, comments of scripts, messages of the terminal.
-NO_TEXT = re.compile(r"-src '|-ancestors|^; script-src|filename=|^# |^\[controllers|^error: internal")
+#: Policies and headers of answers, comments of scripts, help of options, names of fields in files, parts of drawings.
+NO_TEXT = re.compile(
+    r"-src '|-ancestors|^; script-src|filename=|^# |^\[controllers|^set -e$|\$\? -eq|<Controls|never ends|in line 0$|"
+    r"[Dd]efault: |\(default |\(may be given |\(several times |^Print (no|each) |^Scheduler of |"
+    r"^(Axis|Standard uncertainty) of (an inst|meas)|"
+    r"^Tool offset of the model|^[*]\.reversal|^(x|viewBox|transform)=\"|^(cd|volcomp) \{|^What was done in this project, by|"
+    r"^([Mm]easurement|target|serial|version|[Ss]ample|mat temp) (date|id|no|\d)$|^(file type|exp coeff|air temp|measured at)$|"
+    r"^(test date|date time|date of measurement|start time|actual sample rate|[Ss]ample rate|trigger interval)$|"
+    r"^error: internal|^run target data$|^Tool lengths: CSV|"
+    r"^Another machine with its errors|^ecart type$|^coverage factor k$|^Position \[|^run\{zero"
+)
+#: Modules whose constants are words that readers look for.
+WITH_WORD_LISTS = ("column_names.py", "covariates.py", "cells.py", "probe_logs.py")
 
 
 def place_name(node):
@@ -96,41 +135,48 @@ def sentence(node):
     return "".join(found)
 
 
+def pieces_of(text):
+    """Return what is translated as one: the text between two tags of a page, a line of a list without its marker."""
+    if re.search(r"</?[a-z]\w*[ >]", text):
+        return [html.unescape(" ".join(piece.split())) for piece in re.split(r"<[^<>]*>?|^[^<>]*>", text)]
+    return [line[MARKER.match(line).end() :].strip() for line in text.split("\n")]
+
+
 def is_sentence(text):
     """Return whether a string is meant to be read: several words, or one word beside a value."""
     literal = re.sub(r"\{\w+\}", " ", text)
     words = re.findall(r"[^\W\d_]{2,}", literal)
-    if (
-        not words
-        or NO_TEXT.search(text)
-        or "<" in text
-        or " | " in text
-        or "\n" in text
-        or text.startswith(("_", "--", "/", "compgen ", "bold "))
-    ):
+    if not words or NO_TEXT.search(text) or " | " in text or text.startswith(("_", "--", "/", "compgen ", "bold ")):
         return False
     return " " in text.strip() and bool(re.search(r"[a-z]{2,}", literal))
 
 
-def of_module(source):
-    """Yield the messages of a Python module."""
+def of_module(source, *, errors=False, constants_are_words=False):
+    """Yield the messages of a Python module; with ``errors`` also those of its errors and warnings."""
 
     def walk(node):
-        if isinstance(node, ast.Raise | ast.Assert | ast.ImportFrom | ast.Import):
+        if isinstance(node, ast.Assert | ast.ImportFrom | ast.Import):
+            return
+        if not errors and isinstance(node, ast.Raise):
             return
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             return
         if isinstance(node, ast.FunctionDef) and NOT_SHOWN_IN.match(node.name):
             return
-        if isinstance(node, ast.Call) and NOT_SHOWN.search(ast.unparse(node.func).split("(")[-1]):
-            return
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func).split("(")[-1]
+            if NOT_SHOWN.search(called) or (not errors and ERRORS.search(called)):
+                return
+            if called == "Card":  # of an effect: equations and sources are the same in every language
+                node = ast.Call(node.func, node.args, [item for item in node.keywords if item.arg not in UNTRANSLATED])
         if isinstance(node, ast.Subscript):
             yield from walk(node.value)
             return
         text = sentence(node)
         if text is not None:
-            if is_sentence(text):
-                yield text.strip()
+            for piece in pieces_of(text):
+                if is_sentence(piece):
+                    yield piece
             if isinstance(node, ast.JoinedStr):
                 for part in node.values:
                     if isinstance(part, ast.FormattedValue):
@@ -143,7 +189,10 @@ def of_module(source):
                 continue
             yield from walk(child)
 
-    yield from walk(ast.parse(source))
+    body = ast.parse(source).body
+    for part in body:
+        if not (constants_are_words and isinstance(part, ast.Assign | ast.AnnAssign)):
+            yield from walk(part)
 
 
 def of_template(source, *, html):
@@ -166,6 +215,16 @@ def of_card(data):
     """Yield the messages of a control's card that its preflight list shows."""
     for text in (data["title"], *data["limits"], *data.get("unverified", ())):
         yield " ".join(text.split())
+
+
+def of_settings(settings_class):
+    """Yield what the settings of a control mean, as its form in the workbench shows them."""
+    schemas = [section_schema(settings_class)]
+    while schemas:
+        for about in schemas.pop().get("properties", {}).values():
+            schemas.append(about)
+            if about.get("description"):
+                yield about["description"]
 
 
 def messages():
@@ -191,7 +250,16 @@ def messages():
     for path in sorted({path for pattern in MODULES for path in (ROOT / "compgen").glob(pattern)}):
         if path.name in READERS:
             continue
-        add(path, of_module(path.read_text("utf-8")))
+        shown = {
+            "errors": WITH_ERRORS.search(path.as_posix()) is not None,
+            "constants_are_words": path.name in WITH_WORD_LISTS,
+        }
+        add(path, of_module(path.read_text("utf-8"), **shown))
+    for control in CONTROLLERS.values():
+        if kind := getattr(control, "settings_class", None):
+            add(ROOT / f"{kind.__module__.replace('.', '/')}.py", of_settings(kind))
+    for reader in INSTRUMENTS.values():
+        add(ROOT / f"{reader.__module__.replace('.', '/')}.py", [inspect.getdoc(reader).partition("\n")[0]])
     add(Path(__file__), WORDS, WORD)
     return found
 
