@@ -21,7 +21,7 @@ from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, ConvergenceError, InputError
 from compgen.identify.adjust.unknowns import check_travel
 from compgen.kinematics.exact_chain import exact_error
-from compgen.kinematics.first_order import coefficients, modelled_errors
+from compgen.kinematics.first_order import coefficients, modelled_errors, observable_errors
 from compgen.kinematics.many_points import volume_grid
 from compgen.tables import wanted_correction
 from compgen.tables.judge import node_positions
@@ -197,12 +197,20 @@ def _upwards(position_mm: FloatArray) -> Points:
 
 
 def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatArray]) -> list[Term]:
-    """Return one term per error of the machine's model; values are the errors, carriers minus the columns of C."""
+    """Return one term per error of the machine's model; values are the errors, carriers minus the columns of C.
+
+    One field is that of many sets of errors; this is the set that is closest to ``errors`` in this sense: an end-to-end
+    slope is a squareness error, so both ends of its straightness stay as they are, a constant angle is slopes, so angles
+    stay at the reference point, and errors that only another tool would show stay as they are.
+    """
     carriers: dict[str, list[Monomial]] = {}
     for part in coefficients(machine.chain, machine.squareness_reference):
         carriers.setdefault(part.error, []).append(Monomial(part.output, -part.sign, part.lever))
+    names = dict.fromkeys([*modelled_errors(machine), *errors.names])
+    seen = observable_errors(machine)
+    slopes = {(part.output, part.lever) for name in names if name in SQUARENESS_NAMES for part in carriers[name]}
     terms = []
-    for name in dict.fromkeys([*modelled_errors(machine), *errors.names]):
+    for name in names:
         carrier = tuple(carriers[name])
         if name in SQUARENESS_NAMES:
             start = np.array([errors.squareness.get(name, (0.0, 0.0))[0]])
@@ -211,9 +219,17 @@ def _model_terms(machine: Machine, errors: ErrorTable, nodes_mm: Sequence[FloatA
         error = error_named(name)
         nodes = nodes_mm[error.axis]
         start = errors.curves[name].at(nodes) if name in errors.curves else np.zeros(len(nodes))
-        at_mm = machine.axes[error.axis].range_mm if error.is_straightness else None
-        keep_mm = at_mm or (machine.reference_point_mm[error.axis],)
-        terms.append(Term(name, error.axis, nodes, carrier, start, keep_mm=keep_mm))
+        ends_mm, at_mm = machine.axes[error.axis].range_mm, (machine.reference_point_mm[error.axis],)
+        zeros_mm: tuple[float, ...] = ()
+        if set(seen) <= set(names):  # else a constant or a slope may have no other error to be in
+            if name not in seen:
+                zeros_mm = tuple(nodes.tolist())
+            elif error.kind == "angular":
+                zeros_mm = at_mm
+            elif (error.direction, error.axis) in slopes:
+                zeros_mm = ends_mm
+        keep_mm = () if zeros_mm else ends_mm if error.is_straightness else at_mm
+        terms.append(Term(name, error.axis, nodes, carrier, start, keep_mm=keep_mm, zeros_mm=zeros_mm))
     return terms
 
 

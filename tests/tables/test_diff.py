@@ -12,6 +12,7 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data import toml_files
 from compgen.data.error_table import Curve
+from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.kinematics.exact_chain import exact_error
 from compgen.tables import export, read_tables
 from compgen.tables.active import ActiveTables, bare_errors, merge_report, merged_errors, total_correction
@@ -238,6 +239,33 @@ def test_the_merged_errors_are_those_of_the_bare_machine(small_machine, small_er
     position = np.random.default_rng(7).uniform(small_machine.lower_mm, small_machine.upper_mm, (300, 3))
     miss = exact_error(small_machine, bare, position) - exact_error(small_machine, small_errors, position)
     assert np.max(np.abs(miss)) < 0.1 * MICROMETRE
+
+
+def test_merged_errors_are_split_by_a_rule_and_not_by_rounding(small_machine, small_errors, old_and_new):
+    """Slopes are squareness, constants positioning; a millionth of a nanometre in the readings changes nothing more."""
+    old_errors, left = old_and_new
+    active = ActiveTables(exported_tables(small_machine, old_errors, "isg-csv"))
+    noise = np.random.default_rng(8)
+    near = left.replace(
+        curves={
+            k: replace(c, value=c.value * (1 + 1e-10 * noise.normal(size=len(c.value)))) for k, c in left.curves.items()
+        }
+    )
+    one, other = (merged_errors(small_machine, errors, active)[0] for errors in (left, near))
+    for name, curve in one.curves.items():
+        size = 1e-8 if error_named(name).kind == "linear" else 1e-12  # mm, rad
+        assert np.max(np.abs(curve.value - other.curves[name].value)) < size, name
+    for name in SQUARENESS_NAMES:
+        assert abs(one.squareness[name][0] - other.squareness[name][0]) < 1e-13
+        assert abs(one.squareness[name][0] - small_errors.squareness[name][0]) < 1e-6
+    for name in ("EXY", "EXZ", "EYZ"):
+        assert one.curves[name].value[[0, -1]].tolist() == left.curves[name].value[[0, -1]].tolist()
+    for name, curve in one.curves.items():
+        at_mm = small_machine.reference_point_mm[error_named(name).axis]
+        if error_named(name).kind == "angular":
+            assert (
+                abs(np.interp(at_mm, curve.position_mm, curve.value - left.curves[name].at(curve.position_mm))) < 1e-15
+            )
 
 
 def test_a_finer_old_table_keeps_its_nodes(small_machine, small_errors, old_and_new):
