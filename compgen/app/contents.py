@@ -30,6 +30,7 @@ from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.fit.bounds import FitOptions
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.kinematics import exact_error
 from compgen.kinematics.many_points import full_grid
@@ -703,6 +704,10 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     }  # fmt: skip
 
 
+#: Options of the fit that a form has.
+FIT_FIELDS = tuple(item.name.replace("_", "-") for item in fields(FitOptions))
+
+
 def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return the tables that were made, the controls side by side, and verified backups."""
     path = machine_file(project, state)
@@ -733,6 +738,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "controls": controls, "chosen": results[0]["control"] if results else next(iter(controls), ""),
         "identified": state.current("identify"),
         "misfit_codes": MISFIT_CODES,
+        "fit": dict(runs[-1].data.get("fit", {})) if runs else {},
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
     }  # fmt: skip

@@ -707,16 +707,26 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     """Make, read back and verify the tables of a control."""
     words, control = _inputs(state), _control()
     folder = runner.project.new_folder("tables")
-    words = ["run", *words, "--controller", control, *_language(), "--out", folder]
+    typed, fit = _fit_words()
+    words = ["run", *words, "--controller", control, *fit, *_language(), "--out", folder]
     words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
     kind = (CONTROLLERS[control].sample_setting or "style_from").replace("_", "-")
     words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active")]
     words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample")]
     again = next((step for step in state.steps if str(step.number) == _field("again") and step.kind == "run"), None)
-    if again is not None:  # with the files that were given then
-        words += [word for word in again.commands[0] if word.startswith(("--active=", f"--{kind}="))]
-    step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control})
+    if again is not None:  # with the files and the bounds that were given then
+        bounds = tuple(f"--{name}" for name in contents.FIT_FIELDS)
+        words += [word for word in again.commands[0] if word.startswith(("--active=", f"--{kind}=", *bounds))]
+        typed = dict(again.data.get("fit", {}))
+    step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control, "fit": typed})
     runner.start(f"tables for {control}", "tables", [StepTask(step)])
+
+
+def _fit_words() -> tuple[dict[str, str], list[str]]:
+    """Return what was typed about smoothing and bounds, and as options of a command."""
+    typed = {name: _field(name) for name in contents.FIT_FIELDS if name in request.form}
+    words = [f"--{name}={part.strip()}" for name, text in typed.items() for part in text.split(";") if part.strip()]
+    return typed, ["--robust" if word == "--robust=on" else word for word in words]
 
 
 def _uploaded(project: Project, folder: str, name: str) -> list[str]:
@@ -773,7 +783,7 @@ def use_program(runner: Runner, state: ProjectState) -> None:
     commands = [["part", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
     if corrects:
         words += [f"--{option}={typed[option]}" for option in contents.CORRECT_FIELDS if typed[option]]
-        fit = ["fit", machine, errors, "--out", f"{folder}/fit"]
+        fit = ["fit", machine, errors, *_fit_words()[1], "--out", f"{folder}/fit"]
         errors = f"{folder}/fit/fitted.errors.csv"
         commands = [fit, ["correct", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
     title = f"{name} corrected" if corrects else f"Part of {name}"

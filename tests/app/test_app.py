@@ -526,3 +526,24 @@ def test_several_files_before_and_after_are_identified_together_and_axis_runs_by
     assert site.post("/projects/1/compare", {**numbers, "align": "--help"}).status_code == 409
     site.do(f"measurement/{numbers['after'][0]}/remove")
     assert site.get("/projects/1/after").text.count("changed after this comparison") == 2
+
+
+def test_bounds_of_the_curves_are_settings_of_the_tables(site):
+    """X is 100 um/m too long, 40 um over its travel: with a bound of 10 um the tables leave 30."""
+    site.do("machine/describe", MILL)
+    site.do("numbers", {"scale-X": "100"})
+    site.do("identify")
+    form = {"control": "siemens-cec", "allow-misfit": "on"}
+    refused = {**form, "max-abs": "EXX=10; straight=3"}
+    site.post("/projects/1/run", refused)
+    assert "did you mean" in site.get("/projects/1/tables").text or "Known: EAX" in site.get("/projects/1/tables").text
+    state = site.do("run", {**form, "smoothness": "0", "max-abs": "EXX=10; angular=50", "robust": "on"})
+    step = state.last("run")
+    assert {"--max-abs=EXX=10", "--max-abs=angular=50", "--smoothness=0", "--robust"} <= set(step.commands[0])
+    fitted = values(site.project, step, "fitted.errors.csv")
+    assert max(abs(value) for (name, _), value in fitted.items() if name == "EXX") == pytest.approx(10.0, abs=1e-6)
+    result = json.loads(site.project.files_of(step)["result.json"].read_text())
+    assert result["after"]["max_um"] == pytest.approx(30.0, abs=0.2)
+    page = site.get("/projects/1/tables").text
+    assert 'value="EXX=10; angular=50"' in page
+    assert 'name="robust" checked' in page
