@@ -308,55 +308,81 @@ class Corrector:
     ) -> Pieces:
         """Pieces of arcs: one arc where that follows the correction, otherwise halves, and halves of these."""
         done: list[tuple[Any, ...]] = []
-        work = np.array([(row, low, high) for row in rows for low, high in self._cuts(moves.part([row]), turned[row])])
-        length = lengths_of(moves)
+        length, work = lengths_of(moves), self._cuts(moves, rows, turned)
         while len(work):  # all arcs at a time, then the halves of those that do not follow
-            move, low, high = work[:, 0].astype(np.int64), work[:, 1], work[:, 2]
-            steps = max(16, min(2048, int(np.ceil(np.max((high - low) * length[move]) / self.step_mm))))
-            share = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, steps + 1)
-            share[:, -1] = high
-            many = moves.part(np.repeat(move, steps + 1))
-            wanted = points_of(many, share.ravel())
-            middle = np.repeat(directions_at(moves.part(move), 0.5 * (low + high)), steps + 1, axis=0)
-            direction = np.where(middle != 0, middle, ended[np.repeat(move, steps + 1)])
-            target = np.where(many.corrected, self.model.command(wanted, many.tool_mm, direction), wanted)
-            still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
-            sweep = (high - low) * moves.sweep_rad[move]
-            centre, off = _fitted_arcs(target.reshape(len(move), steps + 1, 3), moves.plane[move], sweep)
-            centre[still] = moves.centre_mm[move[still]]
-            # an arc by its radius is well defined up to a third of a circle; one that nearly closes could become a full one
-            wide = by_radius[move] & (np.abs(sweep) > 2.1)
-            ends = target.reshape(len(move), steps + 1, 3)[:, [0, -1]]
-            index, (a, b) = np.arange(len(move)), (_FIRST[moves.plane[move]], _SECOND[moves.plane[move]])
-            chord = np.hypot(*(ends[index, 1, k] - ends[index, 0, k] for k in (a, b)))
-            gap = np.where(is_closed(sweep), chord, 0.0)
-            wide |= gap > max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
-            wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
-            short = (high - low) * length[move] < 2.0 * self.shortest_mm
-            fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
-            # only the block as a whole says how many turns it has
-            fine &= (np.abs(sweep) < 2.0 * np.pi + 1e-9) | (high - low == 1.0)
-            done.append((move[fine], high[fine], ends[fine, 1], centre[fine]))
-            again, half = ~fine, 0.5 * (low + high)
-            work = np.concatenate(
-                [np.stack([move, low, half], axis=1)[again], np.stack([move, half, high], axis=1)[again]]
-            )
+            again = []
+            # each arc has as many samples as its own length needs, in steps of a factor of two
+            needed = np.clip((work[:, 2] - work[:, 1]) * length[work[:, 0].astype(np.int64)] / self.step_mm, 16, 2048)
+            steps = 2 ** np.ceil(np.log2(needed)).astype(np.int64)
+            for count in np.unique(steps).tolist():
+                part = work[steps == count]
+                move, low, high = part[:, 0].astype(np.int64), part[:, 1], part[:, 2]
+                end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, ended, length)
+                done.append((move[fine], high[fine], end[fine], centre[fine]))
+                rest, half = ~fine, 0.5 * (low + high)
+                again += [np.stack([move, low, half], axis=1)[rest], np.stack([move, half, high], axis=1)[rest]]
+            work = np.concatenate(again)
         return Pieces(*(np.concatenate(column) for column in zip(*done, strict=True)))
 
-    def _cuts(self, arc: Moves, turned: bool) -> list[tuple[float, float]]:
-        """Shares of an arc between which no axis reverses, with a short piece after each reversal; else the whole arc."""
+    def _fit_arcs(
+        self,
+        moves: Moves,
+        parts: tuple[IntArray, FloatArray, FloatArray],
+        steps: int,
+        by_radius: NDArray[np.bool_],
+        ended: FloatArray,
+        length: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+        """Ends and centres, (n, 3), of corrected parts of arcs, and which follow; ``parts``: move, shares of begin and end."""
+        move, low, high = parts
+        share = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, steps + 1)
+        share[:, -1] = high
+        many = moves.part(np.repeat(move, steps + 1))
+        wanted = points_of(many, share.ravel())
+        middle = directions_at(moves.part(move), 0.5 * (low + high))
+        direction = np.repeat(np.where(middle != 0, middle, ended[move]), steps + 1, axis=0)
+        target = np.where(many.corrected, self.model.command(wanted, many.tool_mm, direction), wanted)
+        still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
+        sweep = (high - low) * moves.sweep_rad[move]
+        target = target.reshape(len(move), steps + 1, 3)
+        centre, off = _fitted_arcs(target, moves.plane[move], sweep)
+        centre[still] = moves.centre_mm[move[still]]
+        # an arc by its radius is well defined up to a third of a circle; one that nearly closes could become a full one
+        wide = by_radius[move] & (np.abs(sweep) > 2.1)
+        index, (a, b) = np.arange(len(move)), (_FIRST[moves.plane[move]], _SECOND[moves.plane[move]])
+        chord = np.hypot(*(target[index, -1, k] - target[index, 0, k] for k in (a, b)))
+        gap = np.where(is_closed(sweep), chord, 0.0)
+        wide |= gap > max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
+        wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
+        short = (high - low) * length[move] < 2.0 * self.shortest_mm
+        fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
+        # only the block as a whole says how many turns it has
+        fine &= (np.abs(sweep) < 2.0 * np.pi + 1e-9) | (high - low == 1.0)
+        return target[:, -1], centre, fine
+
+    def _cuts(self, moves: Moves, rows: IntArray, turned: NDArray[np.bool_]) -> FloatArray:
+        """Parts of arcs ``rows`` (move, share of begin, share of end) within which no axis reverses.
+
+        With reversal curves there is a short piece after each reversal, also at the begin of those that ``turned``.
+        """
         if self.model.reversal is None:
-            return [(0.0, 1.0)]
-        (u,), (v,) = _in_plane(arc, arc.start_mm)
-        sweep, start = float(arc.sweep_rad[0]), float(np.arctan2(v, u))
-        low, high = sorted((start, start + sweep))
-        quarter = 0.5 * np.pi
-        angles = quarter * np.arange(np.ceil(low / quarter), np.floor(high / quarter) + 1)
-        turns = [share for share in np.abs((angles - start) / sweep) if 1e-9 < share < 1 - 1e-9]
-        short = self.shortest_mm / float(lengths_of(arc)[0])
-        points = {0.0, 1.0, *turns, *(share + short for share in ([0.0] if turned else []) + turns)}
-        known = [share for share in sorted(points) if share <= 1.0]
-        return list(zip(known, known[1:], strict=False))
+            return np.stack([rows, np.zeros(len(rows)), np.ones(len(rows))], axis=1)
+        arcs, quarter = moves.part(rows), 0.5 * np.pi
+        u, v = _in_plane(arcs, arcs.start_mm)
+        start, sweep = np.arctan2(v, u), arcs.sweep_rad
+        first = np.ceil(np.minimum(start, start + sweep) / quarter)
+        count = (np.floor(np.maximum(start, start + sweep) / quarter) + 1 - first).astype(np.int64)
+        own = np.repeat(np.arange(len(rows)), count)
+        rank = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
+        share = np.abs((quarter * (first[own] + rank) - start[own]) / sweep[own])
+        inside = (share > 1e-9) & (share < 1 - 1e-9)
+        own, share = own[inside], share[inside]
+        every, short, at_begin = np.arange(len(rows)), self.shortest_mm / lengths_of(arcs), np.flatnonzero(turned[rows])
+        owners = np.concatenate([every, every, own, own, at_begin])
+        shares = np.concatenate([0.0 * short, 0.0 * short + 1.0, share, share + short[own], short[at_begin]])
+        known = np.unique(np.stack([owners, shares], axis=1)[shares <= 1.0], axis=0)
+        parts = np.concatenate([known[:-1], known[1:, 1:]], axis=1)[known[1:, 0] == known[:-1, 0]]
+        return np.column_stack([rows[parts[:, 0].astype(np.int64)], parts[:, 1:]])
 
 
 def _fitted_arcs(target: FloatArray, plane: IntArray, sweep: FloatArray) -> tuple[FloatArray, FloatArray]:
