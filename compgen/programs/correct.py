@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
 from compgen.errors import InputError
-from compgen.programs.dialects import AT_THE_END, Dialect, dialect_named
+from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.path import (
     PLANE_AXES,
     Corrector,
@@ -34,12 +34,13 @@ from compgen.programs.path import (
     lengths_of,
     path_deviations,
 )
-from compgen.programs.reader import MARK, MM_PER_INCH, Batch, Reader, Setup, SingleBlock
-from compgen.programs.runs import PlainRun
+from compgen.programs.reader import MM_PER_INCH, Batch, Reader, Setup, SingleBlock
+from compgen.programs.runs import P_WORD, R_WORD, Run
 from compgen.resources import LANGUAGES, program_version
 
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
+_TENS = np.array([float(f"1e{k}") for k in range(16)])
 
 
 @dataclass(frozen=True)
@@ -128,91 +129,30 @@ class ProgramWriter:
         """Return the decimals of numbers in mm (``scale`` 1) or inch."""
         return self.decimals[scale == MM_PER_INCH]
 
-    def rewrite(self, batch: Batch, pieces: Pieces, share_before: FloatArray) -> Iterator[tuple[int, str]]:
-        """Yield the blocks of the corrected program, each with the number of the block that it comes from."""
+    def rewrite(self, batch: Batch, pieces: Pieces, share_before: FloatArray) -> tuple[str, IntArray]:
+        """Return the blocks of the corrected program, and for each the number of the block that it comes from."""
         bounds = np.searchsorted(pieces.move, np.arange(len(batch.moves) + 1))
+        start = batch.words.start
+        edits, added = _Edits(), np.zeros(len(start) - 1, dtype=np.int64)
         for segment in batch.segments:
-            if isinstance(segment, PlainRun):
-                yield from self._plain(batch, segment, pieces, bounds)
-            else:
-                rows = slice(int(bounds[segment.first]), int(bounds[segment.first + segment.count]))
-                yield from ((segment.number, text) for text in self._block(batch, segment, pieces, rows, share_before))
+            rows = slice(int(bounds[segment.first]), int(bounds[segment.first + segment.count]))
+            if isinstance(segment, Run):
                 if segment.count:
-                    self.wanted_mm = batch.moves.end_mm[segment.first + segment.count - 1]
+                    _RunPieces(self, batch, segment, pieces, rows, share_before).write(edits, added)
+                elif len(segment.pole_at):
+                    self.pole_mm = [np.nan] * 3
+            else:
+                texts = self._block(batch, segment, pieces, rows, share_before)
+                if texts[0] != segment.text or len(texts) > 1:
+                    line = segment.number - batch.first_line
+                    edits.add(int(start[line]), int(start[line + 1]), "".join(texts))
+                    added[line] = len(texts) - 1
+            if segment.count:
+                self.wanted_mm = batch.moves.end_mm[segment.first + segment.count - 1]
+        return edits.applied(batch.text), np.repeat(batch.first_line + np.arange(len(added)), 1 + added)
 
-    def _plain(self, batch: Batch, run: PlainRun, pieces: Pieces, bounds: Any) -> Iterator[tuple[int, str]]:
-        n = len(run.row)
-        if not n:
-            for k in run.lines:
-                yield batch.first_line + k, batch.lines[k]
-            return
-        rows = slice(int(bounds[run.first]), int(bounds[run.first + n]))
-        move = pieces.move[rows] - run.first
-        offset = batch.moves.offset_mm[run.first] + self.shift_mm
-        digits = self.digits(run.scale)
-        value = (pieces.command_mm[rows] - offset) / run.scale
-        grid = np.rint(np.vstack([(self.target_mm - offset) / run.scale, value]) * 10.0**digits)
-        moves_on = grid[1:] != grid[:-1]
-        first = np.concatenate([[True], move[1:] != move[:-1]])
-        single = first & np.concatenate([first[1:], [True]])
-        named = ~np.isnan(run.value[move]) & first[:, None]
-        own = np.where(named, np.maximum(run.decimals, digits)[move], digits)
-        same = named & single[:, None] & (np.abs(value - run.value[move]) <= _HALF * 10.0**-own)
-        rounded = np.rint(value * 10.0**own) / 10.0**own
-        rounded[same] = run.value[move][same]
-        add = moves_on & ~named
-        alone = ~first & ~add.any(axis=1)
-        add[alone] = True
-        last = np.where(named | add, np.arange(len(value))[:, None], -1).max(axis=0)
-        for k in range(3):
-            if last[k] >= 0:
-                self.written_mm[k] = rounded[last[k], k] * run.scale + offset[k]
-        self.target_mm, self.wanted_mm = pieces.command_mm[rows][-1], batch.moves.end_mm[run.first + n - 1]
-        renew = named & ~same
-        touched = (renew.any(axis=1) | add.any(axis=1)).tolist()
-        # the usual numbers have the decimals of the dialect: they are written in one go
-        form = f"%.{digits}f\n" * 3 * len(rounded)
-        usual = (form % tuple((rounded + 0.0).ravel().tolist())).split("\n")
-        plain = ((run.decimals == digits)[move] | ~named).tolist()
-        order, spans = np.argsort(run.span[:, :, 0], axis=1).tolist(), run.span.tolist()
-        rows_of, owns, firsts, adds = run.row.tolist(), own.tolist(), first.tolist(), add.tolist()
-        at, lines, base = run.lines.start, batch.lines, batch.first_line
-        for p, (m, begins, renewed) in enumerate(zip(move.tolist(), firsts, renew.tolist(), strict=True)):
-            here = run.lines.start + rows_of[m]
-            more = [f"{AXES[k]}{self._number(rounded[p, k], digits)}" for k in range(3) if adds[p][k]]
-            if not begins:
-                self.added += 1
-                yield base + here, " ".join(more) + self._line_end(lines[here])
-                continue
-            while at < here:
-                yield base + at, lines[at]
-                at += 1
-            at = here + 1
-            text = lines[here]
-            if touched[p]:
-                self.changed += 1
-                parts: list[str] = []
-                done = 0
-                for k in order[m]:
-                    start, stop = spans[m][k]
-                    if renewed[k]:
-                        old = text[start:stop]
-                        new = usual[3 * p + k]
-                        if not plain[p][k] or old[0] == "+":
-                            new = self._number(rounded[p, k], owns[p][k], old)
-                        parts += text[done:start], new
-                        done = stop
-                end = spans[m][order[m][2]][1]
-                if more:
-                    parts += text[done:end], _joined(more, text[:end])
-                    done = end
-                parts.append(text[done:])
-                text = "".join(parts)
-            yield base + here, text
-        for k in range(at, run.lines.stop):
-            yield base + k, lines[k]
-
-    def _line_end(self, text: str) -> str:
+    def line_end(self, text: str) -> str:
+        """Return the end of line of a block, with the * of HEIDENHAIN."""
         body = text.rstrip()
         return (" *" if self.dialect.pole and body.endswith("*") else "") + (text[len(text.rstrip("\r\n")) :] or "\n")
 
@@ -275,8 +215,8 @@ class ProgramWriter:
                 if text and letter in "GM" and f"{letter}{float(text):g}" in AT_THE_END
             )
             if moved:
-                body = texts[-1].rstrip("\r\n")
-                texts[-1] = f"{body} {moved}{texts[-1][len(body) :]}"
+                end = self.line_end(block.text)
+                texts[-1] = f"{texts[-1].removesuffix(end)} {moved}{end}"
             self.added += count - 1
         self.changed += texts[0] != block.text
         return texts
@@ -361,7 +301,7 @@ class ProgramWriter:
                 more.append(f"F{faster}")
         if piece > 0:
             skip = re.match(r"\s*(/\d?)", block.text)
-            return (skip[1] if skip else "") + " ".join(more) + self._line_end(block.text)
+            return (skip[1] if skip else "") + " ".join(more) + self.line_end(block.text)
         if count > 1:
             for letter, text, first, last in block.words:
                 if text and letter in "GM" and f"{letter}{float(text):g}" in AT_THE_END:
@@ -468,6 +408,233 @@ class ProgramWriter:
         return _spliced(block.text, changes, 0, ())
 
 
+class _RunPieces:
+    """The pieces of blocks that were read together, rewritten as :meth:`ProgramWriter._piece` does it for each.
+
+    Numbers are found for all pieces (rows) and the words X Y Z I J K and the radius (columns): those of a block that has the
+    word replace it, others are added where they are needed, in the block or in a new one. ``reached_mm`` is where the numbers
+    lead, before the first piece and after each.
+    """
+
+    def __init__(
+        self, writer: ProgramWriter, batch: Batch, run: Run, pieces: Pieces, rows: slice, share_before: FloatArray
+    ) -> None:
+        self.writer, self.batch, self.run, self.words = writer, batch, run, batch.words
+        self.moves = batch.moves.part(slice(run.first, run.first + run.count))
+        self.command_mm, self.centre_mm = pieces.command_mm[rows], pieces.centre_mm[rows]
+        self.move = pieces.move[rows] - run.first
+        self.line, self.absolute = run.row[self.move], run.absolute[self.move]
+        self.begins = np.diff(self.move, prepend=-1) > 0
+        self.whole = self.begins & np.append(self.begins[1:], True)
+        self.digits, self.offset_mm = writer.digits(run.scale), self.moves.offset_mm[0] + writer.shift_mm
+        self.given = np.where(self.begins[:, None], self.words.value[self.line, : R_WORD + 1], np.nan)
+        self.named = ~np.isnan(self.given)
+        self.decimals = self.words.decimals[self.line, : R_WORD + 1]
+        self.own = np.where(self.named, np.maximum(self.decimals, self.digits), self.digits)
+        self.value = np.full(self.given.shape, np.nan)
+        self.same, self.added = np.zeros((2, *self.given.shape), dtype=bool)
+        self.sweep = self.moves.sweep_rad[self.move] * share_before[rows]
+        self.arc = self.sweep != 0
+        self.closed = self.arc & is_closed(self.sweep)
+        self.in_plane = self.arc[:, None] & (np.arange(3) != self.moves.plane[self.move][:, None])
+        self.reached_mm = np.zeros((0, 3))
+
+    def write(self, edits: _Edits, added: IntArray) -> None:
+        """Find the numbers, edit the text, and tell the writer where the control then is; counts new blocks in ``added``."""
+        self._ends()
+        if self.arc.any():
+            self._arcs()
+        writer = self.writer
+        writer.target_mm, writer.written_mm = self.command_mm[-1], np.array(self.reached_mm[-1])
+        added += np.bincount(self.line[~self.begins], minlength=len(added))
+        writer.added += int(np.sum(~self.begins))
+        self._edit(edits)
+
+    def _settle(self, columns: slice, exact: FloatArray, needed: NDArray[np.bool_]) -> None:
+        """Round numbers; those of words that change by less than half their last decimal stay, others are added if ``needed``."""
+        given, own, named = self.given[:, columns], self.own[:, columns], self.named[:, columns]
+        same = named & self.whole[:, None] & (np.abs(exact - given) <= _HALF / _TENS[own])
+        added = ~named & needed & ~np.isnan(exact)
+        rounded = np.where(named | added, np.rint(exact * _TENS[own]) / _TENS[own], np.nan)
+        self.value[:, columns], self.same[:, columns], self.added[:, columns] = (
+            np.where(same, given, rounded),
+            same,
+            added,
+        )
+
+    def _ends(self) -> None:
+        scale, offset, later = self.run.scale, self.offset_mm, ~self.begins[:, None]
+        value = (self.command_mm - offset) / scale
+        grid = np.rint(np.vstack([(self.writer.target_mm - offset) / scale, value]) * _TENS[self.digits])
+        self._settle(np.s_[:3], value, (grid[1:] != grid[:-1]) | (self.in_plane & later))
+        self.reached_mm = np.vstack([self.writer.written_mm, self.value[:, :3] * scale + offset])
+        # ends of increments and of full circles depend on where the numbers before led
+        chained = ~self.absolute[:, None] | (self.closed[:, None] & self.in_plane)
+        for k in range(3):
+            if chained[:, k].any():
+                self._follow(k, chained[:, k])
+            else:
+                known = np.where(np.isnan(self.reached_mm[:, k]), 0, np.arange(len(self.reached_mm)))
+                self.reached_mm[:, k] = self.reached_mm[np.maximum.accumulate(known), k]
+        # a piece that is nowhere else still is a block
+        alone = ~self.begins & ~self.arc & ~self.added.any(axis=1)
+        self.added[alone, 0] = True
+        self.value[alone, 0] = np.where(self.absolute, (self.reached_mm[:-1, 0] - offset[0]) / scale, 0.0)[alone]
+
+    def _follow(self, k: int, chained: NDArray[np.bool_]) -> None:
+        """Ends along one axis, piece after piece: an increment leads on from where the written numbers led."""
+        place, zero, scale = float(self.reached_mm[0, k]), float(self.offset_mm[k]), self.run.scale
+        held, always = self.closed & self.in_plane[:, k], self.in_plane[:, k] & ~self.begins
+        columns = (chained, self.absolute, held, always, self.whole, self.named[:, k], self.given[:, k], self.own[:, k])
+        numbers = (self.value[:, k], self.command_mm[:, k])
+        least, reached, tens = _HALF / _TENS[self.digits], [place], _TENS.tolist()
+        found: list[tuple[float, bool, bool]] = []
+        for follows, absolute, stays, needed, whole, named, given, own, value, command in zip(
+            *(column.tolist() for column in (*columns, *numbers)), strict=True
+        ):
+            got, same, added = value, False, False
+            if follows:
+                way = place - zero if absolute else 0.0
+                exact = (way if stays else command - place) / scale
+                same = named and whole and abs(exact - given) <= _HALF / tens[own]
+                added = not named and (needed or (not absolute and abs(exact) > least))
+                got = given if same else round(exact * tens[own]) / tens[own] if named or added else np.nan
+                found.append((got, same, added))
+            if got == got:
+                place = got * scale + (zero if absolute else place)
+            reached.append(place)
+        self.value[chained, k], self.same[chained, k], self.added[chained, k] = zip(*found, strict=True)
+        self.reached_mm[:, k] = reached
+
+    def _arcs(self) -> None:
+        """Numbers of centres and radii, as seen from where the written numbers lead."""
+        scale, pole, rows = self.run.scale, self.writer.dialect.pole, np.arange(len(self.move))
+        (a, b), centre = np.array(PLANE_AXES)[self.moves.plane[self.move]].T, self.centre_mm
+        start, end = self.reached_mm[:-1], self.reached_mm[1:]
+        chord = np.hypot(end[rows, a] - start[rows, a], end[rows, b] - start[rows, b])
+        lost = np.flatnonzero(self.arc & (chord == 0.0) & ~self.closed)
+        if len(lost):
+            line = self.batch.first_line + int(self.line[lost[0]])
+            raise InputError("the arc is shorter than the last decimal; give more with --decimals", line=line)
+        size = np.hypot(centre[rows, a] - start[rows, a], centre[rows, b] - start[rows, b])
+        programmed = self.words.value[self.line, R_WORD]
+        by_radius = self.arc & ~np.isnan(programmed)
+        sign = np.where((np.abs(self.sweep) <= np.pi) | (programmed > 0), 1.0, -1.0)
+        radius = np.where(by_radius, sign * np.maximum(size, 0.5 * chord) / scale, np.nan)
+        self._settle(np.s_[R_WORD : R_WORD + 1], radius[:, None], by_radius[:, None])
+        from_zero = self.run.centre_absolute | (self.absolute & pole)
+        base = np.where(from_zero[:, None], self.offset_mm, start)
+        exact = np.where(self.in_plane & ~by_radius[:, None], (centre - base) / scale, np.nan)
+        least = _HALF / _TENS[self.digits]
+        self._settle(np.s_[3:6], exact, np.ones_like(self.in_plane) if pole else np.abs(exact) > least)
+        if not pole:
+            return
+        known, lost_at = self.writer.pole_mm, self.run.pole_at.tolist()
+        for p in np.flatnonzero(self.arc).tolist():
+            move = int(self.move[p])
+            while lost_at and lost_at[0] <= move:
+                known = [np.nan] * 3  # the pole is again that of the program
+                lost_at.pop(0)
+            for k in (int(a[p]), int(b[p])):
+                before = self.moves.centre_mm[move, k] if np.isnan(known[k]) else known[k]
+                self.added[p, 3 + k] &= bool(abs(centre[p, k] - before) / scale > least)
+                if self.named[p, 3 + k] or self.added[p, 3 + k]:
+                    known[k] = float(self.value[p, 3 + k] * scale + base[p, k])
+        self.writer.pole_mm = [np.nan] * 3 if lost_at else known
+
+    def _edit(self, edits: _Edits) -> None:
+        """Put the numbers into the text: words replaced, words added after the axis words, and new blocks."""
+        words, text, line, digits = self.words, self.batch.text, self.line, self.digits
+        row, column = np.nonzero(self.named & ~self.same & ~np.isnan(self.value))
+        more, letter = np.nonzero(self.added)
+        # the first axis of a plane goes first: K before I in G18
+        order = np.where((letter == 5) & (self.moves.plane[self.move[more]] == 1), 2.5, letter)
+        sorted_ = np.lexsort((order, more))
+        more, letter, order = more[sorted_], letter[sorted_], order[sorted_]
+        begin, end = words.begin[line[row], column], words.end[line[row], column]
+        numbers = _numbers(
+            np.concatenate([self.value[row, column], self.value[more, letter]]),
+            np.concatenate([self.own[row, column], np.full(len(more), digits)]),
+            np.append(self.decimals[row, column] < self.own[row, column], np.full(len(more), True)),
+            np.append(words.code[begin] == ord("+"), np.full(len(more), self.writer.dialect.pole)),
+        )
+        axes = words.end[line, :3].max(axis=1)
+        place = np.where(self.begins, np.where(axes > 0, axes, words.last[line]), words.start[line + 1])[more]
+        texts = self._added_words(more.tolist(), letter.tolist(), place.tolist(), numbers[len(row) :])
+        # the pieces of a divided arc have no number of turns
+        turns = np.flatnonzero(self.arc & self.begins & ~self.whole & ~np.isnan(words.value[line, P_WORD]))
+        begin = np.concatenate([begin, place, words.begin[line[turns], P_WORD] - 1])
+        end = np.concatenate([end, place, words.end[line[turns], P_WORD]])
+        every = [*numbers[: len(row)], *texts, *[""] * len(turns)]
+        owner = np.concatenate([row, more, turns])
+        chosen = np.lexsort((np.concatenate([column, 10 + order, np.full(len(turns), 20)]), owner, begin))
+        edits.starts += begin[chosen].tolist()
+        edits.stops += end[chosen].tolist()
+        edits.texts += [every[k] for k in chosen.tolist()]
+        touched = np.zeros(len(line), dtype=bool)
+        touched[row[self.whole[row]]] = touched[more] = touched[turns] = True
+        for k in np.flatnonzero(~self.whole[row]).tolist():  # a divided block may end with the same numbers
+            touched[row[k]] |= text[begin[k] : end[k]] != numbers[k]
+        self.writer.changed += int(np.sum(touched & self.begins))
+
+    def _added_words(self, more: list[int], letter: list[int], place: list[int], numbers: list[str]) -> list[str]:
+        """Texts of words that pieces ``more`` get: with a blank before where their block has blanks, or a block of their own."""
+        text, start, line = self.batch.text, self.words.start, self.line
+        names = [*"XYZIJK", "CR=" if self.writer.dialect.name == "siemens" else "R"]
+        texts, last, between = [], -1, ""
+        for k, (p, number) in enumerate(zip(more, numbers, strict=True)):
+            new = names[letter[k]] + number
+            first = p != last
+            if self.begins[p]:
+                if first:
+                    between = " " if " " in text[start[line[p]] : place[k]].strip() else ""
+                texts.append(between + new)
+            else:
+                block = text[start[line[p]] : start[line[p] + 1]]
+                before = "" if block.endswith("\n") or not self.begins[p - 1] else "\n"
+                after = self.writer.line_end(block) if p != (more[k + 1] if k + 1 < len(more) else -1) else ""
+                texts.append((before if first else " ") + new + after)
+            last = p
+        return texts
+
+
+@dataclass
+class _Edits:
+    """Replacements in a text, in order: from ``starts`` to ``stops`` by ``texts``."""
+
+    starts: list[int] = field(default_factory=list)
+    stops: list[int] = field(default_factory=list)
+    texts: list[str] = field(default_factory=list)
+
+    def add(self, start: int, stop: int, text: str) -> None:
+        """Append one."""
+        self.starts.append(start)
+        self.stops.append(stop)
+        self.texts.append(text)
+
+    def applied(self, text: str) -> str:
+        """Return the edited text."""
+        parts: list[str] = []
+        at = 0
+        for start, stop, new in zip(self.starts, self.stops, self.texts, strict=True):
+            parts += text[at:start], new
+            at = stop
+        return "".join([*parts, text[at:]])
+
+
+def _numbers(value: FloatArray, digits: IntArray, stripped: NDArray[np.bool_], signed: NDArray[np.bool_]) -> list[str]:
+    """Write many numbers as :meth:`ProgramWriter._number` does: ``stripped`` without trailing zeros, ``signed`` with a plus."""
+    forms = [f"%.{k}f" for k in range(len(_TENS))]
+    # adding 0 makes -0 a 0
+    texts = ("\n".join([forms[k] for k in digits.tolist()]) % tuple((value + 0.0).tolist())).split("\n")
+    for k in np.flatnonzero(stripped).tolist():
+        texts[k] = texts[k].rstrip("0")
+    for k in np.flatnonzero(signed).tolist():
+        if texts[k][0] != "-":
+            texts[k] = "+" + texts[k]
+    return texts if len(value) else []
+
+
 def _joined(words: Sequence[str], before: str) -> str:
     """Return words that follow ``before`` in a block, without blanks where the block has none."""
     blank = " " if " " in before.strip() else ""
@@ -497,11 +664,11 @@ class _ReadBack:
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
     broken: str = ""
 
-    def add(self, wanted: Moves, texts: list[str], origins: list[int]) -> None:
-        """Read the corrected blocks ``texts`` and compare them with the moves that are wanted."""
-        read = self.reader.batch("".join(texts).encode("latin-1"), self.lines + 1).moves
-        origin = np.array(origins, dtype=np.int64)[read.line - self.lines - 1] if len(read) else read.line
-        self.lines += len(texts)
+    def add(self, wanted: Moves, text: bytes, origins: IntArray) -> None:
+        """Read corrected blocks, of which ``origins`` are the numbers, and compare them with the moves that are wanted."""
+        read = self.reader.batch(text, self.lines + 1).moves
+        origin = origins[read.line - self.lines - 1]
+        self.lines += len(origins)
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
         if len(wanted):
             self.direction = ended[-1]
@@ -626,20 +793,21 @@ def correct_program(
             for batch in reader.batches(stream):
                 by_radius = np.zeros(len(batch.moves), dtype=bool)
                 for segment in batch.segments:
-                    if isinstance(segment, SingleBlock) and segment.kind == "arc":
+                    if isinstance(segment, Run):
+                        rows = slice(segment.first, segment.first + segment.count)
+                        by_radius[rows] = ~np.isnan(batch.words.value[segment.row, R_WORD])
+                    elif segment.kind == "arc":
                         by_radius[segment.first] = any(word[0] in ("R", "CR") for word in segment.words)
                 pieces = corrector.pieces(batch.moves, by_radius)
                 begin = np.where(np.diff(pieces.move, prepend=-1) > 0, 0.0, np.roll(pieces.share, 1))
-                origins, texts = [], []
                 try:
-                    for origin, text in writer.rewrite(batch, pieces, pieces.share - begin):
-                        origins.append(origin)
-                        texts.append(text)
+                    text, origins = writer.rewrite(batch, pieces, pieces.share - begin)
                 except InputError as error:
                     raise InputError(error.message, file=source, line=error.line) from error
-                target.write("".join(texts).encode("latin-1"))
-                check.add(batch.moves, texts, origins)
-                blocks += len(batch.lines)
+                corrected = text.encode("latin-1")
+                target.write(corrected)
+                check.add(batch.moves, corrected, origins)
+                blocks += len(batch.words.start) - 1
                 show(f"{blocks} blocks corrected and read back")
         model.errors.warn_outside(reader.reached_mm)
         unchanged = not writer.changed and not writer.added

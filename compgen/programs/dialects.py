@@ -165,6 +165,8 @@ _SIEMENS_REFUSED = {
 _M_CODES = (*range(10), 10, 11, 13, 14, 19, 29, 30, *range(40, 46), 48, 49, 60)
 #: The M codes that act when the block ends, so that they follow the last piece of a divided block.
 AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "G9"}
+#: Text in the first comment of a corrected program.
+MARK = "CORRECTED BY VOLCOMP"
 
 _VALUE = r"[+-]?\s*(?:\d+\.?\d*|\.\d+)"
 _PARENTHESES = r"\([^()\n]*\)"

@@ -363,7 +363,7 @@ def predict_part(
                     after.add(found)
             drilled = {item.number for item in batch.segments if isinstance(item, SingleBlock) and item.kind == "cycle"}
             features.add(moves, drilled, ended)
-            show(f"{batch.first_line + len(batch.lines) - 1} blocks")
+            show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
     model.errors.warn_outside(reader.reached_mm)
     quantities = features.quantities()
     evaluated = [_feature(item, model, with_tables, covariance) for item in quantities[:MOST_FEATURES]]

@@ -1,8 +1,8 @@
 """NC programs read into moves of the machine axes, in batches of blocks: words, modal state, positions.
 
 A position here is that of the machine axes as the control counts them, mm: program position + work offset + G92 + tool
-length. Blocks with nothing but plain words (N, G0, G1, X, Y, Z, F, S) are read many at a time by numpy, others one by
-one; both ways give the same moves.
+length. Blocks in a row that have nothing but plain words (lines, arcs, G90, G91, planes, M codes that move nothing, comments)
+are read many at a time by numpy, others one by one; both ways give the same moves.
 """
 
 from __future__ import annotations
@@ -15,23 +15,28 @@ from pathlib import Path
 from typing import BinaryIO, NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
+from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError, visible_line
-from compgen.programs.dialects import Dialect
+from compgen.programs.dialects import MARK, Dialect
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
-from compgen.programs.runs import PlainRun, PlainWords
+from compgen.programs.runs import (
+    LONGEST_BLOCK,
+    P_WORD,
+    R_WORD,
+    RADIUS_TOLERANCE_MM,
+    Run,
+    Words,
+    carried,
+    centres_and_sweeps,
+)
 
 MM_PER_INCH = 25.4
-#: Bytes that are read at a time, and the longest block.
-BATCH_BYTES, LONGEST_BLOCK = 1 << 18, 4096
-#: The fewest plain blocks in a row that are read together.
-LEAST_PLAIN = 32
+#: Bytes that are read at a time, and the fewest blocks in a row that are read together.
+BATCH_BYTES, LEAST_RUN = 1 << 18, 12
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
-#: Distances of start and end of an arc from its centre may differ by this much, mm.
-RADIUS_TOLERANCE_MM = 0.02
-#: Text in the first comment of a corrected program.
-MARK = "CORRECTED BY VOLCOMP"
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
 
@@ -75,12 +80,13 @@ class SingleBlock:
 
 @dataclass(frozen=True)
 class Batch:
-    """Blocks in a row: texts with their line ends, moves, and how the blocks were read, in order."""
+    """Blocks in a row: their text and words, moves, and how the blocks were read, in order."""
 
     first_line: int
-    lines: list[str]
+    text: str
+    words: Words
     moves: Moves
-    segments: list[SingleBlock | PlainRun]
+    segments: list[SingleBlock | Run]
 
 
 def number_of(text: str) -> float:
@@ -155,38 +161,34 @@ class Reader:
     def batch(self, content: bytes, first_line: int) -> Batch:
         """Read whole lines, the first with the number ``first_line``."""
         self._refuse_bytes(content, first_line)
-        texts = [line + "\n" for line in content.decode("latin-1").split("\n")]
-        last = texts.pop()[:-1]
-        if last:
-            texts.append(last)
-        tokens = PlainWords(content, len(texts), self.dialect)
+        text, words = content.decode("latin-1"), Words(content, self.dialect, self.setup.keep_unknown)
         self._rows = []
         parts: list[Moves] = []
         count, k = 0, 0
-        segments: list[SingleBlock | PlainRun] = []
-        while k < len(texts):
-            stop = int(tokens.run_end[k])
-            if stop - k >= LEAST_PLAIN and self._takes_plain():
-                if self._rows:
-                    parts.append(Moves.of_rows(self._rows))
-                    self._rows = []
-                run, moves = self._plain(tokens, range(k, stop), first_line, count)
-                segments.append(run)
-                parts.append(moves)
-                count += len(moves)
-                k = stop
-                continue
-            if len(texts[k]) > LONGEST_BLOCK:
+        segments: list[SingleBlock | Run] = []
+        start, run_end = words.start.tolist(), words.run_end.tolist()
+        while k < len(run_end):
+            if run_end[k] - k >= LEAST_RUN and self._takes_run():
+                many = self._run(words, range(k, run_end[k]), first_line, count)
+                if many is not None:
+                    if self._rows:
+                        parts.append(Moves.of_rows(self._rows))
+                        self._rows = []
+                    segments.append(many[0])
+                    parts.append(many[1])
+                    count, k = count + len(many[1]), many[0].lines.stop
+                    continue
+            if start[k + 1] - start[k] > LONGEST_BLOCK:
                 self._line, self._text = first_line + k, ""
                 self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
-            block = self._block(first_line + k, texts[k], count)
+            block = self._block(first_line + k, text[start[k] : start[k + 1]], count)
             segments.append(block)
             count += block.count
             k += 1
         parts.append(Moves.of_rows(self._rows))
         moves = Moves.joined(parts)
         self._check(moves)
-        return Batch(first_line, texts, moves, segments)
+        return Batch(first_line, text, words, moves, segments)
 
     def finish(self, last_line: int) -> None:
         """Refuse a program that ends in the middle."""
@@ -221,45 +223,107 @@ class Reader:
         shown = f" (block: {text})" if text else ""
         raise InputError(message + shown, file=self.source, line=self._line, field=field)
 
-    # Plain blocks, many at a time.
+    # Many blocks at a time.
 
-    def _takes_plain(self) -> bool:
-        known = not any(math.isnan(value) for value in self.position)
-        modal = self.motion in (RAPID, FEED) and self.cycle is None and self.absolute and self.feed != "inverse"
-        return known and modal and all(self.named) and not self.ended and self._unit_known and bool(self.offset_name)
+    def _takes_run(self) -> bool:
+        """Whether blocks of plain words are now moves and nothing else, from a known position."""
+        known = not any(math.isnan(value) for value in self.position) and all(self.named) and bool(self.offset_name)
+        return known and self.cycle is None and self.feed != "inverse" and not self.ended and self._unit_known
 
-    def _plain(self, tokens: PlainWords, lines: range, first_line: int, first: int) -> tuple[PlainRun, Moves]:
-        rows = slice(lines.start, lines.stop)
-        value, g = tokens.value[rows], tokens.g[rows]
-        offset = np.array(self._offset())
-        named = ~np.isnan(value)
-        at = np.vstack([np.array(self.position), np.where(named, value * self.scale + offset, 0.0)])
-        last = np.maximum.accumulate(
-            np.where(np.vstack([np.ones(3, dtype=bool), named]), np.arange(len(at))[:, None], 0)
-        )
-        at = np.take_along_axis(at, last, axis=0)
-        given = np.where(g >= 0, np.arange(1, len(g) + 1), 0)
-        kind = np.concatenate([[self.motion], g])[np.maximum.accumulate(given)].astype(np.int64)
-        row = np.flatnonzero(named.any(axis=1))
+    def _run(self, words: Words, lines: range, first_line: int, first: int) -> tuple[Run, Moves] | None:
+        """Read blocks together, as :meth:`_block` reads each; up to one that cannot be followed, None if that is the first."""
+        rows, pole = slice(lines.start, lines.stop), self.dialect.pole
+        offset, value = np.array(self._offset()), words.value[rows]
+        named, given = ~np.isnan(value[:, :3]), ~np.isnan(value[:, 3:6])
+        motion = carried(words.motion[rows], -1 if self.motion is None else self.motion)
+        absolute = carried(words.absolute[rows], int(self.absolute)) > 0
+        plane = carried(words.plane[rows], self.plane)
+        moving = named.any(axis=1)
+        arc = (motion >= CW) & (moving if pole else moving | given.any(axis=1))
+        at = self._places(named, value[:, :3] * self.scale, absolute, offset)
+        stopped = (moving | arc) & (motion < 0)
+        poles = np.zeros((len(value), 3))
+        if pole:
+            centre = np.where(absolute[:, None], offset, at[:-1]) + value[:, 3:6] * self.scale
+            for k in range(3):
+                poles[:, k] = np.concatenate([[self.pole[k]], centre[:, k]])[
+                    carried(np.where(given[:, k], np.arange(1, len(value) + 1), -1), 0)
+                ]
+        arcs = np.flatnonzero(arc)
+        if len(arcs):
+            if pole:
+                centre = poles[arcs]
+            elif self.centre_absolute:
+                centre = offset + value[arcs, 3:6] * self.scale
+            else:
+                centre = at[arcs] + np.where(given[arcs], value[arcs, 3:6], 0.0) * self.scale
+                none = ~given[arcs[:, None], np.array(PLANE_AXES)[plane[arcs]]].any(axis=1)
+                centre[none] = np.nan
+            turns = np.where(
+                np.isnan(value[arcs, P_WORD]) | (self.dialect.name != "linuxcnc"), 1.0, value[arcs, P_WORD]
+            )
+            centre, sweep, wrong = centres_and_sweeps(
+                at[arcs],
+                at[arcs + 1],
+                centre,
+                value[arcs, R_WORD] * self.scale,
+                plane[arcs],
+                motion[arcs] == CCW,
+                turns - 1.0,
+            )
+            stopped[arcs[wrong]] = True
+        if stopped.any():
+            stop = int(np.argmax(stopped))
+            return self._run(words, lines[:stop], first_line, first) if stop else None
+        row = np.flatnonzero(moving | arc)
         n = len(row)
-        self.position, self.motion = at[-1].tolist(), int(kind[-1])
-        self.started = self.started or n > 0
-        end, tool = at[row + 1], np.array(self._tool())
+        centres, sweeps = np.full((n, 3), np.nan), np.zeros(n)
+        if len(arcs):
+            centres[arc[row]], sweeps[arc[row]] = centre, sweep
+        tool = np.array(self._tool())
         moves = Moves(
             line=first_line + lines.start + row,
-            kind=kind[row],
+            kind=motion[row],
             start_mm=at[row],
-            end_mm=end,
-            centre_mm=np.full((n, 3), np.nan),
-            plane=np.full(n, self.plane),
-            sweep_rad=np.zeros(n),
+            end_mm=at[row + 1],
+            centre_mm=centres,
+            plane=plane[row],
+            sweep_rad=sweeps,
             offset_mm=np.broadcast_to(offset, (n, 3)),
             tool_mm=np.broadcast_to(tool, (n, 3)),
-            at_mm=end,
+            at_mm=at[row + 1],
             corrected=np.ones((n, 3), dtype=bool),
         )
-        run = PlainRun(lines, first, row, value[row], tokens.decimals[rows][row], tokens.span[rows][row], self.scale)
+        self.position, self.motion = at[-1].tolist(), int(motion[-1]) if motion[-1] >= 0 else None
+        turning = motion[motion >= CW]
+        self.last_arc = int(turning[-1]) if len(turning) else self.last_arc
+        self.absolute, self.plane, self.started = bool(absolute[-1]), int(plane[-1]), self.started or n > 0
+        only_pole = np.zeros(0, dtype=np.int64)
+        if pole:
+            self.pole = poles[-1].tolist()
+            only_pole = np.searchsorted(row, np.flatnonzero(given.any(axis=1) & ~moving))
+        run = Run(lines, first, lines.start + row, absolute[row], self.scale, self.centre_absolute, only_pole)
         return run, moves
+
+    def _places(
+        self, named: NDArray[np.bool_], value_mm: FloatArray, absolute: NDArray[np.bool_], offset: FloatArray
+    ) -> FloatArray:
+        """Machine positions before the first of some blocks and after each, (n + 1, 3), mm."""
+        if absolute.all():
+            at = np.vstack([self.position, np.where(named, value_mm + offset, 0.0)])
+            every = np.arange(len(at))[:, None]
+            last = np.maximum.accumulate(np.where(np.vstack([[True] * 3, named]), every, 0))
+            return np.take_along_axis(at, last, axis=0)
+        columns, modes = [], absolute.tolist()
+        for k, place in enumerate(self.position):
+            # one after the other: increments add up with the rounding of single blocks
+            zero, found = float(offset[k]), [place]
+            for mode, there, value in zip(modes, named[:, k].tolist(), value_mm[:, k].tolist(), strict=True):
+                if there:
+                    place = (zero if mode else place) + value
+                found.append(place)
+            columns.append(found)
+        return np.array(columns).T
 
     # One block.
 

@@ -115,3 +115,107 @@ def random_program(seed, count=60, *, linuxcnc=True, cycles=True):
                 lines.append("G92.1")
                 go(["G0"], place(), [0, 1, 2])
     return "\n".join([*lines, "M2", "%", ""])
+
+
+def mixed_program(seed, dialect, count=400):
+    """Blocks as CAM systems mix them: lines, arcs in all forms and planes, increments, M codes, comments, holes."""
+    r = np.random.default_rng(seed)
+    heidenhain, siemens, fanuc = (dialect == name for name in ("heidenhain-iso", "siemens", "fanuc"))
+    inch = seed % 5 == 4 and not heidenhain
+    units = {"siemens": "G70" if inch else "G71", "heidenhain-iso": "G90"}.get(dialect, "G20" if inch else "G21")
+    size, most = (2.0, 4) if inch else (50.0, 3)
+    head = {"fanuc": ["%", "O7"], "heidenhain-iso": ["%P G71"], "siemens": ["%_N_P_MPF"]}.get(dialect, [])
+    end = {"fanuc": ["M30", "%"], "heidenhain-iso": ["N9999 %P G71"]}.get(dialect, ["M30"])
+    lines = [f"{units} G90 G17" if heidenhain else f"{units} G90 G17 G54", "G0 X0. Y0. Z0."]
+    at, absolute, plane, motion, relative = np.zeros(3), True, 2, 0, True
+    closing = "*" if heidenhain else ""
+
+    def word(letter, value):
+        nonlocal plus
+        text = f"{value:.{digits}f}"
+        if short and "." in text:
+            text = text.rstrip("0")
+            text = text if fanuc or r.random() < 0.5 else text.rstrip(".") or "0"
+        text = "0." if text in ("-0.", "-0", "") else text
+        return letter + ("+" if plus and text[0] != "-" else "") + text
+
+    while len(lines) < count:
+        digits, short, plus = int(r.integers(max(most - 2, 1), most + 3)), r.random() < 0.4, r.random() < 0.3
+        kind, codes, more = r.random(), [f"N{10 * len(lines)}"] if r.random() < 0.4 else [], ""
+        if kind < 0.05:
+            said = {"siemens": "; MSG (a) X5", "heidenhain-iso": "; X5 *"}.get(dialect, "(tool X5 ; [1])")
+            lines.append(
+                r.choice([said, "M8", "M3 S900", "", "F300", "N5 M9", "G64" if dialect != "heidenhain-iso" else "G40"])
+            )
+            continue
+        if kind < 0.07:
+            plane = int(r.integers(0, 3))
+            codes.append(["G19", "G18", "G17"][plane])
+        if kind > 0.94:
+            absolute = not absolute
+            codes.append("G90" if absolute else "G91")
+        if dialect == "linuxcnc" and 0.93 < kind < 0.94:
+            relative = not relative
+            lines.append("G91.1" if relative else "G90.1")
+        target = np.clip(at + r.normal(0, size / 8, 3), -size, size)
+        if kind < 0.6 or kind > 0.9:
+            words = sorted(r.choice(3, r.integers(1, 4), replace=False))
+            if motion not in (0, 1) or r.random() < 0.3:
+                motion = int(r.random() < 0.8)
+                codes.append(r.choice([f"G{motion}", f"G0{motion}"]))
+        else:
+            a, b = ((1, 2), (2, 0), (0, 1))[plane]
+            centre = at + r.normal(0, size / 8, 3)
+            arm = (at - centre)[[a, b]]
+            if np.hypot(*arm) < size / 50:
+                continue
+            ccw, full = bool(r.random() < 0.5), r.random() < 0.15
+            turn = (1 if ccw else -1) * (2 * np.pi if full else r.uniform(0.05, 6.0))
+            c, s = np.cos(turn), np.sin(turn)
+            target = np.array(at)
+            if not full:
+                target[a], target[b] = centre[a] + c * arm[0] - s * arm[1], centre[b] + s * arm[0] + c * arm[1]
+            words = [] if full and r.random() < 0.5 else [a, b]
+            if r.random() < 0.3 or (heidenhain and not words):
+                words = [*words, plane]
+                target[plane] = at[plane] + r.normal(0, size / 50)
+            words, digits = sorted(words), 6 if full else max(digits, most)
+            if motion != 2 + ccw or r.random() < 0.3:
+                motion = 2 + ccw
+                codes.append(f"G{motion}")
+            target = np.where(np.isin(np.arange(3), words), at + np.round(target - at, digits), at)
+            if (
+                not full
+                and not heidenhain
+                and r.random() < 0.3
+                and 0.3 < abs(turn) < 5.5
+                and abs(abs(turn) - np.pi) > 0.5
+            ):
+                radius = np.hypot(*arm) * (1 if abs(turn) < np.pi else -1)
+                more = word("CR=" if siemens else "R", radius)
+            else:
+                base = at if relative and not heidenhain else 0.0 * at
+                if heidenhain and not absolute:
+                    base = at
+                values = np.round(centre - base, digits)
+                more = " ".join(word("IJK"[k], values[k]) for k in (a, b))
+                if heidenhain and r.random() < 0.4:
+                    lines.append(more + closing)
+                    more = ""
+            if dialect == "linuxcnc" and r.random() < 0.1:
+                more += " P2"
+        values = np.round(target if absolute else target - at, digits)
+        parts = [
+            *codes,
+            *(word("XYZ"[k], values[k]) for k in words),
+            *more.split(),
+            *(["F500"] if r.random() < 0.1 else []),
+        ]
+        block = ("" if r.random() < 0.3 else " ").join(parts)
+        block = block.lower() if r.random() < 0.1 and not siemens else block
+        comment = {"siemens": " ; c", "heidenhain-iso": ""}.get(dialect, " (c)")
+        lines.append(block + (comment if r.random() < 0.1 else "") + closing)
+        if r.random() < 0.05:
+            lines[-1] = lines[-1].replace("*", "") + (" M8" if r.random() < 0.5 else " M9") + closing
+        at = np.where(np.isin(np.arange(3), words), values if absolute else at + values, at)
+    return "\n".join([*head, *lines, "G90 G0 X0. Y0. Z0." + closing, *end, ""])

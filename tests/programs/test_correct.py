@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
+from programs.make import OFFSETS_MM, TOOLS_MM, mill, mixed_program, random_program
 from scipy.spatial import cKDTree
 
 import compgen
@@ -176,26 +176,24 @@ def test_without_errors_a_program_stays_the_same_byte_for_byte(tmp_path, seed):
     assert result.counts["changed_blocks"] == 0
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_plain_blocks_read_together_give_what_single_blocks_give(tmp_path, seed, make_errors, monkeypatch):
-    """Whatever the size of the batches and however blocks are read, the same bytes are written."""
-    generator = np.random.default_rng(seed)
-    rows = []
-    for _ in range(400):
-        words = [f"{'XYZ'[k]}{generator.uniform(-60, 60):.{generator.integers(1, 5)}f}" for k in range(3)]
-        chosen = sorted(generator.choice(3, generator.integers(0, 4), replace=False))
-        code = generator.choice(["", "", "", "G1 ", "G0 ", "N7 ", "g01"])
-        rows.append(code + " ".join(words[k] for k in chosen) + generator.choice(["", "", " F300", " S900"]))
-    text = "\n".join(["G21 G90 G17 G54", "G0 X0 Y0 Z0", "G1 F9", *[row or "N1" for row in rows], "M2", ""])
+@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_read_together_give_what_single_blocks_give(tmp_path, seed, dialect, make_errors, monkeypatch):
+    """However blocks are read and written, and whatever the size of the batches, the same bytes and figures come out."""
+    text = mixed_program(seed, dialect)
     errors = make_errors(mill(), seed, (300e-6, 200e-6, 100e-6))
-    found = set()
-    for least, size in ((32, 1 << 20), (1, 1 << 20), (10**9, 1 << 20), (3, 700)):
-        monkeypatch.setattr("compgen.programs.reader.LEAST_PLAIN", least)
+    setup, found = Setup({**OFFSETS_MM, "PRESET": (1.5, 2.5, -60.0)}), []
+    for least, size in ((12, 1 << 20), (1, 1 << 20), (10**9, 1 << 20), (3, 700)):
+        monkeypatch.setattr("compgen.programs.reader.LEAST_RUN", least)
         monkeypatch.setattr("compgen.programs.reader.BATCH_BYTES", size)
-        result, corrected = run(tmp_path, text, errors)
-        found.add((corrected, round(result.after.rms_mm, 12), result.counts["added_blocks"]))
-    assert len(found) == 1
+        result, corrected = run(tmp_path, text, errors, dialect, setup)
+        figures = [
+            {name: round(value, 6) for name, value in part.as_dict().items()} for part in (result.before, result.after)
+        ]
+        found.append((corrected, figures, result.counts))
+    assert found[1:] == found[:1] * 3
     assert result.counts["added_blocks"] > 0
+    assert result.accepted
 
 
 def test_line_ends_comments_numbers_and_signs_stay(tmp_path):
@@ -220,6 +218,14 @@ def test_a_long_move_is_divided_where_the_correction_bends(tmp_path):
     _, corrected = run(tmp_path, inverse, errors, setup=PLAIN)
     rates = [float(rate) for rate in re.findall(r"F([\d.]+)", corrected)]
     assert sum(1 / rate for rate in rates) == pytest.approx(1 / 2, rel=1e-5)  # the time of the block
+
+
+def test_what_acts_at_the_end_of_a_divided_block_goes_before_the_asterisk(tmp_path):
+    ends = np.array([-600.0, 0.0, 600.0])
+    bent = ErrorTable({"EYX": Curve(ends, np.array([0.0, 40e-3, 0.0]), np.zeros(3))})
+    text = "%A G71 *\nG00 G90 X-200 Y+0 Z+0*\nG01 X+200 F100 M9*\nN9 %A G71 *\n"
+    _, corrected = run(tmp_path, text, bent, "heidenhain-iso", PLAIN)
+    assert re.search(r"F100 *\*\nX\+200\.? Y-0\.0267 M9 \*\nN9|F100 *\*\nY-0\.0267 M9 \*\nN9", corrected), corrected
 
 
 def test_arcs_stay_arcs(tmp_path):

@@ -101,7 +101,7 @@ def test_original_and_corrected_programs_are_read_as_the_interpreter_reads_them(
     tmp_path, seed, make_errors, monkeypatch
 ):
     if seed % 2:  # plain blocks many at a time, however few there are in a row
-        monkeypatch.setattr("compgen.programs.reader.LEAST_PLAIN", 1)
+        monkeypatch.setattr("compgen.programs.reader.LEAST_RUN", 1)
     program = tmp_path / "p.ngc"
     program.write_text(random_program(seed))
     assert_same(ours(program), canonical(program, tmp_path))
