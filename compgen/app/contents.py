@@ -388,11 +388,12 @@ def chain_picture(chain: Chain) -> Markup:
     """Draw which body carries which: the table side in front, the tool side on the column, an arrow for each axis."""
     bodies, arrows = [_box((0, 0, 0), (270, 130, 16), "bed"), _box((110, 96, 16), (56, 30, 172), "bed")], []
     x, y, z, w, h = 104.0, 96.0, 112.0, 68.0, 60.0
-    for axis in chain.tool_side:
+    for row, axis in enumerate(chain.tool_side):  # each shows its top right edge beside the next, where its line begins
         y -= 22.0
         bodies.append(_box((x, y, z), (w, 22, h), f"axis{axis}"))
-        px, py = _view(x + 0.5 * w, y, z + 0.5 * h)
-        arrows.append(_arrow(px + (34.0, 62.0, 0.0)[axis], py + (26.0, 8.0, 0.0)[axis], axis))
+        (px, py), (ax, ay) = _view(x + w, y + 14.0, z + h - 4.0), (326.0, 46.0 + 62.0 * row)
+        end = ax - _ARROWS[axis][0] - 7.0
+        arrows.append(f'<path class="leader" d="M{px:.1f} {py:.1f}L{end:.1f} {ay:.1f}"/>{_arrow(ax, ay, axis)}')
         x, w, h = x + 6.0, w - 12.0, h - 8.0
     px, py = _view(x + 0.5 * w, y, z)
     bodies.append(f'<path class="tool" d="M{px - 6:.1f} {py:.1f}v14h12v-14zM{px - 2:.1f} {py + 14:.1f}v18h4v-18z"/>')
@@ -401,7 +402,7 @@ def chain_picture(chain: Chain) -> Markup:
         height = 30.0 if axis == 2 else 17.0
         bodies.append(_box((left, front, z), (width, depth, height), f"axis{axis}"))
         px, py = _view(left, front, z + 0.5 * height)
-        arrows.append(_arrow(px + (44.0, width - 20.0, 100.0)[axis], py, axis))
+        arrows.append(_arrow(px + (44.0, width - 20.0, 0.62 * width)[axis], py, axis))
         left, front, width, depth, z = left + 14.0, front + 5.0, width - 28.0, depth - 10.0, z + height
     bodies.append(_box((left + 0.5 * width - 24.0, front + 6.0, z), (48, max(18.0, depth - 14.0), 16), "work"))
     title = f"{chain.name}: {in_words(chain)}"

@@ -780,12 +780,15 @@ def use_program(runner: Runner, state: ProjectState) -> None:
         words += [f"{file}={path}" for path in contents.control_files(project, tables)]
         words.append(f"{control}={tables.data['control']}")
     folder = project.new_folder("correct" if corrects else "part")
-    commands = [["part", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
+    commands = [["part", machine, setup["program"], f"--errors={errors}", *words, *_language(), "--out", folder]]
     if corrects:
         words += [f"--{option}={typed[option]}" for option in contents.CORRECT_FIELDS if typed[option]]
         fit = ["fit", machine, errors, *_fit_words()[1], "--out", f"{folder}/fit"]
         errors = f"{folder}/fit/fitted.errors.csv"
-        commands = [fit, ["correct", machine, setup["program"], f"--errors={errors}", *words, "--out", folder]]
+        commands = [
+            fit,
+            ["correct", machine, setup["program"], f"--errors={errors}", *words, *_language(), "--out", folder],
+        ]
     title = f"{name} corrected" if corrects else f"Part of {name}"
     done = Step(0, "correct" if corrects else "part", title, commands, folder)
     runner.start("correcting the program" if corrects else "predicting the part", "program", [StepTask(done)])

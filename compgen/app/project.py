@@ -46,6 +46,8 @@ INPUTS = ("machine", "instrument", "numbers", "removed", "measurement")
 #: Steps that take the errors that were identified before them.
 OF_ERRORS = ("part", "correct")
 MAIN_PAGES = ("report.html", "index.html", "sheet.html", "part.html")
+#: Messages of a command that refuse, and those that are kept with a step, in the languages of the program.
+REFUSED, TOLD = re.compile("(?:error|Fehler|Abweichung): (.*)"), re.compile("(?:warning|question|Warnung|offen): (.*)")
 #: Exit codes of a command that has written its result: accepted or not.
 DONE = (0, 1)
 
@@ -482,10 +484,10 @@ class Runner:
                 return
             worst = max(worst, code)
             if code not in task.codes:
-                errors = [line.removeprefix("error: ") for line in said if line.startswith("error: ")]
+                errors = [match[1] for line in said if (match := REFUSED.match(line))]
                 job.problems.append("\n".join(errors) or f"volcomp {words[0]} ended with exit code {code}")
                 return
-        told = [line.partition(": ")[2] for line in messages if line.startswith(("warning: ", "question: "))]
+        told = [match[1] for line in messages if (match := TOLD.match(line))]
         found = {"exit_code": worst, "seconds": round(time.monotonic() - began, 2), "warnings": told}
         step = Step(**{**asdict(task.step), **found})
         self.project.add(step if task.finish is None else task.finish(step, output))

@@ -377,6 +377,13 @@ def test_german_pages_are_german_and_their_reports_too(tmp_path, monkeypatch):
         assert words in page
         assert '<html lang="de">' in page
         assert not re.search(r">(Next|Add|Calculate|Choose|Save|Undo|Compare|Verify)\b", page), path
+    # what a command says in German is shown, too
+    site.post("/projects/1/run", {"control": "siemens-cec", "max-abs": "straight=3"})
+    assert "&#39;straight&#39;" in site.get("/projects/1/tables").text
+    site.post("/projects/1/program/use", {**TYPED, "program": (io.BytesIO(b"G1 X1 Y#1\n"), "part.nc"), "what": "part"})
+    page = site.get("/projects/1/program").text
+    assert "part.nc:1" in page
+    assert "Nullpunktverschiebungen" in page
     site.workbench.close()
 
 

@@ -1,6 +1,8 @@
 """The folder of a project: steps, revisions, undo, names of files; what several windows and processes do at once."""
 
+import itertools
 import json
+import math
 import re
 import threading
 
@@ -163,3 +165,20 @@ def test_the_drawing_has_an_arrow_for_each_axis_and_stays_within_its_frame(name)
         tuple(map(float, pair.split(","))) for part in re.findall(r'points="([^"]+)"', drawing) for pair in part.split()
     ]
     assert all(0 <= x <= 380 and 0 <= y <= 280 for x, y in points)
+    letters = [(float(x), float(y)) for x, y in re.findall(r'<text x="([\d.]+)" y="([\d.]+)">[XYZ]<', drawing)]
+    assert min(math.dist(a, b) for a, b in itertools.combinations(letters, 2)) > 20
+
+    def covers(corners, x, y):
+        """Whether a point is inside a polygon: an odd number of its sides is crossed to the right."""
+        ends = zip(corners, [*corners[1:], corners[0]], strict=True)
+        return sum((b > y) != (d > y) and x < (c - a) * (y - b) / (d - b) + a for (a, b), (c, d) in ends) % 2 == 1
+
+    faces = [
+        (kind.split()[0], [tuple(map(float, pair.split(","))) for pair in corners.split()])
+        for kind, corners in re.findall(r'<polygon class="([^"]+)" points="([^"]+)"', drawing)
+    ]
+    found = re.findall(r'class="leader" d="M([\d.]+) ([\d.]+)L.*?>([XYZ])</text>', drawing)
+    assert [letter for *_, letter in found] == ["XYZ"[axis] for axis in Chain(name).tool_side]
+    for x, y, letter in found:  # the line of an arrow begins where its own body is seen
+        seen = [kind for kind, corners in faces if covers(corners, float(x), float(y))]
+        assert seen[-1] == f"axis{'XYZ'.index(letter)}"
