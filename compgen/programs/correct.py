@@ -19,6 +19,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
 from compgen.errors import InputError
+from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.path import (
     PLANE_AXES,
@@ -122,6 +123,8 @@ class ProgramWriter:
     depth: float = np.nan
     level: float = np.nan
     pole_mm: list[float] = field(default_factory=lambda: [np.nan] * 3)
+    #: The drilling cycle as the program defines it, and as it was written last.
+    cycle: tuple[DrillingCycle, DrillingCycle] | None = None
     changed: int = 0
     added: int = 0
 
@@ -179,7 +182,7 @@ class ProgramWriter:
         if block.kind == "store":
             values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
             self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
-        if block.kind not in ("line", "arc", "cycle"):
+        if block.kind not in ("line", "arc", "cycle", "hole"):
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
             if block.count:
@@ -187,6 +190,11 @@ class ProgramWriter:
                 self.written_mm = np.array(self.target_mm)
             return [block.text]
         move = batch.moves.part(slice(block.first, block.first + block.count))
+        if block.drilling:
+            last = (
+                np.searchsorted(pieces.move[rows], np.arange(block.first, block.first + block.count), side="right") - 1
+            )
+            return self._hole(block, block.drilling, move, pieces.command_mm[rows][last], offset)
         if block.kind == "cycle":
             depth = np.flatnonzero((move.kind != 0) & move.corrected[:, 2])
             if not len(depth):
@@ -390,6 +398,42 @@ class ProgramWriter:
         self.changed += bool(changes or more)
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)
         return _spliced(block.text, changes, end or max(w[3] for w in block.words), more)
+
+    def _hole(
+        self, block: SingleBlock, cycle: DrillingCycle, move: Moves, command: FloatArray, offset: FloatArray
+    ) -> list[str]:
+        """Rewrite the place of a hole; its cycle is defined again before it where the heights are other ones.
+
+        ``command`` are those of the ends of its moves: to the place, to the R level, to the depth, and back.
+        """
+        scale, digits = block.scale, self.digits(block.scale)
+        level, depth = command[-4], command[-3]
+        text = block.text
+        if len(move) == 5:
+            named = any(word[0] == "Z" for word in block.words)
+            place = np.array([*depth[:2], command[0, 2] if named else self.target_mm[2]])
+            text = self._piece(block, move, place, np.full(3, np.nan), 0.0, offset, (0, 1), 1.0)
+            self.target_mm = place
+        if self.cycle is None or self.cycle[0] is not cycle:
+            self.cycle = (cycle, cycle)
+
+        def text_of(before: str, value: float) -> str:
+            own = max(digits, len(before.partition(".")[2].strip()))
+            kept = abs(value - float(before.replace(" ", "") or 0.0)) <= _HALF * 10.0**-own
+            return before if kept else self._number(value, own, before)
+
+        z = (np.array([level[2], depth[2], self.written_mm[2]]) - offset[2]) / scale
+        now = self.cycle[1].with_heights(float(z[0]), float(z[1]), float(z[2]), text_of)
+        lines = now.written() if now != self.cycle[1] else []
+        self.cycle = (cycle, now)
+        if "P02" not in now:
+            self.target_mm[2] = self.written_mm[2] = now.heights(0.0)[2] * scale + offset[2]
+        if lines and cycle.lines[0] == block.text:
+            self.changed += 1
+            return lines
+        self.changed += text != block.text
+        self.added += len(lines)
+        return [*(re.sub(r"^(\s*)N\d+\s*", r"\1", line, flags=re.IGNORECASE) for line in lines), text]
 
     def _preset(self, block: SingleBlock) -> str:
         """Rewrite G92: the control sets it at its corrected position, the offset has to become that of the program."""

@@ -61,7 +61,8 @@ _SIEMENS = {
     **{"G70": "inch", "G700": "inch", "G71": "mm", "G710": "mm", "G500": "no work offset", "G93": "feed inverse"},
     **{"G53": "machine coordinates", "G153": "machine coordinates", "SUPA": "machine coordinates"},
     **{"G74": "unknown position", "G75": "unknown position", "TRANS": "shift all", "ATRANS": "shift more"},
-    **{"ROT": "shift off", "SCALE": "shift off", "MIRROR": "shift off"},
+    **{"ROT": "shift off", "SCALE": "shift off", "MIRROR": "shift off", "MCALL": "modal call"},
+    **dict.fromkeys((*(f"CYCLE{k}" for k in range(81, 90)), "CYCLE840"), "drill here"),
     **{f"G{k}": "work offset" for k in range(505, 600)},
     **dict.fromkeys(("G60", "G601", "G602", "G603", "G641", "G642", "G643", "G644", "G645", "G290"), "nothing"),
     **dict.fromkeys(
@@ -80,7 +81,10 @@ for _code in ("G20", "G21"):
 _HEIDENHAIN = {
     **_COMMON,
     **{"G70": "inch", "G71": "mm", "G29": "pole here", "G30": "blank", "G31": "blank", "G99": "tool definition"},
-    **{"G5": "last arc", "G54": "shift", "G79": "drill here", "G98": "label", "FMAX": "rapid once"},
+    **{"G5": "last arc", "G54": "shift", "G98": "label", "FMAX": "rapid once"},
+    # a cycle is defined by its block and executed by G79, M99, or by all positions after M89
+    **{"G79": "drill here", "M99": "drill here", "M89": "calls", "M91": "machine coordinates"},
+    **dict.fromkeys(("G83", "G84", "G85"), "definition"),
     # G62 is the tolerance (cycle 32), G36 turns the spindle, G38 stops, G51 names the next tool
     **{"G62": "setting", "G36": "setting", "G38": "nothing", "G51": "setting"},
 }
@@ -155,7 +159,7 @@ _SIEMENS_REFUSED = {
     **dict.fromkeys(("G331", "G332"), "threads by a moving spindle are not followed; post CYCLE84"),
     **dict.fromkeys(("IF", "ELSE", "ENDIF", "GOTO", "GOTOF", "GOTOB", "GOTOC", "FOR", "WHILE", "LOOP", "REPEAT", "CASE", "DEF"),
                     "variables, conditions and loops are not followed; post the program with numbers"),
-    **dict.fromkeys(("CALL", "PCALL", "EXTERN", "EXTCALL", "PROC", "EXECTAB", "SAVE", "MCALL"), _MACRO),
+    **dict.fromkeys(("CALL", "PCALL", "EXTERN", "EXTCALL", "PROC", "EXECTAB", "SAVE"), _MACRO),
     **dict.fromkeys(("HOLES1", "HOLES2", "CYCLE801", "CYCLE802"), _PATTERN),
     **dict.fromkeys(("LONGHOLE", "SLOT1", "SLOT2", "POCKET1", "POCKET2", "POCKET3", "POCKET4"), _MILLED),
     **dict.fromkeys((f"CYCLE{k}" for k in (*range(60, 65), *range(70, 80), 90, 899)), _MILLED),
@@ -168,9 +172,9 @@ AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "G9"}
 #: Text in the first comment of a corrected program.
 MARK = "CORRECTED BY VOLCOMP"
 
-_VALUE = r"[+-]?\s*(?:\d+\.?\d*|\.\d+)"
+VALUE = r"[+-]?\s*(?:\d+\.?\d*|\.\d+)"
 _PARENTHESES = r"\([^()\n]*\)"
-_WORDS = rf"(?P<address>[A-Z])\s*(?P<value>{_VALUE})"
+_WORDS = rf"(?P<address>[A-Z])\s*(?P<value>{VALUE})"
 
 
 @dataclass(frozen=True)
@@ -211,7 +215,7 @@ class Dialect:
 #: An address of more than one letter needs its equals sign; CR5 is none. X=IC(5) is 5 from where X is, X=AC(5) from its zero.
 _SIEMENS_WORDS = (
     r"(?P<address>(?:CR|TURN|[XYZ]1)(?=\s*=)|(?![SM]\d+\s*=)[A-Z])\s*(?:=\s*(?P<mode>AC|IC|DC|ACP|ACN)\s*\(\s*|=?\s*)"
-    rf"(?P<value>{_VALUE}|\"[^\"]*\")(?(mode)\s*\))"
+    rf"(?P<value>{VALUE}|\"[^\"]*\")(?(mode)\s*\))"
 )
 _CALLS = "MSG|GROUP_BEGIN|GROUP_END|GROUP_ADDEND|WORKPIECE|CYCLE832|SETMS|FGROUP|PROTS"
 _ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|JERKLIM|FA|SCC|SVC|S\d|M\d+)"
@@ -219,7 +223,7 @@ _ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|
 _SIEMENS_SETTINGS = (
     r"\bMSG\s*\([^\n]*\)|;[^\n]*"
     rf"|\b(?:{_CALLS})\s*\((?:\"[^\"\n]*\"|[^()\"\n])*\)|\bCYCLE800\s*\(\s*\)|\bCYCLE832\b(?!\s*\()"
-    rf"|\b{_ASSIGNED}\s*(?:\[\s*\w+\s*\])?\s*=\s*(?:(?:AC|IC|DC|ACP|ACN)\s*\(\s*{_VALUE}\s*\)|{_VALUE})"
+    rf"|\b{_ASSIGNED}\s*(?:\[\s*\w+\s*\])?\s*=\s*(?:(?:AC|IC|DC|ACP|ACN)\s*\(\s*{VALUE}\s*\)|{VALUE})"
 )
 DIALECTS = {
     item.name: item
@@ -227,7 +231,7 @@ DIALECTS = {
         Dialect(
             "fanuc",
             _FANUC,
-            _PARENTHESES + r"|;(?=[;\s]*$)",
+            _PARENTHESES + r"|;(?=[; \t\r]*(?:\n|$))",
             "({})",
             point_needed=True,
             # custom macro: system variables 5221 ... are the offsets of G54
@@ -261,7 +265,7 @@ DIALECTS = {
             "; {}",
             decimals=(4, 5),
             refused={**REFUSED, **_HEIDENHAIN_REFUSED},
-            words=rf"(?P<address>D[LR](?=\s*[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*(?P<value>{_VALUE}|\"[^\"]*\")",
+            words=rf"(?P<address>D[LR](?=\s*[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*(?P<value>{VALUE}|\"[^\"]*\")",
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 91, 94, 101, 102, 103, 107, 108, 116, 117, 118,
                                                 120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
             end=frozenset(("M2", "M30", "%")),
@@ -306,7 +310,7 @@ def read_tools(path: str | Path) -> dict[str, Vector3]:
     if re.match(r"\s*T\d+\s", first):
         tools = {}
         for number, line in enumerate(text.splitlines(), 1):
-            words = dict(re.findall(rf"([A-Z])({_VALUE})(?=\s|$)", line.split(";")[0].upper()))
+            words = dict(re.findall(rf"([A-Z])({VALUE})(?=\s|$)", line.split(";")[0].upper()))
             if "T" not in words:
                 if line.split(";")[0].strip():
                     raise InputError("expected a line such as T1 P1 Z101.5 D6", file=path, line=number)

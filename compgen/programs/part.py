@@ -361,7 +361,11 @@ def predict_part(
             if after is not None:
                 for found in path_deviations(with_tables, STEP_MM, moves, rows, moves.part(rows), shares, ended):
                     after.add(found)
-            drilled = {item.number for item in batch.segments if isinstance(item, SingleBlock) and item.kind == "cycle"}
+            drilled = {
+                item.number
+                for item in batch.segments
+                if isinstance(item, SingleBlock) and item.kind in ("cycle", "hole")
+            }
             features.add(moves, drilled, ended)
             show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
     model.errors.warn_outside(reader.reached_mm)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError, visible_line
+from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
 from compgen.programs.runs import (
@@ -60,8 +61,8 @@ class Setup:
 class SingleBlock:
     """A block that was read by itself: its words (address, value text, first and last column), moves and modal state.
 
-    ``kind`` says how it is rewritten: ``line``, ``arc``, ``cycle``, ``preset`` (G92), or as it is:
-    ``keep``, ``no preset`` (G92.1), ``store`` (a cycle without a hole).
+    ``kind`` says how it is rewritten: ``line``, ``arc``, ``cycle``, ``hole`` (by the cycle ``drilling``), ``preset`` (G92), or
+    as it is: ``keep``, ``no preset`` (G92.1), ``store`` (a cycle without a hole).
     """
 
     number: int
@@ -76,6 +77,7 @@ class SingleBlock:
     inverse_time: bool
     #: Addresses that say for themselves whether they are absolute: X=IC(5), I=AC(5).
     modes: Mapping[str, bool] = field(default_factory=dict)
+    drilling: DrillingCycle | None = None
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,9 @@ class Reader:
         #: Rotary axes that the program names, with their only position.
         self.rotary: dict[str, float] = {}
         self.last_arc: int | None = None
+        #: The drilling cycle that a block has defined, and whether all positions call it (MCALL, M89).
+        self.drilling: DrillingCycle | None = None
+        self.calling = self._defining = False
         self._modes: dict[str, str] = {}
         self.selected = self.loaded = ""
         self.length_on = self.tool_on = False
@@ -228,7 +233,8 @@ class Reader:
     def _takes_run(self) -> bool:
         """Whether blocks of plain words are now moves and nothing else, from a known position."""
         known = not any(math.isnan(value) for value in self.position) and all(self.named) and bool(self.offset_name)
-        return known and self.cycle is None and self.feed != "inverse" and not self.ended and self._unit_known
+        modal = self.cycle is None and not self.calling and self.feed != "inverse" and self._unit_known
+        return known and modal and not self.ended
 
     def _run(self, words: Words, lines: range, first_line: int, first: int) -> tuple[Run, Moves] | None:
         """Read blocks together, as :meth:`_block` reads each; up to one that cannot be followed, None if that is the first."""
@@ -344,6 +350,7 @@ class Reader:
             self.centre_absolute or (self.dialect.pole and self.absolute),
             self.feed == "inverse",
             {letter: mode == "AC" for letter, mode in self._modes.items()},
+            self.drilling if kind == "hole" else None,
         )
 
     def _words(self, text: str) -> list[tuple[str, str, int, int]]:
@@ -369,6 +376,8 @@ class Reader:
         if dialect.pole:
             body = body.rstrip("*").rstrip()
             if re.match(r"\s*(?:N\d+\s*)?\*", body):  # a heading within the program
+                return []
+            if self._takes_definition(body):
                 return []
         label = re.match(r"\s*(?:N\d+\s*)?[A-Z_]{2}\w*\s*:(?!=)", body, re.IGNORECASE)
         if label and dialect.name == "siemens":
@@ -408,6 +417,22 @@ class Reader:
         self.seen_percent = True
         return []
 
+    def _takes_definition(self, body: str) -> bool:
+        """Take a block that defines a cycle from G200, or goes on doing so: ``G200 DRILLING``, ``Q200=2 ;SET-UP CLEARANCE``."""
+        begun = re.match(r"\s*(?:N\d+\s*)?(G2\d\d)\b", body, re.IGNORECASE)
+        if begun:
+            code = begun[1].upper()
+            if not defines_hole(code):
+                reason = self.dialect.refused.get(code, "is no cycle that is followed; post its moves")
+                self._fail(f"{code}: {reason}")
+            self.drilling, self.calling, self._defining = DrillingCycle(code, (), {}), False, True
+        elif not self._defining or not re.match(r"\s*(?:N\d+\s*)?Q\d+\s*=", body, re.IGNORECASE):
+            self._defining = self._defining and body.lstrip().startswith(";")
+            return False
+        assert self.drilling is not None
+        self.drilling = self.drilling.defined_further(self._text)
+        return True
+
     def _unread(self, body: str, at: int, words: list[tuple[str, str, int, int]]) -> int:
         """Refuse what is no word, or take a code in letters; returns where the block goes on."""
         rest, dialect = body[at:].strip(), self.dialect
@@ -415,6 +440,10 @@ class Reader:
         if name:
             code = name[1].upper()
             if code in self.setup.keep_unknown:
+                return name.end()
+            if dialect.name == "siemens" and name[2] and defines_hole(code):
+                self.drilling = DrillingCycle.called(code, self._text, name.start(2), name[2])
+                words.append((code, "", at, at))
                 return name.end()
             if code in dialect.codes and not name[2]:
                 words.append((code, "", at, at))
@@ -479,12 +508,10 @@ class Reader:
         actions: list[str] = []
         first = ("absolute", "incremental", "inch", "mm")  # before what they are about
         for code in sorted(codes, key=lambda code: dialect.codes.get(code) not in first):
-            if code[0] == "M" and code[1:].isdigit():
-                self._m_code(code)
-                if code == "M91":
-                    actions.append("machine coordinates")
-                continue
             meaning = dialect.codes.get(code)
+            if meaning is None and code[0] == "M" and code[1:].isdigit():
+                self._m_code(code)
+                continue
             if code in setting:
                 _, *needed = (meaning or "").split()
                 if needed and not any(f"{letter}{value:g}" in needed for letter, value in values.items()):
@@ -497,6 +524,11 @@ class Reader:
                 actions.insert(0, meaning)
             else:
                 self._modal(code, meaning, values, actions)
+        if "modal call" in actions:
+            self.calling = "drill here" in actions
+            if self.calling and (problem := self.drilling.problem() if self.drilling else "no cycle is called"):
+                self._fail(problem)
+            return "keep"
         if setting:
             motions = [int(action[7:]) for action in actions if action.startswith("motion")]
             if len(motions) != len(actions) or (motions and values.keys() & set("XYZ")):
@@ -598,6 +630,11 @@ class Reader:
         elif meaning == "store home":
             self.home[code[:-2]] = list(self.position)
             actions.append("done")
+        elif meaning == "definition":
+            self.drilling, self.calling = DrillingCycle(code, (), {}).defined_further(self._text), False
+            actions.append("done")
+        elif meaning == "calls":
+            self.calling = True
         elif meaning == "last arc":
             if self.last_arc is None:
                 self._fail(f"{code} goes on in the direction of the last arc, and there is none before; post G2 or G3")
@@ -726,6 +763,8 @@ class Reader:
                 return self._home(axes, self.home.get(action[5:]))
         if "preset" in single:
             return self._preset(axes)
+        if "drill here" in single or (self.calling and moving):
+            return self._hole(axes, single, moving)
         if "machine coordinates" in single:
             return self._machine_move(axes)
         self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
@@ -941,6 +980,41 @@ class Reader:
             go(back, self.cycle_r)
         go(RAPID, level)
         return "cycle"
+
+    def _hole(self, axes: list[float | None], single: list[str], moving: bool) -> str:
+        """Move to a hole, if its block does, and execute the cycle that is defined there: R level, depth, and back."""
+        cycle = self.drilling
+        if cycle is None:
+            self._fail("calls a drilling cycle, and none is defined before")
+        if problem := cycle.problem():
+            self._fail(problem)
+        own = cycle.lines[0] == self._text
+        if "drill here" in single and re.search("M0*99", self._text.upper()):
+            self.calling = False
+        elsewhere = "machine coordinates" in single or (own and moving)
+        if elsewhere or self.plane != 2 or (moving and self.motion not in (RAPID, FEED)):
+            self._fail("a hole is drilled where G0 or G1 led, in the plane G17, not in machine coordinates; post moves")
+        offset, scale = self._offset()[2], self.scale
+        end = self._target(axes) if moving else list(self.position)
+        self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
+        level, depth, left = (offset + height * scale for height in cycle.heights((end[2] - offset) / scale))
+        if math.isnan(level):
+            self._fail(
+                f"{cycle.name} begins where the tool is, and the position of Z is not known; post it in absolute"
+            )
+        x, y = end[:2]
+        sides = [int(moving and known) for known in self.named[:2]]
+        if moving:
+            kind = RAPID if "rapid once" in single or self.motion is None else self.motion
+            self._move(kind, end, at=[x, y, depth], corrected=(sides[0], sides[1], int(self.named[2])))
+        for kind, height, at in (
+            (RAPID, level, level),
+            (FEED, depth, depth),
+            (FEED if cycle.back_at_feed else RAPID, level, level),
+            (RAPID, left, level),
+        ):
+            self._move(kind, [x, y, height], at=[x, y, at], corrected=(sides[0], sides[1], 1))
+        return "hole"
 
     def _check(self, moves: Moves) -> None:
         """Refuse positions outside the travel: usually the work offset is wrong."""

@@ -409,7 +409,7 @@ REFUSED = [
     ("fanuc", "%\nO1\n" + START + "G1 X1. F1\nM30\n", 6, "does not end with it"),
     ("linuxcnc", START + "G1 X1. F1\n", 3, "may have been cut"),
     ("linuxcnc", START + "G1 X1. Y2", 3, "may have been cut|X and Z"),
-    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nCYCLE81(5,0,2,-10)\nM30\n", 3, "CYCLE81 is not known"),
+    ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nCYCLE999(5)\nM30\n", 3, "CYCLE999 is not known"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nG2 X5 Y5 CR5\nM30\n", 3, "CR5"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nR1=5\nM30\n", 3, "variables"),
     ("siemens", "G71 G90 G54\nG0 X0 Y0 Z0\nX=DC(5)\nM30\n", 3, "rotary axes; expected AC or IC"),

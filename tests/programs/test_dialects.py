@@ -1,10 +1,13 @@
 """Constructs that programs of CAM systems contain, in each dialect: followed to the digit, or passed through."""
 
+import numpy as np
 import pytest
+from programs.make import mill
 from programs.test_correct import PLAIN, moves_of, run, shift
 
+from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
-from compgen.programs import Setup
+from compgen.programs import Setup, model_of, predict_part
 
 ZERO = (0.0, 0.0, 0.0)
 TOOLS = {"1": ZERO, "MILL 10": ZERO}
@@ -161,3 +164,189 @@ def test_a_part_that_a_rotary_axis_turns_is_refused_before_it_turns():
         moves_of(f"{start}{text}M30\n", "fanuc", PLAIN)
         with pytest.raises(InputError, match="the rotary axis turns"):
             moves_of(f"{start}{text}G0 A90.\nM30\n", "fanuc", PLAIN)
+
+
+# Drilling cycles that are defined once: EZZ is 1 um/mm of Z, and EXX 0.1 um/mm of X, by hand.
+
+
+def cycle_errors(slope_z=1e-3, slope_x=1e-4, squareness=0.0):
+    """Errors that grow with the position: Z by ``slope_z`` (mm/mm), X by ``slope_x``, Z by ``squareness`` along X."""
+    ends = np.array([-600.0, 600.0])
+    curves = {"EZZ": slope_z * ends, "EXX": slope_x * ends, "EZX": squareness * ends}
+    return ErrorTable({name: Curve(ends, value, np.zeros(2)) for name, value in curves.items()})
+
+
+MCALL = """N10 G17 G71 G90 G94 G54
+N20 T1 M6 D1
+N30 G0 X100 Y10 Z100
+N40 F200
+N50 MCALL CYCLE81(10,0,2,-20) ; four holes
+N60 X100 Y10
+N70 X200
+N80 MCALL CYCLE83(50,-5,1,,30,,5,0,,,1,0)
+N90 G91 X100
+N100 Y20
+N110 MCALL
+N120 G90 G0 X0 Y0 Z100
+CYCLE85(10,,2,-8.5,,0.5,100,200)
+N130 G1 Z-50
+N140 M30
+"""
+
+
+def test_holes_of_mcall_have_their_places_and_their_heights(tmp_path):
+    """At the depth -20 the machine is 20 um too low, at the level 2 it is 2 um too high: -19.98 (rounded) and 1.998.
+
+    The cycle is written again where these change, here once for each definition. CYCLE83: level -4, depth -35: RFP is -5 + 4 um,
+    DPR 30 less 35 - 4 = 31 um. CYCLE85: level 2, depth -8.5: RFP, which is empty, becomes -2 um.
+    """
+    setup = Setup({"G54": ZERO}, TOOLS)
+    result, corrected = run(tmp_path, MCALL, cycle_errors(), "siemens", setup)
+    body = corrected[corrected.index("N10 ") :]
+    assert body == MCALL.replace("N30 G0 X100 Y10 Z100", "N30 G0 X99.99 Y10 Z99.9").replace(
+        "N60 X100 Y10\nN70 X200", "MCALL CYCLE81(10,-0.002,2,-19.98) ; four holes\nN60 X99.99 Y10\nN70 X199.98"
+    ).replace("N90 G91 X100\n", "MCALL CYCLE83(50,-4.996,1,,29.969,,5,0,,,1,0)\nN90 G91 X99.99\n").replace(
+        "G0 X0 Y0 Z100\nCYCLE85(10,,2,-8.5,", "G0 X0 Y0 Z99.9\nCYCLE85(10,-0.002,2,-8.492,"
+    ).replace("G1 Z-50", "G1 Z-49.95")
+    assert result.after.ends_mm < 1e-3 < 0.04 < result.before.ends_mm
+    assert result.counts["added_blocks"] == 2
+    unchanged, same = run(tmp_path, MCALL, shift(), "siemens", setup)
+    assert (same, unchanged.accepted) == (MCALL, True)
+
+
+def test_a_cycle_is_written_again_for_each_hole_where_the_heights_differ(tmp_path):
+    """EZX of 0.1 um/mm: 10 um at X 100, 20 um at X 200, and the same again at X 201."""
+    text = "G17 G71 G90 G54\nG0 X0 Y0 Z50\nF200\nMCALL CYCLE82(10,0,2,-20,,0.5)\nX100\nX200\nX201\nMCALL\nM30\n"
+    _, corrected = run(
+        tmp_path, text, cycle_errors(0.0, 0.0, 1e-4), "siemens", Setup({"G54": ZERO}, TOOLS), tolerance_um=5
+    )
+    assert corrected.endswith(
+        "F200\nMCALL CYCLE82(10,0,2,-20,,0.5)\nMCALL CYCLE82(10,-0.01,2,-20.01,,0.5)\nX100\n"
+        "MCALL CYCLE82(10,-0.02,2,-20.02,,0.5)\nX200\nX201\nMCALL\nM30\n"
+    )
+
+
+def drilled(text, dialect, setup):
+    """The moves of the holes of a program as letters (g: rapid, f: feed) with the end in X and Z."""
+    moves = moves_of(text, dialect, setup)
+    return [("gf"[int(k)], x, z) for k, (x, _, z) in zip(moves.kind, moves.end_mm.tolist(), strict=True)]
+
+
+def test_the_moves_of_a_sinumerik_cycle(tmp_path):
+    """CYCLE81 approaches RFP + SDIS, drills to DP at feed, and goes back to RTP; CYCLE85 goes back to RFP + SDIS at feed."""
+    setup = Setup({"G54": (0.0, 0.0, 1.0)}, TOOLS)
+    start = "G17 G71 G90 G54\nG0 X0 Y0 Z50\n"
+    assert drilled(f"{start}MCALL CYCLE81(10,1,2,-20)\nX5\nM30\n", "siemens", setup)[1:] == [
+        ("g", 5.0, 51.0),
+        ("g", 5.0, 4.0),
+        ("f", 5.0, -19.0),
+        ("g", 5.0, 4.0),
+        ("g", 5.0, 11.0),
+    ]
+    # DPR counts from the reference plane; with _AMODE ending in 1 it does, ending in 2 the depth is absolute
+    for call, depth in (
+        ("CYCLE85(10,1,2,,15,0,100,200)", -13.0),
+        ("CYCLE85(10,1,2,-20,15,0,100,200,0,1,1)", -13.0),
+        ("CYCLE85(10,1,2,-20,15,0,100,200,0,1,12)", -19.0),
+    ):
+        assert drilled(f"{start}{call}\nM30\n", "siemens", setup)[1:] == [
+            ("g", 0.0, 4.0),
+            ("f", 0.0, depth),
+            ("f", 0.0, 4.0),
+            ("g", 0.0, 11.0),
+        ]
+
+
+HOLES_HEIDENHAIN = """%HOLES G71 *
+N10 G30 G17 X+0 Y+0 Z-40*
+N20 G31 G90 X+100 Y+100 Z+0*
+N30 T1 G17 S3000*
+N40 G00 G40 G90 Z+100 M3*
+N50 G200 DRILLING
+ Q200=2 ;SET-UP CLEARANCE
+ Q201=-20 ;DEPTH
+ Q206=150 ;FEED RATE FOR PLNGNG
+ Q202=5 ;PLUNGING DEPTH
+ Q203=+10 ;SURFACE COORDINATE
+ Q204=50 ;2ND SET-UP CLEARANCE
+ Q211=0 ;DWELL TIME AT DEPTH*
+N60 X+100 Y+20 M99*
+N70 X+200 M8*
+N80 G79*
+N90 G83 P01 -2 P02 -20 P03 -10 P04 0 P05 500*
+N100 Z+2*
+N110 X+0 M89*
+N120 X+100 M99*
+N130 G00 Z+100 M2*
+N99999999 %HOLES G71 *
+"""
+
+
+def test_holes_of_heidenhain_cycles_new_and_old(tmp_path):
+    """G200: level 12, depth -10: surface 10 - 12 um, depth 10 + 12 um less. G83: from Z 2 (-2 um) to -20 (+20 um): 22 um less.
+
+    The cycle leaves the tool at the second set-up clearance, 12 um too low: the next move takes it to the corrected height.
+    G79 has no words for a place: the hole stays where the block before has led.
+    """
+    setup = Setup({"PRESET": ZERO}, TOOLS)
+    result, corrected = run(tmp_path, HOLES_HEIDENHAIN, cycle_errors(), "heidenhain-iso", setup)
+    again = (
+        HOLES_HEIDENHAIN[HOLES_HEIDENHAIN.index("G200") : HOLES_HEIDENHAIN.index("N60")]
+        .replace("Q203=+10", "Q203=+9.988")
+        .replace("Q201=-20", "Q201=-19.978")
+    )
+    expected = HOLES_HEIDENHAIN.replace("Z+100 M3", "Z+99.9001 M3").replace("N60 X+100", f"{again}N60 X+99.99")
+    expected = expected.replace("N70 X+200", "N70 X+199.98 Z+59.9401").replace("N100 Z+2*", "N100 Z+1.998*")
+    expected = expected.replace("N110 X+0", "G83 P01 -2 P02 -19.978 P03 -10 P04 0 P05 500*\nN110 X+0")
+    expected = expected.replace("N120 X+100", "N120 X+99.99").replace("N130 G00 Z+100", "N130 G00 Z+99.9001")
+    assert corrected[corrected.index("N10 ") :] == expected[expected.index("N10 ") :]
+    assert result.after.ends_mm < 1e-3 < 0.009 < result.before.ends_mm
+    unchanged, same = run(tmp_path, HOLES_HEIDENHAIN, shift(), "heidenhain-iso", setup)
+    assert (same, unchanged.accepted) == (HOLES_HEIDENHAIN, True)
+    # at the place of the second hole with G79, and old cycles return to where they began
+    ways = drilled(HOLES_HEIDENHAIN, "heidenhain-iso", setup)
+    assert [way for way in ways if way[0] == "f"] == [
+        ("f", 100.0, -10.0),
+        ("f", 200.0, -10.0),
+        ("f", 0.0, -20.0),
+        ("f", 100.0, -20.0),
+    ]
+    assert ways[-2:] == [("g", 100.0, 2.0), ("g", 100.0, 100.0)]
+    assert ("g", 200.0, 60.0) in ways  # the second set-up clearance above the surface
+
+
+@pytest.mark.parametrize(
+    ("dialect", "text", "words"),
+    [
+        ("siemens", "MCALL CYCLE81(10,0,2,R5)", "'R5': variables"),
+        ("siemens", "CYCLE81(10,0,2)", "neither DP nor DPR"),
+        ("siemens", "CYCLE81(10,0,2,-20,15)", "different depths"),
+        ("siemens", "CYCLE82(10,0,2,-20,,0,10,1,12)", "diameter"),
+        ("siemens", "CYCLE81(10,0,2,20)", "goes up"),
+        ("siemens", "MCALL HOLES1(0,0,0,5,5,5)", "patterns of holes"),
+        ("siemens", "MCALL CYCLE81(10,0,2,-9)\nG2 X5 Y5 CR=9", "after|where G0 or G1 led"),
+        ("siemens", "MCALL CYCLE81(10,0,2,-9)\nSUPA G0 X5", "not in machine coordinates"),
+        ("heidenhain-iso", "G208 Q200=2*", "milling"),
+        ("heidenhain-iso", "G79*", "none is defined"),
+        ("heidenhain-iso", "G200 Q200=2 Q201=-5*\nG79*", "without Q203"),
+        ("heidenhain-iso", "G240 Q200=2 Q201=-5 Q203=0 Q343=1*\nG79*", "from a diameter"),
+        ("heidenhain-iso", "Q200=2*", "variables"),
+    ],
+)
+def test_cycles_that_are_refused(dialect, text, words):
+    with pytest.raises(InputError, match=words):
+        moves_of(
+            f"G71 G17 G90 {'G54' * (dialect == 'siemens')}\nG00 X+0 Y+0 Z+50\n{text}\nM30\n",
+            dialect,
+            Setup({"G54": ZERO, "PRESET": ZERO}, TOOLS),
+        )
+
+
+def test_part_measures_the_holes_of_called_cycles(tmp_path):
+    """Four holes of MCALL at X 100, 200, 300, 300: 10 um wider per 100 mm; the one of CYCLE85 at 0."""
+    program = tmp_path / "p.mpf"
+    program.write_text(MCALL)
+    setup = Setup({"G54": ZERO}, TOOLS)
+    found = predict_part(model_of(mill(), cycle_errors(), None), program, "siemens", setup).features
+    across = sorted(f.error for f in found if f.name.startswith("hole") and f.quantity == "position X")
+    assert across == pytest.approx([0.0, 10.0, 20.0, 30.0, 30.0], abs=0.1)
