@@ -163,7 +163,10 @@ class FreeValues:
 
     def gather(self, g: FloatArray) -> FloatArray:
         """T^T g for quantities (parameters, k) of all values: (free, k)."""
-        return np.asarray(g[self.free] + self.rows.T @ g[self.bound])
+        gathered = g[self.free]
+        some = np.flatnonzero(self.rows.any(axis=0))  # few free values are neighbours of bound ones
+        gathered[some] += self.rows[:, some].T @ g[self.bound]
+        return gathered
 
 
 @dataclass(frozen=True)
@@ -478,11 +481,15 @@ def _factorised(problem: _Problem) -> Projector:
     rows = freedom.gather(np.vstack(blocks).T).T
     rows *= scale[:free]
     rows /= np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-300)
-    regular = KEEP * rows.T @ rows
-    regular[np.diag_indices_from(regular)] += RIDGE
+    kept_values = np.flatnonzero(rows.any(axis=0))
+    regular = KEEP * rows[:, kept_values].T @ rows[:, kept_values]
+    weak = np.full(free, RIDGE)  # the diagonal; few values have a position that is kept
+    weak[kept_values] += np.diag(regular)
+    np.fill_diagonal(regular, 0.0)
     normal *= scale[:, None]  # in place: for tables of thousands of nodes these matrices are large
     normal *= scale
-    normal[:free, :free] += regular
+    normal[np.ix_(kept_values, kept_values)] += regular
+    normal[np.arange(free), np.arange(free)] += weak
     factor, failed = lapack().dpotrf(normal.T, lower=1, overwrite_a=1)  # symmetric, and in the order that needs no copy
     if failed:
         raise LinAlgError("the normal matrix of the tables is not positive definite")
