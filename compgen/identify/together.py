@@ -321,7 +321,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
             *not_among(shown, "no reading shows it"),
             *hardly.values(),
             *(
-                f"{name}: part of it cannot be separated from other unknowns"
+                f"{name}: part of it cannot be separated from other unknowns; u leaves that part out"
                 for name in solution.partly
                 if name not in hardly
             ),

@@ -470,9 +470,10 @@ def gauge_plan_table(plan: GaugePlan) -> Group:
     if plan.left_out:
         notes.append(Text(f"not determined, taken as zero: {', '.join(plan.left_out)}", "yellow"))
     if plan.partly:
-        notes.append(
-            Text("partly: not separable from poses, the artefact or other errors in every direction", "yellow")
+        text = (
+            "partly: not separable from poses, the artefact or other errors in every direction; u is that of the rest"
         )
+        notes.append(Text(text, "yellow"))
     if plan.within_circles:
         notes.append(Text(plan.within_circles))
     empty = {axis: nodes for name, nodes in summary["nodes_without_data"].items() if (axis := name[2])}
