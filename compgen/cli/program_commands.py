@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from compgen.cli.common import PATH, Command, for_readers, json_option, language_option, options_of, out_option
+from compgen.cli.common import PATH, Command, json_option, language_option, options_of, out_option
 from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option, tool_offset
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
@@ -19,6 +21,10 @@ from compgen.errors import InputError, number_text
 from compgen.foreign import open_errors
 from compgen.identify.covariance import covariance_or_independent
 from compgen.programs import CorrectOptions, Setup, correct_program, model_of, read_tools
+
+if TYPE_CHECKING:
+    from compgen.programs import Feature, PartMachine, PartPrediction
+    from compgen.programs.path import ExactModel
 
 WCS_HELP = (
     "Work offset: machine position of its zero in mm, e.g. G54=-400,150,-220 (several times for several offsets)."
@@ -43,27 +49,21 @@ def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
 
 
 def program_options(command: Command) -> Command:
-    """Add what a program needs to be read on a machine; the command receives ``setup`` and ``model``."""
+    """Add what a program needs to be read; the command receives ``setup``, ``errors`` and ``reversal``."""
 
     @functools.wraps(command)
     def wrapper(
         *args: Any,
-        machine: Machine,
-        errors: Path,
-        reversal: Path | None,
         wcs: tuple[str, ...],
         tools: Path | None,
         block_delete: bool,
         keep_unknown: tuple[str, ...],
         gauge: str,
-        only: str | None = None,
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
         setup = Setup(_wcs(wcs), read_tools(tools) if tools else {}, block_delete, codes, tool_offset("--gauge", gauge))
-        both = read_reversal(reversal) if reversal else effects_reversal(machine)
-        model = model_of(machine, open_errors(errors), both, only)
-        return command(*args, model=model, setup=setup, errors=errors, **options)
+        return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
     text = "Code that moves nothing and stays as it is, e.g. M100 or G5.1 (may be given several times)."
@@ -82,11 +82,17 @@ def program_options(command: Command) -> Command:
     decorated = path_option("--reversal", text)(decorated)
     return click.option(  # type: ignore[no-any-return]
         "--errors",
-        required=True,
         metavar="ERRORS",
         type=PATH,
         help="*.errors.csv of the machine (um, urad), or an Etalon exchange file (mm, rad).",
     )(decorated)
+
+
+def _model(machine: Machine, errors: Path | None, reversal: Path | None, only: str | None = None) -> ExactModel:
+    if errors is None:
+        raise click.UsageError("Missing option '--errors'.")
+    both = read_reversal(reversal) if reversal else effects_reversal(machine)
+    return model_of(machine, open_errors(errors), both, only)
 
 
 @click.command("correct")
@@ -105,9 +111,11 @@ def program_options(command: Command) -> Command:
 @language_option
 @json_option
 def correct_command(
-    model: Any,
+    machine: Machine,
     setup: Setup,
     errors: Path,
+    reversal: Path | None,
+    only: str | None,
     program: Path,
     options: CorrectOptions,
     active: tuple[Path, ...],
@@ -131,6 +139,7 @@ def correct_command(
     """
     if bool(active) != (active_controller is not None):
         raise InputError("--active and --active-controller belong together; give both")
+    model = _model(machine, errors, reversal, only)
     name = errors.name
     if active:
         from compgen.programs.part import CompensatedModel
@@ -176,77 +185,182 @@ def correct_command(
 ALSO_HELP = (
     "Another machine with its errors, e.g. mill2.toml=mill2.errors.csv (several times): the machines are ranked."
 )
-MOST_ROWS = 30
+FLEET_HELP = (
+    "Job file of `volcomp recal`: all its machines are ranked, as they are now, with their active tables. MACHINE is the name of "
+    "one of them, and --errors is not needed."
+)
+#: Rows of quantities of one kind on the terminal.
+MOST_OF_A_KIND = 6
+
+
+def _also(given: tuple[str, ...]) -> list[PartMachine]:
+    from compgen.programs import PartMachine
+
+    found = []
+    for text in given:
+        name, _, file = text.rpartition("=")
+        if not name:
+            raise InputError(f"{text!r} is not of the form MACHINE=ERRORS", field="--also")
+        machine, errors = open_machine(name), open_errors(Path(file))
+        covariance = covariance_or_independent(errors, covariance_of(Path(file), errors, None, independent=False))
+        found.append(PartMachine(machine.name, model_of(machine, errors, effects_reversal(machine)), covariance))
+    return found
+
+
+def _of_fleet(file: Path, name: str) -> tuple[PartMachine, list[PartMachine], list[str]]:
+    """Return machine ``name`` of a job file, the others, and the names of those without errors in the store."""
+    from compgen.cli.fleet_commands import needed, opened
+    from compgen.fleet.job import read_job
+    from compgen.fleet.process import machine_now
+    from compgen.programs import PartMachine
+
+    needed()
+    job = read_job(file)
+    chosen = job.machine(name)
+    found, missing = {}, []
+
+    def read(store: Any) -> None:
+        known = {record.name: record for record in store.machines()}
+        for item in job.machines.values():
+            now = machine_now(store, known[item.name], item) if item.name in known else None
+            if now is None:
+                missing.append(item.name)
+                continue
+            machine, errors, covariance, tables = now
+            model = model_of(machine, errors, effects_reversal(machine))
+            found[item.name] = PartMachine(item.name, model, covariance_or_independent(errors, covariance), tables)
+
+    opened(job, read)
+    if chosen.name not in found:
+        raise InputError(f"{name} has no identified errors in the store; measure it first, or name another machine")
+    return found.pop(chosen.name), list(found.values()), missing
 
 
 @click.command("part")
-@machine_argument
+@click.argument("machine", metavar="MACHINE")
 @click.argument("program", type=PATH)
 @program_options
 @options_of(CorrectOptions, "options", only=("dialect",))
 @click.option("--uncertainty", is_flag=True, help="Require the uncertainty: exit code 2 if the errors have none.")
 @path_option("--tables", "Table of a control (several times): also evaluate the part with it active.", multiple=True)
 @click.option("--controller", metavar="NAME", help="Name of the control that the tables belong to.")
+@click.option(
+    "--correct",
+    is_flag=True,
+    help="Also with the program as `volcomp correct` writes it; with --tables also with one that corrects what they leave.",
+)
 @click.option("--also", multiple=True, metavar="MACHINE=ERRORS", help=ALSO_HELP)
+@path_option("--fleet", FLEET_HELP, metavar="JOB")
+@click.option("--machines", multiple=True, type=PATH, help="Additional folder with machine files (several times).")
 @click.option("--out", metavar="DIR", type=PATH, help="Folder for part.json and part.html.")
 @language_option
 @json_option
 def part_command(
-    model: Any,
+    machine: str,
+    machines: tuple[Path, ...],
     setup: Setup,
-    errors: Path,
+    errors: Path | None,
+    reversal: Path | None,
     program: Path,
     options: CorrectOptions,
     uncertainty: bool,
     tables: tuple[Path, ...],
     controller: str | None,
+    correct: bool,
     also: tuple[str, ...],
+    fleet: Path | None,
     out: Path | None,
     language: str,
     as_json: bool,
 ) -> int:
     """Predict what the errors of a machine leave on the part of an NC program.
 
-    Figures: the deviation of the tool from the path at all moves at feed (um). Features: position of drilled holes and full
-    circles, diameters, distances, angles of corners (urad) and distances of parallel sides in the plane XY, with the
-    standard uncertainty that the measurement of the machine gives them. --tables evaluates the same with the tables of a
-    control. --also ranks several machines by the largest deviation normal to the path. DIR gets part.json and part.html.
+    Figures: the deviation of the tool from the path at all moves at feed (um). Features: holes, full circles, sides of
+    contours, faces: positions, diameters, roundness, distances, parallelism, flatness (um), angles of corners and walls
+    (urad), with the standard uncertainty that the measurement of the machine gives them. --tables evaluates the same with
+    the tables of a control, --correct with the corrected program, both together with a program that corrects what the
+    tables leave. --also and --fleet rank several machines by the largest deviation, the best-fit rigid motion of the part
+    removed. DIR gets part.json and part.html.
 
     \b
     Example:
       volcomp part zha-gantry part.nc --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350 --out part/
     """
-    from compgen.programs import part_page, predict_part
+    from compgen.programs.part import PartMachine, columns_of, predict_part, rank_machines
 
     if bool(tables) != (controller is not None):
         raise InputError("--tables and --controller belong together; give both")
+    if fleet is not None and (errors or reversal or tables or also):
+        raise InputError(
+            "--fleet takes errors and active tables from the store; leave out --errors, --reversal, --tables and --also"
+        )
     folder = OutputFolder(out) if out is not None else None
-    read = None
-    if tables:
-        from compgen.tables import read_tables
+    notes: list[str] = []
+    if fleet is not None:
+        own, others, missing = _of_fleet(fleet, machine)
+        notes += [f"no identified errors in the store: {', '.join(missing)}"] if missing else []
+    else:
+        model, others = _model(open_machine(machine, machines, used=(controller,)), errors, reversal), _also(also)
+        covariance = covariance_of(Path(str(errors)), model.errors, None, independent=False)
+        read = None
+        if tables:
+            from compgen.tables import read_tables
 
-        read = read_tables(model.machine, tables, str(controller), foreign=True)
-    covariance = covariance_or_independent(model.errors, covariance_of(errors, model.errors, None, independent=False))
-    if uncertainty and covariance is None:
+            read = read_tables(model.machine, tables, str(controller), foreign=True)
+        own = PartMachine(model.machine.name, model, covariance_or_independent(model.errors, covariance), read)
+    if uncertainty and own.covariance is None:
         raise InputError("has no uncertainties; identify the errors again, or leave out --uncertainty", file=errors)
     with progress(quiet=as_json) as show:
-        found = predict_part(model, program, options.dialect, setup, covariance=covariance, tables=read, show=show)
-        others = []
-        for text in also:
-            name, _, file = text.rpartition("=")
-            if not name:
-                raise InputError(f"{text!r} is not of the form MACHINE=ERRORS", field="--also")
-            machine, table = open_machine(name), open_errors(Path(file))
-            other = model_of(machine, table, effects_reversal(machine))
-            others.append(predict_part(other, program, options.dialect, setup, show=show))
-    ranked = sorted([found, *others], key=lambda item: item.figures.normal_mm)
+        how = CorrectOptions(dialect=options.dialect) if correct else None
+        found = predict_part(
+            own.model, program, options.dialect, setup,
+            covariance=own.covariance, tables=own.tables, correct=how, show=show,
+        )  # fmt: skip
+        found = replace(found, machine=own.name)
+        # a table that is to be judged does not run yet; those of a fleet do
+        now = own if fleet is not None else replace(own, tables=None)
+        ranked = rank_machines([now, *others], program, options.dialect, setup, show=show) if others else []
     data = found.as_dict()
-    if also:
-        data["machines"] = [{"machine": item.machine, **item.figures.as_dict()} for item in ranked]
+    if ranked:
+        data["machines"] = [item.ranked() for item in ranked]
     if folder is not None:
         folder.add("part.json", json_text(data))
-        folder.add("part.html", for_readers({"part.html": part_page(found)}, language)["part.html"])
+        from compgen.report.part_page import part_page
+
+        folder.add("part.html", part_page(found, ranked, language))
         paths = list(folder.commit().values())
+    shown = [_figures_table(found, controller), *([_ranking_table(ranked)] if ranked else [])]
+    columns = columns_of(found.features)
+    kinds: dict[tuple[str, str], list[Feature]] = {}
+    for item in found.features:
+        kinds.setdefault((item.name.split()[0], item.quantity.split()[0]), []).append(item)
+    few = [item for group in kinds.values() for item in group[:MOST_OF_A_KIND]]
+    rows = [
+        (
+            item.name,
+            item.quantity,
+            str(item.line),
+            f"{item.nominal:.3f}",
+            *(f"{getattr(item, key):+.2f}" for key in columns),
+            number_text(item.u, 2),
+            item.unit,
+        )
+        for item in few
+    ]
+    if rows:
+        names = ("feature", "quantity", "line", "nominal (mm, deg)", *columns.values(), "u (k = 1)", "unit")
+        shown.append(table_of(names, rows))
+    says = [*found.notes, *notes, *(f"assumed: {text}" for text in found.assumed)]
+    more = len(found.features) - len(few)
+    if more > 0:
+        says.append(f"{more} more quantities{' in part.json' if folder is not None else ', with --out in part.json'}")
+    if found.left_out:
+        says.append(f"{found.left_out} more features were not evaluated")
+    answer(as_json, data, *shown, *says, *([f"  {path}" for path in paths] if folder is not None else []))
+    return 0
+
+
+def _figures_table(found: PartPrediction, controller: str | None) -> Any:
     titles = (
         "tool from the path, moves at feed (um)",
         "from the path",
@@ -257,30 +371,32 @@ def part_command(
         "line",
     )
     keys = ("normal_max_um", "normal_rms_um", "ends_max_um", "max_um", "rms_um")
-    lines = [(item.machine, item.figures.as_dict()) for item in ranked]
-    if found.after is not None:
-        lines.append((f"{found.machine}, {controller}", found.after.as_dict()))
-    rows = [(name, *(f"{one[key]:.2f}" for key in keys), str(one["worst_line"])) for name, one in lines]
-    shown = [table_of(titles, rows)]
-    features = [
-        (
-            item.name,
-            item.quantity,
-            str(item.line),
-            f"{item.nominal:.3f}",
-            f"{item.error:+.2f}",
-            number_text(item.after, 2),
-            number_text(item.u, 2),
-            item.unit,
-        )
-        for item in found.features[:MOST_ROWS]
+    tables = "tables" if controller is None else controller
+    names = ("", f", {tables}", ", program corrected", f", {tables} and program")
+    known = [
+        (f"{found.machine}{name}", one) for name, one in zip(names, found.variants, strict=True) if one is not None
     ]
-    if features:
-        names = ("feature", "quantity", "line", "nominal (mm, deg)", "error", "with tables", "u (k = 1)", "unit")
-        shown.append(table_of(names, features))
-    says = [f"assumed: {text}" for text in found.assumed]
-    more = len(found.features) + found.left_out - MOST_ROWS
-    if more > 0:
-        says.append(f"{more} more features{' in part.json' if folder is not None and not found.left_out else ''}")
-    answer(as_json, data, *shown, *says, *([f"  {path}" for path in paths] if folder is not None else []))
-    return 0
+    figures = [(name, one.as_dict()) for name, one in known]
+    fitted = [tuple(f"{one[key]:.2f}" for key in ("max_um", "rms_um")) for one in found.fitted.values()]
+    both = [*fitted, *[("", "")] * (len(figures) - len(fitted))]
+    rows = [
+        (name, *(f"{one[key]:.2f}" for key in keys), str(one["worst_line"]), *fit)
+        for (name, one), fit in zip(figures, both, strict=True)
+    ]
+    return table_of(titles, rows)
+
+
+def _ranking_table(ranked: Sequence[PartPrediction]) -> Any:
+    titles = ("machine", "best fit (um)", "rms", "from the path", "largest error of a feature", "um", "u (k = 1)")
+    rows: list[tuple[str, ...]] = []
+    for item in ranked:
+        if item.refused:
+            rows.append((item.machine, "-", "-", "-", item.refused, "-", "-"))
+            continue
+        figures, worst = item.rank_figures, item.worst("um")
+        what = ("", "", "")
+        if worst is not None:
+            what = (f"{worst.name}, {worst.quantity}", f"{worst.best:+.2f}", number_text(worst.u, 2))
+        numbers = (figures["max_um"], figures["rms_um"], item.best.as_dict()["normal_max_um"])
+        rows.append((item.machine, *(f"{number:.2f}" for number in numbers), *what))
+    return table_of(titles, rows)

@@ -25,6 +25,7 @@ from compgen.data.machine import Machine, load_machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.change import Change, change_between, likeness, volume_points
+from compgen.fleet.decisions import active_table
 from compgen.fleet.inbox import holds_one_of
 from compgen.fleet.job import MachineJob, Policy
 from compgen.fleet.records import (
@@ -41,7 +42,7 @@ from compgen.fleet.records import (
     active_id,
     active_of,
 )
-from compgen.fleet.store import Store
+from compgen.fleet.store import Store, counting
 from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.identify.covariance import Covariance, covariance_or_independent
@@ -610,6 +611,22 @@ def _tables_read(store: Store, machine: Machine, table: TableRecord, control: st
     names = table.summary.get("tables", {}).get(control, [])
     files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
     return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
+
+
+def machine_now(
+    store: Store, machine: MachineRecord, job: MachineJob
+) -> tuple[Machine, ErrorTable, Covariance | None, ReadTables | None] | None:
+    """Return a machine with its newest identified errors, those of the bare machine, and the tables that are active.
+
+    Tables are those of the first control of the job. None if nothing was identified.
+    """
+    records = counting(store, machine)
+    if not records:
+        return None
+    newest = records[-1]
+    loaded, table = store.machine_of(newest), active_table(store, machine)
+    tables = None if table is None else _tables_read(store, loaded, table, job.controllers[0])
+    return loaded, store.errors_of(newest), store.covariance_of(newest), tables
 
 
 # --- judgement -----------------------------------------------------------------------------------------------------

@@ -7,20 +7,24 @@ from compgen.resources import load_on_first_use
 if TYPE_CHECKING:
     from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program, model_of
     from compgen.programs.dialects import DIALECTS, read_tools
-    from compgen.programs.part import PartPrediction, part_page, predict_part
+    from compgen.programs.features import Quantity
+    from compgen.programs.part import Feature, PartMachine, PartPrediction, predict_part, rank_machines
     from compgen.programs.reader import Reader, Setup
 
 __all__ = [
     "DIALECTS",
     "CorrectOptions",
+    "Feature",
+    "PartMachine",
     "PartPrediction",
     "ProgramCorrection",
+    "Quantity",
     "Reader",
     "Setup",
     "correct_program",
     "model_of",
-    "part_page",
     "predict_part",
+    "rank_machines",
     "read_tools",
 ]
 

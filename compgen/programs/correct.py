@@ -695,6 +695,11 @@ def _spliced(text: str, changes: list[tuple[int, int, str]], end: int, more: Seq
 # Reading back: the tool on the exact machine against the path that the program wanted.
 
 
+#: Receives, batch by batch, the moves of a program, and of the corrected one those at feed: their wanted moves, the moves as
+#: read back, and the shares of the wanted ones between which they are.
+Follow = Callable[[Moves, IntArray, Moves, FloatArray, FloatArray], None]
+
+
 @dataclass
 class _ReadBack:
     """Adds up the deviations of the program and of the corrected one, batch by batch."""
@@ -707,6 +712,7 @@ class _ReadBack:
     lines: int = 0
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
     broken: str = ""
+    follow: Follow | None = None
 
     def add(self, wanted: Moves, text: bytes, origins: IntArray) -> None:
         """Read corrected blocks, of which ``origins`` are the numbers, and compare them with the moves that are wanted."""
@@ -723,6 +729,8 @@ class _ReadBack:
         owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
         if owner is not None:
             self._add(self.after, wanted, owner, read.part(back), (low, high), ended)
+            if self.follow is not None:
+                self.follow(wanted, owner, read.part(back), low, high)
 
     def _add(
         self,
@@ -800,6 +808,7 @@ def correct_program(
     errors_file: tuple[str, str] = ("", ""),
     show: Callable[[str], None] = lambda _: None,
     language: str = LANGUAGES[0],
+    follow: Follow | None = None,
 ) -> ProgramCorrection:
     """Correct an NC program for one machine and write it to the folder ``out``, with ``correction.json``.
 
@@ -816,6 +825,7 @@ def correct_program(
     errors_file : name and SHA-256 of the file of the errors, for the header.
     show : called with the step that is running.
     language : of the preflight list, ``"en"`` or ``"de"``; program and JSON stay in English.
+    follow : called with the moves of each batch, wanted and as read back, see :data:`Follow`.
     """
     source, dialect = Path(program), dialect_named(options.dialect)
     decimals = dialect.decimals if options.decimals is None else (options.decimals, options.decimals)
@@ -828,7 +838,7 @@ def correct_program(
     corrector = Corrector(model, options.tolerance_um * MM_PER_UM, options.shortest_mm, resolution_mm)
     writer = ProgramWriter(dialect, decimals)
     again = Reader(model.machine, dialect, setup, f"{source.name} as corrected")
-    check = _ReadBack(model, again, 2.0 * corrector.step_mm)
+    check = _ReadBack(model, again, 2.0 * corrector.step_mm, follow=follow)
     again.travel_slack_mm = 10.0
     blocks = 0
     with working_folder("correct-") as work:

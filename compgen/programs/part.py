@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-import itertools
-import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from html import escape
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compgen.data.charts import page_assets, rounded
+from compgen.data.comparison import figures_of, without_rigid_motion
 from compgen.data.csv_files import FloatArray
-from compgen.data.files import read_bytes
+from compgen.data.files import read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, error_design
 from compgen.kinematics.many_points import full_grid
+from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
+from compgen.programs.features import PartFeatures, Quantity, Samples
 from compgen.programs.path import (
-    PLANE_AXES,
-    RAPID,
     ExactModel,
+    IntArray,
     Moves,
+    PathDeviations,
     PathFigures,
     directions_at,
-    is_closed,
     kept_directions,
     path_deviations,
     points_of,
@@ -37,12 +37,14 @@ from compgen.tables import ReadTables
 
 #: Samples along an axis for the slope of tables, besides their nodes.
 BEND_SAMPLES = 101
-#: Distance of samples along the path, mm; samples of a circle and of a side; the shortest side.
-STEP_MM, ON_CIRCLE, ON_SIDE, SHORTEST_SIDE_MM = 2.0, 36, 9, 5.0
-#: Features that are evaluated, and the points of the picture; a picture with more shows no more.
-MOST_FEATURES, MOST_POINTS = 500, 6000
-#: How far a corner may be from a right angle, and sides from parallel, rad.
-_SQUARE_RAD = 1e-3
+#: Distance of samples along the path, mm.
+STEP_MM = 2.0
+#: Points of the picture: of more, every second, every fourth ... is left out.
+MOST_POINTS = 6000
+#: What is evaluated, in the order of the fields of a feature.
+VARIANTS = ("as the machine is", "with tables", "program corrected", "tables and program")
+#: Those that the picture can show, also with the best-fit rigid motion of the part removed.
+SHOWN, FITTED = VARIANTS[:2], "best fit"
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,11 @@ class CompensatedModel(ExactModel):
 
 @dataclass(frozen=True)
 class Feature:
-    """One quantity of a feature: nominal size (mm, or degrees), its error before and after, and standard uncertainty.
+    """One quantity of a feature: nominal size (mm, or degrees), its errors, and the standard uncertainty of the first.
 
-    Errors are in um, those of corners in urad; ``u`` is nan if the errors have no covariance.
+    Errors are in um, those of angles in urad: ``error`` as the machine is, ``after`` with the tables of a control,
+    ``corrected`` with a corrected program, ``both`` with tables and a program that corrects what they leave. They are nan
+    where they were not asked for, ``u`` if the errors have no covariance.
     """
 
     name: str
@@ -94,228 +98,128 @@ class Feature:
     unit: str
     error: float
     after: float
+    corrected: float
+    both: float
     u: float
 
+    @property
+    def best(self) -> float:
+        """The error as the part is made: with all that corrects it."""
+        given = (self.both, self.corrected, self.after, self.error)
+        return next(value for value in given if not np.isnan(value))
+
     def as_dict(self) -> dict[str, Any]:
-        """Return the feature for JSON."""
-        names = {"error": f"error_{self.unit}", "after": f"after_{self.unit}", "u": f"u_{self.unit}"}
-        return {names.get(key, key): value for key, value in self.__dict__.items()}
+        """Return the feature for JSON; errors have their unit in the name, those that were not asked for are left out."""
+        found: dict[str, Any] = {"name": self.name, "quantity": self.quantity, "line": self.line}
+        found |= {"nominal": self.nominal, "unit": self.unit, f"error_{self.unit}": self.error}
+        more = {"after": self.after, "corrected": self.corrected, "both": self.both}
+        found |= {f"{key}_{self.unit}": value for key, value in more.items() if not np.isnan(value)}
+        return {**found, f"u_{self.unit}": self.u}
+
+
+def columns_of(features: Sequence[Feature]) -> dict[str, str]:
+    """Return the errors that were asked for: field of the features and heading."""
+    keys = zip(("error", "after", "corrected", "both"), ("error", *VARIANTS[1:]), strict=True)
+    return {key: name for key, name in keys if any(not np.isnan(getattr(f, key)) for f in features)}
+
+
+@dataclass(frozen=True)
+class PartMachine:
+    """A machine on which a part could be made: its errors, their covariance, and the tables that are active on its control."""
+
+    name: str
+    model: ExactModel
+    covariance: Covariance | None = None
+    tables: ReadTables | None = None
+
+    @functools.cached_property
+    def with_tables(self) -> CompensatedModel:
+        """The machine with its tables active."""
+        model = self.model
+        return CompensatedModel(model.machine, model.errors, model.reversal, model.only, self.tables)
 
 
 @dataclass(frozen=True)
 class PartPrediction:
-    """What a machine will leave on a part; ``after`` is with the tables of a control, None without them."""
+    """What a machine will leave on a part.
+
+    ``figures`` are those of the machine as it is, ``after`` with the tables of a control, ``corrected`` with the program
+    corrected for the bare machine, ``both`` with the tables and a program that corrects what they leave; None where not
+    asked for. ``refused`` says why the part cannot be made on this machine. ``position_mm`` (n, 3) are points of the path, one of
+    ``every`` samples and the one that is farthest off; ``deviation_mm`` has the vectors (n, 3) of the tool from the path there:
+    "as the machine is" and "with tables", normal to the path, and both with the best-fit rigid motion removed, from the
+    programmed point. A part that is clamped and touched off shows this "best fit": a shift of all of it is no error.
+    """
 
     machine: str
     program: str
     figures: PathFigures
-    after: PathFigures | None
-    features: tuple[Feature, ...]
-    left_out: int
-    assumed: tuple[str, ...]
-    position_mm: FloatArray = field(repr=False)
-    deviation_mm: FloatArray = field(repr=False)
+    after: PathFigures | None = None
+    corrected: PathFigures | None = None
+    both: PathFigures | None = None
+    features: tuple[Feature, ...] = ()
+    left_out: int = 0
+    assumed: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    refused: str = ""
+    position_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
+    deviation_mm: Mapping[str, FloatArray] = field(default_factory=dict, repr=False)
+    every: int = 1
+
+    @property
+    def fitted(self) -> dict[str, dict[str, float]]:
+        """Largest, rms and 95 % of the points (um) with the best-fit rigid motion removed, by what is shown."""
+        names = [name for name in SHOWN if f"{name}, {FITTED}" in self.deviation_mm and len(self.position_mm)]
+        sizes = {name: np.linalg.norm(self.deviation_mm[f"{name}, {FITTED}"], axis=1) for name in names}
+        return {name: figures_of(size) for name, size in sizes.items()}
+
+    @property
+    def variants(self) -> tuple[PathFigures, PathFigures | None, PathFigures | None, PathFigures | None]:
+        """The figures as the machine is, with tables, with the program corrected, and with both."""
+        return self.figures, self.after, self.corrected, self.both
+
+    @property
+    def best(self) -> PathFigures:
+        """The figures as the part is made: with all that corrects it."""
+        return self.both or self.corrected or self.after or self.figures
+
+    @property
+    def rank_figures(self) -> dict[str, float]:
+        """Figures with the best-fit rigid motion removed, as the machine is used: with tables if it has any."""
+        return list(self.fitted.values())[-1] if self.fitted else figures_of(np.zeros(1))
+
+    def worst(self, unit: str) -> Feature | None:
+        """Return the quantity with the largest error of those in ``unit``, um or urad; None without any."""
+        return max((f for f in self.features if f.unit == unit), key=lambda f: abs(f.best), default=None)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object of ``part.json``."""
+        others = {"path_after": self.after, "path_corrected": self.corrected, "path_both": self.both}
         return {
             "machine": self.machine,
             "program": self.program,
             "path_mm": self.figures.length_mm,
             "path": self.figures.as_dict(),
-            "path_after": None if self.after is None else self.after.as_dict(),
+            **{name: None if one is None else one.as_dict() for name, one in others.items()},
+            "path_best_fit": self.fitted.get(SHOWN[0]),
+            "path_after_best_fit": self.fitted.get(SHOWN[1]),
             "features": [feature.as_dict() for feature in self.features],
             "features_left_out": self.left_out,
             "assumed": list(self.assumed),
+            "notes": list(self.notes),
         }
 
-
-@dataclass(frozen=True)
-class _Sampled:
-    """Points of a feature with their tool and direction, and weights (n, 3): the error is the sum of weight times vector."""
-
-    name: str
-    quantity: str
-    line: int
-    nominal: float
-    unit: str
-    position_mm: FloatArray
-    tool_mm: FloatArray
-    direction: FloatArray
-    weight: FloatArray
-
-
-class _Features:
-    """Collects holes, full circles and straight sides of a program; what is machined in several passes counts once."""
-
-    def __init__(self) -> None:
-        self.holes: dict[tuple[float, ...], tuple[int, FloatArray, FloatArray, FloatArray]] = {}
-        self.offsets: dict[tuple[float, ...], FloatArray] = {}
-        self.circles: dict[tuple[float, ...], tuple[Moves, FloatArray]] = {}
-        self.sides: dict[tuple[float, ...], tuple[Moves, FloatArray]] = {}
-        self.chains: dict[tuple[tuple[float, ...], tuple[float, ...]], None] = {}
-        self._last: tuple[float, ...] | None = None
-        self._first: tuple[float, ...] = ()
-
-    def add(self, moves: Moves, drilled: set[int], ended: FloatArray) -> None:
-        """Take the features of some moves; ``drilled`` are lines of drilling cycles."""
-        length = np.linalg.norm(moves.end_mm - moves.start_mm, axis=1)
-        chosen = (moves.sweep_rad != 0) | (length >= SHORTEST_SIDE_MM) | np.isin(moves.line, list(drilled))
-        chosen |= moves.kind == RAPID
-        for k in np.flatnonzero(chosen).tolist():
-            row = moves.part([k])
-            if row.kind[0] == RAPID:
-                self._last = None
-            elif int(row.line[0]) in drilled:
-                at = row.end_mm[0]
-                key = tuple(np.round(at[:2], 3).tolist())
-                if row.start_mm[0, 2] > at[2]:
-                    self.offsets[key] = row.offset_mm[0]
-                    self.holes[key] = (int(row.line[0]), at, row.tool_mm[0], ended[k])
-            elif row.sweep_rad[0] and is_closed(float(row.sweep_rad[0])):
-                radius = float(np.nanmax(np.abs(row.start_mm[0] - row.centre_mm[0])))
-                self.circles[(*np.round(np.nan_to_num(row.centre_mm[0]), 3).tolist(), round(radius, 1))] = (
-                    row,
-                    ended[k],
-                )
-            elif not row.sweep_rad[0]:
-                ends = np.round(np.concatenate([row.start_mm[0, :2], row.end_mm[0, :2]]), 3)
-                if abs(row.end_mm[0, 2] - row.start_mm[0, 2]) > 1e-6:
-                    self._last = None
-                    continue
-                key = tuple(ends.tolist())
-                self.sides[key] = (row, ended[k])
-                if self._last is None:
-                    self._first = key
-                else:
-                    self.chains[(self._last, key)] = None
-                    if key[2:] == self._first[:2]:
-                        self.chains[(key, self._first)] = None
-                self._last = key
-
-    def quantities(self) -> list[_Sampled]:
-        """Return all quantities, holes first."""
-        return [*self._holes(), *self._circles(), *self._sides()]
-
-    def _holes(self) -> list[_Sampled]:
-        found, items = [], list(self.holes.values())
-        for number, ((line, at, tool, direction), offset) in enumerate(
-            zip(items, self.offsets.values(), strict=True), 1
-        ):
-            name, where = f"hole {number}", ([at], [tool], [direction])
-            for k in range(2):
-                found.append(_sampled(name, f"position {AXES[k]}", line, at[k] - offset[k], *where, np.eye(3)[[k]]))
-        return found + _distances("hole", [(number, *item) for number, item in enumerate(items, 1)])
-
-    def _circles(self) -> list[_Sampled]:
-        found, centres = [], []
-        for number, (row, direction) in enumerate(self.circles.values(), 1):
-            share = np.arange(ON_CIRCLE) / ON_CIRCLE
-            many = row.part(np.zeros(ON_CIRCLE, dtype=np.int64))
-            points, (a, b) = points_of(many, share), PLANE_AXES[int(row.plane[0])]
-            outward = points - row.centre_mm
-            outward[:, int(row.plane[0])] = 0.0
-            radius = float(np.linalg.norm(outward[0]))
-            outward /= radius
-            line, name = int(row.line[0]), f"circle {number}"
-            directions = kept_directions(directions_at(many, share), direction)
-            where = (points, many.tool_mm, directions)
-            found.append(_sampled(name, "diameter", line, 2.0 * radius, *where, 2.0 * outward / ON_CIRCLE))
-            for k in (a, b):
-                weight = 2.0 * outward[:, [k]] * outward / ON_CIRCLE
-                nominal = float(row.centre_mm[0, k] - row.offset_mm[0, k])
-                found.append(_sampled(name, f"position {AXES[k]}", line, nominal, *where, weight))
-            middle = np.where(np.isnan(row.centre_mm[0]), row.end_mm[0], row.centre_mm[0])
-            centres.append((number, line, middle, row.tool_mm[0], direction))
-        return found + _distances("circle", centres)
-
-    def _sides(self) -> list[_Sampled]:
-        """Angles between sides that follow each other at a right angle, distances of parallel ones next but one."""
-        found, paired = [], set[frozenset[tuple[float, ...]]]()
-        after = {first: second for first, second in self.chains}
-        for number, (first, second) in enumerate(self.chains, 1):
-            third = after.get(second)
-            one, two = _side(*self.sides[first]), _side(*self.sides[second])
-            cross = float(one.along[0] * two.along[1] - one.along[1] * two.along[0])
-            line = int(self.sides[second][0].line[0])
-            if abs(float(one.along @ two.along)) < _SQUARE_RAD:
-                # a side turns by the slope of its normal deviation; the angle within the corner is 180 degrees minus the turn
-                sign = 1.0 if cross > 0 else -1.0
-                weight = np.concatenate([sign * one.turn, -sign * two.turn])
-                found.append(_sampled(f"corner {number}", "angle", line, 90.0, *_both(one, two), weight, unit="urad"))
-            if third is not None and frozenset((first, third)) not in paired:
-                paired.add(frozenset((first, third)))
-                three = _side(*self.sides[third])
-                gap = float((three.middle - one.middle) @ one.normal)
-                if abs(float(one.along @ three.normal)) < _SQUARE_RAD and abs(gap) > 1e-3:
-                    away = np.sign(gap) * one.normal / ON_SIDE
-                    weight = np.concatenate([np.tile(-away, (ON_SIDE, 1)), np.tile(away, (ON_SIDE, 1))])
-                    name = f"sides at lines {int(self.sides[first][0].line[0])} and {int(self.sides[third][0].line[0])}"
-                    found.append(_sampled(name, "distance", line, abs(gap), *_both(one, three), weight))
-        return found
-
-
-@dataclass(frozen=True)
-class _Side:
-    points: FloatArray
-    tool: FloatArray
-    direction: FloatArray
-    along: FloatArray
-    normal: FloatArray
-    turn: FloatArray
-    middle: FloatArray
-
-
-def _side(row: Moves, direction: FloatArray) -> _Side:
-    share = (np.arange(ON_SIDE) + 0.5) / ON_SIDE
-    many = row.part(np.zeros(ON_SIDE, dtype=np.int64))
-    way = row.end_mm[0] - row.start_mm[0]
-    length = float(np.linalg.norm(way))
-    along = way / length
-    normal = np.array([-along[1], along[0], 0.0])
-    at = (share - 0.5) * length
-    turn = at[:, None] * normal / float(at @ at)
-    return _Side(
-        points_of(many, share), many.tool_mm, np.tile(direction, (ON_SIDE, 1)), along, normal, turn,
-        0.5 * (row.start_mm[0] + row.end_mm[0]),
-    )  # fmt: skip
-
-
-def _both(one: _Side, two: _Side) -> tuple[FloatArray, FloatArray, FloatArray]:
-    return tuple(np.concatenate([getattr(one, name), getattr(two, name)]) for name in ("points", "tool", "direction"))  # type: ignore[return-value]
-
-
-def _sampled(
-    name: str,
-    quantity: str,
-    line: int,
-    nominal: float,
-    points: Any,
-    tool: Any,
-    direction: Any,
-    weight: Any,
-    unit: str = "um",
-) -> _Sampled:
-    arrays = (np.asarray(item, dtype=np.float64) for item in (points, tool, direction, weight))
-    return _Sampled(name, quantity, line, float(nominal), unit, *arrays)
-
-
-def _distances(kind: str, items: Sequence[tuple[int, int, FloatArray, FloatArray, FloatArray]]) -> list[_Sampled]:
-    """Distances of all pairs of a few features; of many, those that follow each other and the longest."""
-    pairs = list(itertools.combinations(items, 2)) if len(items) <= 8 else list(itertools.pairwise(items))
-    if len(items) > 8:
-        at = np.array([item[2] for item in items])
-        far = [int(np.argmax(np.linalg.norm(at - place, axis=1))) for place in (at.min(axis=0), at.max(axis=0))]
-        pairs.append((items[far[0]], items[far[1]]))
-    found = []
-    for (one, _, p, t, d), (two, line, q, u, e) in pairs:
-        length = float(np.linalg.norm(q - p))
-        if length > 0:
-            way = (q - p) / length
-            found.append(
-                _sampled(f"{kind} {one} to {two}", "distance", line, length, [p, q], [t, u], [d, e], [-way, way])
-            )
-    return found
+    def ranked(self) -> dict[str, Any]:
+        """Return the entry of this machine in a ranking, for JSON."""
+        if self.refused:
+            return {"machine": self.machine, "refused": self.refused}
+        worst = {unit: self.worst(unit) for unit in ("um", "urad")}
+        return {
+            "machine": self.machine,
+            **self.best.as_dict(),
+            "best_fit": self.rank_figures,
+            **{f"worst_{unit}": None if f is None else f.as_dict() for unit, f in worst.items()},
+        }
 
 
 def predict_part(
@@ -326,13 +230,14 @@ def predict_part(
     *,
     covariance: Covariance | None = None,
     tables: ReadTables | None = None,
+    correct: CorrectOptions | None = None,
     show: Callable[[str], None] = lambda _: None,
 ) -> PartPrediction:
     """Predict what the errors of a machine leave on the part of an NC program.
 
-    Every move at feed is sampled on the exact model. Features are found in the program: holes of drilling cycles, full
-    circles, straight sides that follow each other. Their errors are weighted sums of the vectors of the tool at samples, so
-    that the covariance of the errors gives their uncertainty.
+    Every move at feed is sampled on the exact model. Features are found in the program (:mod:`compgen.programs.features`).
+    Their errors are weighted sums of the vectors of the tool at samples, so that the covariance of the errors gives their
+    uncertainty.
 
     Parameters
     ----------
@@ -340,27 +245,71 @@ def predict_part(
     program, dialect, setup : the program, how it is written, its work offsets and tools.
     covariance : of the errors, for the uncertainty of the features.
     tables : tables of the control; then figures and features are given with them, too.
+    correct : how to correct the program (its dialect is ``dialect``); then figures and features are given with the corrected
+        program as it is written, and with ``tables`` also with a program that corrects what these leave.
     show : called with the step that is running.
     """
+    machine = PartMachine(model.machine.name, model, covariance, tables)
+    return _on_machines([machine], program, dialect, setup, correct, show)[0]
+
+
+def rank_machines(
+    machines: Sequence[PartMachine],
+    program: str | Path,
+    dialect: str = "linuxcnc",
+    setup: Setup = Setup(),  # noqa: B008 -- frozen
+    *,
+    show: Callable[[str], None] = lambda _: None,
+) -> list[PartPrediction]:
+    """Predict the part on several machines, each with its tables if it has any: the best first, those that cannot make it last.
+
+    The best one has the smallest of the largest deviations with the best-fit rigid motion removed: where the part is clamped
+    and how its zero is found is no property of the machine.
+    """
+    groups: dict[Any, list[PartMachine]] = {}
+    for machine in machines:  # without a tool length, the tool is that of the machine file
+        groups.setdefault(machine.model.machine.tool_offset_mm, []).append(machine)
+    found = []
+    for group in groups.values():
+        while group:
+            try:
+                found += _on_machines(group, program, dialect, setup, None, show)
+                break
+            except InputError as error:
+                first = group.pop(0)
+                found.append(PartPrediction(first.name, Path(program).name, PathFigures(), refused=str(error)))
+    return sorted(found, key=lambda item: (bool(item.refused), item.rank_figures["max_um"]))
+
+
+def _on_machines(
+    machines: Sequence[PartMachine],
+    program: str | Path,
+    dialect: str,
+    setup: Setup,
+    correct: CorrectOptions | None,
+    show: Callable[[str], None],
+) -> list[PartPrediction]:
+    """Read the program once, within the travel of the first machine, and evaluate it on all."""
     source, known = Path(program), dialect_named(dialect)
     read_bytes(source, 1)
-    reader = Reader(model.machine, known, setup, source)
-    with_tables = CompensatedModel(model.machine, model.errors, model.reversal, model.only, tables)
-    figures, after, features = PathFigures(), PathFigures() if tables is not None else None, _Features()
-    thinned, direction = _Thinned(), np.zeros(3)
+    reader = Reader(machines[0].model.machine, known, setup, source)
+    figures = [(PathFigures(), None if one.tables is None else PathFigures()) for one in machines]
+    features, thinned, direction = PartFeatures(), [_Thinned() for _ in machines], np.zeros(3)
     with source.open("rb") as stream:
         for batch in reader.batches(stream):
             moves = batch.moves
             ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
             direction = ended[-1] if len(moves) else direction
             rows = np.flatnonzero(moves.cutting)
-            shares = (np.zeros(len(rows)), np.ones(len(rows)))
-            for found in path_deviations(model, STEP_MM, moves, rows, moves.part(rows), shares, ended):
-                figures.add(found)
-                thinned.add(found.position_mm, found.normal_mm)
-            if after is not None:
-                for found in path_deviations(with_tables, STEP_MM, moves, rows, moves.part(rows), shares, ended):
-                    after.add(found)
+            driven, shares = moves.part(rows), (np.zeros(len(rows)), np.ones(len(rows)))
+            for machine, (before, after), points in zip(machines, figures, thinned, strict=True):
+                kept: list[list[PathDeviations]] = [[], []]
+                models = [(before, machine.model), *([] if after is None else [(after, machine.with_tables)])]
+                for (own, model), parts in zip(models, kept, strict=False):
+                    for found in path_deviations(model, STEP_MM, moves, rows, driven, shares, ended):
+                        own.add(found)
+                        parts.append(found)
+                points.add(*kept)
             drilled = {
                 item.number
                 for item in batch.segments
@@ -368,104 +317,153 @@ def predict_part(
             }
             features.add(moves, drilled, ended)
             show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
-    model.errors.warn_outside(reader.reached_mm)
-    quantities = features.quantities()
-    evaluated = [_feature(item, model, with_tables, covariance) for item in quantities[:MOST_FEATURES]]
-    return PartPrediction(
-        model.machine.name,
-        source.name,
-        figures,
-        after,
-        tuple(evaluated),
-        max(len(quantities) - MOST_FEATURES, 0),
-        tuple(reader.assumed),
-        *thinned.points(),
-    )
+    for machine in machines:
+        machine.model.errors.warn_outside(reader.reached_mm)
+    quantities = list(features.quantities())
+    evaluated = _Evaluated(quantities)
+    results = []
+    for machine, (before, after), points in zip(machines, figures, thinned, strict=True):
+        outside = _outside(machine, reader.reached_mm)
+        if outside:
+            results.append(PartPrediction(machine.name, source.name, PathFigures(), refused=outside))
+            continue
+        made: list[ProgramCorrection | None] = [None, None]
+        commands: list[FloatArray | None] = [None, None]
+        for which, model in enumerate((machine.model, machine.with_tables) if machine.tables else (machine.model,)):
+            if correct is not None:
+                follow, options = _Followed(evaluated.samples), replace(correct, dialect=dialect)
+                with working_folder("part-") as folder:
+                    made[which] = correct_program(model, source, folder, options, setup, show=show, follow=follow.add)
+                commands[which] = follow.command_mm
+        notes = [
+            f"the corrected program{' with tables' if which else ''} is not acceptable: {reason}"
+            for which, one in enumerate(made)
+            for reason in (one.reasons if one is not None else ())
+        ]
+        position_mm, deviation_mm = points.points(tables=after is not None)
+        result = PartPrediction(
+            machine.name,
+            source.name,
+            before,
+            after,
+            None if made[0] is None else made[0].after,
+            None if made[1] is None else made[1].after,
+            evaluated.features(machine, *commands),
+            features.left_out(),
+            tuple(reader.assumed),
+            tuple(notes),
+            position_mm=position_mm,
+            deviation_mm=deviation_mm,
+            every=points.every,
+        )
+        results.append(result)
+    return results
 
 
-def _feature(
-    item: _Sampled, model: ExactModel, with_tables: CompensatedModel, covariance: Covariance | None
-) -> Feature:
-    where = (item.position_mm, item.tool_mm, item.direction)
-    error, after = (float(np.sum(item.weight * one.error(*where))) for one in (model, with_tables))
-    u = np.nan
-    if covariance is not None:
-        design = error_design(model.machine, covariance, item.position_mm, item.tool_mm)
-        row = np.einsum("nk,nkp->p", item.weight, design) @ covariance.errors_factor
-        u = float(np.linalg.norm(row))
-    per = 1.0 / MM_PER_UM if item.unit == "um" else 1e6
-    left = after * per if with_tables.tables is not None else np.nan
-    return Feature(item.name, item.quantity, item.line, item.nominal, item.unit, error * per, left, u * per)
+def _outside(machine: PartMachine, reached_mm: FloatArray) -> str:
+    """Say where a program leaves the travel of a machine, "" if it does not."""
+    for k, axis in enumerate(machine.model.machine.axes):
+        (low, high), (least, most) = axis.range_mm, reached_mm[:, k]
+        if least < low - 1e-6 or most > high + 1e-6:
+            where = f"{AXES[k]} goes from {least:.3f} to {most:.3f} mm of the machine"
+            return f"{where}, outside its travel {low:g} to {high:g} mm; check --wcs and --tools"
+    return ""
+
+
+class _Evaluated:
+    """Quantities with the samples of all of them together, so that a machine is evaluated in one go."""
+
+    def __init__(self, quantities: Sequence[Quantity]) -> None:
+        self.quantities = quantities
+        parts = [item.samples for item in quantities]
+        nothing = Samples(np.zeros(0, dtype=np.int64), np.zeros(0), *(np.zeros((0, 3)) for _ in range(3)))
+        self.samples = Samples.joined([nothing, *parts])
+        ends = np.cumsum([0, *(len(part.share) for part in parts)])
+        self.rows = [slice(int(low), int(high)) for low, high in zip(ends[:-1], ends[1:], strict=True)]
+
+    def features(
+        self, machine: PartMachine, corrected_mm: FloatArray | None, both_mm: FloatArray | None
+    ) -> tuple[Feature, ...]:
+        """Return all quantities on a machine; with the commands (n, 3) of corrected programs at the samples, if there are any."""
+        at = self.samples.position_mm
+
+        def off(model: ExactModel, command_mm: FloatArray | None) -> FloatArray | None:
+            if command_mm is None:
+                return None
+            return command_mm - at + model.error(command_mm, self.samples.tool_mm, self.samples.direction)
+
+        vectors = [
+            off(machine.model, at),
+            off(machine.with_tables, at if machine.tables is not None else None),
+            off(machine.model, corrected_mm),
+            off(machine.with_tables, both_mm),
+        ]
+        found = []
+        for item, rows in zip(self.quantities, self.rows, strict=True):
+            per = 1.0 / MM_PER_UM if item.unit == "um" else 1e6
+            error, after, corrected, both = (
+                np.nan if one is None else item.value(one[rows])[0] * per for one in vectors
+            )
+            u = np.nan
+            if machine.covariance is not None and vectors[0] is not None:
+                _, weight = item.value(vectors[0][rows])
+                samples = item.samples
+                design = error_design(machine.model.machine, machine.covariance, samples.position_mm, samples.tool_mm)
+                u = float(np.linalg.norm(np.einsum("nk,nkp->p", weight, design) @ machine.covariance.errors_factor))
+            values = (error, after, corrected, both, u * per)
+            found.append(Feature(item.name, item.quantity, item.line, item.nominal, item.unit, *values))
+        return tuple(found)
+
+
+class _Followed:
+    """Finds the commands (n, 3) of a corrected program at samples of the program, batch by batch; nan where it has none."""
+
+    def __init__(self, samples: Samples) -> None:
+        self._order = np.argsort(samples.move, kind="stable")
+        self._move, self._share = samples.move[self._order], samples.share[self._order]
+        self.command_mm = np.full(samples.position_mm.shape, np.nan)
+        self._passed = 0
+
+    def add(self, wanted: Moves, owner: IntArray, driven: Moves, low: FloatArray, high: FloatArray) -> None:
+        """Take the moves of a batch; ``driven`` are corrected moves of ``owner`` between its shares ``low`` and ``high``."""
+        rows = slice(*np.searchsorted(self._move, [self._passed, self._passed + len(wanted)]).tolist())
+        where = self._move[rows] - self._passed + np.minimum(self._share[rows], 1.0 - 1e-9)
+        self._passed += len(wanted)
+        if not len(where):
+            return
+        piece = np.searchsorted(owner + low, where, side="right") - 1
+        width = np.maximum(high - low, 1e-12)[piece]
+        share = np.clip((self._share[rows] - low[piece]) / width, 0.0, 1.0)
+        self.command_mm[self._order[rows]] = points_of(driven.part(piece), share)
 
 
 class _Thinned:
-    """Keeps points of a path of any length, evenly, for a picture."""
+    """Keeps points of a path of any length, evenly, and the one that is farthest off."""
 
     def __init__(self) -> None:
         self.every, self.passed = 1, 0
-        self.kept: list[FloatArray] = []
-        self.count = 0
+        self.kept = np.zeros((0, 15))
+        self.worst = np.zeros((0, 15))
 
-    def add(self, position_mm: FloatArray, deviation_mm: FloatArray) -> None:
-        first = -self.passed % self.every
-        rows = np.hstack([position_mm, deviation_mm])[first :: self.every]
-        self.passed += len(position_mm)
-        self.kept.append(rows)
-        self.count += len(rows)
-        while self.count > MOST_POINTS:
-            self.kept = [np.concatenate(self.kept)[::2]]
-            self.count, self.every = len(self.kept[0]), 2 * self.every
+    def add(self, before: Sequence[PathDeviations], after: Sequence[PathDeviations]) -> None:
+        """Take the samples of a batch, as the machine is and, unless that is empty, with tables."""
+        for k, found in enumerate(before):
+            other = after[k] if after else found
+            every = np.hstack([found.position_mm, found.normal_mm, other.normal_mm, found.whole_mm, other.whole_mm])
+            farthest = every[[int(np.argmax(np.linalg.norm(found.normal_mm, axis=1)))]]
+            if not len(self.worst) or np.linalg.norm(farthest[:, 3:6]) > np.linalg.norm(self.worst[:, 3:6]):
+                self.worst = farthest
+            self.kept = np.concatenate([self.kept, every[-self.passed % self.every :: self.every]])
+            self.passed += len(every)
+            while len(self.kept) > MOST_POINTS:
+                self.kept, self.every = self.kept[::2], 2 * self.every
 
-    def points(self) -> tuple[FloatArray, FloatArray]:
-        every = np.concatenate([np.zeros((0, 6)), *self.kept])
-        return every[:, :3], every[:, 3:]
-
-
-# The page with a picture that is turned with the mouse.
-
-_SHOWN = {
-    "normal_max_um": "largest distance from the path",
-    "normal_rms_um": "rms",
-    "ends_max_um": "largest at ends of moves",
-    "max_um": "largest with what is along the path",
-    "rms_um": "rms",
-}
-
-
-def part_page(found: PartPrediction) -> str:
-    """Return a page in one file: figures, features, and the path with its deviations, turned with the mouse."""
-    style, script, policy = page_assets("part.js")
-    data = {
-        "at": [rounded(row, 6) for row in found.position_mm],
-        "off": [rounded(row / MM_PER_UM, 4) for row in found.deviation_mm],
-    }
-    head = (
-        f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
-        f'<meta name="viewport" content="width=device-width"><title>{escape(found.program)}</title><style>{style}</style>'
-    )
-    figures = [("as the machine is", found.figures), *([("with tables", found.after)] if found.after else [])]
-    lines = "".join(
-        f"<tr><td>{name}</td>" + "".join(f"<td>{one.as_dict()[key]:.2f}</td>" for key in _SHOWN) + "</tr>"
-        for name, one in figures
-    )
-    rows = "".join(
-        f"<tr><td>{escape(f.name)}</td><td>{escape(f.quantity)}</td><td>{f.line}</td><td>{f.nominal:.3f}</td>"
-        f"<td>{f.error:+.2f}</td><td>{'' if np.isnan(f.after) else f'{f.after:+.2f}'}</td>"
-        f"<td>{'' if np.isnan(f.u) else f'{f.u:.2f}'}</td><td>{f.unit}</td></tr>"
-        for f in found.features
-    )
-    titles = "".join(f"<th>{name}</th>" for name in _SHOWN.values())
-    features = f"""<table><tr><th>feature</th><th>quantity</th><th>line</th><th>nominal (mm, deg)</th><th>error</th>
-<th>with tables</th><th>u (k = 1)</th><th>unit</th></tr>{rows}</table>"""
-    body = f"""<h1>{escape(found.program)} on {escape(found.machine)}</h1>
-<table><tr><th>tool from the path (um)</th>{titles}</tr>{lines}</table>
-<p>Grey: the path as programmed. Colours and arrows: the deviation normal to it, as the machine is. Turn with the mouse or
-the arrow keys, zoom with the wheel or + and -.
-<label>Enlarged <input id="scale" type="range" min="0" max="100" value="50"></label> <span id="says"></span></p>
-<canvas id="part" width="1000" height="620" tabindex="0" role="img" aria-label="path of the tool with its deviation"
-style="max-width: 100%"></canvas>
-{features if rows else "<p>The program has no holes, full circles or sides whose size could be given.</p>"}
-<script type="application/json" id="data">{json.dumps(data)}</script>"""
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n<script>{script}</script></body></html>\n'
-    )
+    def points(self, *, tables: bool) -> tuple[FloatArray, dict[str, FloatArray]]:
+        """Return positions (n, 3) and deviations (n, 3) by what is shown, see :class:`PartPrediction`."""
+        rows = np.concatenate([self.kept, self.worst])
+        found = {}
+        for k, name in enumerate(SHOWN if tables else SHOWN[:1]):
+            found[name] = rows[:, 3 + 3 * k : 6 + 3 * k]
+            whole = rows[:, 9 + 3 * k : 12 + 3 * k]
+            found[f"{name}, {FITTED}"] = without_rigid_motion(rows[:, :3], whole) if len(rows) else whole
+        return rows[:, :3], found

@@ -28,9 +28,9 @@ MODULES = (
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
     "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
-    "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py", "programs/part.py",
-    "report/cards.py",
-    "report/html/*.py", "report/options_text.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
+    "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py",
+    "programs/features.py", "programs/part.py", "report/cards.py", "report/html/*.py", "report/options_text.py",
+    "report/part_page.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
 WITH_ERRORS = re.compile(
@@ -57,7 +57,8 @@ WORDS = (
     "urad", "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness",
     "Temperature", "The", "Volume", "no table", "full volumetric", "+ straightness", "+ squareness",
     "+ direction-dependent", "+ angles, as products of tables", "confirmed", "tentative", "not separated", "accepted",
-    "after", "angles", "assumed", "before", "better", "clockwise", "counter-clockwise", "day", "days", "exceeded",
+    "after", "angle", "angles", "diameter", "distance", "error", "flatness",
+    "parallelism", "roundness", "rms", "assumed", "before", "better", "clockwise", "counter-clockwise", "day", "days", "exceeded",
     "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning", "positive", "readings",
     "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with", "within", "without",
     "worse", "positioning runs", "circles", "part", "artefact", "lengths of a tracer", "deviations", "errors",
