@@ -57,6 +57,8 @@ class Moves:
 
     def part(self, rows: Any) -> Moves:
         """Return the moves of ``rows``."""
+        if isinstance(rows, np.ndarray) and rows.dtype == np.int64:  # take is twice as fast
+            return Moves(*(getattr(self, name).take(rows, axis=0) for name in Moves.__dataclass_fields__))
         return Moves(*(getattr(self, name)[rows] for name in Moves.__dataclass_fields__))
 
     @staticmethod
@@ -146,12 +148,15 @@ def _radii(arcs: Moves) -> tuple[FloatArray, FloatArray]:
     return np.hypot(*_in_plane(arcs, arcs.start_mm)), np.hypot(*_in_plane(arcs, arcs.end_mm))
 
 
-def points_of(moves: Moves, fraction: FloatArray) -> FloatArray:
-    """Return the point of each move at its ``fraction`` (n,) of length, (n, 3), mm."""
-    points = moves.start_mm + fraction[:, None] * (moves.end_mm - moves.start_mm)
-    rows = np.flatnonzero(moves.sweep_rad)
+def points_of(moves: Moves, fraction: FloatArray, own: IntArray | None = None) -> FloatArray:
+    """Return the point of each move at its ``fraction`` (n,) of length, (n, 3), mm; ``own`` (n,) if not all moves in order."""
+    start, end, sweep = moves.start_mm, moves.end_mm, moves.sweep_rad
+    if own is not None:
+        start, end, sweep = start.take(own, axis=0), end.take(own, axis=0), sweep.take(own)
+    points = start + fraction[:, None] * (end - start)
+    rows = np.flatnonzero(sweep)
     if len(rows):
-        arcs, share, index = moves.part(rows), fraction[rows], np.arange(len(rows))
+        arcs, share, index = moves.part(rows if own is None else own[rows]), fraction[rows], np.arange(len(rows))
         u, v = _in_plane(arcs, arcs.start_mm)
         first, last = _radii(arcs)
         angle = np.arctan2(v, u) + share * arcs.sweep_rad
@@ -191,21 +196,22 @@ def kept_directions(found: FloatArray, before: FloatArray) -> FloatArray:
     return np.take_along_axis(every, last, axis=0)[1:]
 
 
-def closest_offset(moves: Moves, points_mm: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return the vectors (n, 3) from the path of each move to points (n, 3); ``fraction`` is about where they belong."""
-    way = moves.end_mm - moves.start_mm
+def closest_offset(moves: Moves, own: IntArray, points_mm: FloatArray, fraction: FloatArray) -> FloatArray:
+    """Return vectors (n, 3) to points (n, 3) from the paths of the moves ``own``; ``fraction`` is about where they belong."""
+    start = moves.start_mm.take(own, axis=0)
+    way = moves.end_mm.take(own, axis=0) - start
     square = np.einsum("ij,ij->i", way, way)
-    along = np.einsum("ij,ij->i", points_mm - moves.start_mm, way) / np.where(square > 0, square, 1.0)
+    along = np.einsum("ij,ij->i", points_mm - start, way) / np.where(square > 0, square, 1.0)
     share = np.where(square > 0, along, 1.0)
-    rows = np.flatnonzero(moves.sweep_rad)
+    rows = np.flatnonzero(moves.sweep_rad.take(own))
     if len(rows):
-        arcs = moves.part(rows)
+        arcs = moves.part(own[rows])
         u, v = _in_plane(arcs, points_mm[rows])
         u0, v0 = _in_plane(arcs, arcs.start_mm)
         angle = (np.arctan2(v, u) - np.arctan2(v0, u0)) / arcs.sweep_rad
         turn = 2.0 * np.pi / np.abs(arcs.sweep_rad)
         share[rows] = angle + turn * np.round((fraction[rows] - angle) / turn)
-    return points_mm - points_of(moves, np.clip(share, 0.0, 1.0))
+    return points_mm - points_of(moves, np.clip(share, 0.0, 1.0), own)
 
 
 # Division of moves: straight pieces, and arcs of which each is again an arc.
@@ -287,9 +293,10 @@ class Corrector:
         # after a reversal the slack is taken up at once: the first piece is as short as allowed
         share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
         breaks[first[takes_up] + 1] = True
-        sampled = moves.part(rows[own])
-        wanted = points_of(sampled, share)
-        target = np.where(sampled.corrected, self.model.command(wanted, sampled.tool_mm, ended[rows[own]]), wanted)
+        owner = rows[own]
+        wanted = points_of(moves, share, owner)
+        command = self.model.command(wanted, moves.tool_mm.take(owner, axis=0), ended.take(owner, axis=0))
+        target = np.where(moves.corrected.take(owner, axis=0), command, wanted)
         while True:
             at, part = np.flatnonzero(breaks), np.cumsum(breaks) - 1
             left, right = at[part], at[np.minimum(part + 1, len(at) - 1)]
@@ -311,8 +318,10 @@ class Corrector:
         length, work = lengths_of(moves), self._cuts(moves, rows, turned)
         while len(work):  # all arcs at a time, then the halves of those that do not follow
             again = []
-            # each arc has as many samples as its own length needs, in steps of a factor of two
-            needed = np.clip((work[:, 2] - work[:, 1]) * length[work[:, 0].astype(np.int64)] / self.step_mm, 16, 2048)
+            # each arc has as many samples as its own length and angle need, in steps of a factor of two
+            move, share = work[:, 0].astype(np.int64), work[:, 2] - work[:, 1]
+            least = np.where(share * np.abs(moves.sweep_rad[move]) > 0.5 * np.pi + 1e-6, 16, 8)
+            needed = np.clip(share * length[move] / self.step_mm, least, 2048)
             steps = 2 ** np.ceil(np.log2(needed)).astype(np.int64)
             for count in np.unique(steps).tolist():
                 part = work[steps == count]
@@ -337,11 +346,12 @@ class Corrector:
         move, low, high = parts
         share = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, steps + 1)
         share[:, -1] = high
-        many = moves.part(np.repeat(move, steps + 1))
-        wanted = points_of(many, share.ravel())
+        many = np.repeat(move, steps + 1)
+        wanted = points_of(moves, share.ravel(), many)
         middle = directions_at(moves.part(move), 0.5 * (low + high))
         direction = np.repeat(np.where(middle != 0, middle, ended[move]), steps + 1, axis=0)
-        target = np.where(many.corrected, self.model.command(wanted, many.tool_mm, direction), wanted)
+        command = self.model.command(wanted, moves.tool_mm.take(many, axis=0), direction)
+        target = np.where(moves.corrected.take(many, axis=0), command, wanted)
         still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
         sweep = (high - low) * moves.sweep_rad[move]
         target = target.reshape(len(move), steps + 1, 3)
@@ -457,18 +467,18 @@ def path_deviations(
         own = np.repeat(part, count[part])
         begin = np.repeat(np.cumsum(count[part]) - count[part], count[part])
         share = (np.arange(len(own)) - begin + 1) / count[own]
-        sampled, path = driven.part(own), wanted.part(owner[own])
-        at, direction = points_of(sampled, share), ended[owner[own]]
+        path = owner[own]
+        at, direction = points_of(driven, share, own), ended.take(path, axis=0)
         if model.reversal is not None:
-            now = directions_at(sampled, np.clip(share, 1e-7, 1.0 - 1e-7))
-            direction = np.where((sampled.sweep_rad != 0)[:, None] & (now != 0), now, direction)
-        actual = at + model.error(at, path.tool_mm, direction)
+            now = directions_at(driven.part(own), np.clip(share, 1e-7, 1.0 - 1e-7))
+            direction = np.where((driven.sweep_rad[own] != 0)[:, None] & (now != 0), now, direction)
+        actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction)
         where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
-        whole, normal = actual - points_of(path, where), closest_offset(path, actual, where)
+        whole, normal = actual - points_of(wanted, where, path), closest_offset(wanted, path, actual, where)
         # on a steep helix the point at the same angle may be farther away than that at the same share
         nearer = np.linalg.norm(whole, axis=1) < np.linalg.norm(normal, axis=1)
         yield PathDeviations(
-            path.line,
+            wanted.line[path],
             at,
             whole,
             np.where(nearer[:, None], whole, normal),
