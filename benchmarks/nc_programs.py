@@ -52,6 +52,52 @@ def pockets(blocks: int) -> Iterator[str]:
     yield "G0 Z50\nM2\n"
 
 
+def mixed(blocks: int) -> Iterator[str]:
+    """Passes as CAM writes them: of 100 blocks about 70 lines, 25 arcs, and codes, comments, increments, a drilled hole."""
+    yield "G21 G90 G54 G17\nG0 X0 Y0 Z50\nG1 F800\n"
+    r = np.random.default_rng(0)
+    written = 0
+    while written < blocks:
+        k = written // 100
+        x, y, z = 20.0 * (k % 20), 15.0 * (k // 20 % 20), -0.01 * (k // 400)
+        lines = [f"G0 Z5 (pass {k})", f"X{x:.3f} Y{y:.3f}", "M8", f"G1 Z{z:.3f} F200"]
+        for row in range(9):
+            v = y + 1.0 * row
+            for u in np.sort(r.uniform(0.5, 7.5, 6)):
+                lines.append(f"G1 X{x + (u if row % 2 == 0 else 8 - u):.3f} Y{v + 0.05 * u:.3f}")
+            side, code = (8.0, "G3") if row % 2 == 0 else (0.0, "G2")
+            lines += [f"G1 X{x + side:.3f} Y{v:.3f}", f"{code} X{x + side:.3f} Y{v + 1:.3f} J0.5"]
+        for inset in (0.0, 0.7, 1.4):
+            left, right, low, high = x + inset, x + 12 - inset, y + 10 + inset, y + 16 - inset
+            lines += [f"G1 X{left + 1:.3f} Y{low:.3f}", f"X{right - 1:.3f}", f"G3 X{right:.3f} Y{low + 1:.3f} R1"]
+            lines += [f"G1 Y{high - 1:.3f}", f"G3 X{right - 1:.3f} Y{high:.3f} I-1", f"G1 X{left + 1:.3f}"]
+            lines += [f"G3 X{left:.3f} Y{high - 1:.3f} J-1", f"G1 Y{low + 1:.3f}", f"G3 X{left + 1:.3f} Y{low:.3f} R1"]
+        lines.append("G2 I1")
+        lines += ["G91", "G1 Z0.5", "X0.25 Y-0.25", "G90", "M9", "G0 Z5"]
+        if k % 5 == 0:
+            lines += [f"G81 X{x + 3:.3f} Y{y + 3:.3f} Z{z - 4:.3f} R2 F90", f"X{x + 6:.3f}", "G80", "G0 Z5"]
+        written += len(lines)
+        yield "\n".join([*lines, ""])
+    yield "G0 Z50\nM2\n"
+
+
+def steps(blocks: int) -> Iterator[str]:
+    """Increments of about 0.5 mm along waves."""
+    yield "G21 G90 G54 G17\nG0 X0 Y0 Z0\nG91 G1 F1000\n"
+    for first in range(0, blocks, 10_000):
+        i = np.arange(first, min(first + 10_000, blocks) + 1)
+        at = np.round(np.stack([100 * np.sin(i / 300), 80 * np.cos(i / 410), 10 * np.sin(i / 50)], axis=1), 3)
+        yield "".join(f"X{x:.3f} Y{y:.3f} Z{z:.3f}\n" for x, y, z in np.diff(at, axis=0))
+    yield "G90\nM2\n"
+
+
+def holes(blocks: int) -> Iterator[str]:
+    """A plate of holes under one modal cycle."""
+    yield "G21 G90 G54 G17\nG0 X0 Y0 Z50\nG99 G81 X0 Y0 Z-12 R2 F200\n"
+    yield from (f"X{0.7 * (k % 400):.3f} Y{0.07 * (k // 400):.3f}\n" for k in range(1, blocks))
+    yield "G80\nM2\n"
+
+
 def measured(program: Path, dialect: str, offset: str) -> tuple[float, float, float, float]:
     """Processor time in s, peak memory in MB, largest deviation before and after in um of one run."""
     words = [sys.executable, "-m", "compgen", "correct", "zha-gantry", str(program), "--dialect", dialect, "--json"]
@@ -80,6 +126,9 @@ def main() -> None:
         "surface, fanuc": ("fanuc", lambda: surface(given.blocks, numbered=False)),
         "surface, linuxcnc": ("linuxcnc", lambda: surface(given.blocks, numbered=False)),
         "surface with block numbers, siemens": ("siemens", lambda: surface(given.blocks, numbered=True)),
+        "lines, arcs and others, linuxcnc": ("linuxcnc", lambda: mixed(given.blocks)),
+        "increments, linuxcnc": ("linuxcnc", lambda: steps(given.blocks)),
+        "holes under one cycle, linuxcnc": ("linuxcnc", lambda: holes(given.blocks // 10)),
         "pockets of arcs, linuxcnc": ("linuxcnc", lambda: pockets(given.blocks // 10)),
     }
     rows = []

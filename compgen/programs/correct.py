@@ -514,41 +514,44 @@ class _RunPieces:
         self.reached_mm = np.vstack([self.writer.written_mm, self.value[:, :3] * scale + offset])
         # ends of increments and of full circles depend on where the numbers before led
         chained = ~self.absolute[:, None] | (self.closed[:, None] & self.in_plane)
+        every = np.arange(len(self.reached_mm))
         for k in range(3):
+            known = ~np.isnan(self.reached_mm[:, k])
+            known[1:] |= chained[:, k]
+            last = np.maximum.accumulate(np.where(known, every, 0))
             if chained[:, k].any():
-                self._follow(k, chained[:, k])
-            else:
-                known = np.where(np.isnan(self.reached_mm[:, k]), 0, np.arange(len(self.reached_mm)))
-                self.reached_mm[:, k] = self.reached_mm[np.maximum.accumulate(known), k]
+                self._follow(k, np.flatnonzero(chained[:, k]), last)
+            self.reached_mm[:, k] = self.reached_mm[last, k]
         # a piece that is nowhere else still is a block
         alone = ~self.begins & ~self.arc & ~self.added.any(axis=1)
         self.added[alone, 0] = True
         self.value[alone, 0] = np.where(self.absolute, (self.reached_mm[:-1, 0] - offset[0]) / scale, 0.0)[alone]
 
-    def _follow(self, k: int, chained: NDArray[np.bool_]) -> None:
-        """Ends along one axis, piece after piece: an increment leads on from where the written numbers led."""
-        place, zero, scale = float(self.reached_mm[0, k]), float(self.offset_mm[k]), self.run.scale
+    def _follow(self, k: int, rows: IntArray, last: IntArray) -> None:
+        """Ends of the pieces ``rows`` along one axis: an increment leads on from where the written numbers led.
+
+        ``last`` is the piece whose number says where the axis is before each.
+        """
+        zero, scale, least, tens = float(self.offset_mm[k]), self.run.scale, _HALF / _TENS[self.digits], _TENS.tolist()
         held, always = self.closed & self.in_plane[:, k], self.in_plane[:, k] & ~self.begins
-        columns = (chained, self.absolute, held, always, self.whole, self.named[:, k], self.given[:, k], self.own[:, k])
-        numbers = (self.value[:, k], self.command_mm[:, k])
-        least, reached, tens = _HALF / _TENS[self.digits], [place], _TENS.tolist()
+        columns = (self.absolute, held, always, self.whole, self.named[:, k], self.given[:, k], self.own[:, k])
         found: list[tuple[float, bool, bool]] = []
-        for follows, absolute, stays, needed, whole, named, given, own, value, command in zip(
-            *(column.tolist() for column in (*columns, *numbers)), strict=True
+        place, before = 0.0, -2
+        for p, absolute, stays, needed, whole, named, given, own, command in zip(
+            *(column[rows].tolist() for column in (np.arange(len(held)), *columns, self.command_mm[:, k])), strict=True
         ):
-            got, same, added = value, False, False
-            if follows:
-                way = place - zero if absolute else 0.0
-                exact = (way if stays else command - place) / scale
-                same = named and whole and abs(exact - given) <= _HALF / tens[own]
-                added = not named and (needed or (not absolute and abs(exact) > least))
-                got = given if same else round(exact * tens[own]) / tens[own] if named or added else np.nan
-                found.append((got, same, added))
+            if p != before + 1:
+                place = float(self.reached_mm[last[p], k])
+            way = place - zero if absolute else 0.0
+            exact = (way if stays else command - place) / scale
+            same = named and whole and abs(exact - given) <= _HALF / tens[own]
+            added = not named and (needed or (not absolute and abs(exact) > least))
+            got = given if same else round(exact * tens[own]) / tens[own] if named or added else np.nan
             if got == got:
                 place = got * scale + (zero if absolute else place)
-            reached.append(place)
-        self.value[chained, k], self.same[chained, k], self.added[chained, k] = zip(*found, strict=True)
-        self.reached_mm[:, k] = reached
+            found.append((got, same, added))
+            self.reached_mm[p + 1, k], before = place, p
+        self.value[rows, k], self.same[rows, k], self.added[rows, k] = zip(*found, strict=True)
 
     def _arcs(self) -> None:
         """Numbers of centres and radii, as seen from where the written numbers lead."""
@@ -604,7 +607,7 @@ class _RunPieces:
         )
         axes = words.end[line, :3].max(axis=1)
         place = np.where(self.begins, np.where(axes > 0, axes, words.last[line]), words.start[line + 1])[more]
-        texts = self._added_words(more.tolist(), letter.tolist(), place.tolist(), numbers[len(row) :])
+        texts = self._added_words(more, letter, place, numbers[len(row) :])
         # the pieces of a divided arc have no number of turns
         turns = np.flatnonzero(self.arc & self.begins & ~self.whole & ~np.isnan(words.value[line, P_WORD]))
         begin = np.concatenate([begin, place, words.begin[line[turns], P_WORD] - 1])
@@ -621,24 +624,22 @@ class _RunPieces:
             touched[row[k]] |= text[begin[k] : end[k]] != numbers[k]
         self.writer.changed += int(np.sum(touched & self.begins))
 
-    def _added_words(self, more: list[int], letter: list[int], place: list[int], numbers: list[str]) -> list[str]:
+    def _added_words(self, more: IntArray, letter: IntArray, place: IntArray, numbers: list[str]) -> list[str]:
         """Texts of words that pieces ``more`` get: with a blank before where their block has blanks, or a block of their own."""
-        text, start, line = self.batch.text, self.words.start, self.line
         names = [*"XYZIJK", "CR=" if self.writer.dialect.name == "siemens" else "R"]
-        texts, last, between = [], -1, ""
-        for k, (p, number) in enumerate(zip(more, numbers, strict=True)):
-            new = names[letter[k]] + number
-            first = p != last
-            if self.begins[p]:
-                if first:
-                    between = " " if " " in text[start[line[p]] : place[k]].strip() else ""
-                texts.append(between + new)
-            else:
-                block = text[start[line[p]] : start[line[p] + 1]]
-                before = "" if block.endswith("\n") or not self.begins[p - 1] else "\n"
-                after = self.writer.line_end(block) if p != (more[k + 1] if k + 1 < len(more) else -1) else ""
-                texts.append((before if first else " ") + new + after)
-            last = p
+        text, start, code = self.batch.text, self.words.start[self.line[more]], self.words.code
+        between = self.words.blanks[place - 1] > self.words.blanks[start]
+        for k in np.flatnonzero(code[start] <= ord(" ")).tolist():
+            between[k] = " " in text[start[k] : place[k]].strip()
+        texts = [
+            (" " if blank else "") + names[k] + number
+            for blank, k, number in zip(between.tolist(), letter.tolist(), numbers, strict=True)
+        ]
+        for k in np.flatnonzero(~self.begins[more]).tolist():
+            p, block = more[k], text[start[k] : place[k]]
+            first, last = k == 0 or more[k - 1] != p, k + 1 == len(more) or more[k + 1] != p
+            before = "\n" if first and self.begins[p - 1] and not block.endswith("\n") else "" if first else " "
+            texts[k] = before + names[letter[k]] + numbers[k] + (self.writer.line_end(block) if last else "")
         return texts
 
 

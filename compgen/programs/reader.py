@@ -7,6 +7,7 @@ are read many at a time by numpy, others one by one; both ways give the same mov
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -315,21 +316,17 @@ class Reader:
         self, named: NDArray[np.bool_], value_mm: FloatArray, absolute: NDArray[np.bool_], offset: FloatArray
     ) -> FloatArray:
         """Machine positions before the first of some blocks and after each, (n + 1, 3), mm."""
-        if absolute.all():
-            at = np.vstack([self.position, np.where(named, value_mm + offset, 0.0)])
-            every = np.arange(len(at))[:, None]
-            last = np.maximum.accumulate(np.where(np.vstack([[True] * 3, named]), every, 0))
-            return np.take_along_axis(at, last, axis=0)
-        columns, modes = [], absolute.tolist()
-        for k, place in enumerate(self.position):
-            # one after the other: increments add up with the rounding of single blocks
-            zero, found = float(offset[k]), [place]
-            for mode, there, value in zip(modes, named[:, k].tolist(), value_mm[:, k].tolist(), strict=True):
-                if there:
-                    place = (zero if mode else place) + value
-                found.append(place)
-            columns.append(found)
-        return np.array(columns).T
+        at = np.vstack([self.position, np.where(named, value_mm + offset, np.nan)])
+        changes = [0, *(np.flatnonzero(np.diff(absolute)) + 1).tolist(), len(absolute)]
+        for first, stop in itertools.pairwise(changes):
+            part = at[first : stop + 1]
+            if absolute[first]:
+                last = np.maximum.accumulate(np.where(np.isnan(part), 0, np.arange(len(part))[:, None]))
+                part[:] = np.take_along_axis(part, last, axis=0)
+            else:  # one after the other: increments add up with the rounding of single blocks
+                part[1:] = np.where(named[first:stop], value_mm[first:stop], 0.0)
+                np.add.accumulate(part, out=part)
+        return at
 
     # One block.
 

@@ -59,8 +59,9 @@ class Words:
 
     ``start`` (count + 1,) is where each line begins, ``run_end`` the end of the run of such blocks that a line is part of
     (its own number if it has to be read by itself), ``last`` where its last word ends. ``motion``, ``absolute``, ``plane``
-    are what its G codes select, -1 without one; ``code`` are the bytes. By line and letter, (count, COLUMNS): ``value`` is nan
-    without the word, ``decimals``, and the places ``begin`` and ``end`` of the number.
+    are what its G codes select, -1 without one; ``code`` are the bytes without comments, ``blanks`` counts the blanks up to each.
+    By line and letter, (count, COLUMNS): ``value`` is nan without the word, ``decimals``, and the places ``begin`` and ``end`` of
+    the number.
     """
 
     def __init__(self, content: bytes, dialect: Dialect, keep_unknown: Collection[str]) -> None:
@@ -77,6 +78,7 @@ class Words:
         table[list(b"0123456789")], table[list(b".")], table[list(b"+-")] = _DIGIT, _POINT, _SIGN
         code = np.frombuffer(text, dtype=np.uint8)
         self.code, what = code, table[code]
+        self.blanks = np.cumsum(np.frombuffer(content, dtype=np.uint8) == ord(" "), dtype=np.int32)
         feed = code == ord("\n")
         self.start = np.concatenate([[0], np.flatnonzero(feed) + 1])
         if self.start[-1] < len(code):
