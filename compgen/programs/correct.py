@@ -35,10 +35,12 @@ from compgen.programs.path import (
     lengths_of,
     path_deviations,
 )
-from compgen.programs.reader import MM_PER_INCH, Batch, Reader, Setup, SingleBlock
+from compgen.programs.reader import MM_PER_INCH, PECK_REST_MM, Batch, Reader, Setup, SingleBlock
 from compgen.programs.runs import P_WORD, R_WORD, Run
 from compgen.resources import LANGUAGES, program_version
 
+#: G codes of drilling cycles.
+_CYCLE_CODES = frozenset((73.0, 74.0, 76.0, *map(float, range(81, 90))))
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
@@ -111,7 +113,7 @@ class ProgramWriter:
     """Rewrites blocks with corrected coordinates and keeps what the control then has, in mm of the machine axes.
 
     ``target_mm`` is the command for the last end, ``written_mm`` where the rounded numbers lead; ``shift_mm`` is what the
-    rounding of G92 adds to the offset.
+    rounding of G92 adds to the offset. ``depth``, ``level`` and ``peck`` (given, written) are those of a drilling cycle.
     """
 
     dialect: Dialect
@@ -122,6 +124,8 @@ class ProgramWriter:
     shift_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     depth: float = np.nan
     level: float = np.nan
+    pecking: bool = False
+    peck: tuple[float, float] = (np.nan, np.nan)
     pole_mm: list[float] = field(default_factory=lambda: [np.nan] * 3)
     #: The drilling cycle as the program defines it, and as it was written last.
     cycle: tuple[DrillingCycle, DrillingCycle] | None = None
@@ -182,6 +186,7 @@ class ProgramWriter:
         if block.kind == "store":
             values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
             self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
+            self._note_peck(block)
         if block.kind not in ("line", "arc", "cycle", "hole"):
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
@@ -206,7 +211,8 @@ class ProgramWriter:
             level = pieces.command_mm[rows][np.isin(pieces.move[rows] - block.first, at_level)]
             ends_there = move.end_mm[-1, 2] == move.start_mm[move.kind != 0][0, 2]
             level_z = float(level[-1, 2]) if len(level) else np.nan
-            return [self._cycle(block, target, offset, level_z, bool(ends_there), allowed)]
+            reach_mm = float(move.start_mm[move.kind != 0][0, 2] - move.end_mm[int(depth[0]), 2])
+            return [self._cycle(block, target, offset, level_z, bool(ends_there), allowed, reach_mm)]
         count = rows.stop - rows.start
         texts = []
         total = share_before[rows]
@@ -363,8 +369,12 @@ class ProgramWriter:
         level_z: float,
         ends_there: bool,
         allowed: NDArray[np.bool_],
+        reach_mm: float,
     ) -> str:
-        """Rewrite a drilling block: place, depth and R level of the hole; ``ends_there``: the tool stays at the R level."""
+        """Rewrite a drilling block: place, depth and R level of the hole; ``ends_there``: the tool stays at the R level.
+
+        ``reach_mm`` is the programmed distance from the R level to the depth: a hole of five pecks stays one of five.
+        """
         scale, digits = block.scale, self.digits(block.scale)
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
         changes: list[tuple[int, int, str]] = []
@@ -388,6 +398,22 @@ class ProgramWriter:
                 more.append(f"{letter}{self._number(value, digits)}")
                 found[k] = round(value, digits)
         self.depth, self.level = found[2], found[3]
+        self._note_peck(block)
+        given, written = self.peck
+        if self.pecking and given > 0.0 and np.isfinite(found[3] - found[2]):
+            peck, deep, unit = given, found[3] - found[2], 10.0**-digits
+            strokes, now = (np.ceil((length - PECK_REST_MM / scale) / given) for length in (reach_mm / scale, deep))
+            if now > strokes:
+                peck = (np.floor(deep / strokes / unit + 1e-6) + 1.0) * unit
+            elif now < strokes:
+                peck = (np.ceil(deep / (strokes - 1.0) / unit - 1e-6) - 1.0) * unit
+            if abs(peck - written) > _HALF * unit:
+                if "Q" in words:
+                    text, first, stop = words["Q"]
+                    changes.append((first, stop, self._number(peck, digits, text)))
+                else:
+                    more.append(f"Q{self._number(peck, digits)}")
+                self.peck = given, peck
         for k in range(2):
             if AXES[k] in words or any(word[0] == AXES[k] for word in more):
                 self.written_mm[k] = found[k] * scale + offset[k]
@@ -434,6 +460,14 @@ class ProgramWriter:
         self.changed += text != block.text
         self.added += len(lines)
         return [*(re.sub(r"^(\s*)N\d+\s*", r"\1", line, flags=re.IGNORECASE) for line in lines), text]
+
+    def _note_peck(self, block: SingleBlock) -> None:
+        """Remember whether the cycle pecks, and its Q."""
+        for letter, text, *_ in block.words:
+            if letter == "G" and float(text) in _CYCLE_CODES:
+                self.pecking = float(text) in (73.0, 83.0)
+            elif letter == "Q":
+                self.peck = float(text), float(text)
 
     def _preset(self, block: SingleBlock) -> str:
         """Rewrite G92: the control sets it at its corrected position, the offset has to become that of the program."""

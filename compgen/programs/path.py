@@ -390,7 +390,12 @@ class Corrector:
         every, short, at_begin = np.arange(len(rows)), self.shortest_mm / lengths_of(arcs), np.flatnonzero(turned[rows])
         owners = np.concatenate([every, every, own, own, at_begin])
         shares = np.concatenate([0.0 * short, 0.0 * short + 1.0, share, share + short[own], short[at_begin]])
-        known = np.unique(np.stack([owners, shares], axis=1)[shares <= 1.0], axis=0)
+        # what is shorter than a few last decimals is no piece of its own
+        gap = 4.0 * self.resolution_mm / lengths_of(arcs)[owners]
+        allowed = np.isin(shares, (0.0, 1.0)) | ((shares > gap) & (shares < 1.0 - gap))
+        known = np.unique(np.stack([owners, shares, gap], axis=1)[allowed], axis=0)
+        near = (np.diff(known[:, 0]) == 0) & (np.diff(known[:, 1]) <= known[1:, 2]) & (known[1:, 1] < 1.0)
+        known = known[~np.concatenate([[False], near]), :2]
         parts = np.concatenate([known[:-1], known[1:, 1:]], axis=1)[known[1:, 0] == known[:-1, 0]]
         return np.column_stack([rows[parts[:, 0].astype(np.int64)], parts[:, 1:]])
 
@@ -469,11 +474,13 @@ def path_deviations(
         share = (np.arange(len(own)) - begin + 1) / count[own]
         path = owner[own]
         at, direction = points_of(driven, share, own), ended.take(path, axis=0)
-        if model.reversal is not None:
-            now = directions_at(driven.part(own), np.clip(share, 1e-7, 1.0 - 1e-7))
-            direction = np.where((driven.sweep_rad[own] != 0)[:, None] & (now != 0), now, direction)
-        actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction)
         where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
+        if model.reversal is not None:
+            # that of the programmed arc; a piece ends where an axis turns, and has its direction to the end
+            within = low[own] + np.clip(share, 1e-3, 1.0 - 1e-3) * (high - low)[own]
+            now = directions_at(wanted.part(path), np.clip(within, 0.0, 1.0))
+            direction = np.where((wanted.sweep_rad[path] != 0)[:, None] & (now != 0), now, direction)
+        actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction)
         whole, normal = actual - points_of(wanted, where, path), closest_offset(wanted, path, actual, where)
         # on a steep helix the point at the same angle may be farther away than that at the same share
         nearer = np.linalg.norm(whole, axis=1) < np.linalg.norm(normal, axis=1)
@@ -483,7 +490,8 @@ def path_deviations(
             whole,
             np.where(nearer[:, None], whole, normal),
             length[own] / count[own],
-            (share == 1.0) & (high[own] == 1.0),
+            # the end of a peck is none of the part
+            (share == 1.0) & (high[own] == 1.0) & (wanted.at_mm == wanted.end_mm).all(axis=1)[path],
         )
 
 

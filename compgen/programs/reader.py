@@ -41,6 +41,8 @@ BATCH_BYTES, LEAST_RUN = 1 << 18, 12
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
+#: A rest of a hole below which no further peck is made: the rounding of sums, mm.
+PECK_REST_MM = 1e-9
 
 
 @dataclass(frozen=True)
@@ -964,7 +966,7 @@ class Reader:
         go(RAPID, self.cycle_r)
         pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
         depth = self.cycle_r
-        while pecking and depth - self.cycle_peck > self.cycle_z and self.cycle_peck > 0:
+        while pecking and depth - self.cycle_peck > self.cycle_z + PECK_REST_MM and self.cycle_peck > 0:
             depth -= self.cycle_peck
             go(FEED, depth)
             go(RAPID, self.cycle_r if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)

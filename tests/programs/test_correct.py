@@ -164,6 +164,26 @@ def test_a_reversal_is_taken_up_at_once(tmp_path):
     assert result.after.ends_mm < 1e-9 < 9e-3 < result.before.ends_mm
 
 
+def test_the_correction_of_a_few_um_within_an_arc_reverses_nothing(tmp_path):
+    """Z went down before: EZX changes its command along the arc, but the axis stays on the side that it came from."""
+    ends = np.array([-600.0, 600.0])
+    errors = ErrorTable({"EZX": Curve(ends, 3e-4 * ends, np.zeros(2))})
+    reversal = ReversalCurves({(k, k): Curve(np.zeros(1), np.array([-10e-3]), np.zeros(1)) for k in (0, 2)})
+    text = "G21 G90 G17 G54\nG0 X20. Y0. Z5.\nG1 Z-5. F100\nG3 X12. Y16. I-20. J0.\nG3 X-20. Y0. I-12. J-16.\nM2\n"
+    setup = Setup({"G54": (0.0, 0.0, 0.0)})
+    result, _ = run(tmp_path, text, errors, setup=setup, reversal=reversal)
+    assert result.after.ends_mm < 1e-4 < 9e-3 < result.before.ends_mm
+    assert result.after.normal_rms_mm < 1.5e-3
+
+
+def test_an_arc_that_passes_a_reversal_just_before_its_end_is_followed(tmp_path):
+    """X turns at the top of the arc, 0.3 um before its end: too little for a piece of its own."""
+    reversal = ReversalCurves({(0, 0): Curve(np.zeros(1), np.array([-10e-3]), np.zeros(1))})
+    text = "%\nO1\nG21 G90 G17 G54\nG0 X5. Y0. Z0.\nG3 X-0.0003 Y5. I-5. J0. F100\nG1 X-9.\nM30\n%\n"
+    result, _ = run(tmp_path, text, ErrorTable(), "fanuc", PLAIN, reversal=reversal)
+    assert result.accepted
+
+
 # --- structure -------------------------------------------------------------------------------------------------------
 
 
@@ -281,6 +301,19 @@ def test_a_hole_is_drilled_to_its_depth_where_the_correction_bends_on_the_way(tm
     text = "%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z9.\nG98 G81 X10. Z-20. R5. F90\nX20.\nG80\nM30\n%\n"
     result, corrected = run(tmp_path, text, bent, "fanuc", PLAIN)
     assert "G98 G81 X10. Z-20.1 R5. F90\nX20.\nG80" in corrected
+    assert result.accepted
+
+
+@pytest.mark.parametrize(
+    ("slope", "depth", "peck"), [(-4e-4, "-15.", "Q5.0021"), (-4e-4, "-15.01", "Q5."), (4e-4, "-15.004", "Q4.9989")]
+)
+def test_a_hole_has_as_many_pecks_as_before(tmp_path, slope, depth, peck):
+    """EZZ makes 20 mm in four pecks of 5 mm 20.008 mm: a fifth would be one of 8 um; 20.004 mm in five become 19.996."""
+    ends = np.array([-400.0, 200.0])
+    errors = ErrorTable({"EZZ": Curve(ends, slope * ends, np.zeros(2))})
+    text = f"G21 G90 G17 G54\nG0 X0. Y0. Z9.\nG98 G83 X10. Z{depth} R5. Q5. F90\nX20.\nG80\nM2\n"
+    result, corrected = run(tmp_path, text, errors, setup=PLAIN, decimals=4)
+    assert f" {peck} F90\nX20.\n" in corrected
     assert result.accepted
 
 
