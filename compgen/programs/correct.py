@@ -878,7 +878,7 @@ def correct_program(
     blocks = 0
     with working_folder("correct-") as work:
         body = work / "body"
-        with source.open("rb") as stream, body.open("wb") as target:
+        with reader.opened() as stream, body.open("wb") as target:
             for batch in reader.batches(stream):
                 by_radius = np.zeros(len(batch.moves), dtype=bool)
                 for segment in batch.segments:
@@ -892,7 +892,7 @@ def correct_program(
                 try:
                     text, origins = writer.rewrite(batch, pieces, pieces.share - begin)
                 except InputError as error:
-                    raise InputError(error.message, file=source, line=error.line) from error
+                    raise InputError(error.message, file=source, line=reader.in_file(error.line or 0)) from error
                 corrected = text.encode("latin-1")
                 target.write(corrected)
                 check.add(batch.moves, corrected, origins)
@@ -902,6 +902,7 @@ def correct_program(
         unchanged = not writer.changed and not writer.added
         reasons = []
         before, after = check.before, check.after
+        before.line, after.line = reader.in_file(before.line), reader.in_file(after.line)
         enough_mm = max(options.tolerance_um * MM_PER_UM, resolution_mm)
         if check.broken:
             reasons.append(check.broken)

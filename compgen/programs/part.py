@@ -295,9 +295,9 @@ def _on_machines(
     reader = Reader(machines[0].model.machine, known, setup, source)
     figures = [(PathFigures(), None if one.tables is None else PathFigures()) for one in machines]
     features, thinned, direction = PartFeatures(), [_Thinned() for _ in machines], np.zeros(3)
-    with source.open("rb") as stream:
+    with reader.opened() as stream:
         for batch in reader.batches(stream):
-            moves = batch.moves
+            moves = reader.numbered_as_in_file(batch.moves)
             ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
             direction = ended[-1] if len(moves) else direction
             rows = np.flatnonzero(moves.cutting)
@@ -311,7 +311,7 @@ def _on_machines(
                         parts.append(found)
                 points.add(*kept)
             drilled = {
-                item.number
+                reader.in_file(item.number)
                 for item in batch.segments
                 if isinstance(item, SingleBlock) and item.kind in ("cycle", "hole")
             }

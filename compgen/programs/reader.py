@@ -11,7 +11,8 @@ import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, NoReturn
 
@@ -23,7 +24,7 @@ from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect
-from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, Moves
+from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves
 from compgen.programs.runs import (
     LONGEST_BLOCK,
     P_WORD,
@@ -34,6 +35,7 @@ from compgen.programs.runs import (
     carried,
     centres_and_sweeps,
 )
+from compgen.programs.subprograms import written_out
 
 MM_PER_INCH = 25.4
 #: Bytes that are read at a time, and the fewest blocks in a row that are read together.
@@ -143,9 +145,30 @@ class Reader:
         self.ended = self.seen_percent = self.started = False
         self.closed_by_percent = False
         self._line, self._text = 0, ""
+        self.line_in_file: IntArray | None = None
         self._rows: list[tuple[float, ...]] = []
 
     # Streams of blocks.
+
+    def opened(self) -> BinaryIO:
+        """Open the program; calls of subprograms that are in its file are written out."""
+        path = Path(self.source)
+        found = written_out(path) if self.dialect.name in ("fanuc", "linuxcnc") else None
+        if found is None:
+            return path.open("rb")
+        self.line_in_file = found.line
+        self.assumed[f"calls are written out where they are, so that each is corrected: {', '.join(found.called)}"] = (
+            None
+        )
+        return BytesIO(found.content)
+
+    def numbered_as_in_file(self, moves: Moves) -> Moves:
+        """Return moves with the lines of the file in which their blocks are."""
+        return moves if self.line_in_file is None else replace(moves, line=self.line_in_file[moves.line - 1])
+
+    def in_file(self, line: int) -> int:
+        """Return the line of the file that a line of the program as it was opened is from."""
+        return line if self.line_in_file is None or not line else int(self.line_in_file[line - 1])
 
     def batches(self, stream: BinaryIO) -> Iterator[Batch]:
         """Yield the batches of a program; the last one is followed by the check that the program was whole."""
@@ -229,7 +252,7 @@ class Reader:
     def _fail(self, message: str, field: str | None = None) -> NoReturn:
         text = visible_line(self._text)[:60]
         shown = f" (block: {text})" if text else ""
-        raise InputError(message + shown, file=self.source, line=self._line, field=field)
+        raise InputError(message + shown, file=self.source, line=self.in_file(self._line), field=field)
 
     # Many blocks at a time.
 
@@ -368,7 +391,8 @@ class Reader:
         if percent:
             return self._percent(percent[1])
         named = re.match(r"\s*(?:[O:]\d+|<[^<>]*>)", body, re.IGNORECASE)
-        if named and dialect.name in ("fanuc", "siemens"):
+        alone = named and not re.sub(r"\([^()]*\)", "", body[named.end() :]).strip()
+        if named and (dialect.name in ("fanuc", "siemens") or (dialect.name == "linuxcnc" and alone)):
             if self.started:
                 self._fail("a second program begins here; give one program at a time")
             at = named.end()
@@ -451,6 +475,12 @@ class Reader:
                 self._fail(f"{code}: {dialect.refused[code]}")
         if rest[0] == ",":
             self._fail(f"{rest[:20]!r}: {dialect.refused['M98' if dialect.pole else ',']}")
+        if rest[0] in "@^":
+            self._fail(f"{rest[:20]!r}: {dialect.refused['G16']}")
+        if rest[0] == ";":
+            self._fail(
+                f"{rest[:20]!r}: ; ends a block in this dialect; write comments in parentheses, one block in a line"
+            )
         if rest[0] == "$":
             self._fail(f"{rest[:20]!r} is a command for the control, none of a program; give the program alone")
         variable = r"[A-Z]+\d*\s*=?\s*[-+]?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[-+]?[A-Z(]|="
@@ -556,6 +586,8 @@ class Reader:
         incremental = not self.absolute if letter not in self._modes else self._modes[letter] == "IC"
         if "G90" in codes or "G91" in codes:
             incremental = "G91" in codes
+        if letter == "E" and re.match(r"[+-]\d\d", text):
+            self._fail(f"{letter}{text}: numbers with an exponent are not read by controls; post plain decimals")
         if letter in "UVWE":
             self._fail(f"{letter}{text}: further axes are not followed; correct a program with X, Y and Z")
         moving = next((code for code in codes if code in ("G0", "G1", "G2", "G3", "G28")), f"G{self.motion}")
@@ -691,7 +723,8 @@ class Reader:
             self._set_length((0.0,) * 3, on=False)
             return
         if key not in self._tools:
-            known = f"; the table has {', '.join(sorted(self._tools))}" if self._tools else ""
+            some = sorted(self._tools)[:12]
+            known = f"; the table has {', '.join(some)}{', ...' * (len(some) < len(self._tools))}" if some else ""
             self._fail(f"the length of tool {key} is not known{known}; give it with --tools FILE (tool, length_mm)")
         x, y, z = self._tools[key]
         self._set_length((x, y, z + longer_mm))

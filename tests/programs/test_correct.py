@@ -418,7 +418,7 @@ REFUSED = [
     ("fanuc", START + "G0 A0.\nG0 B90.\nG0 X5. A90.\nM30\n", 5, "the rotary axis turns, from 0"),
     ("fanuc", START + "G1 X1. U2. F100\nM30\n", 3, "further axes"),
     ("fanuc", START + "G1 X5.,R2. F100\nM30\n", 3, "chamfers and roundings"),
-    ("fanuc", START + "G1 X5. F100; X6.\nM30\n", 3, "cannot be read"),
+    ("fanuc", START + "G1 X5. F100; X6.\nM30\n", 3, "; ends a block"),
     ("fanuc", START + "G12 I5. F100\nM30\n", 3, "milling cycles"),
     ("fanuc", START + "G31 Z-5. F100\nM30\n", 3, "where a probe stops"),
     ("fanuc", START + "G91 G52 X5.\nM30\n", 3, "incremental blocks"),

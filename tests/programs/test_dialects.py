@@ -350,3 +350,34 @@ def test_part_measures_the_holes_of_called_cycles(tmp_path):
     found = predict_part(model_of(mill(), cycle_errors(), None), program, "siemens", setup).features
     across = sorted(f.error for f in found if f.name.startswith("hole") and f.quantity == "position X")
     assert across == pytest.approx([0.0, 10.0, 20.0, 30.0, 30.0], abs=0.1)
+
+
+def test_calls_of_fanuc_and_haas_in_the_same_file(tmp_path):
+    """M98 P with the repeats before its last four digits, M97 to a block number; the lines of messages are those of the file."""
+    text = (
+        "%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z0.\nG52 X100.\nM98 P20010\nG52 X200. M98 P10\nG52 X0.\nM97 P500\nM30\n"
+        "N500 G1 Y7. F9\nM99\nO0010 (POCKET)\nG1 X10. F9\nX0.\nM99\n%\n"
+    )
+    result, corrected = run(tmp_path, text, shift(slope=0.1), "fanuc", PLAIN)
+    assert corrected[corrected.index("G21") :] == (
+        "G21 G90 G17 G54\nG0 X0. Y0. Z0.\nG52 X100.\n(O10 2 times)\nG1 X9.989 F9\nX-0.01\nG1 X9.989 F9\nX-0.01\n"
+        "G52 X200. (O10)\nG1 X9.979 F9\nX-0.02\nG52 X0.\n(N500)\nN500 G1 Y7. F9\nM30\n%\n"
+    )
+    assert result.accepted
+    with pytest.raises(InputError, match="outside its travel") as caught:
+        run(tmp_path, text.replace("X10. F9", "X900. F9"), shift(), "fanuc", PLAIN)
+    assert caught.value.line == 14
+    for wrong, words in (
+        ("M98 P99", "in the same file"),
+        ("M98 P10 (no end)", "does not end with M99"),
+        ("/M98 P10", "block with /"),
+    ):
+        broken = text.replace("M98 P20010", wrong)
+        if "no end" in wrong:
+            broken = broken.replace("X0.\nM99\n%", "X0.\n%")
+        with pytest.raises(InputError, match=words) as caught:
+            run(tmp_path, broken, shift(), "fanuc", PLAIN)
+        assert caught.value.line == 6
+    loop = text.replace("X0.\nM99\n%", "M98 P10\nM99\n%")
+    with pytest.raises(InputError, match="call themselves"):
+        run(tmp_path, loop, shift(), "fanuc", PLAIN)

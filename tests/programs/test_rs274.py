@@ -140,3 +140,29 @@ def test_local_shifts_and_stored_reference_points(tmp_path):
         "X1\nG52 X0 Y0 Z0\nX2 Y2\nG28 Z9\nG1 X3 Y3 Z3\nG91\nG52 X7\nG90 X1\nM2\n%\n"
     )
     assert_same(ours(program), canonical(program, tmp_path))
+
+
+def test_calls_of_subprograms_in_the_same_file_are_written_out_as_the_interpreter_executes_them(tmp_path, make_errors):
+    """Nested, repeated, in absolute and in incremental; the corrected program has no calls and moves alike."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nO1\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X1 Y2 Z3\nF100\nM98 P2000\nG55 G0 X0 Y0\nN7 M98 P2000 (again)\n"
+        "G91\nM98 P30 L3\nG90\nG0 X0 Y0 Z9\nM30\nO2000\nG1 Z-1\nX5 Y5\nM98 P30\nG90 G0 Z3\nM99\nO30 (STEP)\nG91 G1 X2\nY1\n"
+        "N9 M99\n%\n"
+    )
+    truth = canonical(program, tmp_path)
+    result = correct_program(
+        model_of(mill(), make_errors(mill(), 3), None), program, tmp_path / "out", CorrectOptions(), SETUP
+    )
+    assert result.accepted
+    assert result.assumed[0].endswith("each is corrected: O2000 (2 times), O30 (5 times)")
+    text = (tmp_path / "out" / "p.ngc").read_text()
+    assert "N7 (O2000) (again)\n" in text.replace(" (again) (O2000)", " (O2000) (again)")
+    assert not re.search("M9[89]|O2000\\n", text)
+    # without errors the program is that of the calls
+    reader = Reader(mill(), DIALECTS["linuxcnc"], SETUP, program)
+    written = tmp_path / "written.ngc"
+    with reader.opened() as stream:
+        written.write_bytes(stream.read())
+    assert_same(ours(written), truth)
+    assert_same(canonical(written, tmp_path), truth)
