@@ -287,9 +287,9 @@ def project_page(number: int, name: str) -> tuple[str, int]:
 def status(number: int) -> dict[str, Any]:
     """Report what runs and the revision; the pages ask for it about twice a second while something runs."""
     runner = the_runner(number)
-    job = runner.job or Progress("", "")
+    job, said = runner.job or Progress("", ""), current_app.jinja_env.filters["lines"]
     return {
-        "revision": runner.project.state().revision, "busy": runner.busy, "title": job.title, "line": job.line,
+        "revision": runner.project.state().revision, "busy": runner.busy, "title": said(job.title), "line": said(job.line),
         "seconds": round(job.seconds, 1),
     }  # fmt: skip
 
@@ -323,10 +323,9 @@ def chain_meaning() -> Response | tuple[str, int]:
         return "", 204
     if not fits:
         return "", 204
-    language = the_workbench().language
-    said = str if language == LANGUAGES[0] else texts_of(language).text
+    said = current_app.jinja_env.filters["lines"]
     words = [[chain.name, said(in_words(chain))] for chain in fits[:6]]
-    return jsonify(fits=words, drawing=contents.chain_picture(fits[0]))
+    return jsonify(fits=words, drawing=current_app.jinja_env.filters["drawn"](contents.chain_picture(fits[0])))
 
 
 # What the buttons do.
@@ -665,7 +664,7 @@ def diagnose(runner: Runner, state: ProjectState) -> None:
     if not files:
         raise InputError("add a measurement first: numbers alone have no residuals")
     folder = runner.project.new_folder("diagnose")
-    words = ["diagnose", machine, *files, *_instrument(state), "--out", folder]
+    words = ["diagnose", machine, *files, *_instrument(state), *_language(), "--out", folder]
     runner.start("looking for missing effects", "result", [StepTask(Step(0, "diagnose", "Diagnosis", [words], folder))])
 
 
@@ -687,7 +686,7 @@ def options(runner: Runner, state: ProjectState) -> None:
     """Show side by side what each control would gain."""
     step = _identified(state)
     folder = runner.project.new_folder("options")
-    words = ["options", _machine_of(state), f"{step.folder}/identified.errors.csv", "--out", folder]
+    words = ["options", _machine_of(state), f"{step.folder}/identified.errors.csv", *_language(), "--out", folder]
     runner.start(
         "exporting for every control",
         "tables",
@@ -854,7 +853,8 @@ def compare(runner: Runner, state: ProjectState) -> None:
                 commands.append(["identify", machine, *side, *words, "--out", f"{folder}/{name}"])
             files, own = [[f"{folder}/before"], [f"{folder}/after"]], []
         words = ["compare", machine, files[0][0], files[1][0], *own, *aligned, "--out", folder]
-        title = " against ".join(", ".join(item.name for item in side) for side in sides)
+        first, second = (", ".join(item.name for item in side) for side in sides)
+        title = f"{first} against {second}"
         commands += [words, ["report", folder, *certificate, *language]]
         return StepTask(Step(0, "compare", title, commands, folder))
 
@@ -1015,6 +1015,7 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.trim_blocks = app.jinja_env.lstrip_blocks = True
     app.jinja_env.filters.update(
         word=str,
+        lines=str,
         drawn=lambda svg: svg,
         figure=_figure,
         unit=lambda text: LABEL.get(text, text),
@@ -1026,7 +1027,9 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
     if workbench.language != LANGUAGES[0]:
         texts = texts_of(workbench.language)
-        texts.translate(app.jinja_env, html=True).filters["drawn"] = lambda svg: Markup(texts.drawn(svg))
+        texts.translate(app.jinja_env, html=True).filters.update(
+            drawn=lambda svg: Markup(texts.drawn(svg)), lines=texts.lines
+        )
     app.url_map.converters["number"] = StepNumber
     app.extensions["compgen"] = workbench
     app.before_request(_begin_request)

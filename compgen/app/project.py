@@ -27,6 +27,7 @@ from typing import Any
 
 from compgen.data.files import json_text, read_bytes, read_text, write_file
 from compgen.errors import InputError
+from compgen.resources import LANGUAGES
 
 PROJECT, UNDONE, LOCK = "project.json", "undone", ".project.lock"
 #: The job file of the hand-over to ``recal``, and what ``recal`` itself writes beside it.
@@ -407,8 +408,9 @@ def arguments_for(words: Sequence[str]) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    """Return the environment of a command: one thread, UTF-8, and no plain-text colours."""
-    return {**os.environ, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "400"}
+    """Return the environment of a command: one thread, UTF-8, no plain-text colours, messages that are kept in English."""
+    english = {"COMPGEN_MESSAGES": LANGUAGES[0]}
+    return {**os.environ, **english, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "400"}
 
 
 class Runner:

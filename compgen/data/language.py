@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 #: Context of single words in the catalogue. They are translated only where a page shows them as a word, because a word in a
 #: text may be a key or a value that has to be typed as it is (``sign = "error"``).
 WORD = "word"
+#: Context of headings and names of facts, which are translated only as such: as the name of a key they must not be.
+LABEL = "label"
 #: Context of parts of templates: they are no values.
 PART = "part"
 
@@ -103,6 +105,11 @@ class Texts:
             for english, text in tuple(self.messages.items()):
                 if english.startswith(end) and text.startswith(end):
                     self.messages.setdefault(english.removeprefix(end), text.removeprefix(end))
+        for end in ("; give ", "; write "):  # what a file leaves open is shown as a question, without what answers it
+            for english, text in tuple(self.messages.items()):
+                asked, given, _ = english.partition(end)
+                if given and "\x04" not in english and len(_PLACE.sub("", asked)) > 2 * _SURE:
+                    self.messages.setdefault(asked, ";".join(text.split(";")[: asked.count(";") + 1]))
         found = []
         for english in self.messages:
             literals = _PLACE.split(english)[::2]
@@ -126,13 +133,15 @@ class Texts:
         return found
 
     def label(self, english: str) -> str:
-        """Return a text that may be a single word, e.g. of a picture or a verdict, or a number with one."""
-        return self._word(english) or self.text(english)
+        """Return a text that may be a single word, e.g. of a picture or a verdict, a heading, or a number with one."""
+        core = english.strip()
+        known = self._word(core) or self.messages.get(f"{LABEL}\x04{core}")
+        return self.text(english) if known is None else english.replace(core, known)
 
     def _word(self, english: str) -> str | None:
         number, word = _COUNTED.fullmatch(english).groups()  # type: ignore[union-attr]
         known = self.messages.get(f"{WORD}\x04{word.strip()}")
-        return None if known is None else (number or "") + word.replace(word.strip(), known)
+        return None if known is None or not word.strip() else (number or "") + word.replace(word.strip(), known)
 
     def _complete(self, english: str, least: int = 0) -> str | None:
         """Return a text in this language, as it is if it contains no sentence; None if a sentence has no translation."""
@@ -222,9 +231,9 @@ class Texts:
 
     def _named(self, english: str) -> str:
         """Return a cell of a table, or a name and its value, in this language."""
-        name, colon, value = english.partition(":")
-        known = self._word(name.replace("_", " ")) if colon and " " not in name else None
-        return self.label(english) if known is None else f"{known}:{self.label(value)}"
+        whole, (name, colon, value) = self.label(english), english.partition(":")
+        known = self.messages.get(f"{LABEL}\x04{name.replace('_', ' ')}")
+        return whole if known is None or not colon or whole != english else f"{known}:{self.label(value)}"
 
     def page(self, html: str) -> str:
         """Return a finished page in this language: all texts between its tags, names of pictures, and its language."""
@@ -267,7 +276,8 @@ class Texts:
             end = last
         text = "".join([*found, source[end:]])
         if html:
-            text = re.sub(r'(?<=aria-label=")[^"{]+', lambda found: self.label(found[0]), text)
+            said = lambda found: self.messages.get(f"{PART}\x04{found[0]}") or self.label(found[0])  # noqa: E731
+            text = re.sub(r'(?<=aria-label=")[^"]+', said, text)
         return text.replace('<html lang="en">', f'<html lang="{self.language}">')
 
     def translate(self, environment: Environment, *, html: bool) -> Environment:
@@ -275,7 +285,7 @@ class Texts:
         assert environment.loader is not None
         environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
         environment.finalize = self.filled
-        environment.filters["word"] = lambda value: self._word(str(value)) or self.filled(str(value))
+        environment.filters["word"] = lambda value: self.label(value) if type(value) is str else self.filled(str(value))
         environment.globals["language"] = self.language
         if not html:  # in HTML this would switch off the escaping
             from markupsafe import Markup

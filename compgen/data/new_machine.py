@@ -144,7 +144,8 @@ def in_words(chain: Chain) -> str:
         letters = [AXES[axis] for axis in axes]
         if not letters:
             return f"{what} does not move"
-        return f"{what} moves in {', on a carriage in '.join(letters)}{', on the bed' if len(letters) > 1 else ''}"
+        carried = "".join(f", on a carriage in {letter}" for letter in letters[1:])
+        return f"{what} moves in {letters[0]}{carried}{', on the bed' if carried else ''}"
 
     return f"{side('table', chain.workpiece_side[::-1])}; {side('head', chain.tool_side[::-1])}"
 

@@ -55,7 +55,7 @@ def level_rows(result: Capability) -> list[list[str]]:
     if result.program is not None:
         left = result.program.left
         uncertainty = "" if result.program.u_um is None else f", U {um_text(2.0 * result.program.u_um)} um (k = 2)"
-        rows.append([PROGRAM, _three(left.after), _three(left.rigid_removed), f"rounding{uncertainty}"])
+        rows.append([PROGRAM, _three(left.after), _three(left.rigid_removed), f"rounding of the program{uncertainty}"])
     return rows
 
 
@@ -190,7 +190,7 @@ CORRECTS = {
 
 def explanation_markdown(item: Explanation) -> str:
     """Return ``explain.md``."""
-    text = f"# {item.controller} on {item.machine}\n\nThis control corrects {CORRECTS[item.level]}."
+    text = f"# Control {item.controller}, machine {item.machine}\n\nThis control corrects {CORRECTS[item.level]}."
     if item.own is not None and item.own.left is not None:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
         text += (

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from compgen.controls import CONTROLLERS
-from compgen.data.language import MARKER, PART, WORD, parts
+from compgen.data.language import LABEL, MARKER, PART, WORD, parts
 from compgen.data.toml_files import section_schema
 from compgen.simulate import INSTRUMENTS
 
@@ -25,6 +25,7 @@ CATALOGUES = ROOT / "templates" / "_language"
 #: Modules whose sentences are shown on a page, in a list for the reader, or in the terminal.
 MODULES = (
     "accuracy/*.py", "app/*.py", "cli/common.py", "cli/accuracy_commands.py", "cli/diagnose_commands.py",
+    "cli/file_commands.py", "cli/fit_commands.py",
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
     "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
@@ -39,7 +40,7 @@ WITH_ERRORS = re.compile(
 )
 ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")
 #: Readers of controls' files, and modules with names of columns and keys: their texts are no sentences for people.
-READERS = ("heidenhain_text.py", "siemens_text.py", "registry.py", "language.py", "display.py", "new_machine.py")
+READERS = ("heidenhain_text.py", "siemens_text.py", "registry.py", "language.py", "display.py")
 #: Calls whose texts are for help, or are no texts.
 NOT_SHOWN = re.compile(
     r"(setting|option|choice|positive|number_of|compile|match|search|sub|split|startswith|endswith|strip|argument|"
@@ -48,10 +49,11 @@ NOT_SHOWN = re.compile(
 UNTRANSLATED = ("name", "equation", "source", "covariates", "scan")
 #: Functions whose texts are read by programs, or shown in a session alone.
 NOT_SHOWN_IN = re.compile(
-    r"^(overview|panels|parse|remarks|usage$|short_text|dossier|calibration|_verification$|machine_text$)"
+    r"^(overview|panels|parse|usage$|short_text|dossier|calibration|_verification$|machine_text$)"
 )
 #: Single words that pages show: no rule tells them from keys.
 WORDS = (
+    "table", "head",
     "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
     "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um",
     "urad", "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness",
@@ -61,23 +63,26 @@ WORDS = (
     "parallelism", "roundness", "rms", "assumed", "before", "better", "clockwise", "counter-clockwise", "day", "days", "exceeded",
     "identified", "larger", "metric", "month", "months", "negative", "off", "on", "positioning", "positive", "readings",
     "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with", "within", "without",
-    "worse", "positioning runs", "circles", "part", "artefact", "lengths of a tracer", "deviations", "errors",
-    "six-DOF readings", "diagonals", "axis", "plane", "station", "targets", "runs", "directions", "both", "one",
-    "both directions", "radius (mm)", "angle", "axes", "base length mm", "calibrated", "columns", "comments", "components",
-    "directions from", "duration s", "effective diameter mm", "encoding", "error", "expected diameter mm", "features",
-    "first", "from mm", "header", "highest", "instrument", "kind", "largest", "largest misfit um", "largest um",
-    "largest urad", "largest um urad", "last", "lowest", "machine", "measured at", "mm per unit by geometry", "notes",
-    "Notes", "not used", "offset mm", "position unit", "points", "poses", "radius mm", "ranges mm", "rms um", "rms urad",
-    "rows", "samples", "sheet", "sign", "sign of squareness", "slope of readings", "squareness urad", "stations", "step s",
-    "temperatures c", "time s", "to mm", "u urad", "unit", "unit angle", "unit length", "serial no", "date", "velocity",
-    "empty", "source", "control", "verdict", "reservations", "REJECTED", "before*", "after*", "figure", "max", "rms",
-    "difference", "length", "factor", "orientation", "volume", "Before", "After", "Suspects", "visible", "gain", "buys",
-    "nothing", "level", "remark", "left", "left*", "none", "from", "named", "unknown", "rise", "fall", "grows", "falls",
-    "rises", "up", "down", "stated", "estimated", "yes", "no", "required", "meaning", "allowed", "default", "key", "limit",
-    "used", "margin", "over", "correction", "parameters", "effect", "equation", "resembles", "chain", "format", "name",
-    "value", "position", "station drift", "smoothness", "free", "bias", "solver", "feature", "quantity", "line", "diameter",
-    "distance", "parallelism", "only", "share", "Errors", "Controls", "Properties", "Limits", "Sources", "Files", "Remarks",
-    "Points", "Scatter", "Without", "nodes", "agrees", "disagrees",
+    "worse", "positioning runs", "lengths of a tracer", "six-DOF readings", "both", "one", "both directions", "radius (mm)",
+    "REJECTED", "nothing", "none", "named", "unknown", "rise", "fall", "grows", "falls", "rises", "up", "down", "stated",
+    "estimated", "yes", "no", "required", "agrees", "disagrees",
+)  # fmt: skip
+#: Headings and names of facts: they are no values, and where they are the name of a key they stay as they are.
+LABELS = (
+    "circles", "part", "artefact", "deviations", "errors", "diagonals", "axis", "plane", "station", "targets", "runs",
+    "directions", "angle", "axes", "base length mm", "calibrated", "columns", "comments", "components", "directions from",
+    "duration s", "effective diameter mm", "encoding", "error", "expected diameter mm", "features", "first", "from mm",
+    "header", "highest", "instrument", "kind", "largest", "largest misfit um", "largest um", "largest urad",
+    "largest um urad", "last", "lowest", "machine", "measured at", "mm per unit by geometry", "notes", "Notes", "not used",
+    "offset mm", "position unit", "points", "poses", "radius mm", "ranges mm", "rms um", "rms urad", "rows", "samples",
+    "sheet", "sign", "sign of squareness", "slope of readings", "squareness urad", "stations", "step s", "temperatures c",
+    "time s", "to mm", "u urad", "unit", "unit angle", "unit length", "serial no", "date", "velocity", "empty", "source",
+    "control", "verdict", "reservations", "before*", "after*", "figure", "max", "rms", "difference", "length", "factor",
+    "orientation", "volume", "Before", "After", "Suspects", "visible", "gain", "buys", "level", "remark", "left", "left*",
+    "from", "meaning", "allowed", "default", "key", "limit", "used", "margin", "over", "correction", "parameters", "effect",
+    "equation", "resembles", "chain", "format", "name", "value", "position", "station drift", "smoothness", "free", "bias",
+    "solver", "feature", "quantity", "line", "diameter", "distance", "parallelism", "only", "share", "Errors", "Controls",
+    "Properties", "Limits", "Sources", "Files", "Remarks", "Points", "Scatter", "Without", "nodes",
 )  # fmt: skip
 
 
@@ -89,11 +94,11 @@ NO_TEXT = re.compile(
     r"^Tool offset of the model|^[*]\.reversal|^(x|viewBox|transform)=\"|^(cd|volcomp) \{|^What was done in this project, by|"
     r"^([Mm]easurement|target|serial|version|[Ss]ample|mat temp) (date|id|no|\d)$|^(file type|exp coeff|air temp|measured at)$|"
     r"^(test date|date time|date of measurement|start time|actual sample rate|[Ss]ample rate|trigger interval)$|"
-    r"^error: internal|^run target data$|^Tool lengths: CSV|"
+    r"^error: internal| \| [A-Z]|^run target data$|^Tool lengths: CSV|"
     r"^Another machine with its errors|^ecart type$|^coverage factor k$|^Position \[|^run\{zero"
 )
 #: Modules whose constants are words that readers look for.
-WITH_WORD_LISTS = ("column_names.py", "covariates.py", "cells.py", "probe_logs.py")
+WITH_WORD_LISTS = ("new_machine.py", "column_names.py", "covariates.py", "cells.py", "probe_logs.py")
 
 
 def place_name(node):
@@ -139,15 +144,17 @@ def sentence(node):
 def pieces_of(text):
     """Return what is translated as one: the text between two tags of a page, a line of a list without its marker."""
     if re.search(r"</?[a-z]\w*[ >]", text):
-        return [html.unescape(" ".join(piece.split())) for piece in re.split(r"<[^<>]*>?|^[^<>]*>", text)]
-    return [line[MARKER.match(line).end() :].strip() for line in text.split("\n")]
+        names = re.findall(r'aria-label="([^"{]+)"', text)
+        return names + [html.unescape(" ".join(piece.split())) for piece in re.split(r"<[^<>]*>?|^[^<>]*>", text)]
+    rows = (line.split("|") if line.startswith("|") else [line] for line in text.split("\n"))
+    return [cell[MARKER.match(cell).end() :].strip() for row in rows for cell in row]
 
 
 def is_sentence(text):
     """Return whether a string is meant to be read: several words, or one word beside a value."""
     literal = re.sub(r"\{\w+\}", " ", text)
     words = re.findall(r"[^\W\d_]{2,}", literal)
-    if not words or NO_TEXT.search(text) or " | " in text or text.startswith(("_", "--", "/", "compgen ", "bold ")):
+    if not words or NO_TEXT.search(text) or text.startswith(("_", "--", "/", "compgen ", "bold ")):
         return False
     return " " in text.strip() and bool(re.search(r"[a-z]{2,}", literal))
 
@@ -208,8 +215,13 @@ def of_template(source, *, html):
         for text in re.findall(r'"([^"]*)"', expression):
             if is_sentence(text) and "%" not in text and ":" not in text:
                 yield None, text
-    for text in re.findall(r'aria-label="([^"{]* [^"{]*)"', source):
-        yield None, text
+    for text in re.findall(r'aria-label="([^"]* [^"]*)"', source):
+        if (
+            re.search(r"[a-z]{2,}", re.sub(r"\{\{.*?\}\}", "", text))
+            and "{%" not in text
+            and text.count("{{") == text.count("}}")
+        ):
+            yield (PART if "{{" in text else None), text
 
 
 def of_card(data):
@@ -262,6 +274,7 @@ def messages():
     for reader in INSTRUMENTS.values():
         add(ROOT / f"{reader.__module__.replace('.', '/')}.py", [inspect.getdoc(reader).partition("\n")[0]])
     add(Path(__file__), WORDS, WORD)
+    add(Path(__file__), LABELS, LABEL)
     return found
 
 
