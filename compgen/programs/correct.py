@@ -178,6 +178,13 @@ class ProgramWriter:
         self, batch: Batch, block: SingleBlock, pieces: Pieces, rows: slice, share_before: FloatArray
     ) -> list[str]:
         """Rewrite one block; moves of a block are one that is divided, or those of a drilling cycle."""
+        if block.parts:
+            texts: list[str] = []
+            for hole in block.parts:
+                low, high = np.searchsorted(pieces.move, [hole.first, hole.first + hole.count]).tolist()
+                texts += self._block(batch, hole, pieces, slice(low, high), share_before)
+            self.changed, self.added = self.changed + 1, self.added + len(texts) - 1
+            return texts
         offset = batch.moves.offset_mm[block.first] + self.shift_mm if block.count else self.shift_mm
         if block.kind == "preset":
             return [self._preset(block)]

@@ -83,6 +83,8 @@ class SingleBlock:
     #: Addresses that say for themselves whether they are absolute: X=IC(5), I=AC(5).
     modes: Mapping[str, bool] = field(default_factory=dict)
     drilling: DrillingCycle | None = None
+    #: The blocks by which a drilling cycle in increments is replaced: one for each hole, in absolute.
+    parts: tuple[SingleBlock, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,8 @@ class Reader:
         self.motion: int | None = 0 if dialect.name == "grbl" else None
         self.cycle: int | None = None
         self.cycle_z = self.cycle_r = self.initial_z = math.nan
+        #: Z and R of the drilling cycle as they were given last.
+        self.cycle_given = [math.nan, math.nan]
         self.cycle_peck, self.to_r_level = 0.0, dialect.name == "linuxcnc"
         self.plane, self.scale, self.absolute, self.centre_absolute = 2, 1.0, True, False
         self.feed, self.offset_name = "minute", ""
@@ -359,6 +363,9 @@ class Reader:
         self._line, self._text = number, text
         self._modes = {}
         before, words = len(self._rows), self._words(text)
+        if parts := self._holes_in_absolute(number, text, words, first):
+            count = sum(part.count for part in parts)
+            return replace(parts[0], text=text, words=words, count=count, parts=parts)
         kind = self._act(words) if words else "keep"
         return SingleBlock(
             number,
@@ -374,6 +381,83 @@ class Reader:
             {letter: mode == "AC" for letter, mode in self._modes.items()},
             self.drilling if kind == "hole" else None,
         )
+
+    def _holes_in_absolute(
+        self, number: int, text: str, words: list[tuple[str, str, int, int]], first: int
+    ) -> tuple[SingleBlock, ...]:
+        """Read a drilling cycle in increments as blocks in absolute, one for each hole; none if the block is no such cycle.
+
+        R counts from where Z was before the cycle, Z from R; X and Y count from hole to hole.
+        """
+        numbers = {letter: number_of(value) for letter, value, *_ in words if value and value[0] != '"'}
+        codes = [f"{letter}{number_of(value):g}" for letter, value, *_ in words if letter == "G"]
+        meanings = [self.dialect.codes.get(code, "") for code in codes]
+        begins = next((meaning for meaning in meanings if meaning.startswith("cycle")), "")
+        on = self.cycle is not None and not any(
+            meaning.startswith(("motion", "no motion", "home")) for meaning in meanings
+        )
+        incremental = "G91" in codes or (not self.absolute and "G90" not in codes)
+        if not incremental or not (begins or on) or not numbers.keys() & set("XYZR"):
+            return ()
+        offset, scale, given = self._offset(), self.scale, list(self.cycle_given)
+        x, y, z = ((place - zero) / scale for place, zero in zip(self.position, offset, strict=True))
+        if self.cycle is not None:
+            z = (self.initial_z - offset[2]) / scale
+        if any(math.isnan(value) for value in (x, y, z)):
+            self._fail(
+                "a drilling cycle in incremental from a position that is not known; position it in absolute first"
+            )
+        if self.dialect.name == "linuxcnc":  # keeps the numbers, whatever they meant when they were given
+            raw = dict(zip("ZR", given, strict=True)) | numbers
+            level = z + raw["R"]
+            depth = level + raw["Z"]
+        elif {"Z", "R"} <= numbers.keys():
+            level = z + numbers["R"]
+            depth = level + numbers["Z"]
+        elif {"Z", "R"} & numbers.keys():
+            self._fail("a drilling cycle in incremental with one of Z and R; give both")
+        else:
+            level, depth = ((height - offset[2]) / scale for height in (self.cycle_r, self.cycle_z))
+        if math.isnan(level + depth):
+            self._fail("a drilling cycle without Z or R")
+        repeats = self._repeats(numbers)
+        if repeats == 0:
+            self._fail("a drilling cycle in incremental that is only stored is not followed; post each hole")
+        digits = self.dialect.decimals[scale == MM_PER_INCH] + 2
+
+        def word(letter: str, value: float) -> str:
+            return f"{letter}{round(value, digits) + 0.0:.{digits}f}".rstrip("0")
+
+        end, body = text[len(text.rstrip()) :] or "\n", text.rstrip()
+        drop = {"X", "Y", "Z", "R", "L", *("K" if "I" not in numbers and "J" not in numbers else "")}
+        for letter, value, begin, stop in reversed(words):
+            mode = letter == "G" and number_of(value) in (90.0, 91.0)
+            if mode or letter in drop:
+                begin = body.upper().rindex(letter, 0, begin)
+                body = body[:begin].rstrip(" ") + (" " if " " in body.strip() else "") + body[stop:].lstrip(" ")
+        step = numbers.get("X", 0.0), numbers.get("Y", 0.0)
+        place = [word("X", x + step[0]), word("Y", y + step[1]), word("Z", depth), word("R", level)]
+        body = body.lstrip()
+        head = re.match(r"(?:/\d?\s*)?(?:N\d+\s*)?", body)
+        at = head.end() if head else 0
+        texts = [" ".join([f"{body[:at]}G90", *place, body[at:]]).rstrip()]
+        for k in range(2, int(repeats) + 1):
+            texts.append(" ".join([word("X", x + k * step[0]), word("Y", y + k * step[1])]))
+        texts.append("G91")
+        parts: list[SingleBlock] = []
+        for one in texts:
+            parts.append(self._block(number, one + end, first + sum(part.count for part in parts)))
+        self._text = text
+        self.cycle_given = [numbers.get("Z", given[0]), numbers.get("R", given[1])]
+        return tuple(parts)
+
+    def _repeats(self, values: Mapping[str, float]) -> float:
+        """How often a drilling cycle is executed: L, or K of FANUC, which is a peck where I or J is given (Haas)."""
+        by_letter = self.dialect.name == "fanuc" and "I" not in values and "J" not in values
+        repeats = values.get("L", values.get("K", 1.0) if by_letter else 1.0)
+        if repeats != int(repeats) or not 0 <= repeats <= 9999:
+            self._fail("expected a whole number of repeats of the drilling cycle")
+        return repeats
 
     def _words(self, text: str) -> list[tuple[str, str, int, int]]:
         """Split a block into words; empty where it has nothing to do: comments, program numbers, % and skipped blocks."""
@@ -511,7 +595,7 @@ class Reader:
                 codes.append(f"{letter}{number_of(text):g}")
         setting = [code for code in codes if self._is_setting(code)]
         cycles = self.cycle is not None or any(dialect.codes.get(code, "").startswith("cycle") for code in codes)
-        lengths = "XYZIJKRQ" if cycles else "XYZIJKR"
+        lengths = "XYZIJRQ" if cycles else "XYZIJKR"
         for letter, text, _, _ in words:
             if not text or text[0] == '"' or letter in "GM":
                 continue
@@ -955,16 +1039,13 @@ class Reader:
         """Expand a drilling cycle: over the hole, to the R level, to the depth at feed, back."""
         if self.plane != 2:
             self._fail("a drilling cycle outside the plane G17 is not followed; post moves")
-        if not self.absolute:
-            self._fail("a drilling cycle in incremental is not followed; post it in absolute (G90)")
         offset, scale = self._offset(), self.scale
         if motion:
             if self.cycle is None:
                 self.initial_z = self.position[2]
             self.cycle = int(motion[6:])
-        repeats = values.get("L", values.get("K", 1.0) if self.dialect.name == "fanuc" else 1.0)
-        if repeats > 1.0:
-            self._fail("a drilling cycle with repeats is not followed; post each hole")
+        repeats = self._repeats(values)
+        self.cycle_given = [values.get("Z", self.cycle_given[0]), values.get("R", self.cycle_given[1])]
         if axes[2] is not None:
             self.cycle_z = offset[2] + axes[2] * scale
         if "R" in values:
@@ -995,22 +1076,23 @@ class Reader:
         # from below the R level up at first; LinuxCNC asks where the series of holes began, not where the tool is
         if known_z and (self.initial_z if self.dialect.name == "linuxcnc" else self.position[2]) < self.cycle_r:
             go(RAPID, self.cycle_r, there=False)
-        go(RAPID, max(self.position[2], self.cycle_r) if known_z else math.nan)
-        go(RAPID, self.cycle_r)
-        pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
-        depth = self.cycle_r
-        while pecking and depth - self.cycle_peck > self.cycle_z + PECK_REST_MM and self.cycle_peck > 0:
-            depth -= self.cycle_peck
-            go(FEED, depth)
-            go(RAPID, self.cycle_r if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)
-            if self.cycle == 83:
-                go(RAPID, depth + _PECK_CLEARANCE_MM)
-        go(FEED, self.cycle_z)
-        back = FEED if self.cycle in (84, 85, 89) else RAPID
-        level = self.cycle_r if self.to_r_level or math.isnan(self.initial_z) else max(self.initial_z, self.cycle_r)
-        if back == FEED or self.dialect.name != "linuxcnc":  # which goes to the initial level at once
-            go(back, self.cycle_r)
-        go(RAPID, level)
+        for _ in range(int(repeats)):  # in the same place
+            go(RAPID, max(self.position[2], self.cycle_r) if known_z else math.nan)
+            go(RAPID, self.cycle_r)
+            pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
+            depth = self.cycle_r
+            while pecking and depth - self.cycle_peck > self.cycle_z + PECK_REST_MM and self.cycle_peck > 0:
+                depth -= self.cycle_peck
+                go(FEED, depth)
+                go(RAPID, self.cycle_r if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)
+                if self.cycle == 83:
+                    go(RAPID, depth + _PECK_CLEARANCE_MM)
+            go(FEED, self.cycle_z)
+            back = FEED if self.cycle in (84, 85, 89) else RAPID
+            level = self.cycle_r if self.to_r_level or math.isnan(self.initial_z) else max(self.initial_z, self.cycle_r)
+            if back == FEED or self.dialect.name != "linuxcnc":  # which goes to the initial level at once
+                go(back, self.cycle_r)
+            go(RAPID, level)
         return "cycle"
 
     def _hole(self, axes: list[float | None], single: list[str], moving: bool) -> str:

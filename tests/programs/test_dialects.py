@@ -381,3 +381,26 @@ def test_calls_of_fanuc_and_haas_in_the_same_file(tmp_path):
     loop = text.replace("X0.\nM99\n%", "M98 P10\nM99\n%")
     with pytest.raises(InputError, match="call themselves"):
         run(tmp_path, loop, shift(), "fanuc", PLAIN)
+
+
+def test_fanuc_drilling_in_increments(tmp_path):
+    """Depth and R level of a cycle in G90 stay when G91 moves on; given in G91, R counts from the initial level, Z from R."""
+    text = (
+        "%\nO1\nG21 G90 G17 G54\nG0 X100. Y0. Z50.\nG98 G81 Z-20. R5. F90\nN2 G91 X100. K2\nG90 X0. K2\nG80\n"
+        "G91 G99 G83 X100. Y10. Z-30. R-45. Q2. F50\nG80\nG90 G0 Z50.\nM30\n%\n"
+    )
+    result, corrected = run(tmp_path, text, shift(slope=0.1), "fanuc", PLAIN)
+    assert corrected[corrected.index("G98") :] == (
+        "G98 G81 Z-20. R5. F90\nN2 G90 X199.98 Y0. Z-20. R5.\nX299.97 Y0.\nG91\nG90 X0. K2\nG80\n"
+        "G90 X99.99 Y10. Z-25. R5. G99 G83 Q2. F50\nG91\nG80\nG90 G0 Z50.\nM30\n%\n"
+    )
+    assert result.accepted
+    for wrong, words in (
+        (
+            "R-45.",
+            "",
+        ),
+        ("K2\nG90", "K0\nG90"),
+    ):
+        with pytest.raises(InputError, match="give both|only stored"):
+            moves_of(text.replace(wrong, words), "fanuc", PLAIN)

@@ -166,3 +166,31 @@ def test_calls_of_subprograms_in_the_same_file_are_written_out_as_the_interprete
         written.write_bytes(stream.read())
     assert_same(ours(written), truth)
     assert_same(canonical(written, tmp_path), truth)
+
+
+def test_drilling_in_increments_and_with_repeats(tmp_path, make_errors):
+    """R counts from where Z was, Z from R, X and Y from hole to hole; in absolute, repeats are in the same place."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X1 Y2 Z10\nF100\nG99 G81 X3 Y4 Z-5 R2 L2\n"
+        "N5 G91 G82 X2.5 Y-1 Z-6 R-7.5 P0.1 L3 (row)\nX1 Y1\nG90 X-5 Z-4 R3\nG80\nG0 Z20\nG91 G98\n"
+        "G83 X-2 Z-9 R-15 Q4\nY2.25 L2\nX1 R-14\nG80\nG90 G0 X0 Y0\nM2\n%\n"
+    )
+    truth = canonical(program, tmp_path)
+    assert_same(ours(program), truth)
+    errors = make_errors(mill(), 4)
+    result = correct_program(model_of(mill(), errors, None), program, tmp_path / "out", CorrectOptions(), SETUP)
+    assert result.accepted, result.reasons
+    text = (tmp_path / "out" / "p.ngc").read_text()
+    assert text.count("G91\n") == 5
+    body = tmp_path / "body.ngc"
+    body.write_text(
+        "\n".join(line for line in text.splitlines() if not re.match(r"o<|\(abort|\(CORRECTED", line)) + "\n"
+    )
+    assert_same(ours(body), canonical(body, tmp_path))
+    # the holes are where they were: the corrected places differ by the errors alone
+    places = [end for feed, end, _ in canonical(body, tmp_path) if feed]
+    assert len(places) == len([row for row in truth if row[0]])
+    assert (
+        max(np.abs(there - row[1]).max() for there, row in zip(places, [r for r in truth if r[0]], strict=True)) < 0.2
+    )
