@@ -57,6 +57,7 @@ from compgen.app.project import (
     StepTask,
     command_line,
     file_name,
+    not_written,
 )
 from compgen.controls import CONTROLLERS
 from compgen.data.charts import LABEL
@@ -347,6 +348,8 @@ def action(name: str, path: str) -> Callable[[Callable[..., str | None]], Callab
                 target = change(runner, state, **arguments)
             except CompgenError as error:
                 return _page(number, name, 409, problem=str(error))
+            except OSError as error:  # the disk is full, or the folder must not be written to
+                return _page(number, name, 409, problem=str(not_written(error)))
             runner.wait(A_MOMENT_S)
             return redirect(f"/projects/{number}/{target or name}", code=303)
 
@@ -1024,7 +1027,9 @@ def make_app(workbench: Workbench) -> Flask:
         um=lambda value: number_text(value, 2).replace("-", "\N{MINUS SIGN}"),
         described=describe_error,
     )
-    app.jinja_env.globals.update(PAGES=PAGES, command_line=command_line, language=workbench.language)
+    app.jinja_env.globals.update(
+        PAGES=PAGES, most=LARGEST_UPLOAD, command_line=command_line, language=workbench.language
+    )
     if workbench.language != LANGUAGES[0]:
         texts = texts_of(workbench.language)
         texts.translate(app.jinja_env, html=True).filters.update(

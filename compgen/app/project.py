@@ -154,6 +154,14 @@ class ProjectState:
         )  # fmt: skip
 
 
+def not_written(error: OSError) -> InputError:
+    """Return what a folder that cannot be written to means for the user."""
+    reason = error.strerror or str(error)
+    return InputError(
+        f"the folder of the project cannot be written to: {reason}; nothing was changed", file=error.filename
+    )
+
+
 def file_name(given: str) -> str:
     r"""Return a safe name for an uploaded file: one part, letters, digits, dot, underscore and hyphen.
 
@@ -467,6 +475,8 @@ class Runner:
                         self._run(job, task)
                 except InputError as error:
                     job.problems.append(str(error))
+                except OSError as error:
+                    job.problems.append(str(not_written(error)))
             recorded = {step.folder for step in self.project.state().steps}
             for task in tasks:
                 if task.step.folder and task.step.folder not in recorded:

@@ -73,6 +73,43 @@
   // a file dropped beside a form must not replace the page
   ["dragover", "drop"].forEach(function (name) { document.addEventListener(name, function (event) { event.preventDefault(); }); });
 
+  // what was typed is written again into the form whose command was refused
+  var typed = "input:not([type=hidden]):not([type=file]), select, textarea", refused = document.querySelector("main > .message.bad");
+  function remembered(form) {
+    try { return JSON.parse(sessionStorage.getItem("form " + form.action)) || []; } catch (error) { return []; }
+  }
+  document.querySelectorAll("form").forEach(function (form) {
+    if (refused) {
+      var fields = form.querySelectorAll(typed);
+      remembered(form).forEach(function (value, k) {
+        if (!fields[k]) { return; }
+        if (typeof value === "boolean") { fields[k].checked = value; } else { fields[k].value = value; }
+      });
+    }
+    form.addEventListener("submit", function () {
+      var values = Array.from(form.querySelectorAll(typed)).map(function (field) {
+        return field.type === "checkbox" || field.type === "radio" ? field.checked : field.value;
+      });
+      try { sessionStorage.setItem("form " + form.action, JSON.stringify(values)); } catch (error) { /* not kept */ }
+    });
+  });
+
+  // files that are larger than what the program takes are refused before they are sent
+  document.querySelectorAll("form[enctype]").forEach(function (form) {
+    form.addEventListener("submit", function (event) {
+      var size = 0, told = document.getElementById("large");
+      form.querySelectorAll("input[type=file]").forEach(function (input) {
+        Array.from(input.files).forEach(function (file) { size += file.size; });
+      });
+      told.hidden = size <= Number(body.dataset.most);
+      if (told.hidden) { return; }
+      event.preventDefault();
+      event.stopImmediatePropagation();
+      told.querySelector("strong").textContent = Math.ceil(size / 1e6);
+      form.append(told);
+    });
+  });
+
   // a button is pressed once
   document.querySelectorAll("form").forEach(function (form) {
     form.addEventListener("submit", function () {
@@ -116,6 +153,6 @@
       clearTimeout(waiting);
       waiting = setTimeout(function () { draw(chain.value, list); }, 150);
     });
-    if (chain.value) { draw(chain.value, list); }
+    if (chain.value) { draw(chain.value, list); }  // also what was typed before a refusal
   }
 })();

@@ -137,7 +137,7 @@ def test_tracer_lengths_on_a_shipped_machine_and_the_controls_side_by_side(site)
     )
     page = site.get("/projects/1/result").text
     assert "17</strong> errors identified" in page
-    assert len(re.findall(r'<figcaption>E[ABCXYZ]{2} ', page)) == 14
+    assert len(re.findall(r"<figcaption>E[ABCXYZ]{2} ", page)) == 14
     state = site.do("run", {"control": "isg-csv"})
     result = json.loads(site.project.files_of(state.last("run"))["result.json"].read_text())
     assert result["verdict"] == "accepted"

@@ -1,9 +1,20 @@
 """Attacks on the workbench: other sites, other programs on the computer, crafted addresses, forms and files."""
 
+import contextlib
+import errno
 import io
+import json
+import os
 import re
+import shutil
+import signal
 import socket
+import subprocess
+import sys
 import time
+import urllib.parse
+import urllib.request
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -17,24 +28,27 @@ from compgen.app import pages
 from compgen.app.pages import OpenPages
 from compgen.app.project import Step
 from compgen.fleet.dashboard import server
+from compgen.fleet.dashboard.settings import DashboardSettings
 
 IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
-#: Every address that changes something.
-CHANGES = (
-    "/open", "/projects/1/machine/choose", "/projects/1/machine/describe", "/projects/1/machine/text",
-    "/projects/1/machine/upload", "/projects/1/machine/settings", "/projects/1/measurement/add",
-    "/projects/1/measurement/1/answer", "/projects/1/measurement/1/remove", "/projects/1/measurement/1/sheet",
-    "/projects/1/numbers", "/projects/1/identify",
-    "/projects/1/diagnose", "/projects/1/apply", "/projects/1/options", "/projects/1/run", "/projects/1/verify",
-    "/projects/1/program/use", "/projects/1/compare", "/projects/1/recal", "/projects/1/undo", "/projects/1/stop", "/alive",
-)  # fmt: skip
-SHOWN = (
-    "/", "/projects/1/", "/projects/1/machine", "/projects/1/measurement", "/projects/1/result", "/projects/1/tables",
-    "/projects/1/program", "/projects/1/after", "/projects/1/project", "/projects/1/status", "/projects/1/commands.sh",
-    "/chain?words=WXYFZT",
-    "/projects/1/steps/1/files/1", "/projects/1/steps/1/files.zip", "/projects/1/steps/1/view/report.html",
-    "/projects/1/steps/1/preflight.html",
-)  # fmt: skip
+
+
+def addresses(method):
+    """Every address that answers a method, from the URL map: numbers are 1, a page of a step is its report."""
+    filled = []
+    for rule in pages.make_app(pages.Workbench(DashboardSettings("", port=8765))).url_map.iter_rules():
+        if method not in rule.methods or rule.endpoint in pages.OPEN:
+            continue
+        path = re.sub(r"<number[^>]*>", "1", rule.rule).replace("<path:name>", "report.html")
+        choices = re.search(r"<any\(([^)]*)\):\w+>", path)
+        names = re.findall(r"[\w.]+", choices[1]) if choices else [""]
+        filled += [path.replace(choices[0], name) if choices else path for name in names]
+    assert not any("<" in path for path in filled), filled
+    return sorted(filled)
+
+
+#: Every address that changes something, and every one that shows something.
+CHANGES, SHOWN = addresses("POST"), [*addresses("GET"), "/chain?words=WXYFZT"]
 
 
 @pytest.fixture
@@ -55,10 +69,13 @@ def everything(site):
     return {path: path.read_bytes() for path in sorted(site.project.folder.rglob("*")) if path.is_file()}
 
 
-def test_every_address_that_changes_something_is_in_the_list(site):
-    rules = site.client.application.url_map.iter_rules()
-    known = {re.sub(r"<[^>]+>", "1", rule.rule) for rule in rules if "POST" in rule.methods}
-    assert known == set(CHANGES)
+def test_the_walk_over_all_addresses_finds_those_that_are_known():
+    """The lists come from the URL map, so that a new address is attacked without being named here."""
+    assert {"/open", "/projects/1/run", "/projects/1/undo", "/projects/1/measurement/1/remove", "/alive"} <= set(
+        CHANGES
+    )
+    assert {"/", "/projects/1/tables", "/projects/1/steps/1/view/report.html", "/projects/1/status"} <= set(SHOWN)
+    assert len(CHANGES) > 20
 
 
 def test_the_first_address_is_valid_once_and_for_one_browser(tmp_path):
@@ -83,8 +100,24 @@ def test_the_first_address_is_valid_once_and_for_one_browser(tmp_path):
 def test_nothing_is_shown_without_the_session_to_another_name_or_to_another_site(site, path):
     stranger = site.client.application.test_client()
     assert stranger.get(path, base_url=site.url).status_code == 403
-    assert site.get(path).status_code in (200, 303)
-    assert site.client.get(path, base_url=site.url, headers={"Host": "evil.example:8765"}).status_code == 421
+    stranger.set_cookie("compgen-8765-app", site.workbench.session[:-1] + "?", domain="127.0.0.1")
+    assert stranger.get(path, base_url=site.url).status_code == 403
+    assert site.get(path).status_code in (200, 204, 303)
+    for name in (
+        "evil.example:8765",
+        "127.0.0.1.evil.example",
+        "0.0.0.0:8765",
+        "[::ffff:7f00:1]:8765",
+        "127.1:8765",
+        "",
+        "a b",
+    ):
+        assert site.client.get(path, base_url=site.url, headers={"Host": name}).status_code in (400, 421), name
+    said = {"X-Forwarded-Host": "localhost:8765", "Forwarded": "host=localhost:8765", "Host": "evil.example"}
+    assert site.client.get(path, headers=said).status_code == 421
+    head = site.client.head(path, base_url=site.url, buffered=True)
+    assert head.status_code in (200, 204, 303)
+    assert head.data == b""
     for kind in ("cross-site", "same-site"):
         assert site.get(path, headers={"Sec-Fetch-Site": kind}).status_code == 403
 
@@ -107,6 +140,33 @@ def test_nothing_is_changed_without_session_token_and_origin(site, path):
     for method in ("PUT", "DELETE", "PATCH", "TRACE", "PROPFIND"):
         assert site.client.open(path, method=method, base_url=site.url, headers=origin, data=data).status_code == 405
     assert everything(site) == before
+
+
+@pytest.mark.parametrize(
+    "number", ["\u0661", "01", "+1", "1.0", "0x1", "\uff11", " 1", "1 ", "2147483648", "99999", "-1", "%00"]
+)
+def test_each_page_has_one_address(site, number):
+    for path in {*CHANGES, *SHOWN}:
+        if "/1" in path:
+            other = path.replace("/1", f"/{number}")
+            if "/projects/1/" in path:
+                assert site.get(other).status_code in (404, 405), other
+            assert site.post(other).status_code in (404, 405), other
+
+
+def test_bytes_that_are_no_text_are_words_that_are_not_found(site):
+    for query in (
+        "?words=%ff%fe%80",
+        "?token=%00",
+        "?save=%D9%A1",
+        "?a[]=x&a=1&a=2",
+        "?q=%0d%0aX-Evil:%201",
+        "?" + "&" * 999,
+    ):
+        for path in SHOWN:
+            answer = site.get(path.partition("?")[0] + query)
+            assert answer.status_code in (200, 204, 303), (path, query)
+            assert "X-Evil" not in answer.headers
 
 
 @pytest.mark.parametrize(
@@ -155,6 +215,65 @@ def test_names_and_contents_of_files_are_shown_as_text(site):
         assert "<img" not in text
     for path in (site.project.folder).rglob("*"):
         assert path.resolve().is_relative_to(site.project.folder)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../x.axis.csv", "CON.csv", "x" * 300 + ".csv", "<b onclick=alert(1)>.csv", "-o.csv", "project.json"],
+)  # fmt: skip
+def test_a_measurement_of_any_name_is_read_and_its_name_is_text(site, name):
+    """The file arrives in the folder of its step, and its content is used, whatever its name says."""
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    content = b"axis,position_mm,direction,run,deviation_um\nX,-800,1,1,1\nX,0,1,1,2\n"
+    state = site.do("measurement/add", {"files": [(io.BytesIO(content), name)]})
+    (item,) = state.measurements
+    assert item.used == (item.file,)
+    path = site.project.folder / item.file
+    assert path.read_bytes() == content
+    assert path.parent.parent == site.project.folder
+    text = site.get("/projects/1/measurement").text
+    assert "<b onclick" not in text
+    assert "2 readings along X" in text
+
+
+def test_a_disk_that_is_full_or_must_not_be_written_to_is_said_in_words(site, monkeypatch):
+    """Nothing is recorded, the pages answer, and after the cause is gone the same button works."""
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    before = site.project.state()
+    content = b"axis,position_mm,direction,run,deviation_um\nX,-800,1,1,1\nX,0,1,1,2\n"
+
+    def full(*args, **options):
+        raise OSError(errno.ENOSPC, "No space left on device", str(site.project.folder))
+
+    for place in ("new_folder", "add", "_write"):
+        with monkeypatch.context() as patch:
+            patch.setattr(type(site.project), place, full)
+            files = {"files": [(io.BytesIO(content), "x.axis.csv")]}
+            answer = site.post("/projects/1/measurement/add", files)
+            page = answer.text if answer.status_code == 409 else site.get("/projects/1/measurement").text
+            assert "cannot be written to: No space left on device" in page, place
+            assert "internal error" not in page
+        assert site.project.state() == before
+        assert site.get("/projects/1/machine").status_code == 200
+    assert len(site.do("measurement/add", {"files": [(io.BytesIO(content), "x.axis.csv")]}).measurements) == 1
+
+
+def test_links_in_the_folder_of_a_project_lead_nowhere(site, tmp_path):
+    """A link in place of a step's folder, and links in it: nothing outside is shown, packed or written."""
+    (tmp_path / "secrets").mkdir()
+    (tmp_path / "secrets" / "report.html").write_text("secret")
+    folder = site.project.folder / site.project.state().steps[0].folder
+    (folder / "link.html").symlink_to(tmp_path / "secrets" / "report.html")
+    (folder / "all").symlink_to(tmp_path / "secrets")
+    packed = zipfile.ZipFile(io.BytesIO(site.get("/projects/1/steps/1/files.zip").data))
+    assert not any(b"secret" in packed.read(name) for name in packed.namelist())
+    assert site.get("/projects/1/steps/1/view/link.html").status_code == 404
+    assert site.get("/projects/1/steps/1/view/all/report.html").status_code == 404
+    shutil.rmtree(folder)
+    folder.symlink_to(tmp_path / "secrets")
+    for path in SHOWN:
+        assert "secret" not in site.get(path).text.replace(str(tmp_path), "")
+    assert [path.name for path in (tmp_path / "secrets").iterdir()] == ["report.html"]
 
 
 @pytest.mark.parametrize("field", ["squareness-EC0Y", "backlash-X", "scale-Y"])
@@ -318,3 +437,80 @@ def test_the_program_ends_after_the_last_page_was_closed(monkeypatch):
     assert not open_pages.over()
     now[0] += 2.0
     assert open_pages.over()  # a browser that was killed says nothing
+
+
+class Program:
+    """The command itself on a folder, as a browser without a screen talks to it."""
+
+    def __init__(self, folder, cache):
+        command = [sys.executable, "-m", "compgen", "app", str(folder), "--no-browser", "--keep-open"]
+        variables = {**os.environ, "XDG_CACHE_HOME": str(cache), "PYTHONUNBUFFERED": "1"}
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=variables
+        )
+        address = re.search(r"http://127\.0\.0\.1:\d+/start\?token=\S+", self.process.stdout.readline())[0]
+        self.url = address.partition("/start")[0]
+        self.browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        self.page = self.browser.open(address, timeout=helper.PATIENCE_S).read().decode()
+
+    def get(self, path):
+        return self.browser.open(self.url + path, timeout=helper.PATIENCE_S).read().decode()
+
+    def post(self, path, **fields):
+        """Send a form with the token and the revision of the page that is shown."""
+        self.page = self.get("/projects/1/project")
+        seen = {name: re.search(rf'data-{name}="([^"]*)"', self.page)[1] for name in ("csrf", "revision")}
+        data = urllib.parse.urlencode({**seen, **fields}).encode()
+        sent = urllib.request.Request(self.url + path, data, {"Origin": self.url})
+        self.page = self.browser.open(sent, timeout=helper.PATIENCE_S).read().decode()
+
+    def busy(self):
+        return json.loads(self.get("/projects/1/status"))["busy"]
+
+    def wait(self, what):
+        until = time.monotonic() + helper.PATIENCE_S
+        while not what():
+            assert time.monotonic() < until
+            time.sleep(0.05)
+
+
+def commands_in(folder):
+    """Process ids of the commands that run in a folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(OSError):
+            if (path / "cwd").resolve() == folder and b"compgen" in (path / "cmdline").read_bytes():
+                found.append(int(path.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/cwd").exists(), reason="the system does not show where a process runs")
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGINT"])
+def test_a_program_that_ends_in_the_middle_of_a_run_loses_no_step_and_leaves_nothing_running(tmp_path, how):
+    """Killed without warning, or Ctrl-C: what was shown as saved is there, and the next program goes on."""
+    folder = tmp_path / "project"
+    name, content = helper.few_lengths()
+    site = helper.Site(folder)
+    site.do("machine/choose", {"machine": "zha-gantry"})
+    before = site.do("measurement/add", {"files": [(io.BytesIO(content), name)]})
+    site.workbench.close()
+    program = Program(folder, tmp_path / "cache")
+    try:
+        program.post("/projects/1/diagnose")
+        program.wait(lambda: commands_in(folder))
+        program.process.send_signal(getattr(signal, how))
+        program.process.communicate(timeout=helper.PATIENCE_S)
+        assert program.process.returncode == (0 if how == "SIGINT" else -signal.SIGKILL)
+        program.wait(lambda: not commands_in(folder))
+        assert site.project.state() == before
+    finally:
+        if program.process.poll() is None:
+            program.process.kill()
+            program.process.communicate()
+    again = helper.Site(folder)
+    assert again.project.state() == before
+    assert again.get("/projects/1/result").status_code == 200
+    state = again.do("identify")
+    assert state.last("identify").exit_code == 0
+    assert [step.kind for step in state.steps] == ["machine", "measurement", "identify"]
+    again.workbench.close()

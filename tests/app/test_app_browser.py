@@ -177,6 +177,65 @@ def test_words_with_two_meanings_are_a_question_on_the_page(page, browser, site)
     assert machine.chain.name == "WYXFZT"
 
 
+def test_what_was_typed_is_still_there_after_a_refusal(page, site):
+    """By the form itself, and by the command that it starts; what is corrected is then taken."""
+
+    def typed():
+        return page.browser.ask(
+            "[...document.querySelectorAll('#describe input:not([type=hidden])')].map(e => e.value)"
+        )
+
+    for letter, low, high in (("X", "0", "400"), ("Y", "0", "400"), ("Z", "-240", "zero")):
+        page.write(f"[name={letter}-low]", low)
+        page.write(f"[name={letter}-high]", high)
+    page.write("#name", "my-mill")
+    page.write("#chain", "WXYFZT")
+    page.choose("#control", "siemens-cec")
+    page.press("Save the machine")
+    assert "'zero' is not a number in mm" in page.text()
+    assert typed()[:8] == ["my-mill", "WXYFZT", "0", "400", "0", "400", "-240", "zero"]
+    page.write("[name=Z-high]", "-300")
+    page.press("Save the machine")
+    assert "writing the machine file" in page.text()
+    assert typed()[:8] == ["my-mill", "WXYFZT", "0", "400", "0", "400", "-240", "-300"]
+    page.write("[name=Z-high]", "0")
+    page.press("Save the machine")
+    assert "my-mill" in page.text()
+    assert list(load_machine(str(site.project.folder / site.project.state().machine)).controllers) == ["siemens-cec"]
+
+
+def test_files_that_are_too_large_are_not_sent(page, site, browser, tmp_path):
+    """600 MB: the page says the limit before anything is sent; a smaller file is then taken."""
+    describe(page)
+    page.visit("/projects/1/measurement")
+    with (tmp_path / "huge.csv").open("wb") as file:
+        file.truncate(600_000_000)  # without taking up the disk
+    page.files("#files-before", tmp_path / "huge.csv")
+    browser.events.clear()
+    browser.ask("[...document.querySelectorAll('.drop button')].find(e => e.textContent === 'Add').click()")
+    assert "These files have 600 MB; at most 200 MB are taken at once." in page.text()
+    assert not [e for e in browser.events if e["params"].get("request", {}).get("url", "").endswith("/measurement/add")]
+    page.files("#files-before", IMPORTS / "linear.rtl")
+    page.press("Add")
+    assert [item.name for item in site.project.state().measurements] == ["linear.rtl"]
+
+
+def test_back_and_reload_after_a_step_show_the_present_state(page, site, browser):
+    """The page before is asked for again, and a reload repeats no step."""
+    describe(page)
+    page.press("Next: the measurement")
+    page.files("#files-before", IMPORTS / "linear.rtl")
+    page.press("Add")
+    page.press("Next: calculate the errors")
+    steps = site.project.state().steps
+    for move in ("history.back()", "history.back()", "location.reload()", "history.forward()", "location.reload()"):
+        page._then(lambda move=move: browser.ask(f"setTimeout(() => {move}, 0)"))
+        page.settle()
+        shown = browser.ask("document.body.dataset.revision")
+        assert shown == str(site.project.state().revision), move
+    assert site.project.state().steps == steps
+
+
 def test_a_refused_file_is_explained_where_it_was_dropped(page, browser, tmp_path):
     describe(page)
     (tmp_path / "bad.axis.csv").write_text("axis,position_mm,direction,run,deviation_um\nX,0,1,1,ten\n")
