@@ -29,6 +29,8 @@ from compgen.programs.path import (
 ON_CIRCLE, ON_SIDE, ON_LEVEL, ON_ROW, MOST_ROWS = 72, 9, 3, 21, 20
 #: The shortest side, and the least height of a wall whose tilt is given, mm.
 SHORTEST_SIDE_MM, LEAST_HEIGHT_MM = 5.0, 5.0
+#: Points of a side are this close to the line between its ends, mm; the sides are at least this share of the lines of a contour.
+STRAIGHT_MM, LEAST_SHARE = 0.002, 0.5
 #: A closed contour of at least this many short lines is a circle if its points are this close to one, and no step is longer.
 LEAST_POINTS, CIRCLE_MM, LONGEST_STEP_RAD = 16, 0.01, np.radians(30.0)
 #: Of contours with more sides only neighbours and sides next but one are compared.
@@ -331,7 +333,7 @@ class PartFeatures:
         self._single_rows = []
 
     def _keep_contour(self, sides: list[_Side], *, closed: bool) -> None:
-        if not sides:
+        if len(sides) < 2:
             return
         key = (sides[0].plane, frozenset(side.key for side in sides))
         if key not in self._contours and len(self._contours) >= MOST_KEPT:
@@ -492,8 +494,21 @@ def _sides(chain: _Chain, plane: int, *, closed: bool) -> list[_Side]:
     goes_on[0] = False
     first = np.flatnonzero(~goes_on)
     last = np.append(first[1:], len(length))
-    found = [_Side(chain.part(slice(i, j)), plane) for i, j in zip(first, last, strict=True) if straight[i]]
-    return [side for side in found if side.length >= SHORTEST_SIDE_MM]
+    found = [_Side(chain.part(slice(i, j)), plane) for i, j in _straight(chain.moves, first, last) if straight[i]]
+    # what consists of short lines for the most part is a curve: its straight pieces are no sides
+    in_sides = sum(side.length for side in found)
+    return found if in_sides > LEAST_SHARE * length[straight].sum() else []
+
+
+def _straight(moves: Moves, first: IntArray, last: IntArray) -> list[tuple[int, int]]:
+    """Pieces of a contour, moves ``first`` to before ``last``, that are long and have their points on the line of their ends."""
+    origin, way = moves.start_mm[first], moves.end_mm[last - 1] - moves.start_mm[first]
+    length = np.linalg.norm(way, axis=1)
+    own = np.repeat(np.arange(len(first)), last - first)
+    unit = way / np.where(length > 0, length, 1.0)[:, None]
+    off = np.linalg.norm(np.cross(moves.end_mm - origin[own], unit[own]), axis=1)
+    fine = (np.maximum.reduceat(off, first) < STRAIGHT_MM) & (length >= SHORTEST_SIDE_MM)
+    return [(int(first[k]), int(last[k])) for k in np.flatnonzero(fine)]
 
 
 def _circle_of_lines(loop: _Chain, plane: int) -> _Circle | None:

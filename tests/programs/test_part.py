@@ -234,6 +234,15 @@ def test_tilt_of_a_wall_by_hand(tmp_path):
         (["G1 X20 Y0", "G3 X0 Y-20 I-20 J0", "G1 X0 Y-40"], set()),
         # rows of a surface that rises: no face
         ([f"G1 X{30 * (k % 2)} Z{-k / 10}" for k in range(10)], set()),
+        # a surface in short lines, flat in places, at several heights of the other axis: no sides, no walls
+        (
+            [
+                f"G1 X{x:.3f} Y{8 * row} Z{15 * np.sin(x / 40):.3f}"
+                for row in range(6)
+                for x in (np.linspace(-90, 90, 181) if row % 2 else np.linspace(90, -90, 181))
+            ],
+            set(),
+        ),
         # a side in three pieces is one side; a step of 90 degrees is a corner
         (["G1 X0 Y0", "G1 X4 Y0", "G1 X8 Y0", "G1 X30 Y0", "G1 Y30"], {"corner"}),
     ],
