@@ -402,7 +402,8 @@ class PartFeatures:
             for k, step in itertools.product(range(count), ahead):
                 if k + step < count and _belong_together(sides[k], sides[k + step], next_but_one=step == 2):
                     yield from _parallel(sides[k], sides[k + step])
-            yield from _walls(plane, [item for _, item in levels.values()], list(levels))
+            if closed:
+                yield from _walls(plane, [item for _, item in levels.values()], list(levels))
 
     def _of_faces(self) -> Iterator[Quantity]:
         for number, (plane, rows) in _evaluated(self._faces.values()):
@@ -572,7 +573,7 @@ def _parallel(one: _Side, two: _Side) -> Iterator[Quantity]:
 
 
 def _walls(plane: int, levels: Sequence[list[_Side]], height_mm: Sequence[float]) -> Iterator[Quantity]:
-    """Tilt of the sides of a contour that is milled at several levels."""
+    """Tilt of the sides of a closed contour that is milled at several levels."""
     if np.ptp(height_mm) < LEAST_HEIGHT_MM:
         return
     chosen = np.unique(np.linspace(0, len(levels) - 1, ON_SIDE).round().astype(int))
