@@ -66,7 +66,7 @@ def program_options(command: Command) -> Command:
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
-    text = "Code that moves nothing and stays as it is, e.g. M100 or G5.1 (may be given several times)."
+    text = "Code that moves nothing and stays as it is, e.g. M100 or M88 (may be given several times)."
     decorated = click.option("--keep-unknown", multiple=True, metavar="CODE", help=text)(decorated)
     text = "Blocks with / are skipped at the control; they stay as they are. Default: they are executed."
     decorated = click.option("--block-delete", is_flag=True, help=text)(decorated)
@@ -129,9 +129,10 @@ def correct_command(
     For controls without tables. Every coordinate is replaced by the command at which the exact model of the machine brings
     the tool where the program wants it. Moves are divided where the correction bends by more than the tolerance. The
     corrected program is read again and compared with the path of the original; if that is not closer to it, the file is
-    named NOT-ACCEPTED-... (exit code 1). Variables, subprograms, cutter radius compensation, turned coordinates and rotary
-    axes are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may be corrected twice:
-    tables that are active while the program runs are given with --active, unless ERRORS were measured with them on.
+    named NOT-ACCEPTED-... (exit code 1). Variables, subprograms of other files, cutter radius compensation, turned coordinates
+    and rotary axes that turn are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may
+    be corrected twice: tables that are active while the program runs are given with --active, unless ERRORS were measured with
+    them on.
 
     \b
     Example:
