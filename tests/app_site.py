@@ -57,8 +57,8 @@ class Site:
 class Served:
     """The workbench on a real port."""
 
-    def __init__(self, folder):
-        self.workbench = Workbench(DashboardSettings("", port=0))
+    def __init__(self, folder, language="en"):
+        self.workbench = Workbench(DashboardSettings("", port=0), language)
         self.workbench.open(folder)
         self.runner = self.workbench.projects[0]
         self.project = self.runner.project
@@ -125,6 +125,14 @@ class Page:
         document = self.browser.call("DOM.getDocument")["root"]["nodeId"]
         node = self.browser.call("DOM.querySelector", nodeId=document, selector=selector)["nodeId"]
         self.browser.call("DOM.setFileInputFiles", nodeId=node, files=[str(path) for path in paths])
+
+    def key(self, name, count=1):
+        """Press Tab, Enter, Space or an arrow, as a keyboard does."""
+        code, text = {"Tab": (9, ""), "Enter": (13, "\r"), "Space": (32, " "), "ArrowDown": (40, "")}[name]
+        pressed = {"key": text if name == "Space" else name, "code": name, "windowsVirtualKeyCode": code}
+        for _ in range(count):
+            self.browser.call("Input.dispatchKeyEvent", type="keyDown" if text else "rawKeyDown", text=text, **pressed)
+            self.browser.call("Input.dispatchKeyEvent", type="keyUp", **pressed)
 
     def text(self):
         return self.browser.ask("document.body.innerText")

@@ -61,7 +61,8 @@ def complaints(browser, url):
 
 
 def barriers(browser):
-    """What axe finds against WCAG 2.2, levels A and AA, on the present page: rule and element."""
+    """What axe finds against WCAG 2.2, levels A and AA, on the present page with all that is folded: rule and element."""
+    browser.ask("document.querySelectorAll('details').forEach(e => { e.open = true; })")
     browser.ask(AXE + ";undefined")
     found = browser.ask(
         "axe.run(document, {runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']}).then(result => "
@@ -70,7 +71,7 @@ def barriers(browser):
     return found
 
 
-def describe(page, control="siemens-cec", *, write_chain=True):
+def describe(page, control="siemens-cec", *, write_chain=True, press=True):
     page.write("#name", "my-mill")
     if write_chain:
         page.write("#chain", "table moves in X and Y, head in Z")
@@ -78,7 +79,8 @@ def describe(page, control="siemens-cec", *, write_chain=True):
         page.write(f"[name={letter}-low]", low)
         page.write(f"[name={letter}-high]", high)
     page.choose("#control", control)
-    page.press("Save the machine")
+    if press:
+        page.press("Save the machine")
 
 
 def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, browser):
@@ -145,6 +147,180 @@ def test_from_laser_files_to_checked_tables_without_a_command_line(page, site, b
     assert "not separated" in page.text()
     look("after")
     assert len(seen) == 8
+
+
+PROGRAM = "G21 G90 G17 G54\nG0 X0 Y0 Z0\nG81 X50. Y50. Z-5. R2. F300\nG80\nG1 X100. F500\nG1 Y50.\nM30\n"
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_pages_in_both_languages_first_page_errors_and_nc_programs_have_no_barrier(
+    browser, tmp_path, monkeypatch, language
+):
+    """In light and dark, by axe; each page states its language."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    site = app_site.Served(tmp_path / "project", language)
+    browser.call("Network.clearBrowserCookies")
+    page = app_site.Page(browser, site.url)
+    looked = []
+
+    def look(path):
+        page.visit(path)
+        for dark in (False, True):
+            browser.picture(dark=dark)
+            assert browser.ask("document.documentElement.lang") == language
+            assert barriers(browser) == [], (path, dark)
+        looked.append(path)
+
+    def press(place):
+        page._then(lambda: browser.ask(f"document.querySelector('form[action$=\"/{place}\"]').requestSubmit()"))
+        page.settle()
+
+    try:
+        look("/projects/1/machine")  # refused: without a session
+        page.visit(site.start)
+        look("/")
+        page.write("#folder", "/proc/none")
+        page._then(lambda: browser.ask("document.querySelector('form.card').requestSubmit()"))
+        assert "/proc/none" in page.text()
+        assert barriers(browser) == []
+        look("/projects/9/machine")
+        look("/projects/1/program")
+        page.visit("/projects/1/machine")
+        describe(page, press=False)
+        press("describe")
+        page.visit("/projects/1/measurement")
+        browser.ask("document.querySelectorAll('details').forEach(e => { e.open = true; })")
+        page.write("#scale-X", "100")
+        press("numbers")
+        page.visit("/projects/1/result")
+        press("identify")
+        (tmp_path / "part.nc").write_text(PROGRAM)
+        page.visit("/projects/1/program")
+        page.files("#program", tmp_path / "part.nc")
+        page.write("#wcs", "G54=0,0,-100")
+        page.choose("#dialect", "fanuc")
+        for what in ("part", "correct"):
+            page._then(lambda what=what: browser.ask(f"document.querySelector('button[value={what}]').click()"))
+            page.settle()
+            assert site.project.state().last(what) is not None, page.text()
+        page.visit("/projects/1/tables")
+        browser.ask("document.querySelector('[name=allow-misfit]').click()")
+        press("run")
+        for name in ("machine", "measurement", "result", "tables", "program", "after", "project"):
+            look(f"/projects/1/{name}")
+        for kind, name in (("part", "view/part.html"), ("correct", "preflight.html"), ("run", "preflight.html")):
+            page.visit(f"/projects/1/steps/{site.project.state().last(kind).number}/{name}")
+            assert barriers(browser) == [], name
+        assert len(looked) == 11
+    finally:
+        browser.picture()
+        site.close()
+
+
+#: Elements of a page that the Tab key reaches, in their order; of radio buttons with one name only one.
+REACHED = """(() => {
+  const names = new Set();
+  return [...document.querySelectorAll('a[href], button, input, select, textarea, summary, [tabindex="0"]')].filter(e => {
+    if (!e.checkVisibility() || e.disabled || e.type === 'hidden') return false;
+    if (e.type !== 'radio') return true;
+    const group = document.querySelectorAll(`input[name="${e.name}"]`), chosen = [...group].find(r => r.checked);
+    return chosen ? chosen === e : !names.has(e.name) && names.add(e.name);
+  });
+})()"""
+
+
+#: The next Tab begins at the top of the page.
+BEGIN = "document.body.tabIndex = -1; document.body.focus(); document.body.removeAttribute('tabindex')"
+
+
+def test_the_whole_job_is_done_with_the_keyboard(page, site, browser):
+    """On each page Tab reaches everything once, in order, visibly, and leads out again; then the button is pressed by Enter."""
+
+    def walk(button):
+        """Go once around the page; then once more to a button, and press it."""
+        count = browser.ask(f"(window.reached = {REACHED}).length")
+        browser.ask(BEGIN)
+        page.key("Tab")
+        assert browser.ask("document.activeElement.className") == "skip"
+        for place in range(count):
+            found = browser.ask(
+                "(e => { const s = getComputedStyle(e), r = e.getBoundingClientRect(); return {place: reached.indexOf(e),"
+                " ring: s.outlineStyle !== 'none' && parseFloat(s.outlineWidth) >= 2,"
+                " seen: r.bottom > 0 && r.top < innerHeight && r.right > 0, what: e.outerHTML.slice(0, 120)}; })"
+                "(document.activeElement)"
+            )
+            assert (found["place"], found["ring"], found["seen"]) == (place, True, True), (button, found)
+            page.key("Tab")
+        assert browser.ask("reached.indexOf(document.activeElement)") in (-1, 0)  # out of the page, or begun again
+        press(button)
+
+    def press(button):
+        browser.ask(BEGIN)
+        for _ in range(300):
+            page.key("Tab")
+            if browser.ask(f"document.activeElement.textContent.trim().startsWith({button!r})"):
+                break
+        page._then(lambda: page.key("Enter"))
+        page.settle()
+
+    def fill(selector, text):
+        """Tab to a field and type."""
+        for _ in range(300):
+            if browser.ask(f"document.activeElement.matches({selector!r})"):
+                break
+            page.key("Tab")
+        browser.call("Input.insertText", text=text)
+
+    page.key("Tab")
+    page.key("Enter")  # the link that leads to the content
+    assert browser.ask("document.activeElement.id") == "content"
+    for selector, text in (("#name", "my-mill"), ("#chain", "WXYFZT"), ("[name=X-low]", "0"), ("[name=X-high]", "400"),
+                           ("[name=Y-low]", "0"), ("[name=Y-high]", "400"), ("[name=Z-low]", "-240"),
+                           ("[name=Z-high]", "0")):  # fmt: skip
+        fill(selector, text)
+    for _ in range(300):
+        if browser.ask("document.activeElement.id") == "control":
+            break
+        page.key("Tab")
+    until = time.monotonic() + app_site.PATIENCE_S
+    while browser.ask("document.activeElement.value") != "siemens-cec":  # down the list
+        assert time.monotonic() < until
+        page.key("ArrowDown")
+    walk("Save the machine")
+    page.visit("/projects/1/measurement")
+    page.files("#files-before", IMPORTS / "linear.rtl")
+    walk("Add")
+    walk("Next: calculate the errors")
+    page.visit("/projects/1/tables")
+    for _ in range(300):
+        page.key("Tab")
+        if browser.ask(
+            "document.activeElement.matches('summary') && document.activeElement.textContent.startsWith('Tables that')"
+        ):
+            break
+    page.key("Enter")
+    for _ in range(300):
+        page.key("Tab")
+        if browser.ask("document.activeElement.name") == "allow-misfit":
+            break
+    page.key("Space")
+    walk("Make and verify")
+    assert site.project.state().last("run").exit_code in (0, 1)
+    walk("Project")
+    assert browser.ask("location.pathname") == "/projects/1/project"
+    walk("Undo the last step")
+    assert site.project.state().last("run") is None
+
+
+def test_nothing_moves_for_who_asked_for_that(page, browser):
+    still = [{"name": "prefers-reduced-motion", "value": "reduce"}]
+    browser.call("Emulation.setEmulatedMedia", media="", features=still)
+    browser.ask("document.getElementById('job').hidden = false")
+    assert browser.ask("getComputedStyle(document.querySelector('progress')).display") == "none"
+    assert browser.ask("getComputedStyle(document.getElementById('job-title')).display") != "none"
+    assert browser.ask("document.getAnimations().length") == 0
+    browser.call("Emulation.setEmulatedMedia", media="", features=[])
+    assert browser.ask("getComputedStyle(document.querySelector('progress')).display") != "none"
 
 
 def test_the_drawing_follows_the_words_while_they_are_typed(page, browser):
