@@ -249,16 +249,6 @@ def spacing_mm(exponent: int) -> Decimal:
     return SPACING_UNIT_MM * Decimal(2) ** exponent
 
 
-def widest_exponent(wanted_mm: float) -> int:
-    """Return n of the widest spacing that is not wider than requested.
-
-    >>> widest_exponent(7.0)
-    16
-    """
-    fitting = [n for n in range(SMALLEST_EXPONENT, LARGEST_EXPONENT + 1) if spacing_mm(n) <= Decimal(repr(wanted_mm))]
-    return max(fitting, default=SMALLEST_EXPONENT)
-
-
 def intervals(travel_mm: float, spacing: Decimal) -> int:
     """Return how many intervals cover a travel; the number of nodes is one more.
 

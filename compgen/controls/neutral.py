@@ -93,7 +93,6 @@ def curves_from(basis: Sequence[Term], values: Mapping[str, FloatArray]) -> Erro
 FIELD_SCHEMA, CURVE_SCHEMA = "compgen-correction-field", "compgen-error-curves"
 POSITION_COLUMNS, VALUE_COLUMNS = ("x_mm", "y_mm", "z_mm"), ("cx_um", "cy_um", "cz_um")
 MOST_CHARACTERS = 20_000_000
-_FIELD_KEYS = ("nodes_mm", "correction_um")
 
 
 def parse_neutral(files: Sequence[SourceFile]) -> NeutralTables:

@@ -301,8 +301,3 @@ def needed(design: Design, wider: Sequence[Wider]) -> list[Wider]:
         if max(gains(design, left, single), default=0.0) < ONE_TERM * float(gains(design, left, [place])[0]):
             found.append(item)
     return found
-
-
-def white_rms(analysis: Analysis) -> float:
-    """RMS of the whitened residual of the base model; 1 if it explains everything."""
-    return float(np.sqrt(analysis.design.total / analysis.design.freedom))

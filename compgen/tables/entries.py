@@ -114,13 +114,8 @@ def numbers_changed(first: Numbers, second: Numbers) -> dict[str, BoolArray]:
     return changed
 
 
-def count_changed(one: object, other: object) -> int:
-    """Return how many numbers of two sets of tables differ; a run of numbers that moved by one place counts as one."""
-    return sum(_changed_by_list(numbers_of(one), numbers_of(other)).values())
-
-
-def _changed_by_list(first: Numbers, second: Numbers) -> dict[str, int]:
-    """Return how many numbers differ in each array, and in each list of single numbers."""
+def changed_by_list(first: Numbers, second: Numbers) -> dict[str, int]:
+    """Return how many numbers differ in each array and list of single numbers; a run that moved by one place counts as one."""
     changed = numbers_changed(first, second)
     lists: dict[str, list[str]] = {}
     for place in changed:
@@ -266,7 +261,7 @@ class EntryCheck:
     @cached_property
     def changed_in(self) -> Mapping[str, int]:
         """How many numbers differ in each list."""
-        return {} if self.made is None else _changed_by_list(self.given_numbers, self.made_numbers)
+        return {} if self.made is None else changed_by_list(self.given_numbers, self.made_numbers)
 
     def reasons(self) -> list[str]:
         """Describe for each axis the place with the largest excess over what the errors require; empty if there is none."""

@@ -16,7 +16,7 @@ from steps import grows_with_its_file
 
 from compgen.controls import SourceFile, controller_named
 from compgen.controls.fanuc_pitch_tables import PitchBlock, PitchTables
-from compgen.controls.shared.grids import FANUC_CORNERS, box_of_corners, trilinear
+from compgen.controls.shared.grids import trilinear
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import read_machine
@@ -224,7 +224,7 @@ def test_render_parse_gives_the_same_tables_and_the_emulator_the_term_model_with
     assert CONTROL(machine, chosen).violations(back) == []
     points = Points(np.random.default_rng(5).uniform(machine.lower_mm, machine.upper_mm, (500, 3)))
     wanted = sum(
-        (term.curve_matrix(points.position_mm) @ term.start)[:, None]
+        term.curve(term.start, points.position_mm)[:, None]
         * term.carrier_field(points.position_mm, np.array(machine.tool_offset_mm))
         for term in basis
     )
@@ -580,6 +580,28 @@ def test_a_wrong_setting_is_refused_with_the_reason(tmp_path, options, words):
 
 
 # --- trilinear -------------------------------------------------------------------------------------------------------
+
+
+#: Corner (x, y, z) of C1 ... C8 in FANUC's formula: around the lower face, then the upper one.
+FANUC_CORNERS = (
+    (0, 0, 0),
+    (1, 0, 0),
+    (1, 1, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 0, 1),
+    (1, 1, 1),
+    (0, 1, 1),
+)
+
+
+def box_of_corners(corners):
+    """Return a grid of one box (2, 2, 2, k) from values (8, k) in FANUC's order C1 ... C8."""
+    values = np.asarray(corners, dtype=np.float64)
+    box = np.empty((2, 2, 2, values.shape[1]))
+    for corner, value in zip(FANUC_CORNERS, values, strict=True):
+        box[corner] = value
+    return box
 
 
 def test_the_worked_box_in_fanuc_order_gives_36_and_2():

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import SourceFile, controller_named
-from compgen.controls.heidenhain_com import GRADIENT_SHARE, intervals, spacing_mm, widest_exponent
+from compgen.controls.heidenhain_com import GRADIENT_SHARE, intervals, spacing_mm
 from compgen.controls.shared.grids import curve_nodes_mm
 from compgen.controls.shared.terms import one_dimensional_terms
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
@@ -81,8 +81,7 @@ def test_with_the_other_sign_the_control_adds_them(tmp_path):
 
 
 def test_spacing_counts_and_positions_are_those_of_the_manual():
-    exponent = widest_exponent(7.0)
-    assert (exponent, spacing_mm(exponent)) == (16, Decimal("6.5536"))
+    assert spacing_mm(16) == Decimal("6.5536")
     assert (intervals(500.0, spacing_mm(16)), intervals(800.0, spacing_mm(16))) == (77, 123)
     ladder = [spacing_mm(n) for n in range(10, 19)]
     printed = "0.1024 0.2048 0.4096 0.8192 1.6384 3.2768 6.5536 13.1072 26.2144"

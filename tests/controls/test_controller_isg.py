@@ -290,7 +290,7 @@ def test_any_values_act_as_the_terms_say(name):
     values = {term.name: generator.normal(size=len(term.nodes_mm)) * 1e-4 for term in basis}
     due = sum(
         term.carrier_field(position, np.array(machine.tool_offset_mm))
-        * (term.curve_matrix(position) @ values[term.name])[:, None]
+        * term.curve(values[term.name], position)[:, None]
         for term in basis
     )
     tables = control(machine, own).build(basis, values)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compgen.controls import CONTROLLERS
-from compgen.controls.shared.integers import best_integers, nearest_polyline, section_weights
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.controls.shared.integers import best_integers, section_weights
+from compgen.data.error_table import Curve, ErrorTable, hat_entries, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.toml_files import Section
@@ -116,6 +116,24 @@ def test_the_windows_hold_the_best_table_of_a_long_steep_curve(seed):
         g0 * a * a + 2 * g1 * a * b + g2 * b * b for (g0, g1, g2), a, b in zip(sections, d[:-1], d[1:], strict=True)
     )
     assert own == pytest.approx(dense_programme(wanted, sections, limit), rel=EQUAL)
+
+
+def nearest_polyline(nodes_mm, position_mm, requested, weight, reference):
+    """Project a curve given at any positions (m,) onto polylines that are zero at node ``reference``.
+
+    Returns the values (n,) at the nodes and G (n-1, 3) of the sections, both with the weights (m,) of the positions.
+    Every section needs enough weighted positions to determine its ends.
+    """
+    matrix = hat_matrix(nodes_mm, position_mm)
+    left, share = hat_entries(nodes_mm, position_mm)
+    sections = np.zeros((len(nodes_mm) - 1, 3))
+    products = np.column_stack([(1.0 - share) ** 2, (1.0 - share) * share, share**2])
+    np.add.at(sections, left, weight[:, None] * products)
+    free = np.arange(len(nodes_mm)) != reference
+    root = np.sqrt(weight)
+    values = np.zeros(len(nodes_mm))
+    values[free] = np.linalg.lstsq(matrix[:, free] * root[:, None], requested * root, rcond=None)[0]
+    return values, sections
 
 
 def test_a_finer_curve_is_met_between_the_nodes_too():

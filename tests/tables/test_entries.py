@@ -16,7 +16,7 @@ from compgen.controls import CONTROLLERS
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.tables import export, read_tables, verify
-from compgen.tables.entries import count_changed, numbers_of, with_number
+from compgen.tables.entries import changed_by_list, numbers_of, with_number
 from compgen.tables.signs import exported_tables
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -249,6 +249,10 @@ def test_a_wrong_position_that_sorts_the_rows_anew_is_one_wrong_number(gantry):
 
 
 # --- numbers ---------------------------------------------------------------------------------------------------------
+
+
+def count_changed(one, other):
+    return sum(changed_by_list(numbers_of(one), numbers_of(other)).values())
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, ReversalCurves, hat_matrix
+from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.errors import InputError
@@ -69,12 +69,6 @@ class Term:
     zero_at_mm: float | None = None
     keep_mm: tuple[float, ...] = ()
     zeros_mm: tuple[float, ...] = ()
-
-    def curve_matrix(self, position_mm: FloatArray) -> FloatArray:
-        """Interpolation matrix (m, n) at commanded positions (m, 3)."""
-        if self.axis is None:
-            return np.ones((len(position_mm), 1))
-        return hat_matrix(self.nodes_mm, position_mm[:, self.axis])
 
     def curve(self, values: FloatArray, position_mm: FloatArray) -> FloatArray:
         """Interpolated values (n,) at commanded positions (m, 3): shape (m,)."""

@@ -317,32 +317,6 @@ def grid_of_step(low: Decimal, high: Decimal, origin: Decimal, step: Decimal) ->
 # corner's value times (1 - x) or x, (1 - y) or y, (1 - z) or z, with x, y, z = 0 ... 1 the position within the box.
 
 
-#: Corner (x, y, z) of C1 ... C8 in FANUC's formula: around the lower face, then the upper one.
-FANUC_CORNERS: tuple[tuple[int, int, int], ...] = (
-    (0, 0, 0),
-    (1, 0, 0),
-    (1, 1, 0),
-    (0, 1, 0),
-    (0, 0, 1),
-    (1, 0, 1),
-    (1, 1, 1),
-    (0, 1, 1),
-)
-
-
-def box_of_corners(corners: FloatArray) -> FloatArray:
-    """Return a grid of one box (2, 2, 2, k) from values (8, k) in FANUC's order C1 ... C8.
-
-    >>> box_of_corners(np.arange(8.0)[:, None])[1, 0, 0, 0], box_of_corners(np.arange(8.0)[:, None])[0, 1, 1, 0]
-    (np.float64(1.0), np.float64(7.0))
-    """
-    values = np.asarray(corners, dtype=np.float64)
-    box = np.empty((2, 2, 2, values.shape[1]))
-    for corner, value in zip(FANUC_CORNERS, values, strict=True):
-        box[corner] = value
-    return box
-
-
 def _cells(ratio: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
     """Cell number and fraction within it for positions (n,) in cells from the first vertex; clamped."""
     inside = np.clip(ratio, 0.0, count - 1)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import hat_entries, hat_matrix
+from compgen.data.error_table import hat_entries
 from compgen.data.machine import Machine
 
 IntArray = NDArray[np.int64]
@@ -85,33 +85,13 @@ def travel_weights(machine: Machine, axis: int, nodes_mm: FloatArray) -> FloatAr
     return section_weights(nodes_mm, machine.axes[axis].range_mm, emphasis.zone_mm[axis], emphasis.zone_weight)
 
 
-def nearest_polyline(
-    nodes_mm: FloatArray, position_mm: FloatArray, requested: FloatArray, weight: FloatArray, reference: int
-) -> tuple[FloatArray, FloatArray]:
-    """Project a curve given at any positions (m,) onto polylines that are zero at node ``reference``.
-
-    Returns the values (n,) at the nodes and G (n-1, 3) of the sections, both with the weights (m,) of the positions.
-    Every section needs enough weighted positions to determine its ends.
-    """
-    matrix = hat_matrix(nodes_mm, position_mm)
-    left, share = hat_entries(nodes_mm, position_mm)
-    sections = np.zeros((len(nodes_mm) - 1, 3))
-    products = np.column_stack([(1.0 - share) ** 2, (1.0 - share) * share, share**2])
-    np.add.at(sections, left, weight[:, None] * products)
-    free = np.arange(len(nodes_mm)) != reference
-    root = np.sqrt(weight)
-    values = np.zeros(len(nodes_mm))
-    values[free] = np.linalg.lstsq(matrix[:, free] * root[:, None], requested * root, rcond=None)[0]
-    return values, sections
-
-
 def best_integers(requested: FloatArray, sections: FloatArray, reference: int, limit: int | None) -> IntegerCurve:
     """Return the whole numbers closest to a polyline, exact by dynamic programming.
 
     Parameters
     ----------
     requested : values v (n,) of the polyline at the nodes in counts, zero at the reference node.
-    sections : G of the sections, shape (n-1, 3), from :func:`section_weights` or :func:`nearest_polyline`.
+    sections : G of the sections, shape (n-1, 3), from :func:`section_weights`.
     reference : index of the node where the table is zero.
     limit : largest step between neighbouring nodes in counts, or None.
     """
