@@ -11,7 +11,6 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.accuracy.diagonals import SAME_CORNER_MM, DiagonalRun, accuracy_of_diagonals
 from compgen.accuracy.evaluate import (
     LINES,
     MOST_IN_PAIRS,
@@ -33,7 +32,17 @@ from compgen.accuracy.field import (
     unknown_spread,
     volume_figures,
 )
-from compgen.accuracy.positioning import EDITIONS, LATEST, SAME_TARGET_MM, RunStatistics, SetupBudget, accuracy_of_runs
+from compgen.accuracy.positioning import (
+    EDITIONS,
+    LATEST,
+    SAME_CORNER_MM,
+    SAME_TARGET_MM,
+    DiagonalRun,
+    RunStatistics,
+    SetupBudget,
+    accuracy_of_diagonals,
+    accuracy_of_runs,
+)
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations

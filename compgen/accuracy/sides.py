@@ -21,7 +21,6 @@ from compgen.accuracy.compare import (
     measured_field,
     paired_figures,
 )
-from compgen.accuracy.diagonals import DiagonalRun, diagonal_runs
 from compgen.accuracy.evaluate import (
     KnownReversal,
     identified_reversal,
@@ -30,7 +29,7 @@ from compgen.accuracy.evaluate import (
     volume_fields,
 )
 from compgen.accuracy.field import Alignment, ErrorField, ErrorSource, aligned, error_source
-from compgen.accuracy.positioning import RunStatistics, axis_statistics
+from compgen.accuracy.positioning import DiagonalRun, RunStatistics, axis_statistics, diagonal_runs
 from compgen.controls.isg_kernel import is_exchange_text, read_error_file
 from compgen.data.axis_runs import AxisRuns, read_diagonals
 from compgen.data.circles import Circles

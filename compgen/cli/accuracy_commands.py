@@ -16,9 +16,8 @@ from rich.console import Console, RenderableType
 
 from compgen.accuracy.circularity import accuracy_of_circles
 from compgen.accuracy.compare import CompareOptions
-from compgen.accuracy.diagonals import accuracy_of_diagonals
 from compgen.accuracy.evaluate import accuracy_of_errors
-from compgen.accuracy.positioning import SetupBudget, accuracy_of_runs
+from compgen.accuracy.positioning import SetupBudget, accuracy_of_diagonals, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
 from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option
 from compgen.cli.shared_options import instrument_option, machine_argument

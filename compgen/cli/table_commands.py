@@ -48,8 +48,15 @@ from compgen.pipeline import (
 from compgen.report.options_text import explanation_markdown, options_markdown, options_tables
 from compgen.report.terminal import crash_table, difference_table, merge_text, verification_table
 from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify
-from compgen.tables.active import ActiveTables, bare_errors, keeping_others, merge_report, merged_errors, read_active
-from compgen.tables.diff import difference
+from compgen.tables.active import (
+    ActiveTables,
+    bare_errors,
+    difference,
+    keeping_others,
+    merge_report,
+    merged_errors,
+    read_active,
+)
 from compgen.tables.judge import SafetyLimits
 from compgen.tables.options import capability
 from compgen.tables.options import explain as explained

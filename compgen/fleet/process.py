@@ -48,8 +48,7 @@ from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.pipeline import RunResult, identified_reversal, run
 from compgen.tables import ReadTables, parse_tables, program_version, verify
-from compgen.tables.active import ActiveTables
-from compgen.tables.diff import difference
+from compgen.tables.active import ActiveTables, difference
 from compgen.tables.judge import SafetyLimits
 from compgen.tables.verification import MISFIT_CODES
 

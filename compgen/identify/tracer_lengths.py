@@ -17,7 +17,6 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
-from compgen.identify.adjust.determined import Observations
 from compgen.identify.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
@@ -63,6 +62,7 @@ from compgen.kinematics.first_order import c_matrix, tool_of
 from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
 if TYPE_CHECKING:
+    from compgen.identify.adjust.determined import Observations
     from compgen.identify.adjust.path_problem import PathProblem
     from compgen.identify.adjust.problem import LengthProblem
 
@@ -628,6 +628,10 @@ def length_observations(
     UndeterminedError
         if all targets of a station lie in a plane: the lengths do not show on which side of it the station is.
     """
+    from compgen.identify.adjust.determined import (
+        Observations,  # whoever adjusts them together has it; lengths alone have not
+    )
+
     check_readings(machine, lengths, 1)
     lengths, conditions = reading_conditions(machine, lengths, temperature=options.temperature)
     task = task_of(machine, lengths)

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
     from compgen.plan.gauges import GaugePlan
     from compgen.tables import Residuals, Verification
-    from compgen.tables.active import MergeReport
-    from compgen.tables.diff import TableDifference
+    from compgen.tables.active import MergeReport, TableDifference
     from compgen.tables.signs import CrashTest
 
 # Readable summaries for the terminal.

@@ -9,8 +9,8 @@ import pytest
 
 from compgen.accuracy import SetupBudget, accuracy_of_errors, compare_sides, error_source, read_side
 from compgen.accuracy.compare import CompareOptions
-from compgen.accuracy.diagonals import accuracy_of_diagonals, diagonal_runs
 from compgen.accuracy.evaluate import KnownReversal
+from compgen.accuracy.positioning import accuracy_of_diagonals, diagonal_runs
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.axis_runs import DIAGONALS, Diagonals, format_diagonals, read_diagonals

@@ -15,8 +15,7 @@ from compgen.data.error_table import Curve
 from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.kinematics.exact_chain import exact_error
 from compgen.tables import export, read_tables
-from compgen.tables.active import ActiveTables, bare_errors, merge_report, merged_errors, total_correction
-from compgen.tables.diff import difference
+from compgen.tables.active import ActiveTables, bare_errors, difference, merge_report, merged_errors, total_correction
 from compgen.tables.signs import exported_tables
 
 NANOMETRE = 1e-6
