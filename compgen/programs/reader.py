@@ -264,7 +264,7 @@ class Reader:
         """Whether blocks of plain words are now moves and nothing else, from a known position."""
         known = not any(math.isnan(value) for value in self.position) and all(self.named) and bool(self.offset_name)
         modal = self.cycle is None and not self.calling and self.feed != "inverse" and self._unit_known
-        return known and modal and not self.ended
+        return known and modal and not (self.ended or self.closed_by_percent)
 
     def _run(self, words: Words, lines: range, first_line: int, first: int) -> tuple[Run, Moves] | None:
         """Read blocks together, as :meth:`_block` reads each; up to one that cannot be followed, None if that is the first."""
@@ -614,6 +614,8 @@ class Reader:
                     f"{letter}{text} has no decimal point: mm or increments; post it with a decimal point", letter
                 )
             values[letter] = value
+        if self.closed_by_percent and dialect.name in ("fanuc", "linuxcnc"):
+            self._fail("blocks after the closing %, which the control does not read; give one program, within % and %")
         if self.ended and (values.keys() - {"N"} or any(code not in dialect.end for code in codes)):
             self._fail("blocks after the end of the program; give one program without subprograms")
         if {"G90", "G91"} <= set(codes):

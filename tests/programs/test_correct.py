@@ -438,6 +438,8 @@ REFUSED = [
     ("fanuc", "G21 G90 G54\nX5.\nM30\n", 2, "before any of G0"),
     ("fanuc", "G21 G91 G54\nG0 X5.\nM30\n", 2, "increment"),
     ("fanuc", START + "M30\nO2\nG1 X1. F1\nM99\n", 4, "second program"),
+    ("fanuc", "%\n" + START + "G1 X1. F1\n%\nX2.\nM30\n%\n", 6, "after the closing %"),
+    ("linuxcnc", "%\n" + START + "G1 X1. F1\n%\nX2.\nM2\n", 6, "after the closing %"),
     ("fanuc", "%\nO1\n" + START + "G1 X1. F1\n", 5, "may have been cut"),
     ("fanuc", "%\nO1\n" + START + "G1 X1. F1\nM30\n", 6, "does not end with it"),
     ("linuxcnc", START + "G1 X1. F1\n", 3, "may have been cut"),
