@@ -1019,6 +1019,7 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.filters.update(
         word=str,
         lines=str,
+        asked=str,
         drawn=lambda svg: svg,
         figure=_figure,
         unit=lambda text: LABEL.get(text, text),
@@ -1033,7 +1034,7 @@ def make_app(workbench: Workbench) -> Flask:
     if workbench.language != LANGUAGES[0]:
         texts = texts_of(workbench.language)
         texts.translate(app.jinja_env, html=True).filters.update(
-            drawn=lambda svg: Markup(texts.drawn(svg)), lines=texts.lines
+            drawn=lambda svg: Markup(texts.drawn(svg)), lines=texts.lines, asked=texts.question
         )
     app.url_map.converters["number"] = StepNumber
     app.extensions["compgen"] = workbench

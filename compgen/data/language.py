@@ -14,7 +14,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from gettext import GNUTranslations
 from html import escape, unescape
 from typing import TYPE_CHECKING, Any
@@ -105,11 +105,6 @@ class Texts:
             for english, text in tuple(self.messages.items()):
                 if english.startswith(end) and text.startswith(end):
                     self.messages.setdefault(english.removeprefix(end), text.removeprefix(end))
-        for end in ("; give ", "; write "):  # what a file leaves open is shown as a question, without what answers it
-            for english, text in tuple(self.messages.items()):
-                asked, given, _ = english.partition(end)
-                if given and "\x04" not in english and len(_PLACE.sub("", asked)) > 2 * _SURE:
-                    self.messages.setdefault(asked, ";".join(text.split(";")[: asked.count(";") + 1]))
         found = []
         for english in self.messages:
             literals = _PLACE.split(english)[::2]
@@ -229,9 +224,25 @@ class Texts:
             found.append(marker[0] + "".join(cells))
         return "\n".join(found)
 
+    def question(self, english: str) -> str:
+        """Return what a file leaves open in this language: a message without what answers it."""
+        return self._asking.label(english)
+
+    @cached_property
+    def _asking(self) -> Texts:
+        found = dict(self.messages)
+        for end in ("; give ", "; write "):
+            for english, text in self.messages.items():
+                asked, given, _ = english.partition(end)
+                if given and "\x04" not in english and len(_PLACE.sub("", asked)) > 2 * _SURE:
+                    found.setdefault(asked, ";".join(text.split(";")[: asked.count(";") + 1]))
+        return Texts(found, self.language)
+
     def _named(self, english: str) -> str:
-        """Return a cell of a table, or a name and its value, in this language."""
+        """Return a cell of a table, a name and its value, or a message and its kind, in this language."""
         whole, (name, colon, value) = self.label(english), english.partition(":")
+        if whole == english and (kind := self.messages.get(f"{name}: {{message}}")):  # a message without a translation
+            return kind.replace("{message}", value.strip())
         known = self.messages.get(f"{LABEL}\x04{name.replace('_', ' ')}")
         return whole if known is None or not colon or whole != english else f"{known}:{self.label(value)}"
 

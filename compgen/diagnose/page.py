@@ -78,7 +78,7 @@ def residual_pictures(found: Diagnosis) -> list[Picture]:
     readings, layout = found.analysis.fit.readings, found.analysis.fit.observed.layout
     over = [(f"{'XYZ'[k]} (mm)", readings.position_mm[:, k]) for k in range(3) if np.ptp(readings.position_mm[:, k])]
     if len(readings.stations) > 1:
-        over += [("station", readings.station.astype(np.float64)), ("range (mm)", readings.range_mm)]
+        over += [("number of the station", readings.station.astype(np.float64)), ("range (mm)", readings.range_mm)]
     over.append(("time (s)" if layout.timed else "order of stops", layout.time[layout.stop]))
     if readings.approach is not None:
         over += [(f"direction of {'XYZ'[k]}", values) for k, values in enumerate(readings.approach.T) if np.ptp(values)]

@@ -515,7 +515,7 @@ def plan_page(found: GaugePlan, errors: ErrorTable | None = None) -> str:
         size = float(np.abs(values).max()) / error.si_per_unit
         unit = error.unit.replace("u", "µ", 1)
         u = (
-            f"± {planned[name]['u_max']:.2g} {unit}" + (" (partly)" if name in found.partly else "")
+            f"± {planned[name]['u_max']:.2g} {unit}{' (partly separable)' if name in found.partly else ''}"
             if name in planned
             else "–"
         )
@@ -540,7 +540,9 @@ def plan_page(found: GaugePlan, errors: ErrorTable | None = None) -> str:
         '<th class="needs-script"></th><th>u of this plan</th></tr>' + "".join(rows) + "</table></div>",
         f"<p>Not visible here: {', '.join(hidden)}.</p>" if hidden else "",
         f"<p>Not determined by this plan: {', '.join(found.left_out)}.</p>" if found.left_out else "",
-        f"<p>{escape(found.within_circles.capitalize())}.</p>" if found.within_circles else "",
+        "<p>Squareness by circles is that within the circle, unless straightness is determined.</p>"
+        if found.within_circles
+        else "",
         "<h2>What to add</h2><ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else "",
     ]
     style, script, policy = page_assets("gauges.js")

@@ -53,6 +53,7 @@ NOT_SHOWN_IN = re.compile(
 )
 #: Single words that pages show: no rule tells them from keys.
 WORDS = (
+    "repeats", "neighbouring readings",
     "table", "head",
     "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
     "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um",
@@ -69,6 +70,8 @@ WORDS = (
 )  # fmt: skip
 #: Headings and names of facts: they are no values, and where they are the name of a key they stay as they are.
 LABELS = (
+    "why", "correlation", "partly", "reversal", "units", "passed", "Diagnosis", "Steps", "done", "progress", "volumetric",
+    "pitch", "skew", "reference point", "tool offset",
     "circles", "part", "artefact", "deviations", "errors", "diagonals", "axis", "plane", "station", "targets", "runs",
     "directions", "angle", "axes", "base length mm", "calibrated", "columns", "comments", "components", "directions from",
     "duration s", "effective diameter mm", "encoding", "error", "expected diameter mm", "features", "first", "from mm",
