@@ -464,6 +464,9 @@ class ProgramWriter:
         if lines and cycle.lines[0] == block.text:
             self.changed += 1
             return lines
+        if lines and self.dialect.pole and not re.search(r"M0*(89|99)(?!\d)|G79", block.text.upper()):
+            body = text.partition(";")[0].rstrip("* \t\r\n")
+            text = f"{body} M89{text[len(body) :]}"  # a definition ends the calls by all positions
         self.changed += text != block.text
         self.added += len(lines)
         return [*(re.sub(r"^(\s*)N\d+\s*", r"\1", line, flags=re.IGNORECASE) for line in lines), text]

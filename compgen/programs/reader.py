@@ -397,7 +397,13 @@ class Reader:
             meaning.startswith(("motion", "no motion", "home")) for meaning in meanings
         )
         incremental = "G91" in codes or (not self.absolute and "G90" not in codes)
-        if not incremental or not (begins or on) or not numbers.keys() & set("XYZR"):
+        own = {"shift", "preset", "store", "machine", "setting", "dwell", "tool"}  # take the words of their block
+        if (
+            not incremental
+            or not (begins or on)
+            or not numbers.keys() & set("XYZR")
+            or own & {m.split()[0] for m in meanings if m}
+        ):
             return ()
         offset, scale, given = self._offset(), self.scale, list(self.cycle_given)
         x, y, z = ((place - zero) / scale for place, zero in zip(self.position, offset, strict=True))
@@ -826,6 +832,10 @@ class Reader:
             given = ", ".join(self.setup.work_offsets_mm) or "none"
             self._fail(f"the work offset {name} is not known (given: {given}); add --wcs {name}=X,Y,Z in mm")
         if name != self.offset_name:
+            if self.dialect.name == "siemens" and any(self.shift):
+                self._fail(
+                    f"{name} while TRANS is active: controls keep or end the shift; post TRANS without axes before"
+                )
             self.named = [False] * 3
         self.offset_name, self.work = name, self.setup.work_offsets_mm[name]
         self.used_offsets[name] = self.work
@@ -1041,6 +1051,10 @@ class Reader:
         """Expand a drilling cycle: over the hole, to the R level, to the depth at feed, back."""
         if self.plane != 2:
             self._fail("a drilling cycle outside the plane G17 is not followed; post moves")
+        if not self.absolute:
+            self._fail(
+                "a drilling cycle in incremental with other codes in its block is not followed; divide the block"
+            )
         offset, scale = self._offset(), self.scale
         if motion:
             if self.cycle is None:
@@ -1105,6 +1119,8 @@ class Reader:
         if problem := cycle.problem():
             self._fail(problem)
         own = cycle.lines[0] == self._text
+        if own and self.calling:
+            self._fail(f"{cycle.name} while MCALL calls a cycle at all positions; end it by MCALL alone before")
         if "drill here" in single and re.search("M0*99", self._text.upper()):
             self.calling = False
         elsewhere = "machine coordinates" in single or (own and moving)

@@ -326,6 +326,7 @@ def test_holes_of_heidenhain_cycles_new_and_old(tmp_path):
         ("siemens", "MCALL HOLES1(0,0,0,5,5,5)", "patterns of holes"),
         ("siemens", "MCALL CYCLE81(10,0,2,-9)\nG2 X5 Y5 CR=9", "after|where G0 or G1 led"),
         ("siemens", "MCALL CYCLE81(10,0,2,-9)\nSUPA G0 X5", "not in machine coordinates"),
+        ("siemens", "MCALL CYCLE81(10,0,2,-9)\nX5\nCYCLE82(10,0,2,-9)", "MCALL alone before"),
         ("heidenhain-iso", "G208 Q200=2*", "milling"),
         ("heidenhain-iso", "G79*", "none is defined"),
         ("heidenhain-iso", "G200 Q200=2 Q201=-5*\nG79*", "without Q203"),
@@ -404,3 +405,29 @@ def test_fanuc_drilling_in_increments(tmp_path):
     ):
         with pytest.raises(InputError, match="give both|only stored"):
             moves_of(text.replace(wrong, words), "fanuc", PLAIN)
+
+
+def test_a_cycle_that_is_defined_again_is_called_on_by_all_positions(tmp_path):
+    """A definition ends M89, so that it is given again; EZX of 0.1 um/mm needs other depths at each hole."""
+    text = (
+        "%A G71 *\nG00 G40 G90 Z+100*\nX+0 Y+0*\nG200 Q200=2 Q201=-20 Q203=+0 Q204=50*\nX+100 M89*\nX+200 M8*\nX+300 ; last\n"
+        "X+400 M99*\nX+0 M2*\nN9 %A G71 *\n"
+    )
+    setup = Setup({"PRESET": ZERO}, TOOLS)
+    result, corrected = run(tmp_path, text, cycle_errors(0.0, 0.0, 1e-4), "heidenhain-iso", setup)
+    assert result.accepted
+    again = "G200 Q200=2 Q201=-20 Q203=-0.0{}0 Q204=50*\n".replace("0 Q204", " Q204")
+    expected = "".join(again.format(k) + f"X+{k}00 {m}\n" for k, m in ((1, "M89*"), (2, "M8 M89*"), (3, "M89 ; last")))
+    assert expected in corrected
+    assert again.format(4) + "X+400 M99*\n" in corrected
+
+
+def test_a_shift_within_a_series_of_holes_is_no_hole(tmp_path):
+    """G52 takes its X; a change of the work offset under TRANS is refused."""
+    text = "G21 G90 G17 G54\nG0 X0. Y0. Z9.\nG91 G99 G81 X10. Z-9. R-4. F9\nG52 X5.\nM30\n"
+    with pytest.raises(InputError, match="incremental blocks"):
+        moves_of(text, "fanuc", PLAIN)
+    moves = moves_of(text.replace("M30", "M2"), "linuxcnc", PLAIN)
+    assert moves.line.max() == 3
+    with pytest.raises(InputError, match="while TRANS is active"):
+        moves_of("G71 G90 G54\nTRANS X5\nG55\nM30\n", "siemens", Setup({"G54": ZERO, "G55": ZERO}))
