@@ -66,7 +66,7 @@ WORDS = (
     "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with", "within", "without",
     "worse", "positioning runs", "lengths of a tracer", "six-DOF readings", "both", "one", "both directions", "radius (mm)",
     "REJECTED", "nothing", "none", "named", "unknown", "rise", "fall", "grows", "falls", "rises", "up", "down", "stated",
-    "estimated", "yes", "no", "required", "agrees", "disagrees",
+    "estimated", "yes", "no", "required", "agrees", "disagrees", "uncalibrated", "both kinds of",
 )  # fmt: skip
 #: Headings and names of facts: they are no values, and where they are the name of a key they stay as they are.
 LABELS = (
@@ -86,6 +86,12 @@ LABELS = (
     "equation", "resembles", "chain", "format", "name", "value", "position", "station drift", "smoothness", "free", "bias",
     "solver", "feature", "quantity", "line", "diameter", "distance", "parallelism", "only", "share", "Errors", "Controls",
     "Properties", "Limits", "Sources", "Files", "Remarks", "Points", "Scatter", "Without", "nodes",
+)  # fmt: skip
+
+
+#: What a measurement file contains, on the pages of the workbench; other overviews are shown in sessions only.
+TITLES = (
+    "{count} positions with {names}", "{count} {kind} features in {setups} set-ups", "{count} readings of {stations}",
 )  # fmt: skip
 
 
@@ -277,6 +283,7 @@ def messages():
     for reader in INSTRUMENTS.values():
         add(ROOT / f"{reader.__module__.replace('.', '/')}.py", [inspect.getdoc(reader).partition("\n")[0]])
     add(Path(__file__), WORDS, WORD)
+    add(Path(__file__), TITLES)
     add(Path(__file__), LABELS, LABEL)
     return found
 
