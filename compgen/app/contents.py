@@ -638,6 +638,22 @@ def machine_file(project: Project, state: ProjectState) -> Path | None:
     return project.path(machine) if machine.endswith(".toml") else machine_files(()).get(machine)
 
 
+def plan_page(project: Project, state: ProjectState) -> dict[str, Any]:
+    """Return the plans of a measurement with the predicted uncertainty of each error, the latest first."""
+    found = []
+    for step in (other for other in reversed(state.steps) if other.kind == "plan"):
+        facts = project.facts(step, "plan.json")
+        predicted = facts.get("u") or {**facts.get("curves", {}), **facts.get("squareness", {})}
+        rows = [
+            (name, item.get("u_max_where_read", item.get("u_max", item.get("u"))), item.get("unit", ""))
+            for name, item in predicted.items()
+        ]
+        views = list(project.pages_of(step))
+        found.append({"step": step, "facts": facts, "rows": rows, "views": views, "current": state.is_current(step)})
+    last = state.last("plan")
+    return {"results": found, "typed": {"circles": "", "poses": ""} if last is None else last.data["typed"]}
+
+
 def measurement_page(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return the measurements of before the correction."""
     open_files = [item for item in state.measurements if not item.after and not item.used]
@@ -855,6 +871,6 @@ def project_page(project: Project, state: ProjectState) -> dict[str, Any]:
 
 #: What each page of a project shows, by its name.
 SHOWN: dict[str, Callable[[Project, ProjectState], dict[str, Any]]] = {
-    "machine": machine_page, "measurement": measurement_page, "result": result_page, "tables": tables_page,
+    "machine": machine_page, "plan": plan_page, "measurement": measurement_page, "result": result_page, "tables": tables_page,
     "program": program_page, "after": after_page, "project": project_page,
 }  # fmt: skip

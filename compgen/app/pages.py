@@ -100,7 +100,7 @@ POLICY = (
 )
 #: Pages of a project, in the order of the work.
 PAGES = {
-    "machine": "Machine", "measurement": "Measurement", "result": "Result", "tables": "Tables",
+    "machine": "Machine", "plan": "Plan", "measurement": "Measurement", "result": "Result", "tables": "Tables",
     "program": "NC program", "after": "Before and after", "project": "Project",
 }  # fmt: skip
 _NUMBER = "number(max=99999)"
@@ -217,7 +217,8 @@ def _page(number: int, name: str, code: int = 200, **more: Any) -> tuple[str, in
     state = runner.project.state()
     shown: dict[str, Any] = {
         "problem": "", "number": number, "project": runner.project, "state": state, "page": name, "job": runner.job,
-        "done": {"machine": state.machine is not None, "measurement": bool(state.used_files()),
+        "done": {"machine": state.machine is not None, "plan": state.current("plan") is not None,
+                 "measurement": bool(state.used_files()),
                  "result": state.current("identify") is not None, "tables": state.current("run") is not None,
                  "program": any(state.is_current(step) for step in state.steps if step.kind == "correct"),
                  "after": state.last("compare") is not None, "project": False},
@@ -509,6 +510,25 @@ def _without_problems(step: Step, output: str) -> Step:
     if listed["problems"]:
         raise InputError("\n".join(problem["text"] for problem in listed["problems"]))
     return Step(**{**step.__dict__, "data": {**step.data, "remarks": listed["warnings"]}})
+
+
+@action("plan", "plan/make")
+def make_plan(runner: Runner, state: ProjectState) -> None:
+    """Predict what circles, an artefact or a laser tracer will determine, before anything is measured."""
+    machine, project = _machine_of(state), runner.project
+    typed = {name: _field(name) for name in ("circles", "poses")}
+    words = [f"--circle={text.strip()}" for text in typed["circles"].split(";") if text.strip()]
+    folder = project.new_folder("plan")
+    given = {name: _uploaded(project, folder, name)[:1] for name in ("artefact", "stations", "points")}
+    words += [f"--{name}={path}" for name, paths in given.items() for path in paths]
+    words += [f"--poses={typed['poses']}"] * bool(given["artefact"] and typed["poses"])
+    words += ["--grid"] * bool(given["stations"] and not given["points"])
+    if not words:
+        project.set_aside(folder)
+        raise InputError("give circles, an artefact or the stations of a tracer")
+    words = ["plan", machine, *words, *_language(), "--out", folder]
+    step = Step(0, "plan", "Plan of a measurement", [words], folder, data={"typed": typed})
+    runner.start("planning the measurement", "plan", [StepTask(step)])
 
 
 @action("measurement", "measurement/add")

@@ -41,12 +41,12 @@ STOP_S = 5.0
 #: Lines of a command's messages that are kept.
 MOST_LINES = 500
 #: Sub-folder of a step for the files that a user gave it, and steps whose command writes pages.
-GIVEN, WITH_PAGES = "given", ("identify", "diagnose", "run", "part", "compare", "accuracy")
+GIVEN, WITH_PAGES = "given", ("plan", "identify", "diagnose", "run", "part", "compare", "accuracy")
 #: Steps that a result depends on.
 INPUTS = ("machine", "instrument", "numbers", "removed", "measurement")
 #: Steps that take the errors that were identified before them.
 OF_ERRORS = ("part", "correct")
-MAIN_PAGES = ("report.html", "index.html", "sheet.html", "part.html")
+MAIN_PAGES = ("report.html", "index.html", "sheet.html", "part.html", "plan.html")
 #: Messages of a command that refuse, and those that are kept with a step, in the languages of the program.
 REFUSED, TOLD = re.compile("(?:error|Fehler|Abweichung): (.*)"), re.compile("(?:warning|question|Warnung|offen): (.*)")
 #: Exit codes of a command that has written its result: accepted or not.
@@ -147,7 +147,7 @@ class ProjectState:
 
     def is_current(self, step: Step) -> bool:
         """Whether nothing that a step depends on has changed since; what is made of errors depends on them, too."""
-        inputs = (*INPUTS, "identify") if step.kind in OF_ERRORS else INPUTS
+        inputs = (*INPUTS, "identify") if step.kind in OF_ERRORS else ("machine",) if step.kind == "plan" else INPUTS
         return not any(
             other.number > step.number and other.kind in inputs
             and (step.kind == "compare" or not other.data.get("after")) for other in self.steps

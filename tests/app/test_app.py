@@ -554,3 +554,28 @@ def test_bounds_of_the_curves_are_settings_of_the_tables(site):
     page = site.get("/projects/1/tables").text
     assert 'value="EXX=10; angular=50"' in page
     assert 'name="robust" checked' in page
+
+
+def test_a_plan_says_what_a_ballbar_will_determine_and_what_to_add(site):
+    """A circle in XY shows the squareness of X and Y alone; with the other two planes all three are determined."""
+    assert "Choose the machine first" in site.get("/projects/1/plan").text
+    site.do("machine/describe", MILL)
+    assert site.post("/projects/1/plan/make", {"circles": "", "poses": ""}).status_code == 409
+    state = site.do("plan/make", {"circles": "XY:100", "poses": ""})
+    page = site.get("/projects/1/plan").text
+    assert "To measure in addition" in page
+    assert "--circle YZ:100" in page
+    assert "EXX" in page.partition("Not determined: ")[2].partition("</p>")[0]
+    assert site.get(f"/projects/1/steps/{state.last('plan').number}/view/plan.html").status_code == 200
+    state = site.do("plan/make", {"circles": "XY:100; YZ:100; ZX:100", "poses": ""})
+    facts = json.loads(site.project.files_of(state.last("plan"))["plan.json"].read_text())
+    assert {"EC0Y", "EB0Z", "EA0Z"} <= {*facts["determined"], *facts["partly"]}
+    assert facts["u"]["EA0Z"]["u_max"] < 1.0
+    stations = "station,x_mm,y_mm,z_mm\n" + "".join(f"{k},{x},{y},{z}\n" for k, (x, y, z) in enumerate(
+        [(-50, -50, -250), (450, -50, -240), (200, 460, -260), (-60, 450, 10)]))  # fmt: skip
+    sent = {"circles": "", "poses": "", "stations": (io.BytesIO(stations.encode()), "stations.csv")}
+    state = site.do("plan/make", sent)
+    assert "--grid" in state.last("plan").commands[0]
+    assert re.search(r'<th scope="row">EXX</th><td class="n">[\d.]+</td><td>µm</td>', site.get("/projects/1/plan").text)
+    site.do("machine/text", {"text": (site.project.folder / state.machine).read_text() + "# again\n"})
+    assert site.get("/projects/1/plan").text.count("changed after this plan") == 3

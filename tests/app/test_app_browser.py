@@ -206,12 +206,15 @@ def test_pages_in_both_languages_first_page_errors_and_nc_programs_have_no_barri
         page.visit("/projects/1/tables")
         browser.ask("document.querySelector('[name=allow-misfit]').click()")
         press("run")
-        for name in ("machine", "measurement", "result", "tables", "program", "after", "project"):
+        page.visit("/projects/1/plan")
+        page.write("#circles", "XY:100")
+        press("plan/make")
+        for name in ("machine", "plan", "measurement", "result", "tables", "program", "after", "project"):
             look(f"/projects/1/{name}")
         for kind, name in (("part", "view/part.html"), ("correct", "preflight.html"), ("run", "preflight.html")):
             page.visit(f"/projects/1/steps/{site.project.state().last(kind).number}/{name}")
             assert barriers(browser) == [], name
-        assert len(looked) == 11
+        assert len(looked) == 12
     finally:
         browser.picture()
         site.close()
