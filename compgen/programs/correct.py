@@ -732,6 +732,8 @@ def _joined(words: Sequence[str], before: str) -> str:
 
 def _spliced(text: str, changes: list[tuple[int, int, str]], end: int, more: Sequence[str]) -> str:
     """Replace columns of a block and put the words ``more`` after column ``end``."""
+    if closing := re.match(r"\s*\)", text[end:]):  # of X=AC(10.5)
+        end += closing.end()
     for start, stop, new in sorted([*changes, (end, end, _joined(more, text[:end]))], reverse=True):
         text = text[:start] + new + text[stop:]
     return text

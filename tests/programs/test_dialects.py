@@ -116,6 +116,16 @@ def test_siemens_words_with_their_own_mode_shifts_and_settings(tmp_path):
     )
 
 
+def test_a_word_is_added_after_the_parenthesis_of_a_mode(tmp_path):
+    """EZX is 50 um at X 500: the block that names X alone moves Z, too."""
+    ends = np.array([-600.0, 600.0])
+    errors = ErrorTable({"EZX": Curve(ends, 1e-4 * ends, np.zeros(2))})
+    text = "G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 X=AC(200) F200\nX=IC(300)\nM30\n"
+    result, corrected = run(tmp_path, text, errors, "siemens", PLAIN)
+    assert "G1 X=AC(200) Z4.98 F200\nX=IC(300) Z4.95\n" in corrected
+    assert result.accepted
+
+
 def test_heidenhain_shift_tool_call_and_the_direction_of_the_last_arc(tmp_path):
     """G54 replaces the shift, in G91 it adds; DL makes the tool longer; G05 goes on as G02 did; M91 is not moved.
 
