@@ -30,7 +30,7 @@ def steps(action):
     return count
 
 
-def grows_with_its_file(read, part, head="", size=20_000):
+def grows_with_its_file(read, part, head="", size=4_000):
     """Whether ``read`` takes at most twice the steps for twice as much of ``part`` behind ``head``; ``size`` in characters."""
     texts = [head + part * max(n // len(part), 1) for n in (size, 2 * size)]
     read(texts[0])  # what is done once for all texts is done
