@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,7 @@ from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.path import (
     PLANE_AXES,
+    RAPID,
     Corrector,
     ExactModel,
     IntArray,
@@ -139,7 +141,7 @@ class ProgramWriter:
     def rewrite(self, batch: Batch, pieces: Pieces, share_before: FloatArray) -> tuple[str, IntArray]:
         """Return the blocks of the corrected program, and for each the number of the block that it comes from."""
         bounds = np.searchsorted(pieces.move, np.arange(len(batch.moves) + 1))
-        start = batch.words.start
+        last, start = bounds[1:] - 1, batch.words.start
         edits, added = _Edits(), np.zeros(len(start) - 1, dtype=np.int64)
         for segment in batch.segments:
             rows = slice(int(bounds[segment.first]), int(bounds[segment.first + segment.count]))
@@ -149,7 +151,7 @@ class ProgramWriter:
                 elif len(segment.pole_at):
                     self.pole_mm = [np.nan] * 3
             else:
-                texts = self._block(batch, segment, pieces, rows, share_before)
+                texts = self._block(batch, segment, pieces, rows, last, share_before)
                 if texts[0] != segment.text or len(texts) > 1:
                     line = segment.number - batch.first_line
                     edits.add(int(start[line]), int(start[line + 1]), "".join(texts))
@@ -175,14 +177,23 @@ class ProgramWriter:
         return text
 
     def _block(
-        self, batch: Batch, block: SingleBlock, pieces: Pieces, rows: slice, share_before: FloatArray
+        self,
+        batch: Batch,
+        block: SingleBlock,
+        pieces: Pieces,
+        rows: slice,
+        last: IntArray,
+        share_before: FloatArray,
     ) -> list[str]:
-        """Rewrite one block; moves of a block are one that is divided, or those of a drilling cycle."""
+        """Rewrite one block; moves of a block are one that is divided, or those of a drilling cycle.
+
+        ``rows`` are its pieces, ``last`` the last piece of each move of the batch.
+        """
         if block.parts:
             texts: list[str] = []
             for hole in block.parts:
                 low, high = np.searchsorted(pieces.move, [hole.first, hole.first + hole.count]).tolist()
-                texts += self._block(batch, hole, pieces, slice(low, high), share_before)
+                texts += self._block(batch, hole, pieces, slice(low, high), last, share_before)
             self.changed, self.added = self.changed + 1, self.added + len(texts) - 1
             return texts
         offset = batch.moves.offset_mm[block.first] + self.shift_mm if block.count else self.shift_mm
@@ -201,25 +212,12 @@ class ProgramWriter:
                 self.target_mm = np.array(pieces.command_mm[rows][-1])
                 self.written_mm = np.array(self.target_mm)
             return [block.text]
+        if block.kind == "cycle":
+            return [self._cycle(block, batch.moves, pieces.command_mm, last, offset)]
         move = batch.moves.part(slice(block.first, block.first + block.count))
         if block.drilling:
-            last = (
-                np.searchsorted(pieces.move[rows], np.arange(block.first, block.first + block.count), side="right") - 1
-            )
-            return self._hole(block, block.drilling, move, pieces.command_mm[rows][last], offset)
-        if block.kind == "cycle":
-            depth = np.flatnonzero((move.kind != 0) & move.corrected[:, 2])
-            if not len(depth):
-                return [block.text]
-            # the stroke to the depth may be several pieces; the hole is where the last ends
-            stroke = np.flatnonzero(pieces.move[rows] == block.first + depth[0])
-            target, allowed = pieces.command_mm[rows][stroke[-1]], move.corrected[int(depth[0])]
-            at_level = np.flatnonzero((move.end_mm[:, 2] == move.start_mm[move.kind != 0][0, 2]) & move.corrected[:, 2])
-            level = pieces.command_mm[rows][np.isin(pieces.move[rows] - block.first, at_level)]
-            ends_there = move.end_mm[-1, 2] == move.start_mm[move.kind != 0][0, 2]
-            level_z = float(level[-1, 2]) if len(level) else np.nan
-            reach_mm = float(move.start_mm[move.kind != 0][0, 2] - move.end_mm[int(depth[0]), 2])
-            return [self._cycle(block, target, offset, level_z, bool(ends_there), allowed, reach_mm)]
+            ends = last[block.first : block.first + block.count]
+            return self._hole(block, block.drilling, move, pieces.command_mm[ends], offset)
         count = rows.stop - rows.start
         texts = []
         total = share_before[rows]
@@ -369,39 +367,43 @@ class ProgramWriter:
                 self.pole_mm[k] = got * block.scale + base
 
     def _cycle(
-        self,
-        block: SingleBlock,
-        target: FloatArray,
-        offset: FloatArray,
-        level_z: float,
-        ends_there: bool,
-        allowed: NDArray[np.bool_],
-        reach_mm: float,
+        self, block: SingleBlock, moves: Moves, command_mm: FloatArray, last: IntArray, offset_mm: FloatArray
     ) -> str:
-        """Rewrite a drilling block: place, depth and R level of the hole; ``ends_there``: the tool stays at the R level.
-
-        ``reach_mm`` is the programmed distance from the R level to the depth: a hole of five pecks stays one of five.
-        """
-        scale, digits = block.scale, self.digits(block.scale)
+        """Rewrite a drilling block: place, depth, R level and pecks of the hole; ``last`` is the last piece of each move."""
+        scale, digits, offset = block.scale, self.digits(block.scale), offset_mm.tolist()
+        rows = slice(block.first, block.first + block.count)
+        kinds, may = moves.kind[rows].tolist(), moves.corrected[rows].tolist()
+        begin_z, end_z = moves.start_mm[rows, 2].tolist(), moves.end_mm[rows, 2].tolist()
+        strokes = [k for k, kind in enumerate(kinds) if kind != RAPID]
+        depth = next((k for k in strokes if may[k][2]), None)
+        if depth is None:
+            return block.text
+        r_level, allowed = begin_z[strokes[0]], may[depth]
+        reach_mm = r_level - end_z[depth]  # as programmed: a hole of five pecks stays one of five
+        # the stroke to the depth may be several pieces; the hole is where the last ends
+        target = command_mm[last[block.first + depth]].tolist()
+        at_level = [k for k, z in enumerate(end_z) if z == r_level and may[k][2]]
+        level_z = float(command_mm[last[block.first + at_level[-1]], 2]) if at_level else math.nan
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
         changes: list[tuple[int, int, str]] = []
         more: list[str] = []
-        before = [*((self.target_mm[:2] - offset[:2]) / scale), self.depth, self.level]
-        wanted = [*((target - offset) / scale), (level_z - offset[2]) / scale]
+        before = [*((self.target_mm[:2] - offset_mm[:2]) / scale).tolist(), self.depth, self.level]
+        wanted = [*((there - zero) / scale for there, zero in zip(target, offset, strict=True))]
+        wanted.append((level_z - offset[2]) / scale)
         found = list(before)
         for k, letter in enumerate("XYZR"):
-            value, may = float(wanted[k]), bool(allowed[min(k, 2)])
-            if np.isnan(value):
+            value, free = wanted[k], allowed[min(k, 2)]
+            if math.isnan(value):
                 continue
             if letter in words:
                 text, first, stop = words[letter]
                 given, own = float(text.replace(" ", "")), max(digits, len(text.partition(".")[2].strip()))
-                if abs(value - given) > _HALF * 10.0**-own and may:
+                if abs(value - given) > _HALF * 10.0**-own and free:
                     changes.append((first, stop, self._number(value, own, text)))
                     found[k] = round(value, own)
                 else:
                     found[k] = given
-            elif may and np.isfinite(before[k]) and np.rint(value * 10**digits) != np.rint(before[k] * 10**digits):
+            elif free and math.isfinite(before[k]) and round(value * 10**digits) != round(before[k] * 10**digits):
                 more.append(f"{letter}{self._number(value, digits)}")
                 found[k] = round(value, digits)
         self.depth, self.level = found[2], found[3]
@@ -425,7 +427,7 @@ class ProgramWriter:
             if AXES[k] in words or any(word[0] == AXES[k] for word in more):
                 self.written_mm[k] = found[k] * scale + offset[k]
         self.target_mm[:2] = target[:2]
-        if ends_there:
+        if end_z[-1] == r_level:
             self.target_mm[2] = level_z
             self.written_mm[2] = found[3] * scale + offset[2]
         self.changed += bool(changes or more)
@@ -892,14 +894,16 @@ def correct_program(
         body = work / "body"
         with reader.opened() as stream, body.open("wb") as target:
             for batch in reader.batches(stream):
-                by_radius = np.zeros(len(batch.moves), dtype=bool)
+                by_radius, drilled = np.zeros((2, len(batch.moves)), dtype=bool)
                 for segment in batch.segments:
                     if isinstance(segment, Run):
                         rows = slice(segment.first, segment.first + segment.count)
                         by_radius[rows] = ~np.isnan(batch.words.value[segment.row, R_WORD])
                     elif segment.kind == "arc":
                         by_radius[segment.first] = any(word[0] in ("R", "CR") for word in segment.words)
-                pieces = corrector.pieces(batch.moves, by_radius)
+                    elif segment.kind in ("cycle", "hole"):
+                        drilled[segment.first : segment.first + segment.count] = True
+                pieces = corrector.pieces(batch.moves, by_radius, drilled)
                 begin = np.where(np.diff(pieces.move, prepend=-1) > 0, 0.0, np.roll(pieces.share, 1))
                 try:
                     text, origins = writer.rewrite(batch, pieces, pieces.share - begin)

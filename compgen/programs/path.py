@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -68,7 +68,7 @@ class Moves:
         return Moves(*(np.concatenate([getattr(p, name) for p in known]) for name in Moves.__dataclass_fields__))
 
     @staticmethod
-    def of_rows(rows: list[tuple[float, ...]]) -> Moves:
+    def of_rows(rows: Sequence[tuple[float, ...]] | FloatArray) -> Moves:
         """Return the moves of rows with line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected."""
         data = np.array(rows, dtype=np.float64).reshape(len(rows), 25)
         whole = data[:, :3].astype(np.int64)
@@ -246,8 +246,11 @@ class Corrector:
         #: Distance of samples, so that the error between them is known to a quarter of the tolerance.
         self.step_mm = 0.5 * self.tolerance_mm / bend if bend > 0 else np.inf
 
-    def pieces(self, moves: Moves, by_radius: NDArray[np.bool_]) -> Pieces:
-        """Return the corrected pieces of moves; ``by_radius`` (n,) are arcs that are programmed with a radius."""
+    def pieces(self, moves: Moves, by_radius: NDArray[np.bool_], drilled: NDArray[np.bool_]) -> Pieces:
+        """Return the corrected pieces of moves.
+
+        ``by_radius`` (n,) are arcs that are programmed with a radius, ``drilled`` (n,) moves of a cycle, which stay whole.
+        """
         one = np.ones(len(moves))
         began = kept_directions(directions_at(moves, 1e-7 * one), self.direction)
         ended = kept_directions(directions_at(moves, one - 1e-7), self.direction)
@@ -256,7 +259,7 @@ class Corrector:
             self.direction = ended[-1]
         correction = self.model.command(moves.at_mm, moves.tool_mm, ended) - moves.at_mm
         command = moves.end_mm + np.where(moves.corrected, correction, 0.0)
-        divisible = moves.cutting & moves.corrected.any(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
+        divisible = ~drilled & moves.cutting & moves.corrected.any(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
         turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
             turned = np.asarray(((began * before) < 0).any(axis=1))

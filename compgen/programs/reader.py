@@ -213,6 +213,14 @@ class Reader:
                     parts.append(many[1])
                     count, k = count + len(many[1]), many[0].lines.stop
                     continue
+            if self.cycle is not None and words.places_end[k] - k >= LEAST_RUN:
+                holes = self._holes(words, text, k, first_line, count)
+                if holes is not None:
+                    parts += [Moves.of_rows(self._rows), holes[1]]
+                    self._rows = []
+                    segments += holes[0]
+                    count, k = count + len(holes[1]), k + len(holes[0])
+                    continue
             if start[k + 1] - start[k] > LONGEST_BLOCK:
                 self._line, self._text = first_line + k, ""
                 self._fail(f"the block is longer than {LONGEST_BLOCK} characters; expected one block in a line")
@@ -356,6 +364,74 @@ class Reader:
                 part[1:] = np.where(named[first:stop], value_mm[first:stop], 0.0)
                 np.add.accumulate(part, out=part)
         return at
+
+    def _holes(
+        self, words: Words, text: str, line: int, first_line: int, first: int
+    ) -> tuple[list[SingleBlock], Moves] | None:
+        """Read blocks from ``line`` on that place holes of the active cycle, as :meth:`_cycle` does; None if they do more."""
+        linuxcnc = self.dialect.name == "linuxcnc"
+        modal = self.absolute and self.plane == 2 and self.feed != "inverse" and all(self.named)
+        modal = modal and not (self.ended or self.closed_by_percent)
+        known = not any(math.isnan(value) for value in (*self.position, self.cycle_z, self.cycle_r))
+        if not modal or not known or (linuxcnc and self.cycle in (73, 83)):
+            return None
+        rows = slice(line, int(words.places_end[line]))
+        given, offset = words.value[rows][:, [0, 1, 2, R_WORD]], np.array(self._offset())
+        value = np.vstack([[*self.position[:2], self.cycle_z, self.cycle_r], given * self.scale + offset[[0, 1, 2, 2]]])
+        every = np.arange(len(value))[:, None]
+        value = np.take_along_axis(value, np.maximum.accumulate(np.where(np.isnan(value), 0, every)), axis=0)
+        wrong = np.flatnonzero(value[1:, 3] < value[1:, 2])
+        n = int(wrong[0]) if len(wrong) else len(given)
+        if n < LEAST_RUN:
+            return None
+        (x, y, depth, level), (before_x, before_y) = value[1 : n + 1].T, value[:n, :2].T
+        left = level if self.to_r_level or math.isnan(self.initial_z) else np.maximum(self.initial_z, level)
+        height = np.concatenate([[self.position[2]], left[:-1]])
+        below = (self.initial_z if linuxcnc else height) < level
+        back = FEED if self.cycle in (84, 85, 89) else RAPID
+        # up to the R level where the tool is, over the hole, to the R level, to the depth, back, and where the next begins
+        over = np.maximum(np.where(below, level, height), level)
+        ends = np.array([[before_x, before_y, level], *([x, y, z] for z in (over, level, depth, level, left))])
+        ends = ends.transpose(2, 0, 1)
+        used = np.full((n, 6), True)
+        used[:, 0], used[:, 4] = below, back == FEED or not linuxcnc
+        end, own, step = ends[used], *np.nonzero(used)
+        start = np.vstack([self.position, end[:-1]])
+        moved = (end != start).any(axis=1)
+        start, end, own, step = start[moved], end[moved], own[moved], step[moved]
+        kind, at_level = np.array([RAPID, RAPID, RAPID, FEED, back, RAPID])[step], end[:, 2] == level[own]
+        there, deep = step > 0, at_level | ((kind == FEED) & (end[:, 2] == depth[own]))
+        moves = Moves(
+            line=first_line + line + own,
+            kind=kind,
+            start_mm=start,
+            end_mm=end,
+            centre_mm=np.full(end.shape, np.nan),
+            plane=np.full(len(end), self.plane),
+            sweep_rad=np.zeros(len(end)),
+            offset_mm=np.broadcast_to(offset, end.shape),
+            tool_mm=np.broadcast_to(np.array(self._tool()), end.shape),
+            at_mm=np.stack([x[own], y[own], np.where(at_level, end[:, 2], depth[own])], axis=1),
+            corrected=np.stack([there, there, deep], axis=1),
+        )
+        self.position, self.started = [float(x[-1]), float(y[-1]), float(left[-1])], True
+        self.cycle_z, self.cycle_r = float(depth[-1]), float(level[-1])
+        for k, column in enumerate(given[:n, 2:].T):
+            last = np.flatnonzero(~np.isnan(column))
+            self.cycle_given[k] = float(column[last[-1]]) if len(last) else self.cycle_given[k]
+        counts = np.bincount(own, minlength=n)
+        numbered = zip(counts.tolist(), (first + np.cumsum(counts) - counts).tolist(), strict=True)
+        zeros = words.start[line : line + n + 1].tolist()
+        begins, stops = (item[line : line + n].tolist() for item in (words.begin, words.end))
+        letters, blocks = ((0, "X"), (1, "Y"), (2, "Z"), (R_WORD, "R")), []
+        for j, (many, number) in enumerate(numbered):
+            zero, begin, stop = zeros[j], begins[j], stops[j]
+            found = [
+                (name, text[begin[k] : stop[k]], begin[k] - zero, stop[k] - zero) for k, name in letters if stop[k]
+            ]
+            head = (first_line + line + j, text[zero : zeros[j + 1]], found, number, many, "cycle")
+            blocks.append(SingleBlock(*head, True, self.scale, self.centre_absolute, False))
+        return blocks, moves
 
     # One block.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,9 +150,21 @@ class Words:
                 for k, with_move in zip(chosen, moving, strict=True)
             ]
             spoil(begin[chosen[~np.array(allowed)]])
-        # the end of each run of plain lines, found backwards
-        stops = np.where(plain, count, np.arange(count))
-        self.run_end = np.minimum.accumulate(stops[::-1])[::-1]
+        self.run_end = _ends_of_runs(plain)
+        self._plain = plain
+
+    @cached_property
+    def places_end(self) -> IntArray:
+        """As ``run_end``, of blocks in a row with X, Y, Z and R, and nothing else but block numbers, feeds and comments."""
+        given = ~np.isnan(self.value)
+        others, named = given[:, [3, 4, 5, P_WORD]].any(axis=1), given[:, :3].any(axis=1)
+        selecting = np.maximum(np.maximum(self.motion, self.absolute), self.plane) >= 0
+        return _ends_of_runs(self._plain & named & ~others & ~selecting)
+
+
+def _ends_of_runs(inside: NDArray[np.bool_]) -> IntArray:
+    stops = np.where(inside, len(inside), np.arange(len(inside)))
+    return np.minimum.accumulate(stops[::-1])[::-1]
 
 
 def _blanked(comment: re.Match[bytes]) -> bytes:
