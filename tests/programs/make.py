@@ -148,6 +148,24 @@ def mixed_program(seed, dialect, count=400):
                 r.choice([said, "M8", "M3 S900", "", "F300", "N5 M9", "G64" if dialect != "heidenhain-iso" else "G40"])
             )
             continue
+        if 0.91 < kind < 0.93 and absolute and plane == 2 and dialect in ("linuxcnc", "fanuc"):
+            low, digits, short = -size / 2, most, False
+            cycle = r.choice(
+                ["G81", "G82 P1", "G83 Q" + f"{size / 25:.{digits}f}", "G85", "G73 Q" + f"{size / 25:.{digits}f}"]
+            )
+            lines.append(
+                f"{r.choice(['G98', 'G99'])} {cycle} {word('Z', low)} {word('R', size / 5)} {word('X', at[0])}"
+            )
+            for _ in range(int(r.integers(2, 25))):
+                at[:2] = np.round(np.where(r.random(2) < 0.8, r.uniform(-size, size, 2), at[:2]), digits)
+                names = [word("XY"[k], at[k]) for k in range(2) if r.random() < 0.9]
+                names += [word("Z", low + r.uniform(0, size / 5))] if r.random() < 0.1 or not names else []
+                names += [word("R", size * r.uniform(-0.1, 0.2))] if r.random() < 0.1 else []
+                lines.append("".join(names))
+            at = np.round(r.uniform(-size, size, 3), digits)
+            lines += ["G80", " ".join(["G0", *(word("XYZ"[k], at[k]) for k in range(3))])]
+            motion = 0
+            continue
         if kind < 0.07:
             plane = int(r.integers(0, 3))
             codes.append(["G19", "G18", "G17"][plane])
