@@ -122,7 +122,7 @@ def test_a_word_is_added_after_the_parenthesis_of_a_mode(tmp_path):
     errors = ErrorTable({"EZX": Curve(ends, 1e-4 * ends, np.zeros(2))})
     text = "G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 X=AC(200) F200\nX=IC(300)\nM30\n"
     result, corrected = run(tmp_path, text, errors, "siemens", PLAIN)
-    assert "G1 X=AC(200) Z4.98 F200\nX=IC(300) Z4.95\n" in corrected
+    assert "G1 X=AC(200) Z4.98 F200\nX=IC(300)Z4.95\n" in corrected
     assert result.accepted
 
 
