@@ -182,14 +182,16 @@ class Dialect:
     """How programs of a control are written.
 
     ``codes`` gives the meaning of G codes (and of words in letters), ``refused`` says why others are not followed, ``end``
-    names the codes that end a program; ``decimals`` are those of mm and inch. ``comments`` is the pattern of comments and of
-    settings in words, which move nothing. ``point_needed``: whole numbers without a decimal point may be increments.
+    names the codes that end a program; ``decimals`` are those of mm and inch. ``comments`` is the pattern of comments,
+    ``settings`` of what moves nothing and is more than a word. ``point_needed``: whole numbers without a decimal point
+    may be increments.
     """
 
     name: str
     codes: Mapping[str, str]
     comments: str
     comment: str
+    settings: str = ""
     decimals: tuple[int, int] = (3, 4)
     refused: Mapping[str, str] = field(default_factory=lambda: REFUSED)
     words: str = _WORDS
@@ -204,7 +206,9 @@ class Dialect:
 
     def word_pattern(self) -> re.Pattern[str]:
         """Return the pattern of one word: its address and value, or a comment."""
-        return re.compile(rf"\s*(?:{self.words}|(?P<comment>{self.comments}))", re.IGNORECASE)
+        return re.compile(
+            rf"\s*(?:{self.words}|(?P<comment>{self.comments}{self.settings and '|'}{self.settings}))", re.IGNORECASE
+        )
 
     def said(self, text: str) -> str:
         """Return ``text`` as a comment block."""
@@ -221,7 +225,7 @@ _CALLS = "MSG|GROUP_BEGIN|GROUP_END|GROUP_ADDEND|WORKPIECE|CYCLE832|SETMS|FGROUP
 _ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|JERKLIM|FA|SCC|SVC|S\d|M\d+)"
 #: Calls, axis functions and labels of SINUMERIK that move nothing of X, Y and Z.
 _SIEMENS_SETTINGS = (
-    r"\bMSG\s*\([^\n]*\)|;[^\n]*"
+    r"\bMSG\s*\([^\n]*\)"
     rf"|\b(?:{_CALLS})\s*\((?:\"[^\"\n]*\"|[^()\"\n])*\)|\bCYCLE800\s*\(\s*\)|\bCYCLE832\b(?!\s*\()"
     rf"|\b{_ASSIGNED}\s*(?:\[\s*\w+\s*\])?\s*=\s*(?:(?:AC|IC|DC|ACP|ACN)\s*\(\s*{VALUE}\s*\)|{VALUE})"
 )
@@ -244,8 +248,9 @@ DIALECTS = {
         Dialect(
             "siemens",
             _SIEMENS,
-            _SIEMENS_SETTINGS,
+            r";[^\n]*",
             "; {}",
+            settings=_SIEMENS_SETTINGS,
             refused={**REFUSED, **_SIEMENS_REFUSED},
             words=_SIEMENS_WORDS,
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 17, 70)),

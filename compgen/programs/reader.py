@@ -630,6 +630,11 @@ class Reader:
             code = name[1].upper()
             if code in self.setup.keep_unknown:
                 return name.end()
+            if code == "CYCLE800" and name[2] and not re.search("[1-9A-Z]", ",".join(name[2].split(",")[4:13]).upper()):
+                # all shifts and angles are 0: the plane is not turned, but the cycle may draw the tool back
+                self.position, self.named = [math.nan] * 3, [False] * 3
+                self.assumed["CYCLE800 without angles leaves the rotary axes where the errors were measured"] = None
+                return name.end()
             if dialect.name == "siemens" and name[2] and defines_hole(code):
                 self.drilling = DrillingCycle.called(code, self._text, name.start(2), name[2])
                 words.append((code, "", at, at))

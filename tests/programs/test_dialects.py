@@ -441,3 +441,15 @@ def test_a_shift_within_a_series_of_holes_is_no_hole(tmp_path):
     assert moves.line.max() == 3
     with pytest.raises(InputError, match="while TRANS is active"):
         moves_of("G71 G90 G54\nTRANS X5\nG55\nM30\n", "siemens", Setup({"G54": ZERO, "G55": ZERO}))
+
+
+def test_a_plane_that_is_turned_by_nothing(tmp_path):
+    """CYCLE800 with angles and shifts 0 may draw the tool back: the program has to position all axes again."""
+    text = 'G71 G90 G17 G54\nCYCLE800(4,"TC1",200000,57,0,0,0,0,0,0,0,0,0,1,,1)\nG0 X100 Y0\nZ5\nG1 X200 F9\nM30\n'
+    result = followed(tmp_path, "siemens", text, ["G0 X99.99 Y0", "G1 X199.98 F9"], slope=0.1)
+    assert any("CYCLE800" in words for words in result.assumed)
+    for angle in ("0,0,0,0,0,0.5,0,0,0", "0,0,25,0,0,0,0,0,0", "0,0,0,A,0,0,0,0,0"):
+        with pytest.raises(InputError, match="a turned plane"):
+            moves_of(text.replace("0,0,0,0,0,0,0,0,0", angle), "siemens", PLAIN)
+    with pytest.raises(InputError, match="position of Z is not known"):
+        moves_of(text.replace("Z5\n", ""), "siemens", PLAIN)
