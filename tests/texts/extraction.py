@@ -288,6 +288,21 @@ def messages():
     return found
 
 
+def refusals():
+    """Return the messages with which NC programs and files of controls are refused; some may lack a translation."""
+    found, known = {}, messages()
+    paths = [
+        path
+        for pattern in ("controls/*.py", "controls/shared/*.py", "programs/*.py")
+        for path in (ROOT / "compgen").glob(pattern)
+    ]
+    for path in sorted(paths):
+        for text in of_module(path.read_text("utf-8"), errors=True):
+            if (None, text) not in known:
+                found.setdefault((None, text), {})[str(path.relative_to(ROOT))] = None
+    return found
+
+
 def update(language):
     """Write the catalogue of a language with all messages of now, and its compiled form; return what has no translation.
 
@@ -305,7 +320,8 @@ def update(language):
     day = datetime(2026, 11, 23, tzinfo=UTC)  # the date of a file is in the history of the project
     catalogue = Catalog(language, header_comment="# Texts of pages and lists.", project="compgen", version=" ", fuzzy=False,
                         msgid_bugs_address=" ", creation_date=day, revision_date=day, last_translator=" ")  # fmt: skip
-    for (context, text), files in messages().items():
+    refused = {key: files for key, files in refusals().items() if known.get(key)}
+    for (context, text), files in {**messages(), **refused}.items():
         string = known.get((context, text), "")
         catalogue.add(text, string, locations=[(name, None) for name in files], context=context)
     with path.open("wb") as file:
