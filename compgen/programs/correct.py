@@ -452,14 +452,19 @@ class ProgramWriter:
         if self.cycle is None or self.cycle[0] is not cycle:
             self.cycle = (cycle, cycle)
 
-        def text_of(before: str, value: float) -> str:
-            own = max(digits, len(before.partition(".")[2].strip()))
-            kept = abs(value - float(before.replace(" ", "") or 0.0)) <= _HALF * 10.0**-own
-            return before if kept else self._number(value, own, before)
+        original, last = self.cycle
+
+        def text_of(name: str, value: float) -> str:
+            like, before = original.numbers[name][3], last.numbers[name][3]
+            own = max(digits, len(like.partition(".")[2].strip()))
+            if abs(value - float(before.replace(" ", "") or 0.0)) <= _HALF * 10.0**-own:
+                return before
+            text = self._number(value, own, like)
+            return text if "." in like else text.rstrip(".")
 
         z = (np.array([level[2], depth[2], self.written_mm[2]]) - offset[2]) / scale
-        now = self.cycle[1].with_heights(float(z[0]), float(z[1]), float(z[2]), text_of)
-        lines = now.written() if now != self.cycle[1] else []
+        now = last.with_heights(float(z[0]), float(z[1]), float(z[2]), text_of)
+        lines = now.written() if now != last else []
         self.cycle = (cycle, now)
         if "P02" not in now:
             self.target_mm[2] = self.written_mm[2] = now.heights(0.0)[2] * scale + offset[2]

@@ -130,12 +130,12 @@ class DrillingCycle:
     def with_heights(
         self, level: float, depth: float, start: float, text_of: Callable[[str, float], str]
     ) -> DrillingCycle:
-        """Return the cycle with other heights; ``text_of`` writes a number in place of the text of the one before."""
+        """Return the cycle with other heights; ``text_of`` writes the number of a name."""
         numbers = dict(self.numbers)
 
         def put(name: str, value: float) -> float:
-            line, first, last, text = numbers[name]
-            numbers[name] = (line, first, last, text_of(text, value))
+            line, first, last, _ = numbers[name]
+            numbers[name] = (line, first, last, text_of(name, value))
             return float(numbers[name][3].replace(" ", "") or 0.0)
 
         if self.name in _SINUMERIK:

@@ -226,13 +226,13 @@ def test_holes_of_mcall_have_their_places_and_their_heights(tmp_path):
 
 def test_a_cycle_is_written_again_for_each_hole_where_the_heights_differ(tmp_path):
     """EZX of 0.1 um/mm: 10 um at X 100, 20 um at X 200, and the same again at X 201."""
-    text = "G17 G71 G90 G54\nG0 X0 Y0 Z50\nF200\nMCALL CYCLE82(10,0,2,-20,,0.5)\nX100\nX200\nX201\nMCALL\nM30\n"
+    text = "G17 G71 G90 G54\nG0 X0 Y0 Z50\nF200\nMCALL CYCLE82(10,0,2,-20,,0.5)\nX100\nX200\nX201\nX0\nMCALL\nM30\n"
     _, corrected = run(
         tmp_path, text, cycle_errors(0.0, 0.0, 1e-4), "siemens", Setup({"G54": ZERO}, TOOLS), tolerance_um=5
     )
     assert corrected.endswith(
         "F200\nMCALL CYCLE82(10,0,2,-20,,0.5)\nMCALL CYCLE82(10,-0.01,2,-20.01,,0.5)\nX100\n"
-        "MCALL CYCLE82(10,-0.02,2,-20.02,,0.5)\nX200\nX201\nMCALL\nM30\n"
+        "MCALL CYCLE82(10,-0.02,2,-20.02,,0.5)\nX200\nX201\nMCALL CYCLE82(10,0,2,-20,,0.5)\nX0\nMCALL\nM30\n"
     )
 
 
