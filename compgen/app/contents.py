@@ -692,6 +692,12 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
     return shown
 
 
+def can_be_diagnosed(state: ProjectState) -> bool:
+    """Whether ``volcomp diagnose`` reads all measurements that a result is calculated from."""
+    used = [item for item in state.measurements if item.used and not item.after]
+    return bool(used) and all(item.step.data["summary"]["kind"] not in ("part", "artefact", "errors") for item in used)
+
+
 def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return what was identified and diagnosed last, and whether it is up to date."""
     step = state.last("identify")
@@ -717,7 +723,7 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "found": found, "diagnosis": diagnosis, "diagnosed_views": list(project.pages_of(found)),
         "gap": gap_picture(diagnosis), "applied": applied,
         "may_add": found is not None and "extended.toml" in project.files_of(found) and not applied,
-        "current_diagnosis": state.current("diagnose") is not None,
+        "current_diagnosis": state.current("diagnose") is not None, "diagnosable": can_be_diagnosed(state),
     }  # fmt: skip
 
 
@@ -754,7 +760,7 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "options_current": state.current("options") is not None,
         "controls": controls, "chosen": results[0]["control"] if results else next(iter(controls), ""),
         "identified": state.current("identify"),
-        "misfit_codes": MISFIT_CODES,
+        "misfit_codes": MISFIT_CODES, "diagnosable": can_be_diagnosed(state),
         "fit": dict(runs[-1].data.get("fit", {})) if runs else {},
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],

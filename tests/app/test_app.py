@@ -13,6 +13,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from markupsafe import escape
 
@@ -146,6 +147,44 @@ def test_tracer_lengths_on_a_shipped_machine_and_the_controls_side_by_side(site)
     page = site.get("/projects/1/tables").text
     options = json.loads(site.project.files_of(state.last("options"))["options.json"].read_text())
     assert all(row["controller"] in page for row in options["controls"])
+
+
+def test_large_residuals_are_explained_and_accepting_the_tables_is_a_box_to_tick(site, tmp_path):
+    """Holes of a part that scatter by 1 um, on a machine whose scale of 8 um/m and squareness of 20 urad are not much larger."""
+    rng = np.random.default_rng(3)
+    nominal = rng.uniform((20, 20), (380, 380), (60, 2))
+    x, y = nominal.T - 200.0
+    made = nominal + np.column_stack([8e-6 * x - 20e-6 * y, -6e-6 * y]) + rng.normal(0.0, 1e-3, (60, 2))
+    rows = [
+        f"H{k},{a:.4f},{b:.4f},0,{p:.6f},{q:.6f}" for k, ((a, b), (p, q)) in enumerate(zip(nominal, made, strict=True))
+    ]
+    (tmp_path / "holes.part.csv").write_text("\n".join(["feature,x_mm,y_mm,z_mm,mx_mm,my_mm", *rows]) + "\n")
+    site.do("machine/describe", MILL)
+    site.do("measurement/add", upload(tmp_path / "holes.part.csv"))
+    site.do("identify")
+    settings = (site.project.folder / site.project.state().machine).read_text()
+    assert "siemens-cec" in settings
+    state = site.do("run", {"control": "siemens-cec"})
+    first = state.last("run")
+    result = json.loads(site.project.files_of(first)["result.json"].read_text())
+    assert [item["code"] for item in result["objections"] if item["blocking"]] == ["residual_too_large"]
+    page = site.get("/projects/1/tables").text
+    assert "What it means, and what to do" in page
+    assert "The measurement scatters" in page
+    assert "this one cannot" in page
+    assert "/projects/1/diagnose" not in page + site.get("/projects/1/result").text
+    asked = re.search(
+        r'name="again" value="(\d+)">\s*<label[^>]*><input type="checkbox" name="allow-misfit" required>', page
+    )
+    assert asked
+    assert asked[1] == str(first.number)
+    state = site.do("run", {"control": "siemens-cec", "again": asked[1], "allow-misfit": "on"})
+    assert "--allow-misfit" in state.last("run").commands[0]
+    result = json.loads(site.project.files_of(state.last("run"))["result.json"].read_text())
+    assert result["verdict"] == "accepted_with_reservations"
+    page = site.get("/projects/1/tables").text
+    assert page.index("accepted with reservations") < page.index("not accepted")
+    assert "What it means, and what to do" not in page
 
 
 def test_a_second_measurement_is_compared_with_the_first(site, tmp_path):
@@ -353,6 +392,10 @@ def test_tables_that_were_active_are_taken_out_of_the_measurement(site):
     state = site.do("run", {"control": "isg-csv", "active": tables})
     step = state.last("run")
     assert f"--active={step.folder}/given/active-1-volcomp0.csv" in step.commands[0]
+    state = site.do("run", {"control": "isg-csv", "again": str(step.number)})  # with the files that were given then
+    assert [word for word in state.last("run").commands[0] if word.startswith("--active=")] == [
+        word for word in step.commands[0] if word.startswith("--active=")
+    ]
     second = values(site.project, step)
     assert second["EC0Y", ""] == pytest.approx(2.0 * first["EC0Y", ""], rel=1e-3)
     assert second["EXX", -800.0] == pytest.approx(2.0 * first["EXX", -800.0], abs=0.5)
