@@ -563,7 +563,7 @@ class Reader:
                 self._fail("a second program begins here; give one program at a time")
             at = named.end()
         if dialect.pole:
-            body = body.rstrip("*").rstrip()
+            body = re.sub(r"\*(\s*;)", r" \1", body.rstrip("*").rstrip(), count=1)
             if re.match(r"\s*(?:N\d+\s*)?\*", body):  # a heading within the program
                 return []
             if self._takes_definition(body):

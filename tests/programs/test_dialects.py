@@ -133,7 +133,7 @@ def test_heidenhain_shift_tool_call_and_the_direction_of_the_last_arc(tmp_path):
     """
     text = (
         "%PART G71 *\nN10 * - FACE OF A PLATE*\nN20 G30 G17 X+0 Y+0 Z-40*\nN30 G31 G90 X+100 Y+100 Z+0*\nN35 G99 T2 L+0 R+5*\n"
-        "N40 T1 G17 S3000 DL+0.5 DR+0*\nN45 G51 T2*\nN50 G00 G40 G90 Z+50 M3*\nN55 G62 T0.02 P01 1 P02 5*\n"
+        "N40 T1 G17 S3000 DL+0.5 DR+0*\nN45 G51 T2* ;next*\nN50 G00 G40 G90 Z+50 M3*\nN55 G62 T0.02 P01 1 P02 5*\n"
         "N60 G54 X+100 Y+20*\nN70 X+0 Y+0 M8*\nN80 G54 G91 X+50*\nN90 G90 G01 X+50 Z-2 F200*\nN100 G98 L1*\n"
         "N110 G02 X+60 Y+10 R+10*\nN120 G05 X+50 Y+0 R+10*\nN130 G54 X+0 Y+0*\nN140 G01 X+200 FMAX*\nN150 G00 Z+0 M91*\n"
         "N160 M2*\n"
