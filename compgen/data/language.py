@@ -59,6 +59,7 @@ _WEAK, _LOWER = 5, re.compile(r"(?:^|\s)[a-z]{3,}(?:$|[\s,;:.])")
 _LETTERS = re.compile(r"[a-z]{2,}")
 _SENTENCES, _CLAUSES = re.compile(r"(?<=[.!?]) (?=\S)"), re.compile(r"(?<=;) (?=\S)")
 _COMMAS = re.compile(r"(?<=,) (?=\S)")
+_REMARK = re.compile(r" (?=\([^()]*\)$)")
 _AFTER_COLON = re.compile(r"(?<=:) (?=\S)")
 #: Several words in small letters, as only sentences have them.
 _PROSE = re.compile(r"\b[a-z]{2,},? [a-z]{2,}\b")
@@ -177,7 +178,7 @@ class Texts:
         known = self._whole(rest, least)
         if known is not None and not _PROSE.search(name):
             return f"{self._word(name) or name}: {known}"
-        for end in (_SENTENCES, _CLAUSES, _AFTER_COLON, _COMMAS):
+        for end in (_SENTENCES, _REMARK, _CLAUSES, _AFTER_COLON, _COMMAS):
             pieces = end.split(english)
             found: list[str | None] = []
             first = 0
@@ -216,7 +217,8 @@ class Texts:
         for line in english.split("\n"):
             marker = MARKER.match(line)
             assert marker is not None
-            cells = re.split(r"(\||(?<=\S) {2,}(?=\S))", line[marker.end() :])
+            whole = line[marker.end() :]
+            cells = [whole] if self.text(whole) != whole else re.split(r"(\||(?<=\S) {2,}(?=\S))", whole)
             for k in range(0, len(cells), 2):
                 given, cells[k] = cells[k], self._named(cells[k])
                 if k + 1 < len(cells) and cells[k + 1] != "|":  # columns of a table stay where they are
@@ -240,9 +242,10 @@ class Texts:
 
     def _named(self, english: str) -> str:
         """Return a cell of a table, a name and its value, or a message and its kind, in this language."""
-        whole, (name, colon, value) = self.label(english), english.partition(":")
-        if whole == english and (kind := self.messages.get(f"{name}: {{message}}")):  # a message without a translation
-            return kind.replace("{message}", value.strip())
+        name, colon, value = english.partition(":")
+        if kind := self.messages.get(f"{name}: {{message}}"):  # of errors and warnings, also without a translation
+            return kind.replace("{message}", self.label(value.strip()))
+        whole = self.label(english)
         known = self.messages.get(f"{LABEL}\x04{name.replace('_', ' ')}")
         return whole if known is None or not colon or whole != english else f"{known}:{self.label(value)}"
 

@@ -66,10 +66,11 @@ WORDS = (
     "rejected", "same", "smaller", "smoothed", "squareness", "straightness", "week", "weeks", "with", "within", "without",
     "worse", "positioning runs", "lengths of a tracer", "six-DOF readings", "both", "one", "both directions", "radius (mm)",
     "REJECTED", "nothing", "none", "named", "unknown", "rise", "fall", "grows", "falls", "rises", "up", "down", "stated",
-    "estimated", "yes", "no", "required", "agrees", "disagrees", "uncalibrated", "both kinds of",
+    "estimated", "required", "agrees", "disagrees", "uncalibrated", "both kinds of",
 )  # fmt: skip
 #: Headings and names of facts: they are no values, and where they are the name of a key they stay as they are.
 LABELS = (
+    "yes", "no",
     "why", "correlation", "partly", "reversal", "units", "passed", "Diagnosis", "Steps", "done", "progress", "volumetric",
     "pitch", "skew", "reference point", "tool offset",
     "circles", "part", "artefact", "deviations", "errors", "diagonals", "axis", "plane", "station", "targets", "runs",

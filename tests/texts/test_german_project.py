@@ -250,3 +250,20 @@ def test_rows_of_a_list_keep_their_columns():
     assert texts.lines("name      before    after") == "name      vorher    nachher"
     assert texts.lines("| before | after |") == "| vorher | nachher |"
     assert list(csv.reader([texts.lines("- [ ] not used: X")])) == [["- [ ] unbenutzt: X"]]
+
+
+def test_kind_and_place_of_a_message_are_german_around_it(tmp_path, capsys):
+    (tmp_path / "a.nc").write_text("G21 G90\nG1 X10 F100\nM30\n")
+    words = ["correct", "zha-gantry", str(tmp_path / "a.nc"), "--errors", ERRORS, "--dialect", "fanuc"]
+    code, _, told = said(capsys, *words, "--out", str(tmp_path / "out"), "--language", "de")
+    assert code == 2
+    assert " ".join(told.split()).endswith(
+        "X: X10 hat keinen Dezimalpunkt: mm oder Inkremente; mit Dezimalpunkt ausgeben (Satz: G1 X10 F100)"
+    )
+    assert told.startswith("Fehler: ")
+    german = texts_of("de")
+    assert german.lines("warning: a message of a plug-in") == "Warnung: a message of a plug-in"
+    assert german.lines("parameter   c1_um: half the reversal value; at most about 100") == (
+        "Parameter   c1_um: die halbe Umkehrspanne; höchstens etwa 100"
+    )
+    assert german.lines("mill.toml: machine, no problem") == "mill.toml: machine, kein Problem"
