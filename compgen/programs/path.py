@@ -22,7 +22,7 @@ RAPID, FEED, CW, CCW = range(4)
 PLANE_AXES = ((1, 2), (2, 0), (0, 1))
 #: The inverse is repeated until commands change by less, mm.
 CONVERGED_MM = 1e-9
-_MOST_STEPS = 30
+_MOST_STEPS, _MOST_SAMPLES = 30, 200_000
 _FIRST, _SECOND = np.array(PLANE_AXES).T
 
 
@@ -170,6 +170,12 @@ def points_of(moves: Moves, fraction: FloatArray, own: IntArray | None = None) -
     return points
 
 
+def _portions(samples: IntArray) -> list[IntArray]:
+    """Indices of moves in portions of about _MOST_SAMPLES, so that memory does not grow with their length."""
+    every = np.arange(len(samples))
+    return np.split(every, np.flatnonzero(np.diff(np.cumsum(samples) // _MOST_SAMPLES)) + 1) if len(samples) else []
+
+
 def directions_at(moves: Moves, fraction: FloatArray) -> FloatArray:
     """Return the sign of travel of each axis at a ``fraction`` of each move, (n, 3); 0 where an axis rests."""
     change = moves.end_mm - moves.start_mm
@@ -263,7 +269,9 @@ class Corrector:
         turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
             turned = np.asarray(((began * before) < 0).any(axis=1))
-        inner = [self._straight(moves, np.flatnonzero(divisible & (moves.sweep_rad == 0)), ended, turned)]
+        lines = np.flatnonzero(divisible & (moves.sweep_rad == 0))
+        samples = np.ceil(lengths_of(moves.part(lines)) / self.step_mm).astype(np.int64) + 1
+        inner = [self._straight(moves, lines[part], ended, turned) for part in _portions(samples)]
         arcs = np.flatnonzero(divisible & (moves.sweep_rad != 0))
         centre = np.array(moves.centre_mm)
         if len(arcs):
@@ -327,12 +335,13 @@ class Corrector:
             needed = np.clip(share * length[move] / self.step_mm, least, 2048)
             steps = 2 ** np.ceil(np.log2(needed)).astype(np.int64)
             for count in np.unique(steps).tolist():
-                part = work[steps == count]
-                move, low, high = part[:, 0].astype(np.int64), part[:, 1], part[:, 2]
-                end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, ended, length)
-                done.append((move[fine], high[fine], end[fine], centre[fine]))
-                rest, half = ~fine, 0.5 * (low + high)
-                again += [np.stack([move, low, half], axis=1)[rest], np.stack([move, half, high], axis=1)[rest]]
+                for some in _portions(steps[steps == count]):
+                    part = work[steps == count][some]
+                    move, low, high = part[:, 0].astype(np.int64), part[:, 1], part[:, 2]
+                    end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, ended, length)
+                    done.append((move[fine], high[fine], end[fine], centre[fine]))
+                    rest, half = ~fine, 0.5 * (low + high)
+                    again += [np.stack([move, low, half], axis=1)[rest], np.stack([move, half, high], axis=1)[rest]]
             work = np.concatenate(again)
         return Pieces(*(np.concatenate(column) for column in zip(*done, strict=True)))
 
@@ -470,8 +479,7 @@ def path_deviations(
     low, high = shares
     length = lengths_of(driven)
     count = np.clip(np.ceil(length / step_mm), 2, 2000).astype(np.int64)
-    for first in range(0, len(driven), 50_000):
-        part = np.arange(first, min(first + 50_000, len(driven)))
+    for part in _portions(count):
         own = np.repeat(part, count[part])
         begin = np.repeat(np.cumsum(count[part]) - count[part], count[part])
         share = (np.arange(len(own)) - begin + 1) / count[own]
