@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 RAPID, FEED, CW, CCW = range(4)
 #: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
 PLANE_AXES = ((1, 2), (2, 0), (0, 1))
-#: The inverse is repeated until commands change by less, mm.
+#: The inverse is repeated until commands would change by less, mm.
 CONVERGED_MM = 1e-9
 _MOST_STEPS, _MOST_SAMPLES = 30, 200_000
 _FIRST, _SECOND = np.array(PLANE_AXES).T
@@ -102,10 +102,14 @@ class ExactModel:
         travel = np.array([axis.range_mm for axis in self.machine.axes])
         wanted = np.where(unknown, np.clip(0.0, travel[:, 0], travel[:, 1]), wanted_mm)
         found, allowed = wanted, np.array(self.only, dtype=np.float64)
+        last = 0.0
         for _ in range(_MOST_STEPS):
             before, found = found, wanted - allowed * self.error(found, tool_mm, direction)
-            if np.abs(found - before).max(initial=0.0) < CONVERGED_MM:
+            change = float(np.abs(found - before).max(initial=0.0))
+            # the next change would be smaller by the same factor as this one
+            if change < CONVERGED_MM or (change < 0.1 * last and change * change < CONVERGED_MM * last):
                 return np.where(unknown, np.nan, found)
+            last = change
         raise ConvergenceError("the errors change too fast along the axes to be corrected; check the errors file")
 
     def bend(self) -> float:
