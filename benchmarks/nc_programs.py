@@ -3,7 +3,8 @@
     python benchmarks/nc_programs.py [--blocks 1000000] [--rounds 3]
 
 Programs like those of CAM: a surface finished in lines of 0.4 mm (FANUC, LinuxCNC), the same with block numbers and
-blanks (SINUMERIK), and pockets of arcs and lines (LinuxCNC, a tenth of the blocks). The machine is the example with its
+blanks (SINUMERIK); lines, arcs and all that CAM mixes among them, increments, and, a tenth of the blocks, holes under one
+cycle and pockets of arcs and lines (LinuxCNC). The machine is the example with its
 true errors. Least of several rounds of whole processes, one thread; processor time, which other programs disturb little.
 """
 
