@@ -25,7 +25,7 @@ CATALOGUES = ROOT / "templates" / "_language"
 #: Modules whose sentences are shown on a page, in a list for the reader, or in the terminal.
 MODULES = (
     "accuracy/*.py", "app/*.py", "cli/common.py", "cli/accuracy_commands.py", "cli/diagnose_commands.py",
-    "cli/file_commands.py", "cli/fit_commands.py",
+    "cli/file_commands.py",
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
     "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
@@ -108,7 +108,7 @@ NO_TEXT = re.compile(
     r"^Another machine with its errors|^ecart type$|^coverage factor k$|^Position \[|^run\{zero"
 )
 #: Modules whose constants are words that readers look for.
-WITH_WORD_LISTS = ("new_machine.py", "column_names.py", "covariates.py", "cells.py", "probe_logs.py")
+WITH_WORD_LISTS = ("new_machine.py", "column_names.py", "covariates.py", "cells.py")
 
 
 def place_name(node):
