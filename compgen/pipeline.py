@@ -291,6 +291,7 @@ def identify_bare(
     """
     if active is None and not isinstance(measurement, ErrorTable | MixedMeasurement):
         return identify_measurement(machine, measurement, options)
+    from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.foreign.converted import given_errors
     from compgen.tables.active import without_active
@@ -301,9 +302,9 @@ def identify_bare(
         tables_of = {name: part for name, part in measurement.parts if isinstance(part, ErrorTable)}
         known = {name: given_errors(machine, table, whole=False) for name, table in tables_of.items()}
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
-    if active is None or not isinstance(measurement, Lengths | Deviations):
+    if active is None or not isinstance(measurement, Lengths | Deviations | Circles):
         raise InputError(
-            "active tables (--active) can be removed from lengths and deviations only; measure anything else with "
+            "active tables (--active) can be removed from lengths, deviations and circles only; measure anything else with "
             "the compensation off, and state it (no --active; in `volcomp recal` active_table = none or measured_with = bare)"
         )
     wider, moved, report = without_active(machine, measurement, active)

@@ -13,6 +13,7 @@ import numpy as np
 
 from compgen.controls.shared.base import Monomial, Term
 from compgen.controls.shared.grids import curve_nodes_mm
+from compgen.data.circles import Circles
 from compgen.data.comparison import figures_of, rms
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
@@ -41,7 +42,7 @@ from compgen.tables.verification import ReadTables, read_tables, table_files
 # with the exact error e; this is solved for P by least squares over the volume, repeated until it converges.
 
 
-Measurement = Lengths | Deviations
+Measurement = Lengths | Deviations | Circles
 
 #: A larger correction means a wrong table or a wrong unit, mm.
 LARGEST_CORRECTION_MM = 20.0
@@ -124,8 +125,10 @@ def without_active(
 
     The commanded positions become p + c(p), the actual commands of the axes; deviations refer to these. The travel of
     the returned machine is wider if a corrected position is outside; its nodes, and therefore the curves, are
-    unchanged.
+    unchanged. Circles stay where they are: their radii lose what c adds to them, in the direction of travel.
     """
+    if isinstance(measurement, Circles):
+        return _circles_without(machine, measurement, active)
     # Commanded positions outside the travel are refused before the tables widen it.
     check_travel(machine, measurement.position_mm, measurement.origin)
     points = Points(measurement.position_mm, measurement.tool_mm, measurement.approach)
@@ -136,6 +139,25 @@ def without_active(
         moved = replace(measurement, position_mm=shifted, deviation_mm=measurement.deviation_mm - added)
         return _widened(machine, shifted), moved, report
     return _widened(machine, shifted), replace(measurement, position_mm=shifted), report
+
+
+def _circles_without(
+    machine: Machine, circles: Circles, active: ActiveTables
+) -> tuple[Machine, Circles, dict[str, object]]:
+    """Subtract from each radius by how much the point p + c(p) is farther from the centre than p.
+
+    The errors are then those at p + c(p), taken as at p: they differ by about 1e-4 of c.
+    """
+    from compgen.identify.axis_tests import circle_positions
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)  # said when the circles are identified
+        position_mm = circle_positions(machine, circles)
+    points = Points(position_mm, approach=circles.travel())
+    added, outward = active.correction(machine, points), circles.radius_mm[:, None] * circles.radial()
+    farther = np.linalg.norm(outward + added, axis=1) - circles.radius_mm
+    moved = replace(circles, deviation_mm=circles.deviation_mm - farther)
+    return machine, moved, active.summary(machine, points)
 
 
 def _widened(machine: Machine, position_mm: FloatArray) -> Machine:

@@ -1,6 +1,7 @@
 """Circular tests against machines with known errors; the readings are distances of the exact model from a pivot."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.circles import PLANES, Circles, format_circles, read_circles
 from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.lengths import Points
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.foreign import open_measurement
-from compgen.identify.axis_tests import identify_circles
+from compgen.identify.axis_tests import circle_positions, identify_circles
 from compgen.kinematics.exact_chain import tip_position
 from compgen.pipeline import identify_bare
+from compgen.tables.active import read_active
 
 RADIUS_MM, NOISE_MM = 100.0, 2e-4
 SQUARENESS = {"EC0Y": 80e-6, "EB0Z": -60e-6, "EA0Z": 45e-6}
@@ -236,3 +239,32 @@ def test_planes_keep_their_joint_covariance_beside_other_measurements(tmp_path, 
     np.testing.assert_allclose(np.linalg.norm(factor, axis=1), together.errors.uncertainties(), rtol=1e-9)
     assert not (factor @ factor.T)[own][:, names.index("EXX")].any()
     assert abs(covariance[0, 1]) > 0.1 * np.sqrt(covariance[0, 0] * covariance[1, 1])
+
+
+def test_tables_that_were_active_are_taken_out_of_circles(tmp_path, machine):
+    """The tables move the axes before the machine errs: commands p + c(p) by their text, the tip by the exact model."""
+    errors = errors_of(machine)
+    wrong = {name: 0.7 * value + 9e-6 for name, value in SQUARENESS.items()}  # tables of an earlier measurement
+    old = ErrorTable({"EXX": errors.curves["EXX"]}, {name: (value, 0.0) for name, value in wrong.items()})
+    files = compgen.export(machine, old, "isg-csv").write(tmp_path)
+    active = read_active(machine, files, "isg-csv")
+    parts = []
+    for plane in PLANES:
+        bare = readings(machine, errors, plane)
+        position, tip = circle_positions(machine, bare), []
+        added = active.correction(machine, Points(position, approach=bare.travel()))
+        centre = np.array([20.0, -10.0, 30.0]) + [0.02, -0.03, 0.01]
+        for command in (position, position + added):
+            tip.append(np.linalg.norm(tip_position(machine, errors.at(command), command, np.zeros(3)) - centre, axis=1))
+        parts.append(replace(bare, deviation_mm=bare.deviation_mm + tip[1] - tip[0]))
+    paths = [file_of(tmp_path, part, f"{k}-on") for k, part in enumerate(parts)]
+    circles = read_circles(paths)
+    with_tables = identify_bare(machine, circles)
+    found = identify_bare(machine, circles, active=active)
+    bare = identify_circles(machine, read_circles([file_of(tmp_path, readings(machine, errors, p), p) for p in PLANES]))
+    for name, value in SQUARENESS.items():
+        assert abs(found.errors.squareness[name][0] - value) < 2e-6
+        assert found.errors.squareness[name][0] == pytest.approx(bare.errors.squareness[name][0], abs=5e-8)
+        assert abs(with_tables.errors.squareness[name][0] - value) > 15e-6
+    assert found.corrections["active_tables"]["controller"] == "isg-csv"
+    assert found.corrections["active_tables"]["largest_correction_um"] > 5.0
