@@ -187,7 +187,7 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
         worst_u=worst_uncertainty(errors) if whole else {},
         layout=error_parameters(machine, errors.names),
         values_factor=np.hstack(factors) if whole else None,
-        details={"parts": [part.summary() for part in parts]},
+        details={"parts": [part.summary() for part in parts], "within_circles": _within_circles(parts)},
     )
 
 
@@ -259,6 +259,21 @@ def _with_known_curves(layout: ErrorParameters, found: Sequence[Observations], k
         if name not in others.covered and not (name in known and others.shows[:, number].any()):
             design[:, curve.columns] = 0.0
     return replace(found[k], design=design)
+
+
+def _within_circles(
+    parts: Sequence[Source], layout: ErrorParameters | None = None, found: Sequence[Observations] = ()
+) -> list[str]:
+    """Squareness that circles show, unless the straightness of both axes is taken into account by their readings."""
+    names: list[str] = []
+    for k, part in enumerate(parts):
+        if isinstance(part.measurement, Circles) and part.alone is not None:
+            curves = () if layout is None else layout.curves
+            taken = {curve.error.name for curve in curves if found[k].design[:, curve.columns].any()}
+            for name in part.alone.errors.squareness:
+                one, other = (AXES[axis] for axis in range(3) if axis != error_named(name).direction)
+                names += [name] if {f"E{one}{other}", f"E{other}{one}"} - taken else []
+    return names
 
 
 def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
@@ -335,6 +350,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         values_factor=factor,
         details={
             "parts": [part.summary() for part in adjusted],
+            "within_circles": _within_circles(parts, layout, found),
             "en": agreement,
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 #: Further reasons and rejected readings are in the JSON files only.
 MOST_VERDICT_REASONS = 10
+_WITHIN_CIRCLES = "squareness within the circles: bent guides make it differ over the whole travel, beyond u"
 
 
 def identification_table(result: Identification) -> Group:
@@ -54,13 +55,14 @@ def identification_table(result: Identification) -> Group:
         text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
         return Group(Text(text), _errors_table(result))
     if result.method == "together":
-        listed = [
-            f"{part['name']}: {', '.join(part['errors']) or 'nothing alone,'}"
-            + (f" from {part['readings']} readings" if part["readings"] else "")
-            for part in result.details["parts"]
-        ]
+        listed = []
+        for part in result.details["parts"]:
+            alone = ", ".join(part["errors"]) or "nothing alone,"
+            shown = f"{alone} from {part['readings']} readings" if part["readings"] else alone
+            listed.append(f"{part['name']}: {shown}")
         count = len(result.errors.names)
-        quality = f"{count} error{'s' if count > 1 else ''}, residual {result.rms_um:.3f} um rms"
+        residual = f"residual {result.rms_um:.3f} um rms"
+        quality = f"1 error, {residual}" if count == 1 else f"{count} errors, {residual}"
         apart = [text.partition(":")[0] for text in result.unobservable if text.endswith("stations and other errors")]
         if apart:
             quality += (
@@ -68,7 +70,9 @@ def identification_table(result: Identification) -> Group:
             )
         disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
                     for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
-        return Group(Text("\n".join([*listed, quality, *disagree])), _errors_table(result))
+        local = result.details.get("within_circles", ())
+        bent = [f"{', '.join(local)}: {_WITHIN_CIRCLES}"] if local else []
+        return Group(Text("\n".join([*listed, quality, *bent, *disagree])), _errors_table(result))
     counted = {
         "deviations": "components of measured positions used",
         "artefact": "probed coordinates used",
@@ -101,7 +105,7 @@ def identification_table(result: Identification) -> Group:
         if item["what"] in ("reversal", "scales", "servo mismatch")
     ]
     if result.method == "circles" and result.errors.squareness:
-        lines.append("squareness within the circles: bent guides make it differ over the whole travel, beyond u")
+        lines.append(_WITHIN_CIRCLES)
     if result.method == "merged":
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")

@@ -408,6 +408,7 @@ def test_circles_enter_an_adjustment_with_their_joint_covariance(small_machine):
     assert found.errors.values() == pytest.approx(alone.errors.values() + gain * u_rad, abs=1e-10)
     u = found.errors.uncertainties() / found.u_scale
     assert u == pytest.approx(np.sqrt(np.diag(prior - np.outer(gain, weights @ prior))), rel=1e-6)
+    assert set(found.details["within_circles"]) == {"EC0Y", "EB0Z", "EA0Z"}  # nothing tells how the guides are bent
 
 
 def test_circles_and_straightness_together_give_the_squareness_over_the_travel(tmp_path, small_machine, truth):
@@ -423,3 +424,4 @@ def test_circles_and_straightness_together_give_the_squareness_over_the_travel(t
         value, u = found.errors.squareness[name]
         assert abs(value - flat.squareness[name][0]) < 4.0 * u + 1e-6, name
         assert u < 5e-6
+    assert not found.details["within_circles"]
