@@ -138,12 +138,11 @@ class Sketch(click.Command):
             keys = cls.KEYS if isinstance(item, click.Option) else ("nargs",)
             words = [item.name, *item.opts] if isinstance(item, click.Option) else [item.name]
             noted.append({"words": words, **{key: getattr(item, key) for key in keys}})
-        sources = [getattr(module, "__file__", None) for name, module in sys.modules.items() if name[:7] == "compgen"]
-        files = [
-            (path, (stat := os.stat(path)).st_mtime_ns, stat.st_size) for path in (click.__file__, *sources) if path
-        ]
+        own = [module for name, module in sys.modules.items() if name.partition(".")[0] == "compgen"]  # no plug-ins
+        sources = [click.__file__, *(getattr(module, "__file__", None) for module in own)]
         target = cls.file(command)
         try:
+            files = [(path, (stat := os.stat(path)).st_mtime_ns, stat.st_size) for path in sources if path]
             target.parent.mkdir(parents=True, exist_ok=True)
             part = target.with_suffix(f".{os.getpid()}")
             part.write_text(json.dumps({"files": files, "parameters": noted}), encoding="utf-8")
