@@ -175,7 +175,7 @@ def correct_command(
     ]
     table = table_of(("tool from the path, moves at feed (um)", "before", "after"), rows)
     counts = f"{found['blocks']} blocks, {found['changed_blocks']} changed, {found['added_blocks']} added"
-    says = [f"assumed: {text}" for text in result.assumed]
+    says = [*result.notes, *(f"assumed: {text}" for text in result.assumed)]
     answer(as_json, {**found, "file": str(out / result.file)}, table, counts, *says, f"-> {out / result.file}")
     return 0 if result.accepted else 1
 

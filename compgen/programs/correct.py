@@ -80,6 +80,7 @@ class ProgramCorrection:
     reasons: tuple[str, ...]
     file: str = ""
     errors: tuple[str, str] = ("", "")
+    notes: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -102,6 +103,7 @@ class ProgramCorrection:
             "work_offsets_mm": {name: list(value) for name, value in self.work_offsets_mm.items()},
             "tools_mm": {name: list(value) for name, value in self.tools_mm.items()},
             "assumed": list(self.assumed),
+            "notes": list(self.notes),
             "tolerance_um": self.tolerance_um,
             "file": self.file,
         }
@@ -894,7 +896,7 @@ def correct_program(
     again = Reader(model.machine, dialect, setup, f"{source.name} as corrected")
     check = _ReadBack(model, again, 2.0 * corrector.step_mm, follow=follow)
     again.travel_slack_mm = 10.0
-    blocks = 0
+    blocks, in_cycle = 0, False
     with working_folder("correct-") as work:
         body = work / "body"
         with reader.opened() as stream, body.open("wb") as target:
@@ -917,13 +919,16 @@ def correct_program(
                 corrected = text.encode("latin-1")
                 target.write(corrected)
                 check.add(batch.moves, corrected, origins)
+                if check.after.normal_line > blocks:  # the farthest so far is in this batch
+                    in_cycle = bool(drilled[batch.moves.line == check.after.normal_line].any())
                 blocks += len(batch.words.start) - 1
                 show(f"{blocks} blocks corrected and read back")
         model.errors.warn_outside(reader.reached_mm)
         unchanged = not writer.changed and not writer.added
         reasons = []
         before, after = check.before, check.after
-        before.line, after.line = reader.in_file(before.line), reader.in_file(after.line)
+        for figures in (before, after):
+            figures.line, figures.normal_line = reader.in_file(figures.line), reader.in_file(figures.normal_line)
         enough_mm = max(options.tolerance_um * MM_PER_UM, resolution_mm)
         if check.broken:
             reasons.append(check.broken)
@@ -942,6 +947,12 @@ def correct_program(
                 f"the deviation is not smaller: {before.normal_rms_mm / MM_PER_UM:.2f} um rms before, "
                 f"{after.normal_rms_mm / MM_PER_UM:.2f} um rms after"
             )
+        notes = []
+        if in_cycle and after.normal_mm > enough_mm:
+            notes.append(
+                f"line {after.normal_line}: a drilling cycle has one X and Y, here those that are right at its depth; the stroke "
+                f"above is up to {after.normal_mm / MM_PER_UM:.2f} um from the axis of the hole"
+            )
         result = ProgramCorrection(
             model.machine.name,
             source.name,
@@ -957,6 +968,7 @@ def correct_program(
             tuple(reasons),
             ("" if not reasons else REJECTED_PREFIX) + source.name,
             errors_file,
+            tuple(notes),
         )
         final = work / "program"
         with source.open("rb") as stream:
@@ -997,6 +1009,7 @@ def preflight(result: ProgramCorrection) -> str:
         "given with --active.",
         "The machine is warm, as it was during the measurement.",
         *(f"It was assumed that {text}." for text in result.assumed),
+        *(text[0].upper() + text[1:] + "." for text in result.notes),
         "Compare with the original by `diff`, and let the program run in the air first.",
     ]
     before, after = result.before.as_dict(), result.after.as_dict()

@@ -207,7 +207,10 @@ def kept_directions(found: FloatArray, before: FloatArray) -> FloatArray:
 
 
 def closest_offset(moves: Moves, own: IntArray, points_mm: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return vectors (n, 3) to points (n, 3) from the paths of the moves ``own``; ``fraction`` is about where they belong."""
+    """Return vectors (n, 3) to points (n, 3) from the paths of the moves ``own``; ``fraction`` is about where they belong.
+
+    A peck may end a little higher or lower: the line of its stroke counts, also beyond its end.
+    """
     start = moves.start_mm.take(own, axis=0)
     way = moves.end_mm.take(own, axis=0) - start
     square = np.einsum("ij,ij->i", way, way)
@@ -221,7 +224,8 @@ def closest_offset(moves: Moves, own: IntArray, points_mm: FloatArray, fraction:
         angle = (np.arctan2(v, u) - np.arctan2(v0, u0)) / arcs.sweep_rad
         turn = 2.0 * np.pi / np.abs(arcs.sweep_rad)
         share[rows] = angle + turn * np.round((fraction[rows] - angle) / turn)
-    return points_mm - points_of(moves, np.clip(share, 0.0, 1.0), own)
+    peck = (moves.at_mm != moves.end_mm).any(axis=1).take(own)
+    return points_mm - points_of(moves, np.where(peck, share, np.clip(share, 0.0, 1.0)), own)
 
 
 # Division of moves: straight pieces, and arcs of which each is again an arc.
@@ -515,11 +519,12 @@ class PathFigures:
     """Deviations of the tool from the programmed path over the length of all moves at feed, in mm.
 
     ``largest`` and ``rms`` compare with the point at the same share of a move, ``normal`` ones with the nearest point of
-    the path, ``ends`` with the ends of the moves; ``line`` is that of the largest deviation.
+    the path, ``ends`` with the ends of the moves; ``line`` and ``normal_line`` are those of the largest of both.
     """
 
     largest_mm: float = 0.0
     line: int = 0
+    normal_line: int = 0
     normal_mm: float = 0.0
     ends_mm: float = 0.0
     length_mm: float = 0.0
@@ -532,7 +537,9 @@ class PathFigures:
         worst = int(np.argmax(size))
         if size[worst] > self.largest_mm:
             self.largest_mm, self.line = float(size[worst]), int(found.line[worst])
-        self.normal_mm = max(self.normal_mm, float(across.max()))
+        farthest = int(np.argmax(across))
+        if across[farthest] > self.normal_mm:
+            self.normal_mm, self.normal_line = float(across[farthest]), int(found.line[farthest])
         self.ends_mm = max(self.ends_mm, float(size[found.at_end].max(initial=0.0)))
         self.length_mm += float(found.weight_mm.sum())
         self._square += float(found.weight_mm @ size**2)
@@ -562,4 +569,5 @@ class PathFigures:
             "normal_rms_um": self.normal_rms_mm / MM_PER_UM,
             "ends_max_um": self.ends_mm / MM_PER_UM,
             "worst_line": self.line,
+            "normal_line": self.normal_line,
         }

@@ -304,6 +304,31 @@ def test_a_hole_is_drilled_to_its_depth_where_the_correction_bends_on_the_way(tm
     assert result.accepted
 
 
+def test_what_a_cycle_cannot_bend_is_said_with_its_line(tmp_path):
+    """EXZ is 1 um/mm: a hole 25 mm deep is right in X at its depth, and 25 um off at the R level."""
+    ends = np.array([-400.0, 200.0])
+    errors = ErrorTable({"EXZ": Curve(ends, 1e-3 * ends, np.zeros(2))})
+    text = "%\nO1\nG21 G90 G17 G54\nG0 X0. Y0. Z9.\nG1 X1. F90\nG98 G81 X10. Z-40. R-15. F90\nG80\nM30\n%\n"
+    result, _ = run(tmp_path, text, errors, "fanuc", PLAIN)
+    assert (
+        0.02 < result.after.normal_mm <= 0.025 and result.after.normal_line == 6
+    )  # the first sample is below the R level
+    assert result.accepted and result.notes == (
+        "line 6: a drilling cycle has one X and Y, here those that are right at its depth; the stroke above is up to "
+        f"{1e3 * result.after.normal_mm:.2f} um from the axis of the hole",
+    )
+    assert "- [ ] Line 6: a drilling cycle" in (tmp_path / "out" / "preflight.md").read_text()
+
+
+def test_the_end_of_a_peck_is_none_of_the_part(tmp_path):
+    """EZZ is 1 um/mm: the pecks of LinuxCNC end up to 28 um beside those of the program, the hole does not."""
+    ends = np.array([-400.0, 200.0])
+    errors = ErrorTable({"EZZ": Curve(ends, 1e-3 * ends, np.zeros(2))})
+    text = "G21 G90 G17 G54\nG0 X0. Y0. Z9.\nG98 G83 X10. Z-28. R5. Q5. F90\nX20.\nG80\nM2\n"
+    result, _ = run(tmp_path, text, errors, setup=PLAIN, decimals=4)
+    assert result.accepted and result.after.worst_mm < 1e-3 < 0.02 < result.before.worst_mm
+
+
 @pytest.mark.parametrize(
     ("slope", "depth", "peck"), [(-4e-4, "-15.", "Q5.0021"), (-4e-4, "-15.01", "Q5."), (4e-4, "-15.004", "Q4.9989")]
 )
