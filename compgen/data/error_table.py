@@ -377,17 +377,20 @@ class ReversalCurves(Displayed):
     curves: Mapping[tuple[int, int], Curve]
     metadata: Mapping[str, str] = field(default_factory=dict)
 
-    def displacement(self, position_mm: FloatArray, approach: FloatArray) -> FloatArray:
+    def displacement(
+        self, position_mm: FloatArray, approach: FloatArray, taken_up: FloatArray | float = 1.0
+    ) -> FloatArray:
         """Return the displacement of the tip from the mean of both directions, shape (n, 3), mm.
 
         Parameters
         ----------
         position_mm : commanded positions, shape (n, 3).
         approach : last direction of travel of each axis, shape (n, 3): +1, -1, or 0 (unknown: the mean).
+        taken_up : 1 where an axis has taken up its slack, -1 where it has just turned, shape (n, 3); by default all.
         """
-        moved = np.zeros((len(position_mm), 3))
+        moved, share = np.zeros((len(position_mm), 3)), np.sign(approach) * taken_up
         for (axis, component), curve in self.curves.items():
-            moved[:, component] += 0.5 * np.sign(approach[:, axis]) * curve.at(position_mm[:, axis])
+            moved[:, component] += 0.5 * share[:, axis] * curve.at(position_mm[:, axis])
         return moved
 
     def mean_mm(self, axis: int) -> float:

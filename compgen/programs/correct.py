@@ -770,21 +770,28 @@ class _ReadBack:
     broken: str = ""
     follow: Follow | None = None
 
-    def add(self, wanted: Moves, text: bytes, origins: IntArray) -> None:
-        """Read corrected blocks, of which ``origins`` are the numbers, and compare them with the moves that are wanted."""
+    def add(self, wanted: Moves, text: bytes, origins: IntArray, pieces: Pieces) -> None:
+        """Read corrected blocks and compare them with the moves that are wanted.
+
+        ``origins`` are the numbers of the blocks that they come from, ``pieces`` how the moves were meant to be divided.
+        """
         read = self.reader.batch(text, self.lines + 1).moves
         origin = origins[read.line - self.lines - 1]
         self.lines += len(origins)
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
+        directions = np.vstack([self.direction, ended[:-1]])[: len(wanted)], ended
         if len(wanted):
             self.direction = ended[-1]
         rows = np.flatnonzero(wanted.cutting)
         zero, one = np.zeros(len(rows)), np.ones(len(rows))
-        self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), ended)
+        self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), directions)
         back = np.flatnonzero(read.cutting)
         owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
         if owner is not None:
-            self._add(self.after, wanted, owner, read.part(back), (low, high), ended)
+            meant = np.flatnonzero(wanted.cutting[pieces.move])
+            if np.array_equal(pieces.move[meant], owner):  # else shares by length, which slack makes longer
+                low, high = pieces.begins()[meant], pieces.share[meant]
+            self._add(self.after, wanted, owner, read.part(back), (low, high), directions)
             if self.follow is not None:
                 self.follow(wanted, owner, read.part(back), low, high)
 
@@ -795,9 +802,9 @@ class _ReadBack:
         owner: IntArray,
         driven: Moves,
         shares: tuple[FloatArray, FloatArray],
-        ended: FloatArray,
+        directions: tuple[FloatArray, FloatArray],
     ) -> None:
-        for found in path_deviations(self.model, self.step_mm, wanted, owner, driven, shares, ended):
+        for found in path_deviations(self.model, self.step_mm, wanted, owner, driven, shares, directions):
             figures.add(found)
 
     def _owners(self, wanted: Moves, rows: Any, read: Moves, origin: Any) -> tuple[Any, FloatArray, FloatArray]:
@@ -911,14 +918,13 @@ def correct_program(
                     elif segment.kind in ("cycle", "hole"):
                         drilled[segment.first : segment.first + segment.count] = True
                 pieces = corrector.pieces(batch.moves, by_radius, drilled)
-                begin = np.where(np.diff(pieces.move, prepend=-1) > 0, 0.0, np.roll(pieces.share, 1))
                 try:
-                    text, origins = writer.rewrite(batch, pieces, pieces.share - begin)
+                    text, origins = writer.rewrite(batch, pieces, pieces.share - pieces.begins())
                 except InputError as error:
                     raise InputError(error.message, file=source, line=reader.in_file(error.line or 0)) from error
                 corrected = text.encode("latin-1")
                 target.write(corrected)
-                check.add(batch.moves, corrected, origins)
+                check.add(batch.moves, corrected, origins, pieces)
                 if check.after.normal_line > blocks:  # the farthest so far is in this batch
                     in_cycle = bool(drilled[batch.moves.line == check.after.normal_line].any())
                 blocks += len(batch.words.start) - 1

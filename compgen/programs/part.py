@@ -53,13 +53,19 @@ class CompensatedModel(ExactModel):
 
     tables: ReadTables | None = None
 
-    def error(self, position_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:
+    def error(
+        self,
+        position_mm: FloatArray,
+        tool_mm: FloatArray,
+        direction: FloatArray,
+        taken_up: FloatArray | float = 1.0,
+    ) -> FloatArray:
         """Return what the control adds plus the error where the machine then is."""
         if self.tables is None:
-            return super().error(position_mm, tool_mm, direction)
+            return super().error(position_mm, tool_mm, direction, taken_up)
         tool = np.broadcast_to(tool_mm, position_mm.shape)
         added = self.tables.correction(self.machine, Points(position_mm, tool_mm=tool, approach=direction))
-        return np.asarray(added + super().error(position_mm + added, tool_mm, direction))
+        return np.asarray(added + super().error(position_mm + added, tool_mm, direction, taken_up))
 
     def bend(self) -> float:
         """Add half the range of the slope of the tables, on nine lines along each axis."""
@@ -299,6 +305,7 @@ def _on_machines(
         for batch in reader.batches(stream):
             moves = reader.numbered_as_in_file(batch.moves)
             ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
+            directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended
             direction = ended[-1] if len(moves) else direction
             rows = np.flatnonzero(moves.cutting)
             driven, shares = moves.part(rows), (np.zeros(len(rows)), np.ones(len(rows)))
@@ -306,7 +313,7 @@ def _on_machines(
                 kept: list[list[PathDeviations]] = [[], []]
                 models = [(before, machine.model), *([] if after is None else [(after, machine.with_tables)])]
                 for (own, model), parts in zip(models, kept, strict=False):
-                    for found in path_deviations(model, STEP_MM, moves, rows, driven, shares, ended):
+                    for found in path_deviations(model, STEP_MM, moves, rows, driven, shares, directions):
                         own.add(found)
                         parts.append(found)
                 points.add(*kept)

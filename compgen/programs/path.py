@@ -87,10 +87,19 @@ class ExactModel:
     reversal: ReversalCurves | None = None
     only: tuple[bool, bool, bool] = (True, True, True)
 
-    def error(self, position_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:
-        """Return the error of the tool tip at machine positions (n, 3) after travel in ``direction`` (n, 3): (n, 3), mm."""
+    def error(
+        self,
+        position_mm: FloatArray,
+        tool_mm: FloatArray,
+        direction: FloatArray,
+        taken_up: FloatArray | float = 1.0,
+    ) -> FloatArray:
+        """Return the error of the tool tip at machine positions (n, 3) after travel in ``direction`` (n, 3): (n, 3), mm.
+
+        ``taken_up`` (n, 3) is less than 1 while an axis that has turned takes up its slack, -1 at the beginning.
+        """
         found = exact_error(self.machine, self.errors, position_mm, tool_mm)
-        return found if self.reversal is None else found + self.reversal.displacement(position_mm, direction)
+        return found if self.reversal is None else found + self.reversal.displacement(position_mm, direction, taken_up)
 
     def command(self, wanted_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:
         """Return machine positions (n, 3) at which the tip is where it would be at ``wanted_mm`` without errors.
@@ -240,6 +249,10 @@ class Pieces:
     command_mm: FloatArray
     centre_mm: FloatArray
 
+    def begins(self) -> FloatArray:
+        """Return the share of its move where each piece begins."""
+        return np.where(np.diff(self.move, prepend=-1) > 0, 0.0, np.roll(self.share, 1))
+
 
 @dataclass
 class Corrector:
@@ -283,7 +296,7 @@ class Corrector:
         arcs = np.flatnonzero(divisible & (moves.sweep_rad != 0))
         centre = np.array(moves.centre_mm)
         if len(arcs):
-            found = self._arcs(moves, arcs, by_radius, ended, turned)
+            found = self._arcs(moves, arcs, by_radius, (before, ended), turned)
             last = found.share == 1.0
             centre[found.move[last]] = found.centre_mm[last]
             inner.append(Pieces(*(getattr(found, name)[~last] for name in Pieces.__dataclass_fields__)))
@@ -330,9 +343,17 @@ class Corrector:
         return Pieces(rows[own[inner]], share[inner], target[inner], np.full((int(inner.sum()), 3), np.nan))
 
     def _arcs(
-        self, moves: Moves, rows: IntArray, by_radius: NDArray[np.bool_], ended: FloatArray, turned: NDArray[np.bool_]
+        self,
+        moves: Moves,
+        rows: IntArray,
+        by_radius: NDArray[np.bool_],
+        directions: tuple[FloatArray, FloatArray],
+        turned: NDArray[np.bool_],
     ) -> Pieces:
-        """Pieces of arcs: one arc where that follows the correction, otherwise halves, and halves of these."""
+        """Pieces of arcs: one arc where that follows the correction, otherwise halves, and halves of these.
+
+        ``directions`` are the signs of travel (n, 3) before each move and at its end.
+        """
         done: list[tuple[Any, ...]] = []
         length, work = lengths_of(moves), self._cuts(moves, rows, turned)
         while len(work):  # all arcs at a time, then the halves of those that do not follow
@@ -346,7 +367,7 @@ class Corrector:
                 for some in _portions(steps[steps == count]):
                     part = work[steps == count][some]
                     move, low, high = part[:, 0].astype(np.int64), part[:, 1], part[:, 2]
-                    end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, ended, length)
+                    end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, directions, length)
                     done.append((move[fine], high[fine], end[fine], centre[fine]))
                     rest, half = ~fine, 0.5 * (low + high)
                     again += [np.stack([move, low, half], axis=1)[rest], np.stack([move, half, high], axis=1)[rest]]
@@ -359,11 +380,12 @@ class Corrector:
         parts: tuple[IntArray, FloatArray, FloatArray],
         steps: int,
         by_radius: NDArray[np.bool_],
-        ended: FloatArray,
+        directions: tuple[FloatArray, FloatArray],
         length: FloatArray,
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Ends and centres, (n, 3), of corrected parts of arcs, and which follow; ``parts``: move, shares of begin and end."""
         move, low, high = parts
+        before, ended = directions
         share = low[:, None] + (high - low)[:, None] * np.linspace(0.0, 1.0, steps + 1)
         share[:, -1] = high
         many = np.repeat(move, steps + 1)
@@ -386,6 +408,17 @@ class Corrector:
         wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
         short = (high - low) * length[move] < 2.0 * self.shortest_mm
         fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
+        if self.model.reversal is not None:
+            # the slack of an axis that has turned is taken up within a short arc, from where the piece before it ended
+            arcs = moves.part(move)
+            came = directions_at(arcs, np.maximum(low - 1e-7, 0.0))
+            within = (low > 0.0)[:, None]
+            came = np.where(within, np.where(came != 0, came, ended[move]), before[move])
+            start = self.model.command(wanted[:: steps + 1], arcs.tool_mm, came)
+            start = np.where(arcs.corrected, start, wanted[:: steps + 1])
+            slack = np.hypot(*(start[index, k] - target[index, 0, k] for k in (a, b))) > self.resolution_mm
+            around = _arc_centre(start, target[:, -1], arcs, sweep)
+            centre[slack], fine[slack] = around[slack], short[slack]
         # only the block as a whole says how many turns it has
         fine &= (np.abs(sweep) < 2.0 * np.pi + 1e-9) | (high - low == 1.0)
         return target[:, -1], centre, fine
@@ -418,6 +451,18 @@ class Corrector:
         known = known[~np.concatenate([[False], near]), :2]
         parts = np.concatenate([known[:-1], known[1:, 1:]], axis=1)[known[1:, 0] == known[:-1, 0]]
         return np.column_stack([rows[parts[:, 0].astype(np.int64)], parts[:, 1:]])
+
+
+def _arc_centre(start_mm: FloatArray, end_mm: FloatArray, arcs: Moves, sweep: FloatArray) -> FloatArray:
+    """Centres (n, 3) of arcs of less than half a turn between two points, with about the radius of ``arcs`` and their sense."""
+    index, a, b = np.arange(len(arcs)), _FIRST[arcs.plane], _SECOND[arcs.plane]
+    du, dv = end_mm[index, a] - start_mm[index, a], end_mm[index, b] - start_mm[index, b]
+    chord = np.maximum(np.hypot(du, dv), 1e-12)
+    height = np.sqrt(np.maximum(_radii(arcs)[0], chord) ** 2 - 0.25 * chord**2) * np.sign(sweep) / chord
+    centre = np.full((len(arcs), 3), np.nan)
+    centre[index, a] = start_mm[index, a] + 0.5 * du - height * dv
+    centre[index, b] = start_mm[index, b] + 0.5 * dv + height * du
+    return centre
 
 
 def _fitted_arcs(target: FloatArray, plane: IntArray, sweep: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -466,6 +511,31 @@ class PathDeviations:
     at_end: NDArray[np.bool_]
 
 
+def _slack_taken_up(
+    reversal: ReversalCurves,
+    at_mm: FloatArray,
+    direction: FloatArray,
+    before: tuple[FloatArray, FloatArray],
+    anew: NDArray[np.bool_],
+) -> FloatArray:
+    """How much of its slack each axis has taken up at samples, (n, 3): from -1 where it has just turned to 1.
+
+    The tool rests while the command moves by the reversal value, so its displacement changes by as much. ``before`` are
+    direction and command before each sample, ``anew`` (n,) where slack of earlier samples is over. An axis that
+    overshoots (a positive reversal value) has no slack.
+    """
+    found = np.ones_like(direction)
+    came, came_from = before
+    for axis in {axis for axis, component in reversal.curves if axis == component}:
+        value = reversal.curves[axis, axis].at(at_mm[:, axis])
+        turned = came[:, axis] * direction[:, axis] < 0.0
+        place = np.where(turned, came_from[:, axis], np.inf)
+        last = np.maximum.accumulate(np.where(turned | anew, np.arange(len(place)), 0))
+        share = 2.0 * np.abs(at_mm[:, axis] - place[last]) / np.maximum(-value, 1e-12) - 1.0
+        found[:, axis] = np.where(value < 0.0, np.clip(share, -1.0, 1.0), 1.0)
+    return found
+
+
 def path_deviations(
     model: ExactModel,
     step_mm: float,
@@ -473,18 +543,18 @@ def path_deviations(
     owner: IntArray,
     driven: Moves,
     shares: tuple[FloatArray, FloatArray],
-    ended: FloatArray,
+    directions: tuple[FloatArray, FloatArray],
 ) -> Iterator[PathDeviations]:
     """Sample moves that are driven and compare the tool there with the moves that are wanted.
 
     Parameters
     ----------
     model, step_mm : the machine, and the distance of samples.
-    wanted, ended : moves of the program, and the directions of the axes at their ends.
+    wanted, directions : moves of the program, and the directions of the axes before each and at its end.
     owner, shares : for each driven move the wanted one, and the shares of that at which it begins and ends.
     driven : the moves at feed that the machine executes.
     """
-    low, high = shares
+    (low, high), (before, ended) = shares, directions
     length = lengths_of(driven)
     count = np.clip(np.ceil(length / step_mm), 2, 2000).astype(np.int64)
     for part in _portions(count):
@@ -494,12 +564,19 @@ def path_deviations(
         path = owner[own]
         at, direction = points_of(driven, share, own), ended.take(path, axis=0)
         where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
+        taken_up: FloatArray | float = 1.0
         if model.reversal is not None:
             # that of the programmed arc; a piece ends where an axis turns, and has its direction to the end
             within = low[own] + np.clip(share, 1e-3, 1.0 - 1e-3) * (high - low)[own]
             now = directions_at(wanted.part(path), np.clip(within, 0.0, 1.0))
             direction = np.where((wanted.sweep_rad[path] != 0)[:, None] & (now != 0), now, direction)
-        actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction)
+            begins = np.arange(len(own)) == begin
+            fresh = begins & (low[own] == 0.0)  # the moves before this one may be rapid, and are not among the samples
+            came = np.where(fresh[:, None], before.take(path, axis=0), np.roll(direction, 1, axis=0))
+            came_from = np.where(begins[:, None], driven.start_mm.take(own, axis=0), np.roll(at, 1, axis=0))
+            rapid = np.append(wanted.kind[:-1] == RAPID, True)[path - 1]
+            taken_up = _slack_taken_up(model.reversal, at, direction, (came, came_from), fresh & rapid)
+        actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction, taken_up)
         whole, normal = actual - points_of(wanted, where, path), closest_offset(wanted, path, actual, where)
         # on a steep helix the point at the same angle may be farther away than that at the same share
         nearer = np.linalg.norm(whole, axis=1) < np.linalg.norm(normal, axis=1)

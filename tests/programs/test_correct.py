@@ -184,6 +184,19 @@ def test_an_arc_that_passes_a_reversal_just_before_its_end_is_followed(tmp_path)
     assert result.accepted
 
 
+@pytest.mark.parametrize("dialect", ["fanuc", "siemens", "linuxcnc", "grbl"])
+def test_circles_of_a_machine_with_much_backlash_are_corrected(tmp_path, dialect):
+    """0.2 mm in X and Y: each quadrant begins with a short arc that takes it up, which the reader of the dialect accepts."""
+    reversal = ReversalCurves({(k, k): Curve(np.zeros(1), np.array([-0.2]), np.zeros(1)) for k in (0, 1)})
+    unit = "G71" if dialect == "siemens" else "G21"
+    arcs = "G1 X20. F100\nG3 I-20. J0.\nG2 X0. Y-20. I-20. J0.\nG3 X-1. Y-19. I0. J1.\nG2 X1. Y-17. I2. J0.\n"
+    text = f"{unit} G90 G17 G54\nG0 X0. Y0. Z0.\n{arcs}M30\n"
+    result, _ = run(tmp_path, text, ErrorTable(), dialect, PLAIN, reversal=reversal)
+    assert result.accepted, result.reasons
+    assert result.after.ends_mm < 1.5e-3 < 0.09 < result.before.ends_mm
+    assert result.after.normal_mm < 4e-3 < 0.05 < result.before.normal_mm
+
+
 # --- structure -------------------------------------------------------------------------------------------------------
 
 
