@@ -22,8 +22,6 @@ RADIUS_TOLERANCE_MM = 0.02
 #: The longest block, characters.
 LONGEST_BLOCK = 4096
 _BLANK, _OTHER, _LETTER, _DIGIT, _POINT, _SIGN = range(6)
-#: Stands for ``CR=`` of SINUMERIK, the radius of an arc; no program contains this byte.
-_RADIUS = 1
 _GROUPS = {"motion": 0, "absolute": 1, "incremental": 1, "plane": 2, "nothing": 3}
 
 
@@ -72,7 +70,7 @@ class Words:
             text = re.sub(dialect.comments.encode(), _blanked, text, flags=re.IGNORECASE)
         if dialect.pole:
             text = text.replace(b"*\n", b" \n").replace(b"*\r\n", b" \r\n")
-        if siemens:
+        if siemens:  # one byte that no program contains stands for CR=, the radius of an arc
             text, letters = text.replace(b"CR=", b"  \x01"), letters.replace(b"R", b"\x01")
         table = np.full(256, _OTHER, dtype=np.uint8)
         table[list(b" \t\r\n")], table[list(letters + letters.lower())] = _BLANK, _LETTER
