@@ -242,6 +242,7 @@ def test_a_hidden_effect_is_named_and_added_and_the_residual_shrinks(site, tmp_p
     state = site.do("diagnose")
     found = json.loads(site.project.files_of(state.last("diagnose"))["diagnosis.json"].read_text())
     page = site.get("/projects/1/result").text
+    assert "EC0Y within the circles: bent guides make it differ" in page
     assert found["verdict"] == "named"
     assert all(effect["name"] in page for effect in found["effects"])
     assert ("Add it to the machine" in page) == ("extended.toml" in site.project.files_of(state.last("diagnose")))
