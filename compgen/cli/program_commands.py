@@ -370,6 +370,8 @@ def _figures_table(found: PartPrediction, controller: str | None) -> Any:
         "with along it",
         "rms",
         "line",
+        "after best fit",
+        "rms",
     )
     keys = ("normal_max_um", "normal_rms_um", "ends_max_um", "max_um", "rms_um")
     tables = "tables" if controller is None else controller
@@ -381,7 +383,7 @@ def _figures_table(found: PartPrediction, controller: str | None) -> Any:
     fitted = [tuple(f"{one[key]:.2f}" for key in ("max_um", "rms_um")) for one in found.fitted.values()]
     both = [*fitted, *[("", "")] * (len(figures) - len(fitted))]
     rows = [
-        (name, *(f"{one[key]:.2f}" for key in keys), str(one["worst_line"]), *fit)
+        (name, *(f"{one[key]:.2f}" for key in keys), str(one["normal_line"]), *fit)
         for (name, one), fit in zip(figures, both, strict=True)
     ]
     return table_of(titles, rows)

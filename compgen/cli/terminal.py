@@ -108,6 +108,7 @@ def table_of(headings: Sequence[str], rows: Iterable[Sequence[str]], **options: 
     for heading in headings:
         table.add_column(heading, overflow="fold")
     for row in rows:
+        assert len(row) <= len(headings), row
         table.add_row(*row)
     return table
 
