@@ -596,7 +596,7 @@ class PathFigures:
     """Deviations of the tool from the programmed path over the length of all moves at feed, in mm.
 
     ``largest`` and ``rms`` compare with the point at the same share of a move, ``normal`` ones with the nearest point of
-    the path, ``ends`` with the ends of the moves; ``line`` and ``normal_line`` are those of the largest of both.
+    the path, ``ends`` with the ends of the moves; ``line`` is that of ``largest_mm``, ``normal_line`` that of ``normal_mm``.
     """
 
     largest_mm: float = 0.0

@@ -219,6 +219,7 @@ def level_key(basis: Sequence[Term]) -> str:
 #: Tool lengths that are evaluated in addition to the tool of the machine file, along Z, mm.
 TOOL_LENGTHS_MM = (0.0, -100.0, -200.0)
 #: Coordinates of a corrected NC program are written in steps of this length, mm; of controls whose programs have more decimals.
+#: These are the last decimals of the dialects in compgen.programs, a later stage (a test holds both to the same).
 PROGRAM_STEP_MM = 1e-3
 PROGRAM_STEPS_MM: Mapping[str, float] = {
     **dict.fromkeys(("heidenhain-com", "heidenhain-kinematics"), 1e-4),

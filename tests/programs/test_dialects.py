@@ -8,6 +8,8 @@ from programs.test_correct import PLAIN, moves_of, run, shift
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.programs import Setup, model_of, predict_part
+from compgen.programs.dialects import DIALECTS
+from compgen.tables.options import PROGRAM_STEP_MM, PROGRAM_STEPS_MM
 
 ZERO = (0.0, 0.0, 0.0)
 TOOLS = {"1": ZERO, "MILL 10": ZERO}
@@ -453,3 +455,19 @@ def test_a_plane_that_is_turned_by_nothing(tmp_path):
             moves_of(text.replace("0,0,0,0,0,0,0,0,0", angle), "siemens", PLAIN)
     with pytest.raises(InputError, match="position of Z is not known"):
         moves_of(text.replace("Z5\n", ""), "siemens", PLAIN)
+
+
+def test_options_round_as_the_dialects_do():
+    """The steps in which ``volcomp options`` rounds a corrected program are the last decimals of the dialects, in mm."""
+
+    last_mm = {name: 10.0 ** -dialect.decimals[0] for name, dialect in DIALECTS.items()}
+    for control, dialect in (
+        ("heidenhain-com", "heidenhain-iso"),
+        ("heidenhain-kinematics", "heidenhain-iso"),
+        ("linuxcnc-comp", "linuxcnc"),
+        ("linuxcnc-volumetric", "linuxcnc"),
+        ("siemens-cec", "siemens"),
+        ("fanuc-pitch", "fanuc"),
+        ("klipper", "grbl"),
+    ):
+        assert PROGRAM_STEPS_MM.get(control, PROGRAM_STEP_MM) == pytest.approx(last_mm[dialect]), control
