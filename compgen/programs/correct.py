@@ -128,6 +128,8 @@ class ProgramWriter:
     shift_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     depth: float = np.nan
     level: float = np.nan
+    #: By how much the initial level of a series of holes is higher than in the program, mm.
+    lift_mm: float = np.nan
     pecking: bool = False
     peck: tuple[float, float] = (np.nan, np.nan)
     pole_mm: list[float] = field(default_factory=lambda: [np.nan] * 3)
@@ -203,6 +205,9 @@ class ProgramWriter:
             return [self._preset(block)]
         if block.kind == "no preset":
             self.shift_mm = np.zeros(3)
+        if block.begins_series:
+            self.depth = self.level = np.nan
+            self.lift_mm = float(self.written_mm[2] - self.wanted_mm[2] - self.shift_mm[2])
         if block.kind == "store":
             values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
             self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
@@ -432,6 +437,8 @@ class ProgramWriter:
         if end_z[-1] == r_level:
             self.target_mm[2] = level_z
             self.written_mm[2] = found[3] * scale + offset[2]
+        elif kinds[-1] == RAPID:  # at the initial level, whose number is that of the position written before the series
+            self.target_mm[2] = self.written_mm[2] = end_z[-1] + self.lift_mm + self.shift_mm[2]
         self.changed += bool(changes or more)
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)
         return _spliced(block.text, changes, end or max(w[3] for w in block.words), more)

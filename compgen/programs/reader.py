@@ -85,6 +85,8 @@ class SingleBlock:
     drilling: DrillingCycle | None = None
     #: The blocks by which a drilling cycle in increments is replaced: one for each hole, in absolute.
     parts: tuple[SingleBlock, ...] = ()
+    #: Whether a series of holes begins here, whose initial level G98 returns to.
+    begins_series: bool = False
 
 
 @dataclass(frozen=True)
@@ -118,9 +120,13 @@ class Reader:
         self._tools = dict(setup.tools_mm)
         self.motion: int | None = 0 if dialect.name == "grbl" else None
         self.cycle: int | None = None
-        self.cycle_z = self.cycle_r = self.initial_z = math.nan
-        #: Z and R of the drilling cycle as they were given last.
-        self.cycle_given = [math.nan, math.nan]
+        #: Depth and R level of the drilling cycle, mm above the zero of the program: a shift within the cycle moves both.
+        self.cycle_z = self.cycle_r = math.nan
+        #: Z and R of the drilling cycle as they were given last, in the unit ``cycle_scale`` of the program.
+        self.cycle_given, self.cycle_scale = [math.nan, math.nan], 1.0
+        #: Machine position of Z and its offset where the series of holes began.
+        self.initial_z, self.initial_offset = math.nan, 0.0
+        self._begins_series = False
         self.cycle_peck, self.to_r_level = 0.0, dialect.name == "linuxcnc"
         self.plane, self.scale, self.absolute, self.centre_absolute = 2, 1.0, True, False
         self.feed, self.offset_name = "minute", ""
@@ -372,12 +378,15 @@ class Reader:
         linuxcnc = self.dialect.name == "linuxcnc"
         modal = self.absolute and self.plane == 2 and self.feed != "inverse" and all(self.named)
         modal = modal and not (self.ended or self.closed_by_percent)
-        known = not any(math.isnan(value) for value in (*self.position, self.cycle_z, self.cycle_r))
-        if not modal or not known or (linuxcnc and self.cycle in (73, 83)):
+        offset = np.array(self._offset())
+        zero, initial = float(offset[2]), self._initial_level(float(offset[2]))
+        known = not any(math.isnan(value) for value in (*self.position, self.cycle_z, self.cycle_r, initial))
+        if not modal or not known or (linuxcnc and self.cycle in (73, 83)) or self.scale != self.cycle_scale:
             return None
         rows = slice(line, int(words.places_end[line]))
-        given, offset = words.value[rows][:, [0, 1, 2, R_WORD]], np.array(self._offset())
-        value = np.vstack([[*self.position[:2], self.cycle_z, self.cycle_r], given * self.scale + offset[[0, 1, 2, 2]]])
+        given = words.value[rows][:, [0, 1, 2, R_WORD]]
+        before = [*self.position[:2], zero + self.cycle_z, zero + self.cycle_r]
+        value = np.vstack([before, given * self.scale + offset[[0, 1, 2, 2]]])
         every = np.arange(len(value))[:, None]
         value = np.take_along_axis(value, np.maximum.accumulate(np.where(np.isnan(value), 0, every)), axis=0)
         wrong = np.flatnonzero(value[1:, 3] < value[1:, 2])
@@ -385,12 +394,13 @@ class Reader:
         if n < LEAST_RUN:
             return None
         (x, y, depth, level), (before_x, before_y) = value[1 : n + 1].T, value[:n, :2].T
-        left = level if self.to_r_level or math.isnan(self.initial_z) else np.maximum(self.initial_z, level)
+        left = level if self.to_r_level else np.maximum(initial, level)
         height = np.concatenate([[self.position[2]], left[:-1]])
-        below = (self.initial_z if linuxcnc else height) < level
+        below = (initial if linuxcnc else height) < level
         back = FEED if self.cycle in (84, 85, 89) else RAPID
         # up to the R level where the tool is, over the hole, to the R level, to the depth, back, and where the next begins
-        over = np.maximum(np.where(below, level, height), level)
+        over = np.where(below, level, height)
+        over = np.where(over > level, over, left if linuxcnc else level)
         ends = np.array([[before_x, before_y, level], *([x, y, z] for z in (over, level, depth, level, left))])
         ends = ends.transpose(2, 0, 1)
         used = np.full((n, 6), True)
@@ -415,10 +425,9 @@ class Reader:
             corrected=np.stack([there, there, deep], axis=1),
         )
         self.position, self.started = [float(x[-1]), float(y[-1]), float(left[-1])], True
-        self.cycle_z, self.cycle_r = float(depth[-1]), float(level[-1])
         for k, column in enumerate(given[:n, 2:].T):
             last = np.flatnonzero(~np.isnan(column))
-            self.cycle_given[k] = float(column[last[-1]]) if len(last) else self.cycle_given[k]
+            self._give_height(k, float(column[last[-1]]) if len(last) else None)
         counts = np.bincount(own, minlength=n)
         numbered = zip(counts.tolist(), (first + np.cumsum(counts) - counts).tolist(), strict=True)
         zeros = words.start[line : line + n + 1].tolist()
@@ -437,7 +446,7 @@ class Reader:
 
     def _block(self, number: int, text: str, first: int) -> SingleBlock:
         self._line, self._text = number, text
-        self._modes = {}
+        self._modes, self._begins_series = {}, False
         before, words = len(self._rows), self._words(text)
         if parts := self._holes_in_absolute(number, text, words, first):
             count = sum(part.count for part in parts)
@@ -456,6 +465,7 @@ class Reader:
             self.feed == "inverse",
             {letter: mode == "AC" for letter, mode in self._modes.items()},
             self.drilling if kind == "hole" else None,
+            begins_series=self._begins_series,
         )
 
     def _holes_in_absolute(
@@ -484,7 +494,7 @@ class Reader:
         offset, scale, given = self._offset(), self.scale, list(self.cycle_given)
         x, y, z = ((place - zero) / scale for place, zero in zip(self.position, offset, strict=True))
         if self.cycle is not None:
-            z = (self.initial_z - offset[2]) / scale
+            z = (self._initial_level(offset[2]) - offset[2]) / scale
         if any(math.isnan(value) for value in (x, y, z)):
             self._fail(
                 "a drilling cycle in incremental from a position that is not known; position it in absolute first"
@@ -499,7 +509,7 @@ class Reader:
         elif {"Z", "R"} & numbers.keys():
             self._fail("a drilling cycle in incremental with one of Z and R; give both")
         else:
-            level, depth = ((height - offset[2]) / scale for height in (self.cycle_r, self.cycle_z))
+            level, depth = self.cycle_r / scale, self.cycle_z / scale
         if math.isnan(level + depth):
             self._fail("a drilling cycle without Z or R")
         repeats = self._repeats(numbers)
@@ -530,7 +540,9 @@ class Reader:
         for one in texts:
             parts.append(self._block(number, one + end, first + sum(part.count for part in parts)))
         self._text = text
-        self.cycle_given = [numbers.get("Z", given[0]), numbers.get("R", given[1])]
+        if self.dialect.name == "linuxcnc":
+            for k, letter in enumerate("ZR"):
+                self._give_height(k, numbers.get(letter, given[k]))
         return tuple(parts)
 
     def _repeats(self, values: Mapping[str, float]) -> float:
@@ -738,7 +750,8 @@ class Reader:
                     f"{setting[0]} and a move are in one block, so that the words are ambiguous; divide the block"
                 )
             if motions:
-                self.motion, self.cycle = motions[0], None
+                self.motion = motions[0]
+                self._end_cycle()
             if not dialect.pole:  # there T is a tolerance (G62) or the next tool (G51)
                 self._tool_words(values, codes, name)
             return "keep"
@@ -846,7 +859,7 @@ class Reader:
         elif meaning == "no motion":
             if self.dialect.name != "fanuc":
                 self.motion = None
-            self.cycle = None
+            self._end_cycle()
         elif meaning == "tool definition":
             self._tools[f"{values.get('T', 0):g}"] = (0.0, 0.0, values.get("L", 0.0) * self.scale)
             actions.append("done")
@@ -943,7 +956,8 @@ class Reader:
     def _execute(self, actions: list[str], axes: list[float | None], values: dict[str, float]) -> str:
         motion = next((action for action in actions if action.startswith(("motion", "cycle"))), "")
         if motion.startswith("motion"):
-            self.motion, self.cycle = int(motion[7:]), None
+            self.motion = int(motion[7:])
+            self._end_cycle()
             self.last_arc = self.motion if self.motion in (CW, CCW) else self.last_arc
         named = any(axis is not None for axis in axes)
         if named and self.feed == "inverse" and self.motion in (FEED, CW, CCW) and "F" not in values:
@@ -1139,14 +1153,14 @@ class Reader:
         offset, scale = self._offset(), self.scale
         if motion:
             if self.cycle is None:
-                self.initial_z = self.position[2]
+                self.initial_z, self.initial_offset = self.position[2], offset[2]
+                self.cycle_scale, self._begins_series = scale, True
             self.cycle = int(motion[6:])
+        if scale != self.cycle_scale:
+            self._fail("the unit changes within a drilling cycle; end the cycle by G80 before, and give Z and R again")
         repeats = self._repeats(values)
-        self.cycle_given = [values.get("Z", self.cycle_given[0]), values.get("R", self.cycle_given[1])]
-        if axes[2] is not None:
-            self.cycle_z = offset[2] + axes[2] * scale
-        if "R" in values:
-            self.cycle_r = offset[2] + values["R"] * scale
+        self._give_height(0, axes[2])
+        self._give_height(1, values.get("R"))
         if "Q" in values:
             self.cycle_peck = values["Q"] * scale
         if repeats == 0.0 or not any(axis is not None for axis in axes):
@@ -1156,41 +1170,71 @@ class Reader:
         x, y, _ = self._target(axes)
         if self.cycle_r < self.cycle_z:
             self._fail("the R level of the drilling cycle is below its depth")
-        bottom = [x, y, self.cycle_z]
+        self.named[2] = True  # by Z and R of the cycle, which count from the offset that is now in force
+        self._drill(x, y, offset[2], int(repeats))
+        return "cycle"
+
+    def _drill(self, x: float, y: float, zero: float, repeats: int) -> None:
+        """Move as the cycle does at one place; ``zero`` is the machine position of Z = 0 of the program."""
+        linuxcnc, initial = self.dialect.name == "linuxcnc", self._initial_level(zero)
+        bottom, level = zero + self.cycle_z, zero + self.cycle_r
 
         def go(kind: int, z: float, *, there: bool = True) -> None:
             sides = [x, y] if there else self.position[:2]
             # place and depth are corrected at the bottom, the R level where it is, what is between by neither
-            end, level = [*sides, z], z == self.cycle_r
+            end, at_level = [*sides, z], z == level
             if end != self.position:
-                depth = level or (kind == FEED and z == self.cycle_z)
-                x_too, y_too, z_too = (
-                    int(o and known) for o, known in zip((there, there, depth), self.named, strict=True)
-                )
-                self._move(kind, end, at=[x, y, z] if level else bottom, corrected=(x_too, y_too, z_too))
+                deep = at_level or (kind == FEED and z == bottom)
+                x_too, y_too, z_too = (int(o and known) for o, known in zip((there, there, deep), self.named, strict=True))
+                self._move(kind, end, at=[x, y, z if at_level else bottom], corrected=(x_too, y_too, z_too))
 
         known_z = not math.isnan(self.position[2])
         # from below the R level up at first; LinuxCNC asks where the series of holes began, not where the tool is
-        if known_z and (self.initial_z if self.dialect.name == "linuxcnc" else self.position[2]) < self.cycle_r:
-            go(RAPID, self.cycle_r, there=False)
-        for _ in range(int(repeats)):  # in the same place
-            go(RAPID, max(self.position[2], self.cycle_r) if known_z else math.nan)
-            go(RAPID, self.cycle_r)
-            pecking = self.cycle in (73, 83) and self.dialect.name == "linuxcnc"
-            depth = self.cycle_r
-            while pecking and depth - self.cycle_peck > self.cycle_z + PECK_REST_MM and self.cycle_peck > 0:
+        if known_z and (initial if linuxcnc else self.position[2]) < level:
+            go(RAPID, level, there=False)
+        clear = level if self.to_r_level else initial if math.isnan(initial) else max(initial, level)
+        for _ in range(repeats):  # in the same place
+            over = clear if linuxcnc and self.position[2] <= level else max(self.position[2], level)
+            go(RAPID, over if known_z else math.nan)
+            go(RAPID, level)
+            pecking = self.cycle in (73, 83) and linuxcnc
+            depth = level
+            while pecking and depth - self.cycle_peck > bottom + PECK_REST_MM and self.cycle_peck > 0:
                 depth -= self.cycle_peck
                 go(FEED, depth)
-                go(RAPID, self.cycle_r if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)
+                go(RAPID, level if self.cycle == 83 else depth + _PECK_CLEARANCE_MM)
                 if self.cycle == 83:
                     go(RAPID, depth + _PECK_CLEARANCE_MM)
-            go(FEED, self.cycle_z)
+            go(FEED, bottom)
             back = FEED if self.cycle in (84, 85, 89) else RAPID
-            level = self.cycle_r if self.to_r_level or math.isnan(self.initial_z) else max(self.initial_z, self.cycle_r)
-            if back == FEED or self.dialect.name != "linuxcnc":  # which goes to the initial level at once
-                go(back, self.cycle_r)
-            go(RAPID, level)
-        return "cycle"
+            if back == FEED or not linuxcnc:  # which goes to the initial level at once
+                go(back, level)
+            go(RAPID, clear)
+
+    def _give_height(self, k: int, value: float | None) -> None:
+        """Take over Z (``k`` 0) or R (1) of a drilling cycle, if the block gives it."""
+        if value is not None:
+            self.cycle_given[k] = value
+            if k == 0:
+                self.cycle_z = value * self.scale
+            else:
+                self.cycle_r = value * self.scale
+
+    def _initial_level(self, zero: float) -> float:
+        """Machine position of Z to which G98 returns while the machine position of Z = 0 is ``zero``.
+
+        LinuxCNC keeps the number that Z had in the program, and so goes elsewhere after a shift. Of FANUC no document says
+        whether it keeps that or the place: the level is not known until the cycle ends.
+        """
+        moved = zero - self.initial_offset
+        return self.initial_z + moved if self.dialect.name == "linuxcnc" or moved == 0.0 else math.nan
+
+    def _end_cycle(self) -> None:
+        """End a drilling cycle: its numbers have to be given again."""
+        if self.cycle is not None:
+            self.cycle, self.cycle_peck = None, 0.0
+            self.cycle_z = self.cycle_r = math.nan
+            self.cycle_given = [math.nan, math.nan]
 
     def _hole(self, axes: list[float | None], single: list[str], moving: bool) -> str:
         """Move to a hole, if its block does, and execute the cycle that is defined there: R level, depth, and back."""
