@@ -437,7 +437,7 @@ class ProgramWriter:
         if end_z[-1] == r_level:
             self.target_mm[2] = level_z
             self.written_mm[2] = found[3] * scale + offset[2]
-        elif kinds[-1] == RAPID:  # at the initial level, whose number is that of the position written before the series
+        else:  # at the initial level, whose number is that of the position written before the series
             self.target_mm[2] = self.written_mm[2] = end_z[-1] + self.lift_mm + self.shift_mm[2]
         self.changed += bool(changes or more)
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)

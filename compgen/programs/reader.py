@@ -404,12 +404,15 @@ class Reader:
         ends = np.array([[before_x, before_y, level], *([x, y, z] for z in (over, level, depth, level, left))])
         ends = ends.transpose(2, 0, 1)
         used = np.full((n, 6), True)
-        used[:, 0], used[:, 4] = below, back == FEED or not linuxcnc
+        used[:, 0], used[:, 4] = below, not linuxcnc or self.cycle == 85
         end, own, step = ends[used], *np.nonzero(used)
         start = np.vstack([self.position, end[:-1]])
         moved = (end != start).any(axis=1)
         start, end, own, step = start[moved], end[moved], own[moved], step[moved]
-        kind, at_level = np.array([RAPID, RAPID, RAPID, FEED, back, RAPID])[step], end[:, 2] == level[own]
+        kind, at_level = (
+            np.array([RAPID, RAPID, RAPID, FEED, back, FEED if linuxcnc and self.cycle == 89 else RAPID])[step],
+            end[:, 2] == level[own],
+        )
         there, deep = step > 0, at_level | ((kind == FEED) & (end[:, 2] == depth[own]))
         moves = Moves(
             line=first_line + line + own,
@@ -719,6 +722,11 @@ class Reader:
             self._fail("blocks after the end of the program; give one program without subprograms")
         if {"G90", "G91"} <= set(codes):
             self._fail("G90 and G91 in one block: which coordinates are incremental is not clear; divide the block")
+        if "M6" in codes and not (setting and dialect.pole):
+            # the tool is changed before its length is called in the same block, wherever that stands
+            self.loaded = self.selected = f"{values['T']:g}" if "T" in values else name or self.selected
+        if "M61" in codes and dialect.name == "linuxcnc":
+            self.loaded = ""
         actions: list[str] = []
         first = ("absolute", "incremental", "inch", "mm")  # before what they are about
         for code in sorted(codes, key=lambda code: dialect.codes.get(code) not in first):
@@ -789,10 +797,7 @@ class Reader:
     def _m_code(self, code: str) -> None:
         if code in self.dialect.end:
             self.ended = True
-        elif code in self.dialect.m_codes or code in self.setup.keep_unknown:
-            if code == "M6":
-                self.loaded = self.selected
-        else:
+        elif code not in self.dialect.m_codes and code not in self.setup.keep_unknown:
             advice = f"is not known; if it moves nothing, add --keep-unknown {code}"
             refused = self.dialect.refused
             self._fail(f"{code}: {refused[code]}" if code in refused else f"{code} {advice}")
@@ -825,9 +830,16 @@ class Reader:
             self.length_on = False
         elif meaning == "tool":
             self.length_on = True
-            key = f"{values['H']:g}" if "H" in values else self.loaded if self.dialect.name == "linuxcnc" else ""
+            linuxcnc = self.dialect.name == "linuxcnc"
+            key = f"{values['H']:g}" if "H" in values else self.loaded if linuxcnc else ""
             if not key:
-                self._fail(f"{code} without H; add the number of the tool offset")
+                self._fail(
+                    f"{code} without H, and the tool in the spindle is not known; add the number of the tool offset"
+                )
+            if linuxcnc and key == "0":
+                self._fail(
+                    f"{code} H0 is another length with each kind of tool changer; post {code} H and the tool, or G49"
+                )
             self._use_tool(key)
         elif meaning == "tool offset":
             given = [values.get(letter, math.nan) * self.scale for letter in "XYZ"]
@@ -890,9 +902,9 @@ class Reader:
         number = f"{values['T']:g}" if "T" in values else name
         if number:
             self.selected = number
-        if "M6" in codes:
-            self.loaded = self.selected
         if not self.dialect.tool_by_number:
+            if "H" in values and "G43" not in codes and self.dialect.name == "linuxcnc":
+                self._fail(f"H{values['H']:g} without G43, which the control refuses; post G43 with it")
             if self.length_on and "H" in values and "G43" not in codes:
                 self._use_tool(f"{values['H']:g}")
         elif self.dialect.pole:
@@ -1185,7 +1197,9 @@ class Reader:
             end, at_level = [*sides, z], z == level
             if end != self.position:
                 deep = at_level or (kind == FEED and z == bottom)
-                x_too, y_too, z_too = (int(o and known) for o, known in zip((there, there, deep), self.named, strict=True))
+                x_too, y_too, z_too = (
+                    int(o and known) for o, known in zip((there, there, deep), self.named, strict=True)
+                )
                 self._move(kind, end, at=[x, y, z if at_level else bottom], corrected=(x_too, y_too, z_too))
 
         known_z = not math.isnan(self.position[2])
@@ -1207,9 +1221,9 @@ class Reader:
                     go(RAPID, depth + _PECK_CLEARANCE_MM)
             go(FEED, bottom)
             back = FEED if self.cycle in (84, 85, 89) else RAPID
-            if back == FEED or not linuxcnc:  # which goes to the initial level at once
+            if not linuxcnc or self.cycle == 85:  # the others of LinuxCNC go to the initial level at once
                 go(back, level)
-            go(RAPID, clear)
+            go(back if linuxcnc and self.cycle == 89 else RAPID, clear)
 
     def _give_height(self, k: int, value: float | None) -> None:
         """Take over Z (``k`` 0) or R (1) of a drilling cycle, if the block gives it."""

@@ -237,3 +237,56 @@ def mixed_program(seed, dialect, count=400):
             lines[-1] = lines[-1].replace("*", "") + (" M8" if r.random() < 0.5 else " M9") + closing
         at = np.where(np.isin(np.arange(3), words), values if absolute else at + values, at)
     return "\n".join([*head, *lines, "G90 G0 X0. Y0. Z0." + closing, *end, ""])
+
+
+def random_holes(seed, count=40):
+    """Series of holes of LinuxCNC with all that may change within them: shifts, offsets, lengths, levels, increments, repeats."""
+    r = np.random.default_rng(seed)
+    inch = bool(r.random() < 0.3)
+    unit, digits = (25.4, 4) if inch else (1.0, 3)
+    lines = ["%", f"{'G20' if inch else 'G21'} G90 G17 G54 G94 G40 G49", "T1 M6", "G43", "G0 X0 Y0 Z0 F300"]
+
+    def word(letter, low, high):
+        return f"{letter}{r.uniform(low, high) / unit:.{digits}f}"
+
+    def one(*choices):
+        return choices[r.integers(0, len(choices))]
+
+    def place(size=40):
+        return f"{word('X', -size, size)} {word('Y', -size, size)}"
+
+    def change():
+        """What may stand between two holes, or in the block of the next."""
+        return [
+            lambda: f"G52 {word(one('X', 'Y'), -8, 8)} {word('Z', -8, 8)}",
+            lambda: f"G92 {word('Z', 20, 60)}",
+            lambda: "G92.1",
+            lambda: f"{one('G54', 'G55')} {place()}",
+            lambda: f"{one('G54', 'G55')}\n{place()}",
+            lambda: f"G43 H{one(1, 2)} {place()}",
+            lambda: one(f"G43.1 {word('Z', 10, 90)}", "G49"),
+            lambda: one("G98", "G99"),
+            lambda: f"{word('X', -40, 40)} {word('R', 10, 30)}",
+        ][r.integers(0, 9)]()
+
+    for _ in range(count // 8):
+        if r.random() < 0.4:
+            lines.append(one("T1 M6 G43", "G43 M6 T2", "G43 H1 T2 M6", "M6 T1\nG43"))
+        lines += [f"G0 {place()} {word('Z', 20, 60)}", "S900 M3"]
+        cycle = one("G81", "G82", "G83", "G73", "G85", "G86", "G89")
+        extra = f" {word('Q', 4, 9)}" if cycle in ("G83", "G73") else "" if cycle in ("G81", "G85") else " P0.1"
+        lines.append(f"{one('G98', 'G99')} {cycle} {place()} {word('Z', -20, 5)} {word('R', 10, 30)}{extra}")
+        for _ in range(r.integers(2, 7)):
+            lines.append(one(place(), word("X", -40, 40), f"{word('Y', -40, 40)} L2"))
+            if r.random() < 0.7:
+                lines.append(change())
+        if r.random() < 0.4:
+            lines.append("G99")
+            lines.append(f"G91 {word('X', -5, 5)} {word('R', -20, -10)} {word('Z', -9, -3)} L{one(1, 2, 3)}")
+            lines.append(
+                one(f"G52 {word('Z', -5, 5)} {word('X', -5, 5)}", f"G92 {word('Z', 20, 40)}", "G43 H2", "G98", "")
+            )
+            lines.append(place(3))
+            lines.append(f"G90 {place()} {word('Z', -20, 5)} {word('R', 10, 30)}")
+        lines.append(one("G80", f"G0 {place()}"))
+    return "\n".join([*lines, "G80", "G92.1", "G0 X0 Y0", "M2", "%", ""])

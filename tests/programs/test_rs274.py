@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_program
+from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_holes, random_program
 
 from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of
 from compgen.programs.dialects import DIALECTS
@@ -19,8 +19,8 @@ pytestmark = pytest.mark.skipif(
 SETUP = Setup(OFFSETS_MM, TOOLS_MM)
 
 
-def canonical(program, folder, *, stopped=False):
-    """Moves of the interpreter: kind, end in units of the program, and for arcs centre, turns and normal axis.
+def interpreted(program, folder, *, stopped=False):
+    """What the interpreter does, as text.
 
     Without an INI file the interpreter's machine is in inches: so are its offsets and tools.
     """
@@ -37,10 +37,15 @@ def canonical(program, folder, *, stopped=False):
     )  # fmt: skip
     if stopped:
         assert "PROGRAM_END" not in done.stdout and "is not that of the correction" in done.stderr
-        return []
+        return ""
     assert "PROGRAM_END" in done.stdout, done.stdout[-500:] + done.stderr[-500:]
+    return done.stdout
+
+
+def canonical(program, folder, *, stopped=False):
+    """Moves of the interpreter: kind, end in units of the program, and for arcs centre, turns and normal axis."""
     moves, plane, last = [], 2, None
-    for line in done.stdout.splitlines():
+    for line in interpreted(program, folder, stopped=stopped).splitlines():
         found = re.search(r"(\w+)\((.*)\)", line)
         name, text = (found[1], found[2]) if found else ("", "")
         if name == "SELECT_PLANE":
@@ -194,3 +199,104 @@ def test_drilling_in_increments_and_with_repeats(tmp_path, make_errors):
     assert (
         max(np.abs(there - row[1]).max() for there, row in zip(places, [r for r in truth if r[0]], strict=True)) < 0.2
     )
+
+
+# Positions of the machine, by the offsets that the interpreter has at each move: for what changes them between moves.
+
+
+def machine_moves(program, folder):
+    """Straight moves of the interpreter: whether at feed, and where the machine goes (mm): all offsets are added."""
+    unit, zero, moves, last = 1.0, {}, [], np.full(3, np.nan)
+    for line in interpreted(program, folder).splitlines():
+        found = re.search(r"([A-Z_0-9]+)\((.*)\)", line)
+        name, text = (found[1], found[2]) if found else ("", "")
+        if name == "USE_LENGTH_UNITS":
+            unit = 25.4 if "INCH" in text else 1.0
+        elif name in ("SET_G5X_OFFSET", "SET_G92_OFFSET", "USE_TOOL_LENGTH_OFFSET"):
+            numbers = [float(part) for part in re.split("[, ]+", text)]
+            zero[name] = np.array(numbers[1:4] if name == "SET_G5X_OFFSET" else numbers[:3]) * unit
+        elif name.startswith("STRAIGHT_"):
+            end = np.array([float(part) for part in text.split(",")[:3]]) * unit + sum(zero.values())
+            if not np.abs(end - last).max() < MICRON:
+                moves.append((name == "STRAIGHT_FEED", end))
+            last = end
+    return moves
+
+
+def our_machine_moves(text):
+    """The same of our reader, and the moves themselves."""
+    every, found, last = (
+        Reader(mill(), DIALECTS["linuxcnc"], SETUP, "p").batch(text.encode(), 1).moves,
+        [],
+        np.full(3, np.nan),
+    )
+    for end, feed in zip(every.end_mm, every.cutting, strict=True):
+        if not np.abs(end - last).max() < MICRON:
+            found.append((bool(feed), end))
+        last = end
+    return found, every
+
+
+MICRON = 1e-3
+#: Four decimals of an inch, of a position and of its offsets.
+PRINTED_MM = 6e-3
+
+
+def without_header(text):
+    return "\n".join(line for line in text.splitlines() if not re.match(r"o<|\(abort|\(CORRECTED", line)) + "\n"
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_holes_are_where_the_interpreter_drills_them_whatever_changes_between_them(
+    tmp_path, seed, make_errors, monkeypatch
+):
+    """G52, G92, another work offset, tool length or level within a cycle; and so the corrected program, by the exact errors."""
+    if seed % 2:
+        monkeypatch.setattr("compgen.programs.reader.LEAST_RUN", 1)
+    program = tmp_path / "p.ngc"
+    program.write_text(random_holes(seed))
+    found, every = our_machine_moves(program.read_text())
+    truth = machine_moves(program, tmp_path)
+    assert [feed for feed, _ in found] == [feed for feed, _ in truth]
+    for k, ((_, end), (_, there)) in enumerate(zip(found, truth, strict=True)):
+        assert np.abs(end - there).max(where=~np.isnan(end), initial=0.0) < PRINTED_MM, (k, end, there)
+
+    model = model_of(mill(), make_errors(mill(), seed, (900e-6, -600e-6, 700e-6)), None)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions("linuxcnc"), SETUP)
+    assert result.accepted, result.reasons
+    body = tmp_path / "body.ngc"
+    body.write_text(without_header((tmp_path / "out" / result.file).read_text()))
+    driven = machine_moves(body, tmp_path)
+    cut = every.part(np.flatnonzero(every.cutting))
+    command = np.array([end for feed, end in driven if feed])
+    assert len(command) == len(cut)
+    tip = command + model.error(command, cut.tool_mm, np.zeros_like(command))
+    deep = (cut.end_mm[:, 2] < cut.start_mm[:, 2]) & (cut.at_mm == cut.end_mm).all(axis=1)  # not between two pecks
+    assert deep.sum() > 5
+    assert np.abs(tip - cut.end_mm)[deep].max() < PRINTED_MM / 2
+    before = np.abs(model.error(cut.end_mm, cut.tool_mm, np.zeros_like(command)))[deep].max()
+    assert before > 5 * PRINTED_MM
+    # rapid moves lead where the program led, but for the correction
+    assert np.abs(driven[-1][1] - truth[-1][1]).max() < 3 * before
+
+
+def test_a_cycle_keeps_its_numbers_from_increments_to_absolute(tmp_path):
+    """LinuxCNC keeps R 2 and Z -6 of a block in increments as numbers: in absolute they are heights."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X0 Y0 Z-20 F90\nG91 G99 G81 X3 R2 Z-6\nX4\nG90 X20\nY5\nG80\nM2\n%\n"
+    )
+    found, _ = our_machine_moves(program.read_text())
+    truth = machine_moves(program, tmp_path)
+    assert [feed for feed, _ in found] == [feed for feed, _ in truth]
+    assert np.abs(np.array([a - b for (_, a), (_, b) in zip(found, truth, strict=True)])).max() < 2e-4
+
+
+def test_the_length_of_the_tool_that_the_same_block_changes(tmp_path):
+    """The tool is changed first, wherever M6 and G43 stand in their block."""
+    for block in ("T2 M6 G43", "G43 M6 T2", "G43 T2 M6 Z30", "M6 T2 G43 H1", "T2\nM6 G43"):
+        program = tmp_path / "p.ngc"
+        program.write_text(f"%\nG21 G90 G17 G54\nT1 M6 G43\nG0 X0 Y0 Z20\n{block}\nG0 X1 Y2 Z3\nG1 X5 F9\nM2\n%\n")
+        found, _ = our_machine_moves(program.read_text())
+        truth = machine_moves(program, tmp_path)
+        assert found[-1][1] == pytest.approx(truth[-1][1], abs=2e-4), block
