@@ -168,7 +168,13 @@ def identification_files(
 
 
 #: Files that only some identifications write.
-SOME_WRITE = ("stations.csv", "measured.deviations.csv", "identified.reversal.csv", covariance.FILE_NAME)
+SOME_WRITE = (
+    "stations.csv",
+    "measured.deviations.csv",
+    "identified.reversal.csv",
+    "residuals.csv",
+    covariance.FILE_NAME,
+)
 
 
 def add_identification(output: OutputFolder, files: Mapping[str, str | bytes]) -> None:
@@ -291,6 +297,7 @@ def identify_bare(
     """
     if active is None and not isinstance(measurement, ErrorTable | MixedMeasurement):
         return identify_measurement(machine, measurement, options)
+    from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.foreign.converted import given_errors
@@ -300,7 +307,12 @@ def identify_bare(
         return given_errors(machine, measurement)
     if active is None and isinstance(measurement, MixedMeasurement):
         tables_of = {name: part for name, part in measurement.parts if isinstance(part, ErrorTable)}
-        known = {name: given_errors(machine, table, whole=False) for name, table in tables_of.items()}
+        # the arms of a square count where nothing else shows a squareness
+        whole = all(
+            not part.squareness if isinstance(part, ErrorTable) else isinstance(part, AxisRuns)
+            for _, part in measurement.parts
+        )
+        known = {name: given_errors(machine, table, whole=whole) for name, table in tables_of.items()}
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
     if active is None or not isinstance(measurement, Lengths | Deviations | Circles):
         raise InputError(

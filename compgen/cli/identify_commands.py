@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,11 @@ from compgen.cli.shared_options import (
     stated_options,
 )
 from compgen.cli.terminal import progress, stdout
+from compgen.data.error_table import SQUARENESS_APART
 from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
@@ -172,6 +174,11 @@ def fit_command(
     table = open_errors(errors)
     known = covariance_of(errors, table, covariance, independent=independent)
     result = fit(machine, table, fitting, covariance=known)
+    gained = [name for name in result.errors.squareness if name not in table.squareness]
+    if gained:
+        text = f"{', '.join(gained)} comes from the lines of straightness curves and the zeros of angles; if these are those of "
+        text += f"instruments, write the comment # squareness = {SQUARENESS_APART} into {errors}"
+        warnings.warn(text, CompgenWarning, stacklevel=2)
     write_all(out, fit_files(result))
     answer(as_json, result.to_dict(), fit_table(result))
     return 0

@@ -8,7 +8,7 @@ in um and urad (``*.errors.csv``). :class:`ReversalCurves` adds the difference b
 from __future__ import annotations
 
 import warnings
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -230,6 +230,52 @@ class ErrorTable(Drawable):
                 if lines:
                     panels.append(Panel(f"errors of {letter}", f"error ({unit})", lines, x_label=f"{letter} (mm)"))
         return panels
+
+
+# The line of a straightness: how a straightedge lay, unless something says what it was aligned to.
+
+
+#: The comment ``# squareness = ...`` of errors whose lines and constants say nothing about squareness: of a straightedge and a
+#: level, or of separate sheets for straightness and squareness.
+SQUARENESS_APART = "measured apart from straightness"
+#: Straightness curves of each pair of axes: as two arms of one square their lines show the squareness, one alone does not.
+ARMS = {"EC0Y": ("EYX", "EXY"), "EB0Z": ("EZX", "EXZ"), "EA0Z": ("EZY", "EYZ")}
+
+#: Slope and standard uncertainty of the lines of straightness curves, rad.
+Lines = Mapping[str, tuple[float, float]]
+
+
+def is_apart(table: ErrorTable) -> bool:
+    """Whether a table says that its lines and constants are not of the machine."""
+    return table.metadata.get("squareness") == SQUARENESS_APART
+
+
+def marked_apart(table: ErrorTable) -> ErrorTable:
+    """Return errors read by an instrument, marked as apart if neither squareness nor both arms of a square are among them."""
+    related = table.squareness or any(set(pair) <= set(table.curves) for pair in ARMS.values())
+    moved = any(name != f"E{name[2]}{name[2]}" for name in table.curves)
+    return table if related or not moved else table.replace(metadata={**table.metadata, "squareness": SQUARENESS_APART})
+
+
+def about_own_lines(table: ErrorTable, without: Collection[str] = ()) -> tuple[ErrorTable, Lines]:
+    """Return a table whose straightness is zero at its own ends, with the noise of these, and the lines that were removed.
+
+    The curves ``without`` stay as they are, also those of a single position.
+    """
+    curves, lines = dict(table.curves), {}
+    for name, curve in table.curves.items():
+        if not error_named(name).is_straightness or name in without or len(curve.value) < 2:
+            continue
+        ends, span_mm = curve.value[[0, -1]], float(np.ptp(curve.position_mm))
+        lines[name] = float(ends[1] - ends[0]) / span_mm, float(np.hypot(*curve.u[[0, -1]])) / span_mm
+        if not ends.any() and not curve.u[[0, -1]].any():
+            continue  # zero by definition
+        share = (curve.position_mm - curve.position_mm[0]) / span_mm
+        value = curve.value - np.column_stack([1.0 - share, share]) @ ends
+        u = np.sqrt(curve.u**2 + ((1.0 - share) * curve.u[0]) ** 2 + (share * curve.u[-1]) ** 2)
+        value[[0, -1]] = u[[0, -1]] = 0.0
+        curves[name] = Curve(curve.position_mm, value, u)
+    return table.replace(curves=curves), lines
 
 
 def read_errors(path: str | Path) -> ErrorTable:

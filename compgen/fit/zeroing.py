@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, about_own_lines, is_apart
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError
@@ -270,6 +270,8 @@ class Zeroed:
 def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, FloatArray] | None = None) -> Zeroed:
     """Zero every curve at its fixed points; E stays the same over the travel up to a rigid motion.
 
+    Of errors whose squareness was measured apart, the lines and constants are those of the instruments: they are removed.
+
     Parameters
     ----------
     machine : its travel, reference point, chain, tool offset and squareness reference are used.
@@ -282,12 +284,13 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
         for a value that is not finite, or if a squareness error that has to absorb a part is not in the machine's
         model.
     """
-    known = covariance or {}
+    known, apart = covariance or {}, is_apart(errors)
+    errors = about_own_lines(errors)[0] if apart else errors
     curves = {name: fix_to_zero(machine, name, curve, known.get(name)) for name, curve in errors.curves.items()}
     change, variance = decompose(machine, curves)
     kept = {*modelled_errors(machine), *errors.squareness}
     for name, value in change.squareness.items():
-        if name not in kept and abs(value) > NOTHING:
+        if name not in kept and abs(value) > NOTHING and not apart:
             raise _no_room(machine, name, value, curves)
     # the table may distinguish tools of different offset, and the removed motion differs between them
     one_tool = observable_errors(machine)
@@ -301,7 +304,7 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
             stacklevel=3,
         )
     squareness = dict(errors.squareness)
-    for name in SQUARENESS_NAMES:
+    for name in () if apart else SQUARENESS_NAMES:
         if name in squareness or abs(change.squareness[name]) > _ROUNDING:
             value, u = errors.squareness.get(name, (0.0, np.nan))
             squareness[name] = (value + change.squareness[name], float(np.sqrt(u**2 + variance[name])))

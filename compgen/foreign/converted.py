@@ -7,7 +7,7 @@ another program usable like an identification.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -27,14 +27,24 @@ from compgen.data.deviations import (
     read_deviations,
     read_parts,
 )
-from compgen.data.error_table import Curve, ErrorTable, read_errors
+from compgen.data.error_table import (
+    ARMS,
+    SQUARENESS_APART,
+    Curve,
+    ErrorTable,
+    Lines,
+    about_own_lines,
+    is_apart,
+    read_errors,
+)
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
-from compgen.data.names import error_named
+from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
+from compgen.fit.zeroing import zero_ends
 from compgen.foreign.detect import import_file
-from compgen.foreign.findings import SQUARENESS_APART, Imported, ImportOptions
+from compgen.foreign.findings import Imported, ImportOptions
 from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
@@ -176,33 +186,38 @@ def _joined(parts: Sequence[Plain]) -> Plain:
 # Errors identified by another program, instead of an identification here.
 
 
+#: Lines that raise an end of a straightness by less than this are not worth a word, mm.
+_LINE_MM = 0.1 * MM_PER_UM
+
+
 def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> Identification:
     """Return errors of a foreign file as the result of an identification.
 
     They are brought to the gauge of every identification (positioning and angles zero at the reference point,
-    straightness at both ends; squareness absorbs the lines), without smoothing; ``details`` says what that changed. Of
-    a table that is not the ``whole`` of what is known and contains no squareness, or whose squareness was measured apart,
-    the lines are left out: how a straightedge lay says nothing about the machine.
+    straightness at both ends), without smoothing; ``details`` says what that changed.
+
+    How a straightedge lay, and where an angle was set to zero, says nothing about the machine: squareness absorbs lines and
+    constants only in a table that contains squareness, which was not measured apart. In a table without it that is the
+    ``whole`` of what is known of it, the lines of both curves of a pair of axes are those of the arms of one square; the
+    line of a single one is never squareness. The uncertainty of a straightness is that about its own line.
 
     Raises
     ------
     InputError
         for errors that do not match the machine's travel or chain.
     """
-    apart = table.metadata.get("squareness") == SQUARENESS_APART
-    if apart or (not whole and not table.squareness):
-        curves = dict(table.curves)
-        for name, curve in table.curves.items():
-            if error_named(name).is_straightness:
-                ends = np.interp(curve.position_mm, curve.position_mm[[0, -1]], curve.value[[0, -1]])
-                curves[name] = Curve(curve.position_mm, curve.value - ends, curve.u)
-        table = table.replace(curves=curves)
-    zeroed = fit(machine, table, FitOptions(smoothness=0.0))
-    if not whole and not table.squareness:
-        zeroed = replace(zeroed, errors=zeroed.errors.replace(squareness={}))
-    errors = zeroed.errors.replace(
-        metadata={**metadata_of(machine, table.metadata), "source": "given by another program"}
-    )
+    model = bool(table.squareness) and not is_apart(table)
+    own, lines = about_own_lines(table)
+    own = table if model else own
+    arms = _arms(lines) if whole and not model and not is_apart(table) else {}
+    # constants of angles become squareness that is not kept: so a model without it has room for it
+    room = {} if model else dict.fromkeys(SQUARENESS_NAMES, (0.0, 0.0))
+    zeroed = fit(machine, own.replace(squareness={**room, **table.squareness}), FitOptions(smoothness=0.0))
+    squareness = zeroed.errors.squareness if model else {**_of_arms(machine, lines, arms), **table.squareness}
+    comments = {**metadata_of(machine, table.metadata), "source": "given by another program"}
+    errors = zeroed.errors.replace(squareness=squareness, metadata=comments)
+    for text in _said_of_lines(table, errors, lines, arms) if whole or model else ():
+        warnings.warn(text, CompgenWarning, stacklevel=3)
     values = sum(len(curve.value) for curve in errors.curves.values()) + len(errors.squareness)
     known = bool(errors.curves) and all(np.isfinite(curve.u).all() for curve in errors.curves.values())
     return replace(
@@ -215,5 +230,55 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
             "file": table.metadata.get("source", ""),
             "values": values,
             "frame_change": zeroed.to_dict()["frame_change"],
+            "own_lines_urad": {name: slope / RAD_PER_URAD for name, (slope, _) in lines.items()},
         },
     )
+
+
+def _arms(lines: Lines) -> dict[str, tuple[str, str]]:
+    """Return the pairs of curves of which at least one has a line, as of a square whose other arm was aligned."""
+    return {name: pair for name, pair in ARMS.items() if set(pair) <= set(lines) and any(lines[arm][0] for arm in pair)}
+
+
+def _of_arms(machine: Machine, lines: Lines, arms: Mapping[str, tuple[str, str]]) -> dict[str, tuple[float, float]]:
+    """Return squareness errors by the lines of the arms of squares, which may be shorter than the travel."""
+    curves = {}
+    for name in (arm for pair in arms.values() for arm in pair):
+        (slope, u), ends = lines[name], np.array(machine.axes[error_named(name).axis].range_mm)
+        span_mm = float(np.ptp(ends))
+        # 1 mm above zero, which is no error of the machine: a value of zero would count as one by definition
+        curves[name] = Curve(ends, 1.0 + slope * (ends - ends[0]), np.full(2, u * span_mm / np.sqrt(2.0)))
+    found = zero_ends(machine, ErrorTable(curves, dict.fromkeys(arms, (0.0, 0.0)))).squareness
+    return {name: found[name] for name in arms}
+
+
+def _said_of_lines(
+    table: ErrorTable, errors: ErrorTable, lines: Lines, arms: Mapping[str, tuple[str, str]]
+) -> Iterator[str]:
+    """Say what became of the lines of straightness curves."""
+    pairs = [pair for pair in ARMS.values() if set(pair) <= set(table.curves)]
+    model = table.squareness and not is_apart(table)
+    for name, (slope, _) in lines.items():
+        rise_mm = slope * float(np.ptp(table.curves[name].position_mm))
+        square, pair = next(item for item in ARMS.items() if name in item[1])
+        if square in arms or (model and pair in pairs) or abs(rise_mm) < _LINE_MM:
+            continue
+        rises = f"{name} rises by {rise_mm / MM_PER_UM:.4g} um from end to end ({slope / RAD_PER_URAD:.4g} urad): "
+        if model:
+            yield (
+                f"{rises}this line counts as a part of the squareness, which the same table contains; if it is how a "
+                f"straightedge lay, write the comment # squareness = {SQUARENESS_APART} into the file"
+            )
+        else:
+            yield (
+                f"{rises}how the straightedge lay; this line was removed and is no squareness. Give {square} by both arms of a "
+                f"square in one file ({' and '.join(pair)}), or as a number: --squareness {square}=..."
+            )
+    for name, (one, other) in arms.items():
+        value, u = errors.squareness[name]
+        stated = "" if np.isnan(u) else f" +- {2 * u / RAD_PER_URAD:.3g} (k = 2)"
+        yield (
+            f"{name} = {value / RAD_PER_URAD:.4g}{stated} urad by the lines of {one} and {other}, read as the arms of one "
+            "square that is exact; if they are two straightedges, each with its own lay, write the comment "
+            f"# squareness = {SQUARENESS_APART} into the file"
+        )

@@ -49,8 +49,6 @@ SUFFIXES = {
     "circle": ".circle.csv",
     "artefact": ".artefact.csv",
 }
-#: The comment ``# squareness = ...`` of errors whose squareness and straightness come from separate sheets.
-SQUARENESS_APART = "measured apart from straightness"
 #: Answers to ``--sign`` for all tables; the others are for squareness.
 TABLE_SIGNS = ("error", "correction")
 Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact

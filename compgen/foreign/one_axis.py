@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import ErrorTable, ReversalCurves, marked_apart
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError, nearest
 from compgen.identify.axis_tests import SAME_TARGET_MM, two_way_mean, worth_a_table
@@ -177,7 +177,7 @@ def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[E
     0.1 um.
     """
     centre, reversal, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)
-    table = ErrorTable({error: centre}, {}, dict(metadata))
+    table = marked_apart(ErrorTable({error: centre}, {}, dict(metadata)))
     name = error_named(error)
     if name.kind != "linear" or reversal is None or not worth_a_table(reversal):
         return table, None

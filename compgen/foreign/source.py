@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 from compgen.data.csv_files import names_in_header
-from compgen.data.error_table import ErrorTable, read_errors
+from compgen.data.error_table import ErrorTable, about_own_lines, is_apart, read_errors
 from compgen.data.files import read_bytes
 from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
 from compgen.errors import InputError
@@ -474,6 +474,8 @@ def open_measurement(
 def open_errors(path: str | Path) -> ErrorTable:
     """Read errors: ``*.errors.csv``, or a foreign file with errors, or with axis runs (their bidirectional means).
 
+    Straightness that says nothing about squareness is returned about its own line: how a straightedge lay is no error.
+
     Raises
     ------
     InputError
@@ -482,9 +484,11 @@ def open_errors(path: str | Path) -> ErrorTable:
     source = Path(path)
     kind = native_format(source)
     if kind == "errors" or (kind is None and source.name.lower().endswith(".errors.csv")):
-        return read_errors(source)
-    if kind not in (None, "axis"):
+        table = read_errors(source)
+    elif kind not in (None, "axis"):
         raise InputError(f"contains {kind}, not errors; identify them first", file=source)
-    from compgen.foreign.converted import converted_errors
+    else:
+        from compgen.foreign.converted import converted_errors
 
-    return converted_errors(source, kind)
+        table = converted_errors(source, kind)
+    return about_own_lines(table)[0] if is_apart(table) else table

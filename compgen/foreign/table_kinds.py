@@ -17,7 +17,7 @@ from compgen.data.axis_runs import AxisRuns, check_single, join_axis_runs
 from compgen.data.circles import LARGEST_RADIUS_MM, PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
-from compgen.data.error_table import ErrorTable, ReversalCurves
+from compgen.data.error_table import ARMS, SQUARENESS_APART, ErrorTable, ReversalCurves, marked_apart
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM
 from compgen.data.records import LARGEST_DEVIATION_UM
@@ -46,7 +46,6 @@ from compgen.foreign.column_names import (
 from compgen.foreign.covariates import RowData, directions_of, labels_of, metadata_of, row_data_of
 from compgen.foreign.error_tables import long_errors, si_values, summed_steps, wide_errors
 from compgen.foreign.findings import (
-    SQUARENESS_APART,
     USUAL_URAD,
     Data,
     Imported,
@@ -575,7 +574,7 @@ def error_motions(findings: TableFindings, columns: Sequence[MotionColumn]) -> t
             "both directions differ: the mean is used, and import writes the reversal to a separate file"
         )
     findings.understood |= {"errors": list(curves), "sign": findings.options.sign or "errors"}
-    return ErrorTable(curves, {}, metadata), ReversalCurves(reversals, metadata) if reversals else None
+    return marked_apart(ErrorTable(curves, {}, metadata)), ReversalCurves(reversals, metadata) if reversals else None
 
 
 def _over_position(
@@ -1021,7 +1020,7 @@ def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") ->
         else:
             _need(findings, "position")
         data = wide_errors(findings, columns) if columns else long_errors(findings)
-        data = data.replace(metadata=metadata_of(findings, row_data_of(findings, "errors")))
+        data = marked_apart(data.replace(metadata=metadata_of(findings, row_data_of(findings, "errors"))))
     else:
         _need(findings, "position")
         data, reversal, kind = _along_axes(findings)
@@ -1205,6 +1204,11 @@ def _joined_errors(first: Imported, parts: Sequence[ErrorTable]) -> ErrorTable:
         raise InputError(f"{twice} is on two sheets; choose one with --sheet", file=first.path)
     curves = {name: curve for item in parts for name, curve in item.curves.items()}
     squareness = {name: value for item in parts for name, value in item.squareness.items()}
+    metadata = {key: value for key, value in parts[0].metadata.items() if key != "squareness"}
+    # what is on one sheet was measured together: curves with squareness, or both arms of a square
+    arms = [pair for pair in ARMS.values() if set(pair) <= set(curves)]
     together = any(item.curves and item.squareness for item in parts)
-    apart = {"squareness": SQUARENESS_APART} if curves and squareness and not together else {}
-    return ErrorTable(curves, squareness, {**parts[0].metadata, **apart})
+    together |= not squareness and any(set(pair) <= set(item.curves) for item in parts for pair in arms)
+    if (squareness or arms) and curves and not together:
+        metadata["squareness"] = SQUARENESS_APART
+    return marked_apart(ErrorTable(curves, squareness, metadata))

@@ -291,8 +291,10 @@ def identify_mixed(
 def evidence_files(
     machine: Machine, measurement: Measurement | ErrorTable, result: Identification
 ) -> dict[str, str | bytes]:
-    """Return ``machine.toml``, the machine file byte by byte, and ``residuals.csv``."""
-    files: dict[str, str | bytes] = {"residuals.csv": format_residuals(machine, measurement, result)}
+    """Return ``machine.toml``, the machine file byte by byte, and ``residuals.csv`` if anything was read."""
+    files: dict[str, str | bytes] = {}
+    if len(result.residual_mm):
+        files["residuals.csv"] = format_residuals(machine, measurement, result)
     if machine.file is not None and machine.file.is_file():
         files["machine.toml"] = machine.file.read_bytes()
     return files

@@ -187,7 +187,7 @@ class Identification(Drawable):
         return {
             "method": self.method,
             "residual_rms_um": self.rms_um,
-            "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]))) / MM_PER_UM,
+            "residual_max_um": float(np.max(np.abs(self.residual_mm[self.accepted]), initial=0.0)) / MM_PER_UM,
             "degrees_of_freedom": self.degrees_of_freedom,
             "reduced_chi_square": None if np.isnan(self.reduced_chi_square) else self.reduced_chi_square,
             ("u_length" if of_lengths else "u_deviation"): {

@@ -52,7 +52,8 @@ def identification_table(result: Identification) -> Group:
         lines.append(f"scatter within targets and directions {result.rms_um:.3f} um rms, method {result.method}")
         return Group(Text("\n".join(lines)), _errors_table(result))
     if result.method == "given":
-        text = f"{result.details['values']} values of errors given in {one_line(result.details['file'])}; not identified here"
+        source = f" in {one_line(result.details['file'])}" if result.details["file"] else ""
+        text = f"{result.details['values']} values of errors given{source}; not identified here"
         return Group(Text(text), _errors_table(result))
     if result.method == "together":
         listed = []
