@@ -163,7 +163,9 @@ class Reader:
     def opened(self) -> BinaryIO:
         """Open the program; calls of subprograms that are in its file are written out."""
         path = Path(self.source)
-        found = written_out(path) if self.dialect.name in ("fanuc", "linuxcnc") else None
+        found = None
+        if self.dialect.name in ("fanuc", "linuxcnc"):
+            found = written_out(path, self.dialect.name, skip_deleted=self.setup.skip_deleted)
         if found is None:
             return path.open("rb")
         self.line_in_file = found.line

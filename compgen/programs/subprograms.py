@@ -1,14 +1,17 @@
 """Subprograms in the file of their program: every call is written out, since each place needs its own correction.
 
 ``M98 P1001 L3`` calls the blocks from ``O1001`` to ``M99`` three times, as does ``M98 P31001`` of FANUC; ``M97 P100`` of
-Haas those from ``N100``.
+Haas those from ``N100``. What stands in comments, or in blocks that the control skips, calls nothing and ends nothing.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -17,10 +20,14 @@ from compgen.programs.path import IntArray
 
 #: Calls within calls, and blocks of a program that is written out.
 _DEEPEST, _MOST_BLOCKS = 10, 5_000_000
-_CALL = re.compile(rb"M0*9([78])(?!\d)", re.IGNORECASE)
-_WORDS = re.compile(rb"\s*(?:M0*9[789](?!\d)|[PL]\s*\d+)", re.IGNORECASE)
-_RETURN = re.compile(rb"M0*99(?!\d)", re.IGNORECASE)
-_COMMENT = re.compile(rb"\([^()\n]*\)")
+_MENTIONED = re.compile(rb"M[ \t]*\+?[ \t]*0*9[78]", re.IGNORECASE)
+_WORD = re.compile(rb"([A-Z])[ \t]*([+-]?[ \t]*(?:\d+\.?\d*|\.\d+))", re.IGNORECASE)
+#: What is no code: comments, program names; of FANUC what follows a semicolon is another block, which is refused later.
+_LATER = {
+    "fanuc": re.compile(rb"\([^()\n]*\)|<[^<>\n]*>|;[^\n]*"),
+    "linuxcnc": re.compile(rb"\([^()\n]*\)|;[^\n]*"),
+}
+_SKIPPED = re.compile(rb"\s*/")
 
 
 @dataclass(frozen=True)
@@ -32,95 +39,193 @@ class WrittenOut:
     called: tuple[str, ...]
 
 
-def written_out(source: Path) -> WrittenOut | None:
+@dataclass(frozen=True)
+class _Block:
+    """One line of a program: its text, its code without comments, and whether it is one with ``/``."""
+
+    text: bytes
+    code: bytes
+    slash: bool
+
+    @cached_property
+    def words(self) -> list[tuple[bytes, float]]:
+        """Its words; none where a parenthesis is open, which the reader refuses."""
+        if b"(" in self.code or b")" in self.code:
+            return []
+        found = _WORD.finditer(self.code)
+        return [(word[1].upper(), float(re.sub(rb"\s", b"", word[2]))) for word in found]
+
+    def has(self, *codes: float) -> bool:
+        """Whether it has one of the M codes."""
+        return b"M" in self.code.upper() and any(letter == b"M" and value in codes for letter, value in self.words)
+
+    def given(self, letter: bytes) -> float | None:
+        """The value of a word."""
+        return next((value for found, value in self.words if found == letter), None)
+
+    def number(self, letters: bytes) -> bytes | None:
+        """The number of a program or block that begins here, after one of ``letters``."""
+        found = re.match(rb"\s*(?:N\s*\d+\s*)?[" + letters + rb"]\s*0*(\d+)(?!\d)", self.code, re.IGNORECASE)
+        return found[1] if found else None
+
+    def without(self, letters: bytes) -> bytes:
+        """Its text without its M97 to M99 and the words of ``letters``; comments stay."""
+        text = self.text
+        for word in reversed(list(_WORD.finditer(self.code))):
+            letter, value = word[1].upper(), float(re.sub(rb"\s", b"", word[2]))
+            if letter in letters or (letter == b"M" and value in (97, 98, 99)):
+                start = len(text[: word.start()].rstrip(b" \t"))
+                text = text[:start] + text[word.end() :]
+        return text
+
+
+def written_out(source: Path, dialect: str, *, skip_deleted: bool = False) -> WrittenOut | None:
     """Return a program of FANUC, Haas or LinuxCNC with its calls written out; None if it calls nothing that is in its file.
 
     The corrected program has no calls left. Calls of programs in other files stay for the reader to refuse.
+    ``skip_deleted``: the control skips blocks with ``/``.
     """
     with source.open("rb") as stream:
         before = b""
         while chunk := stream.read(1 << 20):
-            if _CALL.search(before + chunk + b" "):
+            if _MENTIONED.search(before + chunk):
                 break
-            before = chunk[-16:]
+            before = chunk[-64:]
         else:
             return None
-    lines = source.read_bytes().splitlines(keepends=True)
-    plain = [_COMMENT.sub(b"", line) for line in lines]
-    found = [(re.match(rb"\s*[O:]\s*0*(\d+)", line, re.IGNORECASE), k) for k, line in enumerate(plain)]
-    begin = {b"O" + name[1]: k + 1 for name, k in found if name}
-    labels = [(re.match(rb"\s*N\s*0*(\d+)(?=\D)", line, re.IGNORECASE), k) for k, line in enumerate(plain)]
-    for name, k in labels:
-        if name:
-            begin.setdefault(b"N" + name[1], k)
-    numbers = [k for name, k in found if name]
-    last = (k + 1 for k, line in enumerate(plain) if re.search(rb"M0*(2|30)(?!\d)", line, re.IGNORECASE))
-    first = next(last, len(lines))
-    out: list[bytes] = []
-    origin: list[int] = []
-    called: dict[str, int] = {}
+    return _Program(source, dialect, skip_deleted).written_out()
 
-    def body(name: bytes, number: int) -> range:
-        """Lines of a subprogram, from its number to its M99."""
-        for k in range(begin[name], len(lines)):
-            if _RETURN.search(plain[k]):
-                return range(begin[name], k + 1)
-            if k in numbers:
-                break
-        said = name.decode()
-        raise InputError(f"calls {said}, which does not end with M99; give the whole program", file=source, line=number)
 
-    def add(block: bytes, k: int) -> None:
-        if len(out) > _MOST_BLOCKS:
-            raise InputError("calls make the program longer than 5e6 blocks; divide it", file=source, line=k + 1)
-        out.append(block)
-        origin.append(k + 1)
+class _Program:
+    """The blocks of a file, where its subprograms begin, and what is written while calls are followed."""
 
-    def follow(rows: range, depth: int) -> None:
+    def __init__(self, source: Path, dialect: str, skip_deleted: bool) -> None:
+        self.source, self.haas = source, dialect == "fanuc"
+        self.blocks: Sequence[_Block] = []
+        for text in source.read_bytes().splitlines(keepends=True):
+            slash = _SKIPPED.match(text) is not None
+            code = b"" if slash and skip_deleted else _LATER[dialect].sub(lambda part: b" " * len(part[0]), text)
+            self.blocks.append(_Block(text, code, slash))
+        self.starts: dict[bytes, list[int]] = {}
+        for k, block in enumerate(self.blocks):
+            if (name := block.number(b"O:")) is not None:
+                self.starts.setdefault(b"O" + name, []).append(k)
+        self.ends = [k for k, block in enumerate(self.blocks) if block.has(2, 30)]
+        self.out: list[bytes] = []
+        self.origin: list[int] = []
+        self.called: dict[str, int] = {}
+
+    def written_out(self) -> WrittenOut | None:
+        """Follow the program from its first block to the one that ends it."""
+        stop = self.ends[0] + 1 if self.ends else len(self.blocks)
+        self._follow(range(stop), 0)
+        if not self.called:
+            return None
+        for k in range(stop, len(self.blocks)):
+            if self.blocks[k].code.strip() == b"%":
+                self._add(self.blocks[k].text, k)
+        said = tuple(f"{name} ({count} times)" if count > 1 else name for name, count in self.called.items())
+        return WrittenOut(b"".join(self.out), np.array(self.origin), said)
+
+    def _fail(self, message: str, k: int) -> NoReturn:
+        raise InputError(message, file=self.source, line=k + 1)
+
+    def _add(self, text: bytes, k: int) -> None:
+        if len(self.out) > _MOST_BLOCKS:
+            self._fail("calls make the program longer than 5e6 blocks; divide it", k)
+        self.out.append(text)
+        self.origin.append(k + 1)
+
+    def _follow(self, rows: range, depth: int) -> None:
         for k in rows:
-            call = _CALL.search(plain[k])
-            back = depth > 0 and _RETURN.search(plain[k]) is not None
-            if not call and not back:
-                add(lines[k], k)
+            block = self.blocks[k]
+            back = depth > 0 and block.has(99)
+            target = self._target(k) if block.has(97, 98) else None
+            if target is None and not back:
+                self._add(block.text, k)
                 continue
-            name, repeats = _called(plain[k], begin) if call else (b"", 0)
-            if call and plain[k].lstrip().startswith(b"/"):
-                raise InputError("calls a subprogram in a block with /; post it without", file=source, line=k + 1)
-            if call and name not in begin:
-                add(lines[k], k)
+            if block.slash:
+                what = "returns from" if back else "calls"
+                self._fail(f"{what} a subprogram in a block with /; post it without", k)
+            if back and target is None and block.given(b"P") is not None:
+                self._fail("returns to another block than that of its call; post M99", k)
+            name, first, repeats = target or (b"", 0, 0)
+            self._write_rest(k, name, repeats)
+            if target is None:
                 continue
-            rest = _WORDS.sub(b"", lines[k])
-            if back and re.search(rb"P\s*\d", plain[k]) and not call:
-                raise InputError("returns to another block than that of its call; post M99", file=source, line=k + 1)
-            if call:
-                said = name.decode() + (f" {repeats} times" if repeats != 1 else "")
-                head = rest.rstrip(b"\r\n; ")
-                rest = head + b" " * bool(head.strip()) + f"({said})".encode() + rest[len(head) :]
-            if re.sub(rb"\s*/?\s*(N\d+)?[\s;]*", b"", rest):
-                add(rest, k)
-            if call:
-                if depth == _DEEPEST:
-                    raise InputError(f"calls are deeper than {_DEEPEST}, or call themselves", file=source, line=k + 1)
-                called[name.decode()] = called.get(name.decode(), 0) + repeats
-                rows_called = body(name, k + 1)
-                for _ in range(repeats):
-                    follow(rows_called, depth + 1)
+            if depth == _DEEPEST:
+                self._fail(f"calls are deeper than {_DEEPEST}, or call themselves", k)
+            rows_called = self._body(first, name, k)
+            self.called[name.decode()] = self.called.get(name.decode(), 0) + repeats
+            for _ in range(repeats):
+                self._follow(rows_called, depth + 1)
 
-    follow(range(first), 0)
-    if not called:
-        return None
-    for k in range(first, len(lines)):
-        if plain[k].strip() == b"%":
-            add(lines[k], k)
-    said = tuple(f"{name} ({count} times)" if count > 1 else name for name, count in called.items())
-    return WrittenOut(b"".join(out), np.array(origin), said)
+    def _write_rest(self, k: int, name: bytes, repeats: int) -> None:
+        """Write what a block with a call or return does beside it, and what it called as a comment."""
+        rest = self.blocks[k].without(b"PL" if name else b"")
+        if name:
+            said = name.decode() + (f" {repeats} times" if repeats != 1 else "")
+            head = rest.rstrip(b"\r\n; ")
+            rest = head + b" " * bool(head.strip()) + f"({said})".encode() + rest[len(head) :]
+        if re.sub(rb"\s*/?\s*(N\d+)?[\s;]*", b"", rest):
+            self._add(rest, k)
 
+    def _target(self, k: int) -> tuple[bytes, int, int] | None:
+        """Name of what a block calls, the block with which that begins, and how often; None if it is not in the file.
 
-def _called(block: bytes, begin: dict[bytes, int]) -> tuple[bytes, int]:
-    """Name of what a block with a call executes, and how often: P1001 L3, or P31001 for 3 times O1001."""
-    kind = b"N" if re.search(rb"M0*97", block, re.IGNORECASE) else b"O"
-    given = [re.search(letter + rb"\s*0*(\d+)", block, re.IGNORECASE) for letter in (b"P", b"L")]
-    number, repeats = given[0][1] if given[0] else b"", int(given[1][1]) if given[1] else 1
-    if kind + number not in begin and kind == b"O" and len(number) > 4 and not given[1]:
-        repeats, number = int(number[:-4]), number[-4:].lstrip(b"0") or b"0"
-    return kind + number, repeats
+        ``P1001 L3``, or ``P31001`` of FANUC for 3 times O1001.
+        """
+        block = self.blocks[k]
+        local, given, times = block.has(97), block.given(b"P"), block.given(b"L")
+        if (local and not self.haas) or given is None or given != int(given) or given < 0:
+            return None
+        if times is not None and (times != int(times) or times < 0 or (times == 0 and self.haas)):
+            self._fail(
+                f"L{times:g} is no number of repeats that is followed; post the call without L, or with L1 or more", k
+            )
+        number, repeats = b"%d" % int(given), 1 if times is None else int(times)
+        found = self._labels(number, k) if local else self.starts.get(b"O" + number, [])
+        if not local and times is None and len(number) > 4:
+            short = number[-4:].lstrip(b"0") or b"0"
+            others = self.starts.get(b"O" + short, [])
+            if others and found:
+                self._fail(f"P{int(given)} may be O{int(given)}, or O{short.decode()} several times; post L", k)
+            if others:
+                repeats, number, found = int(number[:-4]), short, others
+        if not found:
+            return None
+        self._check_call(k, local, number, found)
+        return (b"N" if local else b"O") + number, found[0] + (not local), repeats
+
+    def _check_call(self, k: int, local: bool, number: bytes, found: list[int]) -> None:
+        name = f"{'N' if local else 'O'}{number.decode()}"
+        if len(found) > 1:
+            self._fail(
+                f"calls {name}, which begins in lines {found[0] + 1} and {found[1] + 1}; give each its own number", k
+            )
+        others = {letter for letter, _ in self.blocks[k].words} - {b"N", b"M", b"P", b"L"}
+        codes = [value for letter, value in self.blocks[k].words if letter == b"M"]
+        if others & {b"Q", b"H"}:
+            self._fail("calls a block within a subprogram; post M98 with P and L alone", k)
+        if not self.haas and (others or len(codes) > 1):
+            self._fail("has other words beside M98, which the control does not execute; divide the block", k)
+
+    def _labels(self, number: bytes, k: int) -> list[int]:
+        """Blocks with a number in the program, between two O numbers, that block ``k`` belongs to."""
+        heads = sorted(start for starts in self.starts.values() for start in starts)
+        low = max((head for head in heads if head <= k), default=0)
+        high = min((head for head in heads if head > k), default=len(self.blocks))
+        return [j for j in range(low, high) if self.blocks[j].number(b"N") == number]
+
+    def _body(self, first: int, name: bytes, k: int) -> range:
+        """Lines of a subprogram, from its number to its M99."""
+        for j in self._rows_of(first):
+            if self.blocks[j].has(99):
+                return range(first, j + 1)
+        self._fail(f"calls {name.decode()}, which does not end with M99; give the whole program", k)
+
+    def _rows_of(self, first: int) -> Iterator[int]:
+        for j in range(first, len(self.blocks)):
+            if j > first and self.blocks[j].number(b"O:") is not None:
+                return
+            yield j

@@ -7,7 +7,7 @@ from programs.test_correct import PLAIN, moves_of, run, shift
 
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
-from compgen.programs import Setup, model_of, predict_part
+from compgen.programs import Reader, Setup, model_of, predict_part
 from compgen.programs.dialects import DIALECTS
 from compgen.tables.options import PROGRAM_STEP_MM, PROGRAM_STEPS_MM
 
@@ -394,6 +394,67 @@ def test_calls_of_fanuc_and_haas_in_the_same_file(tmp_path):
     loop = text.replace("X0.\nM99\n%", "M98 P10\nM99\n%")
     with pytest.raises(InputError, match="call themselves"):
         run(tmp_path, loop, shift(), "fanuc", PLAIN)
+
+
+CALLS = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\n{}\nG1 X50. F9\nM30\nO10\nG1 X10. F9\nM99\nO10010\nG1 X20. F9\nM99\n"
+
+
+def called_moves(tmp_path, block, dialect, *, skip=False):
+    """Places in X of a program with a block that may call."""
+    program = tmp_path / "p.nc"
+    program.write_text(f"%\nO1\n{CALLS.format(block)}%\n")
+    setup = Setup({"G54": ZERO}, TOOLS, skip_deleted=skip)
+    reader = Reader(mill(), DIALECTS[dialect], setup, program)
+    with reader.opened() as stream:
+        return [x for batch in reader.batches(stream) for x in batch.moves.end_mm[:, 0].tolist()]
+
+
+@pytest.mark.parametrize("dialect", ["fanuc", "linuxcnc"])
+def test_what_the_control_skips_calls_nothing_and_ends_nothing(tmp_path, dialect):
+    """With --block-delete, blocks with / do nothing; without, M30 in one ends the program, and calls are refused."""
+    for block in ("/M30", "/M98 P10", "/ N5 M98 P10 L3", "(M98 P10) M8", "/M2 (M30)"):
+        assert called_moves(tmp_path, f"M98 P10\n{block}", dialect, skip=True) == [0.0, 10.0, 50.0], block
+    assert called_moves(tmp_path, "M98 P10\n/M30", dialect) == [0.0, 10.0]
+    for block in ("/M98 P10", "/ M 98 P10"):
+        with pytest.raises(InputError, match="block with /"):
+            called_moves(tmp_path, block, dialect)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "block", "words"),
+    [
+        ("fanuc", "G1 X5. F9 ; M98 P10", "; ends a block"),
+        ("fanuc", "M98 P10 ; M30", "; ends a block"),
+        ("fanuc", "M98 P10 Q5", "within a subprogram"),
+        ("fanuc", "M98 P10 L0", "L0 is no number"),
+        ("fanuc", "M98 P10 L1.5", "L1.5 is no number"),
+        ("fanuc", "M98 P10010", "may be O10010"),
+        ("fanuc", "M98 P10 (open", "cannot be read"),
+        ("fanuc", "M198 P10", "subprograms"),
+        ("linuxcnc", "X5. M98 P10", "divide the block"),
+        ("linuxcnc", "M98 P10 M8", "divide the block"),
+        ("linuxcnc", "M97 P10", "subprograms"),
+    ],
+)
+def test_calls_that_are_refused(tmp_path, dialect, block, words):
+    with pytest.raises(InputError, match=words) as caught:
+        called_moves(tmp_path, block, dialect)
+    assert caught.value.line == 5
+
+
+def test_calls_of_numbers_that_are_given_twice_are_refused(tmp_path):
+    program = tmp_path / "p.nc"
+    for text, words in (
+        (f"%\nO1\n{CALLS.format('M98 P10')}O10\nG1 X1. F9\nM99\n%\n", "lines 8 and 14"),
+        (f"%\nO1\n{CALLS.format('M97 P5')}N5 G1 X1. F9\nM99\n%\n", "subprograms"),  # in another program of the file
+    ):
+        program.write_text(text)
+        with pytest.raises(InputError, match=words):
+            list(
+                Reader(mill(), DIALECTS["fanuc"], PLAIN, program).batches(
+                    Reader(mill(), DIALECTS["fanuc"], PLAIN, program).opened()
+                )
+            )
 
 
 def test_fanuc_drilling_in_increments(tmp_path):

@@ -173,6 +173,24 @@ def test_calls_of_subprograms_in_the_same_file_are_written_out_as_the_interprete
     assert_same(canonical(written, tmp_path), truth)
 
 
+@pytest.mark.parametrize(
+    "comment", ["; was M98 P2000", "; drill M2 holes", "(M30) (M98 P2000)", "; M99", "; O30", "(; M30) ; (M2"]
+)
+def test_what_stands_in_comments_calls_nothing_and_ends_nothing(tmp_path, comment):
+    program = tmp_path / "p.ngc"
+    text = "%\nO1\nG21 G90 G17 G54\nT1 M6\nG43 H1;\nG0 X1 Y2 Z3\n;\nG1 X50 F100 ;\nM 98 P02000 L2 ;\nG1 Y50 ;\nN8 M98 P30\nX9\n"
+    text += "M30 ;\nO2000 ;\nG91 G1 Z-1 ;\nG90\nM99 ;\nN5 O30\nX7 ;\nM99\n%\n"
+    program.write_text(text.replace(";", comment))
+    reader = Reader(mill(), DIALECTS["linuxcnc"], SETUP, program)
+    written = tmp_path / "written.ngc"
+    with reader.opened() as stream:
+        written.write_bytes(stream.read())
+    truth = canonical(program, tmp_path)
+    assert len(truth) == 7
+    assert_same(ours(written), truth)
+    assert_same(canonical(written, tmp_path), truth)
+
+
 def test_drilling_in_increments_and_with_repeats(tmp_path, make_errors):
     """R counts from where Z was, Z from R, X and Y from hole to hole; in absolute, repeats are in the same place."""
     program = tmp_path / "p.ngc"
