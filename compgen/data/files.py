@@ -1,12 +1,13 @@
-"""Output files: written to a temporary name and renamed, all files of a step or none.
+"""Output files: written to a temporary name and renamed, all files of a step or none; locks between processes.
 
 Temporary files and folders are locked by the process that made them, so that the next one can recognise and remove what
-a killed process left behind.
+a killed process left behind. Nobody waits for ever for a lock: a process may be stopped while it has one.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import filecmp
 import hashlib
 import itertools
@@ -15,10 +16,11 @@ import math
 import os
 import re
 import shutil
+import socket
 import stat
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -233,12 +235,17 @@ def _write_temporary(target: Path, content: bytes | Path) -> Path:
 def _locked(handle: int) -> bool:
     """Lock an open file; the system releases it when this process ends. False if another process has the lock."""
     try:
-        import fcntl
-
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # a system without such locks: nothing counts as abandoned
+        return _lock(handle)
+    except (ImportError, OSError):  # a system or a file system without such locks: nothing counts as abandoned
         return False
-    except OSError:
+
+
+def _lock(handle: int) -> bool:
+    import fcntl
+
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         return False
     return True
 
@@ -249,10 +256,10 @@ def _unlock(path: Path) -> None:
         os.close(handle)
 
 
-def _abandoned(path: Path) -> bool:
+def _abandoned(path: Path, new_s: float = NEW_S) -> bool:
     """Whether the process that made a temporary file, or the lock of a folder, was killed: no process has the lock."""
     try:
-        if time.time() - path.lstat().st_mtime < NEW_S:
+        if time.time() - path.lstat().st_mtime < new_s:
             return False
         handle = os.open(path, os.O_RDWR | getattr(os, "O_NOFOLLOW", 0))
     except OSError:
@@ -270,14 +277,113 @@ def working_folder(name: str = "") -> Iterator[Path]:
     Its files need not survive a power failure, so they are not forced to the disk.
     """
     remove_abandoned_folders()
-    folder = Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}"))
-    _locks[folder] = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT, 0o600)
+    with _own_folder(Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}"))) as folder:
+        yield folder
+
+
+@contextlib.contextmanager
+def folder_beside(target: Path) -> Iterator[Path]:
+    """Yield a temporary folder next to ``target``, for a file that is made there and then linked to its name.
+
+    It is removed at the end, and by whoever makes the next one in that folder if this process is killed.
+    """
+    with contextlib.suppress(OSError):
+        for path in target.parent.glob(f".*{TEMPORARY}"):
+            named = re.fullmatch(r"\..+\.[a-z0-9_]{8}" + re.escape(TEMPORARY), path.name, re.DOTALL)
+            if named and path.is_dir() and not path.is_symlink() and _left(path):
+                _remove_folder(path)
+    made = tempfile.mkdtemp(prefix=f".{target.name[:100]}.", suffix=TEMPORARY, dir=target.parent)
+    with _own_folder(Path(made)) as folder:
+        yield folder
+
+
+def _left(folder: Path) -> bool:
+    """Whether the process that made a temporary folder beside a file was killed, maybe before it had a lock there."""
+    if os.path.lexists(folder / LOCK):
+        return _abandoned(folder / LOCK, 0.0)
+    own = {path.name for path in folder.iterdir()} <= {f"{LOCK}{TEMPORARY}"}
+    return own and time.time() - folder.stat().st_mtime > NEW_S
+
+
+@contextlib.contextmanager
+def _own_folder(folder: Path) -> Iterator[Path]:
+    """Keep the lock of a temporary folder while it is in use, then remove both; nobody sees the lock before it is kept."""
+    first = folder / (f"{LOCK}{TEMPORARY}" if os.name == "posix" else LOCK)  # elsewhere an open file keeps its name
+    _locks[folder] = os.open(first, os.O_RDWR | os.O_CREAT, 0o600)
     try:
         _locked(_locks[folder])
+        first.rename(folder / LOCK)
         yield folder
     finally:
         _remove_folder(folder)
         _unlock(folder)
+
+
+#: How long a process waits for the lock of a folder, and between attempts, s.
+LOCK_WAIT_S, LOCK_POLL_S = 30.0, 0.05
+
+
+@contextlib.contextmanager
+def exclusive(
+    path: Path, wait_s: float | None = None, mode: int = 0o666, waiting: Callable[[], object] = lambda: None
+) -> Iterator[None]:
+    """Keep other processes out by the lock file ``path``; the system releases it whatever happens to this one.
+
+    The file says which process has the lock; ``mode`` is for a new one. ``waiting`` is called before it waits.
+
+    Raises
+    ------
+    InputError
+        if another process keeps the lock for longer than ``wait_s`` (default :data:`LOCK_WAIT_S`); it is named.
+    """
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    handle = os.open(path, flags, mode)
+    try:
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            raise InputError("is not a file; a lock is kept here, so remove it", file=path)
+        with contextlib.suppress(ImportError):  # a system without such locks
+            if not _lock(handle):
+                waiting()
+                _wait_for_lock(handle, path, LOCK_WAIT_S if wait_s is None else wait_s)
+        with contextlib.suppress(OSError):  # a full disk: the lock holds without the note
+            os.ftruncate(handle, 0)
+            os.write(handle, f"{os.getpid()} {socket.gethostname()}\n".encode())
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                os.ftruncate(handle, 0)
+    finally:
+        os.close(handle)
+
+
+def _wait_for_lock(handle: int, path: Path, wait_s: float) -> None:
+    until = time.monotonic() + wait_s
+    while not _lock(handle):
+        if time.monotonic() >= until:
+            raise InputError(
+                f"is kept by {_holder(os.pread(handle, 300, 0))}, also after {wait_s:g} s; nothing was changed here: let "
+                "that process go on, or end it, then try again",
+                file=path.parent,
+            ) from BlockingIOError(errno.EAGAIN, "locked by another process")
+        time.sleep(LOCK_POLL_S)
+
+
+def _holder(noted: bytes) -> str:
+    """Return the process that a lock file names, in words: its number, its command, and whether it is stopped."""
+    found = re.fullmatch(r"([0-9]{1,10}) (\S+)\n", noted.decode("utf-8", "replace"))
+    if found is None:
+        return "another process"
+    if found[2] != socket.gethostname():
+        return f"process {found[1]} of the computer {found[2]}"
+    folder = Path("/proc") / found[1]
+    try:
+        words = (folder / "cmdline").read_bytes().decode("utf-8", "replace").split("\0")
+        state = (folder / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):  # it has ended, or the system does not show it
+        return f"process {found[1]}"
+    called = "".join(char if char.isprintable() else "?" for char in " ".join(words).strip()[:80])
+    return f"process {found[1]} ({called}{', which is stopped' if state in 'Tt' else ''})"
 
 
 def _remove_folder(folder: Path) -> None:

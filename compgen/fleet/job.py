@@ -262,8 +262,8 @@ class Policy:
     clock_minutes: float = setting(
         toml_files.not_negative,
         30.0,
-        meaning="It was measured within this time of a decision that changed the active tables, and does not state which "
-        "were active.",
+        meaning="It was measured within this time, or within an hour more (daylight-saving time), of a decision that "
+        "changed the active tables, and does not state which were active. 0: the times are certain.",
     )
 
 

@@ -54,6 +54,8 @@ from compgen.tables.verification import MISFIT_CODES
 
 #: A measurement dated further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
+#: A clock that was not set to daylight-saving time, or back, is wrong by this in addition to what clocks differ by.
+DAYLIGHT_SAVING = timedelta(hours=1)
 #: Kinds of events: the store's clock went back; a machine's folder was given to this store.
 CLOCK, ADOPTED = "clock", "adopted"
 #: Key in a version's figures: which tables were on, as stated by a file or a person.
@@ -211,15 +213,20 @@ def judge_assumption(judgement: Judgement, case: Case) -> None:
         doubts.append("the time of the measurement has no zone")
     for before, swap in zip([None, *swaps], swaps, strict=False):
         since = None if before is None else before.at
-        near = abs(measurement.measured_at - swap.at) < margin
+        away = abs(measurement.measured_at - swap.at)
+        near = away < margin
+        hour_off = bool(margin) and not near and away < margin + DAYLIGHT_SAVING
         inside = (
             since is None or since - margin < measurement.measured_at
         ) and measurement.measured_at < swap.at + margin
-        if near:
-            away = abs(measurement.measured_at - swap.at).total_seconds() / 60.0
+        if near or hour_off:
+            minutes, needed = away / timedelta(minutes=1), job.policy.clock_minutes
+            required = f"{needed:g} min are required, because clocks differ"
+            if hour_off:
+                required = f"{needed:g} min and an hour are required: a clock may be off by daylight-saving time, too"
             doubts.append(
-                f"it was measured {away:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
-                f"{job.policy.clock_minutes:g} min are required, because clocks differ"
+                f"it was measured {minutes:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
+                f"{required}"
             )
         elif inside and _doubtful(swap, past, case.now):
             doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")

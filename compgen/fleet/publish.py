@@ -16,7 +16,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-from compgen.data.files import OutputFolder, sha256_of, write_file
+from compgen.data.files import OutputFolder, exclusive, sha256_of, write_file
 from compgen.errors import InputError
 from compgen.fleet import logs
 from compgen.fleet.records import HELD_BACK, MachineRecord, TableRecord, TableState, active_of
@@ -300,18 +300,9 @@ def version_name(table: TableRecord) -> str:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep other processes out; the system releases the lock whatever happens to this one."""
-    with (folder / ".lock").open("a") as stream:
-        try:
-            import fcntl
-        except ImportError:  # a system that lacks such locks
-            yield
-            return
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            logs.warning("waiting for another process that works in this folder", folder=str(folder))
-            fcntl.flock(stream, fcntl.LOCK_EX)
+    """Keep other processes out."""
+    told = "waiting for another process that works in this folder"
+    with exclusive(folder / ".lock", waiting=lambda: logs.warning(told, folder=str(folder))):
         yield
 
 

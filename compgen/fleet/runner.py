@@ -43,8 +43,9 @@ from compgen.kinematics.parallel import (
 from compgen.plugins import WithPlugins, with_plugins
 
 #: Causes that may go away by themselves, so a measurement is retried instead of given up: a full disk or quota, a file
-#: that cannot be read now, too many open files.
+#: that cannot be read now, too many open files, another process that keeps a folder.
 PASSING = (
+    errno.EAGAIN,
     errno.ENOSPC,
     errno.EDQUOT,
     errno.EFBIG,

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import shutil
 import sqlite3
+import time
 import zlib
-from collections.abc import Callable, Mapping
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
 from contextvars import ContextVar
 from copy import copy
 from datetime import UTC, datetime
@@ -23,7 +25,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import sqlalchemy as sa
 
 from compgen.data.error_table import ErrorTable, parse_errors
-from compgen.data.files import decoded, sha256_of, working_folder
+from compgen.data.files import decoded, folder_beside, sha256_of, working_folder
 from compgen.data.machine import Machine, parse_machine
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import database
@@ -541,8 +543,23 @@ def open_store(url: str, *, clock: Clock | None = None) -> Store:
         if it cannot be reached after several attempts.
     """
     engine = engine_of(url)
+    if engine.dialect.name == "sqlite":
+        _make_file(Path(str(engine.url.database)), url)
     number = retried(lambda: upgrade(engine), url)
     return Store(engine, url, clock, number)
+
+
+def _make_file(path: Path, url: str) -> None:
+    """Make the file of a new SQLite store whole or not at all: a kill or a full disk leaves no empty file behind."""
+    if os.path.lexists(path):
+        return
+    try:
+        with _whole_file(path):
+            pass
+    except FileExistsError:  # another process was faster
+        return
+    except OSError as error:
+        raise StoreError(f"the store {shown(url)} cannot be made: {error.strerror or error}") from error
 
 
 def _machine_named(connection: sa.Connection, name: str) -> MachineRecord | None:
@@ -595,6 +612,8 @@ def counting(store: Store, machine: MachineRecord) -> list[IdentificationRecord]
 #: Rows in memory at once.
 ROWS = 200
 MAGIC = b"SQLite format 3\0"
+#: A temporary file of an earlier version in which nothing has changed for this long belongs to no process, s.
+LEFT_S = 86400.0
 #: Error numbers of a file system that does not support links.
 NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 
@@ -611,34 +630,63 @@ def backup(url: str, path: Path) -> dict[str, int]:
     """
     if path.exists():
         raise InputError("already exists; a backup never overwrites another one", file=path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with closing(open_store(url)) as source, closing(open_store(f"sqlite:///{temporary}")) as target:
-            counts = _copy(source, target)
+        _remove_left(path.parent)
+        with closing(open_store(url)) as source, _whole_file(path) as target:
+            return _copy(source, target)
+    except OSError as error:
+        raise InputError(f"cannot be written: {error.strerror or error}", file=path) from error
 
-            def end_log() -> None:  # nothing is left in the write-ahead log
-                with target.engine.connect() as connection:
-                    connection.exec_driver_sql("COMMIT")
-                    connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
 
-            retried(end_log, target.url)
+@contextmanager
+def _whole_file(path: Path) -> Iterator[Store]:
+    """Yield a new, empty SQLite store that gets its name when the block ends without an error; nothing is overwritten.
+
+    If this process is killed, the next one that makes such a file in the folder removes what was made so far.
+
+    Raises
+    ------
+    OSError
+        if it cannot be written, or the file exists by then.
+    """
+    with folder_beside(path) as folder:
+        made = folder / "store.sqlite"
+        engine = engine_of(f"sqlite:///{made}")
+        try:
+            number = retried(lambda: upgrade(engine), str(path))
+            yield Store(engine, str(path), None, number)
+            retried(lambda: _end_log(engine), str(path))
+        finally:
+            engine.dispose()
         try:  # never overwrite a file created meanwhile, if the file system can guarantee that
-            os.link(temporary, path)
+            os.link(made, path)
         except OSError as error:
             if error.errno not in NO_LINKS or path.exists():
                 raise
-            temporary.rename(path)
-        return counts
-    except OSError as error:
-        raise InputError(f"cannot be written: {error.strerror or error}", file=path) from error
-    finally:
-        for left in (temporary, *(temporary.with_name(temporary.name + end) for end in ("-wal", "-shm", "-journal"))):
-            left.unlink(missing_ok=True)
+            made.rename(path)
+
+
+def _end_log(engine: sa.Engine) -> None:
+    """Leave nothing in the write-ahead log: the file alone is the store."""
+    with engine.connect() as connection:
+        connection.exec_driver_sql("COMMIT")
+        connection.exec_driver_sql("PRAGMA journal_mode = DELETE")
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove what earlier versions left of a backup when they were killed: old files named after their process."""
+    with suppress(OSError):
+        for path in folder.glob(".*.tmp*"):
+            named = re.fullmatch(r"\..+\.[0-9]+\.tmp(-wal|-shm|-journal)?", path.name)
+            if named and path.is_file() and not path.is_symlink() and time.time() - path.stat().st_mtime > LEFT_S:
+                path.unlink()
 
 
 def restore(path: Path, url: str) -> dict[str, int]:
     """Fill an empty store from a backup, which is not changed; return the number of rows by table.
+
+    A new SQLite store gets its name when it is complete: a restore that is killed leaves none.
 
     Raises
     ------
@@ -659,10 +707,25 @@ def restore(path: Path, url: str) -> dict[str, int]:
             shutil.copyfile(path, copy)
         except OSError as error:
             raise InputError(f"cannot be copied: {error.strerror or error}", file=path) from error
-        with closing(open_store(url)) as target, closing(open_store(f"sqlite:///{copy}")) as source:
-            if target.machines():
-                raise InputError(f"the store {shown(url)} is not empty; restore into a new one")
-            return _copy(source, target)
+        engine = engine_of(url)
+        file = Path(str(engine.url.database)) if engine.dialect.name == "sqlite" else None
+        with closing(open_store(f"sqlite:///{copy}")) as source:
+            if file is None or os.path.lexists(file):
+                with closing(open_store(url)) as target:
+                    return _fill(source, target)
+            try:
+                with _whole_file(file) as target:
+                    return _fill(source, target)
+            except FileExistsError as error:
+                raise InputError(f"the store {shown(url)} was made meanwhile; nothing was restored") from error
+            except OSError as error:
+                raise StoreError(f"the store {shown(url)} cannot be written: {error.strerror or error}") from error
+
+
+def _fill(source: Store, target: Store) -> dict[str, int]:
+    if target.machines():
+        raise InputError(f"the store {shown(target.url)} is not empty; restore into a new one")
+    return _copy(source, target)
 
 
 def _copy(source: Store, target: Store) -> dict[str, int]:

@@ -197,6 +197,18 @@ def test_an_instrument_whose_clock_is_ten_minutes_behind(site):
     assert "by what version 1 adds" in reasons
 
 
+@pytest.mark.parametrize(("after", "away"), [(20, 40), (85, 25), (140, 80)])
+def test_an_instrument_whose_clock_missed_daylight_saving_time(site, after, away):
+    """An hour behind, whatever the clocks differ by otherwise: a time up to 30 min and an hour from a decision says nothing."""
+    site.measure("first", active_table="none")
+    assert site.run().active == 1
+    site.now += timedelta(minutes=after)
+    site.measure("check", on=site.on(), seed=2, at=site.now - timedelta(minutes=60))
+    reasons = held(site)
+    assert f"{away} min from the decision of" in reasons
+    assert ("30 min and an hour are required" in reasons) == (away > 30)
+
+
 def test_the_margin_can_be_chosen(running, small_errors):
     running.write(policy="clock_minutes = 20000")
     running.measure("drift", drifted(small_errors, 40.0), on=running.on(), seed=2)
