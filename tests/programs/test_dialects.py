@@ -404,6 +404,11 @@ def called_moves(tmp_path, block, dialect, *, skip=False):
     program = tmp_path / "p.nc"
     program.write_text(f"%\nO1\n{CALLS.format(block)}%\n")
     setup = Setup({"G54": ZERO}, TOOLS, skip_deleted=skip)
+    return run_file(program, dialect, setup)
+
+
+def run_file(program, dialect, setup=PLAIN):
+    """Places in X to which the moves of a program lead, with its calls."""
     reader = Reader(mill(), DIALECTS[dialect], setup, program)
     with reader.opened() as stream:
         return [x for batch in reader.batches(stream) for x in batch.moves.end_mm[:, 0].tolist()]
@@ -450,11 +455,7 @@ def test_calls_of_numbers_that_are_given_twice_are_refused(tmp_path):
     ):
         program.write_text(text)
         with pytest.raises(InputError, match=words):
-            list(
-                Reader(mill(), DIALECTS["fanuc"], PLAIN, program).batches(
-                    Reader(mill(), DIALECTS["fanuc"], PLAIN, program).opened()
-                )
-            )
+            run_file(program, "fanuc")
 
 
 def test_fanuc_drilling_in_increments(tmp_path):
