@@ -66,7 +66,7 @@ def program_options(command: Command) -> Command:
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
-    text = "Code that moves nothing and stays as it is, e.g. M100 or M88 (may be given several times)."
+    text = "M code that moves and calls nothing and stays as it is, e.g. M100 or M88 (may be given several times)."
     decorated = click.option("--keep-unknown", multiple=True, metavar="CODE", help=text)(decorated)
     text = "Blocks with / are skipped at the control; they stay as they are. Default: they are executed."
     decorated = click.option("--block-delete", is_flag=True, help=text)(decorated)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from compgen.data.csv_files import csv_table
 from compgen.data.files import read_text
 from compgen.data.machine import Vector3
-from compgen.errors import InputError
+from compgen.errors import InputError, visible_line
 
 #: What a G code does, in words that the reader knows; codes that only change how the control moves do "nothing".
 #: A "setting" takes all words of its block as its own; "setting P0" is one with P0 only.
@@ -112,6 +112,7 @@ REFUSED = {
     "G52": "shifts of coordinates are not known in this dialect; post the program without them",
     "G16": _POLAR,
     **dict.fromkeys(("G5", "G5.1", "G5.2", "G5.3", "G6", "G6.1", "G6.2"), _SPLINE),
+    **dict.fromkeys(("M95", "M96", "M199"), f"jumps, or lets something interrupt the program; {_CALLED}"),
     **dict.fromkeys(("G65", "G66", "M98", "M97", "M198"), f"{_MACRO}, or M98 with its subprogram in the same file"),
     "G10": _TABLES,
     "G44": "negative tool length is not followed; use G43",
@@ -142,8 +143,9 @@ _HEIDENHAIN_REFUSED = {
     **dict.fromkeys((f"G{k}" for k in (37, *range(56, 60), *range(74, 79), *range(120, 126), 127)), _MILLED),
     **dict.fromkeys((f"G{k}" for k in (204, 208, *range(210, 240), *range(251, 300))), _MILLED),
     **dict.fromkeys((f"G{k}" for k in (55, *range(400, 500))), _PROBED),
-    "M92": "positions from a point of the maker are not known; use M91",
-    **dict.fromkeys(("M128", "M130", "M144"), _ROTARY),
+    **dict.fromkeys(("M92", "M104"), "positions from a point of the maker, and older datums, are not known; use M91"),
+    **dict.fromkeys(("M112", "M113", "M114", "M115", "M128", "M130", "M138", "M144"), _ROTARY),
+    **dict.fromkeys(("M142", "M143"), "deletes settings that the program does not show; post the program without it"),
     "M140": "how far the tool goes back is not known; post the move",
 }  # fmt: skip
 _SIEMENS_REFUSED = {
@@ -302,6 +304,34 @@ def dialect_named(name: str) -> Dialect:
     if name not in DIALECTS:
         raise InputError(f"dialect {name!r} is not known; use {', '.join(DIALECTS)}")
     return DIALECTS[name]
+
+
+def codes_that_stay(dialect: Dialect, given: Collection[str]) -> frozenset[str]:
+    """Return the M codes among ``given`` that are not known and stay as they are; InputError for what may move, call or jump.
+
+    What a builder of machines adds are M codes that switch something. A G code or a word that is not known may as well move.
+    """
+    kept, wrong = set[str](), []
+    for text in sorted(given):
+        found = re.fullmatch(r"([GM])\s*0*(\d{1,5}(?:\.\d+)?)", text.strip().upper())
+        code = f"{found[1]}{float(found[2]):g}" if found else text.strip().upper()
+        meaning = dialect.codes.get(code, "nothing" if code in dialect.m_codes | dialect.end else "")
+        if meaning.startswith(("nothing", "setting")):
+            continue
+        if meaning:
+            wrong.append(f"{code} (it is followed)")
+        elif code in dialect.refused:
+            wrong.append(f"{code} ({dialect.refused[code]})")
+        elif found and found[1] == "M" and found[2].isdigit():
+            kept.add(code)
+        else:
+            wrong.append(f"{visible_line(code)[:20]} (may move the machine or call a program)")
+    if wrong:
+        raise InputError(
+            f"{'; '.join(wrong[:5])}: only M codes that move, call and change nothing may be kept; post the program without it",
+            field="--keep-unknown",
+        )
+    return frozenset(kept)
 
 
 def read_tools(path: str | Path) -> dict[str, Vector3]:

@@ -23,7 +23,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs.cycles import DrillingCycle, defines_hole
-from compgen.programs.dialects import MARK, Dialect
+from compgen.programs.dialects import MARK, Dialect, codes_that_stay
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves
 from compgen.programs.runs import (
     LONGEST_BLOCK,
@@ -109,7 +109,9 @@ class Reader:
     """Reads the blocks of one program in order and keeps its modal state."""
 
     def __init__(self, machine: Machine, dialect: Dialect, setup: Setup, source: str | Path) -> None:
-        self.machine, self.dialect, self.setup, self.source = machine, dialect, setup, source
+        kept = codes_that_stay(dialect, setup.keep_unknown)
+        self.machine, self.dialect, self.source = machine, dialect, source
+        self.setup = replace(setup, keep_unknown=kept)
         self._pattern = dialect.word_pattern()
         self._name = re.compile(r"\s*([A-Z_][A-Z_0-9]+)\s*(\([^()\n]*\))?", re.IGNORECASE)
         #: How far corrected positions may leave the travel, mm.
@@ -645,8 +647,6 @@ class Reader:
         name = self._name.match(body, at)
         if name:
             code = name[1].upper()
-            if code in self.setup.keep_unknown:
-                return name.end()
             if code == "CYCLE800" and name[2] and not re.search("[1-9A-Z]", ",".join(name[2].split(",")[4:13]).upper()):
                 # all shifts and angles are 0: the plane is not turned, but the cycle may draw the tool back
                 self.position, self.named = [math.nan] * 3, [False] * 3
@@ -679,8 +679,9 @@ class Reader:
         if rest[0] in "oO":
             self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")
         if name:
-            advice = f"; if it moves nothing, add --keep-unknown {name[1].upper()}"
-            self._fail(f"{name[1]} is not known in the dialect {dialect.name}{advice}")
+            self._fail(
+                f"{name[1]} is not known in the dialect {dialect.name}, and may call a program or move; post the moves themselves"
+            )
         self._fail(f"{rest[:20]!r} cannot be read; expected words such as X10.5")
 
     def _act(self, words: list[tuple[str, str, int, int]]) -> str:
@@ -741,9 +742,10 @@ class Reader:
                 if needed and not any(f"{letter}{value:g}" in needed for letter, value in values.items()):
                     self._fail(f"{code} is followed with {' or '.join(needed)} only; post the program without it")
             elif meaning is None:
-                advice = f"if it moves nothing, add --keep-unknown {code}"
-                reason = dialect.refused.get(code, f"is not known in the dialect {dialect.name}; {advice}")
-                self._fail(f"{code}: {reason}" if code in dialect.refused else f"{code} {reason}")
+                unknown = (
+                    f"is not known in the dialect {dialect.name}, and may move the machine; post the program without it"
+                )
+                self._fail(f"{code}: {dialect.refused[code]}" if code in dialect.refused else f"{code} {unknown}")
             elif meaning.startswith(("motion", "cycle")):
                 actions.insert(0, meaning)
             else:
@@ -772,8 +774,7 @@ class Reader:
 
     def _is_setting(self, code: str) -> bool:
         """Whether the words of a block with ``code`` belong to it and move nothing."""
-        kept = code in self.setup.keep_unknown and code[0] != "M"
-        return kept or self.dialect.codes.get(code, "").startswith("setting")
+        return self.dialect.codes.get(code, "").startswith("setting")
 
     def _further_axis(self, letter: str, text: str, value: float, codes: list[str]) -> None:
         """Take a rotary axis that stays where it is; refuse what moves."""

@@ -543,6 +543,43 @@ def test_codes_that_move_nothing_can_be_kept(tmp_path):
         run(tmp_path, text.replace("G187", "G1 G187"), shift(x=10.0), "fanuc", setup)
 
 
+@pytest.mark.parametrize(
+    ("dialect", "block", "code", "words"),
+    [
+        ("fanuc", "G320 X5.", "G320", "may move the machine"),
+        ("fanuc", "G81.5 X5.", "g81.5", "may move the machine"),
+        ("fanuc", "M98 P99", "M0098", "subprograms"),
+        ("fanuc", "M96 P99", "M96", "jumps"),
+        ("fanuc", "G54", "G54", "it is followed"),
+        ("fanuc", "G65 P1", "G65", "subprograms"),
+        ("fanuc", "WHILE", "WHILE", "may move the machine or call"),
+        ("siemens", "G810", "G810", "may move the machine"),
+        ("siemens", "SUB1", "SUB1", "may move the machine or call"),
+        ("siemens", "CYCLE999(5)", "CYCLE999", "may move the machine or call"),
+        ("siemens", "GOTOF A", "GOTOF", "loops"),
+        ("linuxcnc", "G84 X5 Z-5 R2", "G84", "may move the machine"),
+        ("linuxcnc", "M70", "M70", "modal states"),
+        ("heidenhain-iso", "G901", "G901", "may move the machine"),
+        ("heidenhain-iso", "M91", "M91", "it is followed"),
+        ("heidenhain-iso", "M140", "M140", "goes back"),
+        ("grbl", "G38.2 Z-5", "G38.2", "probe"),
+        ("grbl", "M0.5", "M0.5", "may move"),
+        ("grbl", "X", "", "may move"),
+    ],
+)
+def test_what_may_move_or_call_is_neither_kept_nor_offered_to_be(tmp_path, dialect, block, code, words):
+    unit = {"siemens": "G71", "heidenhain-iso": ""}.get(dialect, "G21")
+    text = f"{unit} G90 G17\nG0 X0. Y0. Z0.\n{block}\nG1 X9. F9\nM30\n"
+    offsets = {"G54": (0.0, 0.0, 0.0), "PRESET": (0.0, 0.0, 0.0)}
+    with pytest.raises(InputError, match=words) as caught:
+        run(tmp_path, text, shift(x=10.0), dialect, Setup(offsets, keep_unknown=frozenset({code})))
+    assert caught.value.field == "--keep-unknown"
+    if code not in ("G54", "M91", ""):
+        with pytest.raises(InputError) as caught:
+            run(tmp_path, text, shift(x=10.0), dialect, Setup(offsets))
+        assert "--keep-unknown" not in caught.value.message
+
+
 def test_skipped_blocks_stay(tmp_path):
     text = START + "/G1 X5. F1\nG1 X7. F1\nM2\n"
     setup = Setup({"G54": (0.0, 0.0, 0.0)}, skip_deleted=True)
