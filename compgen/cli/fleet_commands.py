@@ -448,9 +448,19 @@ def adopt_command(machine: str, job: Job, actor: str | None, reason: str, as_jso
 
 
 def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:
+    from compgen.fleet.decisions import CLOCKS_DIFFER
     from compgen.fleet.status import status
 
-    now = opened(job, lambda store: status(store, job, (machine,)))[0]
+    now, clock = opened(job, lambda store: (status(store, job, (machine,))[0], store.now()))
+    said = []
+    if decision.at > clock + CLOCKS_DIFFER:
+        said = [
+            f"the clock went back: it is {clock.isoformat(timespec='seconds')}, but the last decision was made at "
+            f"{decision.at.isoformat(timespec='seconds')}; this one is recorded with that time, so the times do not tell which "
+            "tables were on: set the clock right, and state it in measurement files or add a backup of the control"
+        ]
+    for text in said:
+        complain(f"warning: {text}", "yellow")
     if as_json:
         facts = {
             "kind": decision.kind,
@@ -458,7 +468,8 @@ def _decided(job: Job, machine: str, decision: Any, as_json: bool) -> int:
             "reason": decision.reason,
             "at": decision.at.isoformat(),
         }
-        print_json({"accepted": True, "machine": machine, "active": now.active, "decision": facts})
+        made = {"accepted": True, "machine": machine, "active": now.active, "decision": facts}
+        print_json({**made, "warnings": said} if said else made)
     else:
         active = "no tables are active" if now.active is None else f"version {now.active} is active"
         say(f"{machine}: {decision.kind} by {decision.actor}; {active}")
@@ -671,13 +682,16 @@ def backup_command(file: Path, job: Job, as_json: bool) -> int:
 def restore_command(file: Path, job: Job, as_json: bool) -> int:
     """Fill the store of the job, which must be empty, from the backup FILE; the next run writes the tables again.
 
+    The store does not know what was loaded into the controls after the backup: a measurement of that time must state which
+    tables were on, or come with a backup of the control.
+
     \b
     Example:
       volcomp recal restore backups/2026-06-01.sqlite --job recal.toml
     """
     from compgen.fleet.store import restore
 
-    return _copied(restore(file, job.store), as_json)
+    return _copied(restore(file, job.store, mark=True), as_json)
 
 
 def _copied(counts: dict[str, int], as_json: bool) -> int:

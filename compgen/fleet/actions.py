@@ -18,9 +18,10 @@ from compgen.fleet import claims, decisions, logs
 from compgen.fleet.claims import keep_result
 from compgen.fleet.decisions import check_person
 from compgen.fleet.job import Job, MachineJob
-from compgen.fleet.process import ADOPTED, process, without_folder
-from compgen.fleet.publish import check_folder, notify, publish, set_aside
+from compgen.fleet.process import process, without_folder
+from compgen.fleet.publish import begin_folder, check_folder, notify, publish, set_aside
 from compgen.fleet.records import (
+    ADOPTED,
     HELD_BACK,
     DecisionRecord,
     MachineRecord,
@@ -135,6 +136,7 @@ def carried_out(
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)
         check_folder(store, machine, machine_job.out)
+        begin_folder(store, machine, machine_job.out)
         decision = decide(store, machine)
         _follow(store, machine_job, machine, "The decision is recorded")
         return decision
@@ -195,6 +197,7 @@ def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | 
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)
         check_folder(store, machine, machine_job.out)
+        begin_folder(store, machine, machine_job.out)
         measurement = _chosen(store, machine, request.measurement)
         with one_thread():  # the same bytes however many processors there are
             table, revision = _again(store, machine_job, machine, measurement, request)

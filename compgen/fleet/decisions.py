@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from contextlib import closing
+from datetime import datetime, timedelta
 
 import sqlalchemy as sa
 
@@ -17,6 +18,7 @@ from compgen.fleet import database
 from compgen.fleet.job import Job
 from compgen.fleet.records import (
     AUTOMATIC,
+    CLOCK,
     OPEN,
     WAS_ACTIVE,
     DecisionKind,
@@ -30,6 +32,9 @@ from compgen.fleet.records import (
     state_of,
 )
 from compgen.fleet.store import Clock, Store, at_one_moment, files_of, open_store
+
+#: A clock that is behind the last decision by less was not set back: two computers decided one after another.
+CLOCKS_DIFFER = timedelta(seconds=2)
 
 
 class DecisionError(InputError):
@@ -215,9 +220,17 @@ def add_decision(
     actor: str,
     reason: str,
 ) -> DecisionRecord:
-    """Add one decision; its time is never earlier than the previous decision's, whatever the clock says."""
+    """Add one decision; its time is never earlier than the previous decision's, whatever the clock says.
+
+    Times tell which tables were on, so an event records that the clock went back: a measurement between such decisions
+    has to say which they were.
+    """
     last = next(iter(connection.execute(_DECIDED, {"machine": machine.id}).all()[-1:]), None)
     now = store.now(connection)
+    if last is not None and last.at > now + CLOCKS_DIFFER:
+        text = f"the clock went backwards: at {_seconds(now)} a decision got the time of the one before, {_seconds(last.at)}"
+        event = {"machine_id": machine.id, "kind": CLOCK, "subject": CLOCK, "message": text, "at": now}
+        connection.execute(sa.insert(database.events), event)
     row = {
         "machine_id": machine.id,
         "sequence": 1 if last is None else last.sequence + 1,
@@ -229,6 +242,10 @@ def add_decision(
     }
     connection.execute(sa.insert(database.decisions), row)
     return DecisionRecord(*connection.execute(_DECIDED, {"machine": machine.id}).all()[-1])  # as it is stored
+
+
+def _seconds(time: datetime) -> str:
+    return time.isoformat(timespec="seconds")
 
 
 def _open(connection: sa.Connection, machine: MachineRecord, version: int) -> tuple[list[DecisionRecord], int, bool]:

@@ -23,6 +23,8 @@ TIME_KEYS = ("measured_at", "date")
 ACTIVE_KEY = "active_table"
 #: Largest number of files of one measurement, and of characters of a comment about it.
 MOST_FILES, LONGEST_COMMENT = 1000, 200
+#: No measurement takes longer, s: a year.
+LONGEST_S = 366 * 86400.0
 
 
 @dataclass(frozen=True)
@@ -216,34 +218,68 @@ def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
 def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
     """Return a measurement from the contents of its files."""
     comments: dict[str, str] = {}
-    for (
-        content
-    ) in contents.values():  # the known comments `# key = value`, cut at a sensible length; the first file wins
-        said: dict[str, str] = {}
-        for line in content.splitlines():
-            key, equals, value = line.strip().partition(b"=")
-            field = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
-            if equals and field in (*TIME_KEYS, ACTIVE_KEY):
-                said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
-        comments = {**said, **comments}
-    times = []  # in ISO form, and how sure each is: a time without a time zone is taken as local
-    for word in TIME_KEYS:
-        with contextlib.suppress(ValueError, OverflowError, OSError):
-            said_at = datetime.fromisoformat(comments.get(word, "").strip())
-            source = "file" if said_at.tzinfo is not None else "file, no zone"
-            times.append((said_at.astimezone(UTC), source))
+    for content in contents.values():  # the first file wins
+        comments = {**comments_in(content), **comments}
+    stated = _time_of(comments)
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
         temperatures |= _temperatures(content)
     return NewMeasurement(
         sha256=digest_of(contents),
         name=name,
-        measured_at=times[0][0] if times else file_time,
-        measured_at_source=times[0][1] if times else "file time",
+        measured_at=file_time if stated is None else stated[0],
+        measured_at_source="file time" if stated is None else stated[1],
         contents=contents,
         active_table=comments.get(ACTIVE_KEY) or None,
         temperatures_c=temperatures,
     )
+
+
+def comments_in(content: bytes) -> dict[str, str]:
+    """Return the known comments `# key = value` of a file, cut at a sensible length; the last of a key wins."""
+    said: dict[str, str] = {}
+    for line in content.splitlines():
+        key, equals, value = line.strip().partition(b"=")
+        field = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
+        if equals and field in (*TIME_KEYS, ACTIVE_KEY):
+            said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
+    return said
+
+
+def time_in(content: bytes) -> tuple[datetime, str] | None:
+    """Return the time that a file states, and how sure it is; None if it states none.
+
+    >>> time_in(b"# measured_at = 2026-03-01T06:30:00+01:00")
+    (datetime.datetime(2026, 3, 1, 5, 30, tzinfo=datetime.timezone.utc), 'file')
+    """
+    return _time_of(comments_in(content))
+
+
+def _time_of(comments: Mapping[str, str]) -> tuple[datetime, str] | None:
+    """The time in ISO form, and how sure it is: a time without a time zone is taken as local."""
+    for word in TIME_KEYS:
+        with contextlib.suppress(ValueError, OverflowError, OSError):
+            said_at = datetime.fromisoformat(comments.get(word, "").strip())
+            return said_at.astimezone(UTC), "file" if said_at.tzinfo is not None else "file, no zone"
+    return None
+
+
+def duration_s(content: bytes) -> float:
+    r"""Return how long the readings of a file took, by its column ``time_s``; 0 without one.
+
+    >>> duration_s(b"x_mm,time_s\n1.0,30.5\n2.0,90.5\n")
+    60.0
+    """
+    if b"time_s" not in content:
+        return 0.0
+    rows = (line.split(b",") for line in content.splitlines() if line.strip() and not line.startswith(b"#"))
+    names = [cell.strip() for cell in next(rows, [])]
+    if b"time_s" not in names:
+        return 0.0
+    column = names.index(b"time_s")
+    values = [_number(row[column].decode("ascii", "replace"), 1e12) for row in rows if len(row) > column]
+    known = [value for value in values if value is not None]
+    return min(max(known) - min(known), LONGEST_S) if known else 0.0
 
 
 def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
@@ -266,9 +302,9 @@ def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
     return found
 
 
-def _number(cell: str) -> float | None:
+def _number(cell: str, most: float = 1e6) -> float | None:
     try:
         value = float(cell)
     except ValueError:
         return None
-    return value if abs(value) < 1e6 else None
+    return value if abs(value) < most else None

@@ -10,116 +10,56 @@ import re
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import FOLDERS, read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, load_machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning, InputError
-from compgen.fleet.change import Change, change_between, likeness, volume_points
+from compgen.fleet.change import Change, change_between
 from compgen.fleet.decisions import active_table
 from compgen.fleet.inbox import holds_one_of
 from compgen.fleet.job import MachineJob, Policy
 from compgen.fleet.records import (
-    AFTER,
     RESERVATION,
-    DecisionRecord,
-    EventRecord,
     IdentificationRecord,
     MachineRecord,
     MeasurementRecord,
     NewResult,
     StoredTableFile,
-    TableRecord,
-    active_id,
     active_of,
 )
 from compgen.fleet.store import Store, counting
+from compgen.fleet.tables_on import (
+    STATED,
+    Case,
+    Judgement,
+    Past,
+    judge_assumption,
+    judge_likeness,
+    judge_statement,
+    span_of,
+    tables_read,
+    tables_taken,
+)
 from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
 from compgen.identify.covariance import Covariance, covariance_or_independent
 from compgen.pipeline import RunResult, identified_reversal, run
-from compgen.tables import ReadTables, parse_tables, program_version, verify
+from compgen.tables import ReadTables, program_version, verify
 from compgen.tables.active import ActiveTables, difference
 from compgen.tables.judge import SafetyLimits
 from compgen.tables.verification import MISFIT_CODES
 
 #: A measurement dated further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
-#: A clock that was not set to daylight-saving time, or back, is wrong by this in addition to what clocks differ by.
-DAYLIGHT_SAVING = timedelta(hours=1)
-#: Kinds of events: the store's clock went back; a machine's folder was given to this store.
-CLOCK, ADOPTED = "clock", "adopted"
-#: Key in a version's figures: which tables were on, as stated by a file or a person.
-STATED = "active_table_stated"
-
-
-@dataclass
-class Judgement:
-    """Reasons to hold tables back, reservations that are only shown, and figures by name; each rule adds to them."""
-
-    hold: list[str] = field(default_factory=list)
-    reservations: list[str] = field(default_factory=list)
-    figures: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Past:
-    """Everything the store knows about a machine: decisions, tables with figures, measurements, events."""
-
-    decisions: Sequence[DecisionRecord]
-    tables: Sequence[TableRecord]
-    measurements: Sequence[MeasurementRecord]
-    events: Sequence[EventRecord]
-
-    @property
-    def swaps(self) -> list[DecisionRecord]:
-        """Decisions that changed the active tables since the folder was given to this store."""
-        return [item for item in self.decisions if AFTER[item.kind] == "active" and item.at >= self._since]
-
-    @property
-    def stated(self) -> str | None:
-        """Latest statement of which tables were on, by a file or a person, since this store got the folder."""
-        said = [(item.received_at, item.active_table) for item in self.measurements if item.active_table is not None]
-        said += [(item.at, str(item.summary[STATED])) for item in self.tables if STATED in item.summary]
-        return max((item for item in said if item[0] >= self._since), default=(None, None))[1]
-
-    @property
-    def _since(self) -> datetime:
-        adopted = [item.at for item in self.events if item.kind == ADOPTED]
-        return max(adopted, default=datetime.min.replace(tzinfo=UTC))
-
-
-@dataclass(frozen=True)
-class Case:
-    """One measurement to be judged: the job of its machine, what the store knows of the machine, the current time.
-
-    ``said`` states which tables were on during the measurement, by a person or the file, None if neither states it;
-    ``taken`` are the tables whose effect is removed from the readings, None if none were on.
-    """
-
-    store: Store
-    job: MachineJob
-    record: MachineRecord
-    machine: Machine
-    measurement: MeasurementRecord
-    past: Past
-    now: datetime
-    said: str | None
-    taken: TableRecord | None
-
-    @property
-    def version_taken(self) -> int | None:
-        """Version of the tables whose effect is removed."""
-        return None if self.taken is None else self.taken.version
 
 
 @dataclass(frozen=True)
@@ -136,7 +76,7 @@ class ActiveState:
         on = active_of(case.past.tables)
         if on is None:
             return None
-        read = {control: _tables_read(case.store, case.machine, on, control) for control in on.controllers}
+        read = {control: tables_read(case.store, case.machine, on, control) for control in on.controllers}
         known = {control: found for control, found in read.items() if found is not None}
         return cls(on.version, known, case.store.identification(on.identification_id))
 
@@ -184,156 +124,6 @@ def judge_order(judgement: Judgement, case: Case) -> None:
                 judgement.hold.append(
                     f"version {table.version} waits for approval and comes from a newer measurement ({_day(made)})"
                 )
-
-
-# --- which tables were on while the machine was measured --------------------------------------------------------------
-
-
-def judge_assumption(judgement: Judgement, case: Case) -> None:
-    """Hold if the time of the measurement does not determine which tables were on.
-
-    Only for a measurement that does not state it, on a machine that is measured with its tables on. A wrong assumption
-    enters the errors in full: the new tables then undo the compensation, or apply it twice.
-    """
-    job, measurement, past, taken = case.job, case.measurement, case.past, case.version_taken
-    swaps, margin = past.swaps, timedelta(minutes=job.policy.clock_minutes)
-    if not swaps:
-        said = past.stated
-        if said is None or version_said(said) != taken:
-            judgement.hold.append(
-                "the store does not know which tables were on while the machine was measured: it has never made tables of "
-                f"{job.name} active. If none were on: {how_to_state(job.name, measurement, 'none')}; if tables were on, "
-                "switch them off and measure again"
-            )
-        return
-    doubts = []
-    if measurement.measured_at_source == "file time":
-        doubts.append("the file does not state when it was measured, and the time of a file changes when it is copied")
-    elif measurement.measured_at_source == "file, no zone":
-        doubts.append("the time of the measurement has no zone")
-    for before, swap in zip([None, *swaps], swaps, strict=False):
-        since = None if before is None else before.at
-        away = abs(measurement.measured_at - swap.at)
-        near = away < margin
-        hour_off = bool(margin) and not near and away < margin + DAYLIGHT_SAVING
-        inside = (
-            since is None or since - margin < measurement.measured_at
-        ) and measurement.measured_at < swap.at + margin
-        if near or hour_off:
-            minutes, needed = away / timedelta(minutes=1), job.policy.clock_minutes
-            required = f"{needed:g} min are required, because clocks differ"
-            if hour_off:
-                required = f"{needed:g} min and an hour are required: a clock may be off by daylight-saving time, too"
-            doubts.append(
-                f"it was measured {minutes:.0f} min from the decision of {_day(swap.at)} that changed the active tables; "
-                f"{required}"
-            )
-        elif inside and _doubtful(swap, past, case.now):
-            doubts.append(f"the clock went back, so the time of the decision of {_day(swap.at)} is not certain")
-    if doubts:
-        judgement.hold.append(
-            "it is not certain which tables were on while the machine was measured (assumed: "
-            f"{'none' if taken is None else f'version {taken}'}): "
-            f"{'; '.join(dict.fromkeys(doubts))}; {how_to_state(job.name, measurement, 'VERSION|none')}"
-        )
-
-
-def version_said(text: str) -> int | str | None:
-    """Return the version that ``active_table`` names, None for "none" or "bare", any other text unchanged."""
-    word = text.lower()
-    number = word.removeprefix("v")
-    return None if word in ("none", "bare") else int(number) if number.isdecimal() and number.isascii() else text
-
-
-def how_to_state(name: str, measurement: MeasurementRecord, tables: str) -> str:
-    """Tell a person how to state which tables were on; ``tables`` is a version, "none" or a placeholder for either."""
-    return (
-        f"state it: `volcomp recal reprocess {name} --measurement {measurement.id} --active-table {tables} --reason TEXT`, "
-        f"or `# active_table = {tables}` in the next file"
-    )
-
-
-def _doubtful(decision: DecisionRecord, past: Past, now: datetime) -> bool:
-    """Whether the clock was ahead at this decision: a later entry has an earlier time."""
-    if decision.at > now:
-        return True
-    if any(item.at < decision.at <= _seen(item) for item in past.events if item.kind == CLOCK):
-        return True
-    known = {item.table_id for item in past.decisions if item.sequence <= decision.sequence}
-    return any(table.at < decision.at for table in past.tables if table.id not in known)
-
-
-def _seen(event: EventRecord) -> datetime:
-    """Time of the newest entry when the clock was found to have gone back, read from the end of the message."""
-    try:
-        return datetime.fromisoformat(event.message.rsplit(" ", 1)[-1]) + timedelta(seconds=1)
-    except ValueError:
-        return event.at
-
-
-def judge_likeness(judgement: Judgement, case: Case, result: RunResult) -> None:
-    """Hold if the machine seems to have changed by what some tables add, or by its opposite.
-
-    The change is relative to the errors behind the active tables, or the last active ones; it is compared with what
-    each version that is or was active adds.
-    """
-    machine, taken = case.machine, case.version_taken
-    were_active, last = _were_active(case)
-    if last is None:
-        return
-    old_errors = case.store.errors_of(last)
-    if not set(old_errors.names) <= set(result.identification.errors.names):
-        return  # already held for that; an incomplete set of errors has no field to compare
-    added, missing = _added(case, were_active)
-    old = (old_errors, case.store.covariance_of(last))
-    found = likeness(machine, _identified(result), old, added, missing)
-    if found is None:
-        return
-    judgement.figures["likeness"] = found.summary()
-    assumed = "no tables were" if taken is None else f"version {taken} was"
-    seems, what = ("was on", "what") if found.sign > 0 else ("was off", "the opposite of what")
-    version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
-    judgement.hold.append(
-        f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
-        f"while the machine was measured, but the evaluation assumed that {assumed} on; "
-        f"{how_to_state(case.job.name, case.measurement, version)}; if the machine has really changed, approve with --override"
-    )
-
-
-def _were_active(case: Case) -> tuple[dict[int, ReadTables], IdentificationRecord | None]:
-    """Return the tables that are or were active, by version in the order of activation, and the last errors."""
-    by_id = {table.id: table for table in case.past.tables}
-    order = [
-        item.table_id for item in case.past.decisions if AFTER[item.kind] == "active" and item.table_id is not None
-    ]
-    known = [by_id[key] for key in dict.fromkeys(order[::-1])][:LOOKED_BACK][::-1]
-    found: dict[int, ReadTables] = {}
-    for table in known:
-        control = next((name for name in case.job.controllers if name in table.controllers), table.controllers[0])
-        read = _tables_read(case.store, case.machine, table, control)
-        if read is not None:
-            found[table.version] = read
-    return found, case.store.identification(known[-1].identification_id) if found else None
-
-
-def _added(case: Case, were_active: Mapping[int, ReadTables]) -> tuple[dict[str, FloatArray], dict[str, FloatArray]]:
-    """What tables add to the commands that may have been on by mistake, and that may have been off, in words.
-
-    Each is the mean of both directions of travel at points of the volume, (n, 3), mm.
-    """
-    machine, taken, on = case.machine, case.version_taken, active_of(case.past.tables)
-    points_mm = volume_points(machine)
-    sides = [Points(points_mm, approach=np.full_like(points_mm, side)) for side in (1.0, -1.0)]
-    adds = {
-        version: np.asarray(0.5 * sum(tables.correction(machine, side) for side in sides))
-        for version, tables in were_active.items()
-    }
-    added = {f"version {version}": field for version, field in adds.items()}
-    if taken in adds:  # the clock may be slow: a later version may already have been on
-        later = list(adds)[list(adds).index(taken) + 1 :]
-        added |= {f"version {version} instead of version {taken}": adds[version] - adds[taken] for version in later}
-    active = None if on is None else on.version
-    return added, {f"version {version}": field for version, field in adds.items() if version in (taken, active)}
 
 
 def judge_twins(judgement: Judgement, case: Case) -> None:
@@ -494,8 +284,6 @@ NOT_OF_A_CONTROL = (
     "fitted.errors.csv",
     "fit.json",
 )
-#: A change is compared with at most this many of the newest versions that were active.
-LOOKED_BACK = 20
 #: Prefix of temporary folders; their names mean nothing to a reader.
 FOLDER = "compgen-recal-"
 _TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\](?:measurement|settings)[/\\]")
@@ -533,18 +321,22 @@ def process(
         lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
     )
     said = measurement.active_table if stated is None else stated
-    taken = _active_then(job, measurement, past, said)
-    case = Case(store, job, record, machine, measurement, past, store.now(), said, taken)
+    taken = tables_taken(job, measurement, past, said)
+    contents = store.contents_of(measurement)
+    case = Case(
+        store, job, record, machine, measurement, past, store.now(), said, stated is not None, taken,
+        span_of(measurement, contents)
+    )  # fmt: skip
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        was_active = None if taken is None else _tables_read(store, machine, taken, job.controllers[0])
+        was_active = None if taken is None else tables_read(store, machine, taken, job.controllers[0])
         if taken is not None and was_active is None:
             text = f"version {taken.version} was active, but contains no tables of {job.controllers[0]}"
             raise InputError(f"{text}; is the control right?")
         outcome = run(
             machine,
-            write_files(Path(folder) / "measurement", store.contents_of(measurement)),
+            write_files(Path(folder) / "measurement", contents),
             job.controllers,
             Path(folder) / "out",
             identify_options=IdentifyOptions(**job.identify),
@@ -590,35 +382,6 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:
 # --- active tables -------------------------------------------------------------------------------------------------
 
 
-def _active_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
-    """Return the tables that were active during the measurement: as stated, else as the job says."""
-    tables = past.tables
-    version = None if said is None else version_said(said)
-    if said is not None and version is None:
-        return None
-    if said is not None:
-        found = next((table for table in tables if table.version == version), None)
-        if found is None or not found.accepted:
-            of_file = said == measurement.active_table
-            raise InputError(
-                f"says active_table = {said}, but {job.name} has no such tables; give a version or none",
-                file=measurement.name if of_file else None,
-                field=None if of_file else "--active-table",
-            )
-        return found
-    if job.measured_with == "bare":
-        return None
-    then = active_id([decision for decision in past.decisions if decision.at <= measurement.measured_at])
-    return next((table for table in tables if table.id == then), None)
-
-
-def _tables_read(store: Store, machine: Machine, table: TableRecord, control: str) -> ReadTables | None:
-    """Parse the table files of one control, without manifest and notes; None if there are none."""
-    names = table.summary.get("tables", {}).get(control, [])
-    files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
-    return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
-
-
 def machine_now(
     store: Store, machine: MachineRecord, job: MachineJob
 ) -> tuple[Machine, ErrorTable, Covariance | None, ReadTables | None] | None:
@@ -631,7 +394,7 @@ def machine_now(
         return None
     newest = records[-1]
     loaded, table = store.machine_of(newest), active_table(store, machine)
-    tables = None if table is None else _tables_read(store, loaded, table, job.controllers[0])
+    tables = None if table is None else tables_read(store, loaded, table, job.controllers[0])
     return loaded, store.errors_of(newest), store.covariance_of(newest), tables
 
 
@@ -662,10 +425,12 @@ def _judged(case: Case, result: RunResult) -> Judgement:
     judge_order(judgement, case)
     if case.said is not None:
         judgement.figures[STATED] = case.said
+        if not case.by_person:
+            judge_statement(judgement, case)
     elif case.job.measured_with == "active":
         judge_assumption(judgement, case)
     if result.accepted:
-        judge_likeness(judgement, case, result)
+        judge_likeness(judgement, case, _identified(result))
     judge_twins(judgement, case)
     return judgement
 

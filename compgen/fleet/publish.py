@@ -19,7 +19,7 @@ from typing import IO, Any, TypeVar
 from compgen.data.files import OutputFolder, exclusive, sha256_of, write_file
 from compgen.errors import InputError
 from compgen.fleet import logs
-from compgen.fleet.records import HELD_BACK, MachineRecord, TableRecord, TableState, active_of
+from compgen.fleet.records import ADOPTED, AFTER, HELD_BACK, RESTORED, MachineRecord, TableRecord, TableState, active_of
 from compgen.fleet.store import Store
 
 # The output folder of a machine follows the store: one folder per version, and the pointer ``active``.
@@ -66,6 +66,26 @@ def check_folder(store: Store, machine: MachineRecord, folder: Path) -> None:
         _compare(store, machine, store.tables(machine, figures=False), folder, seen)
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=folder) from error
+
+
+def begin_folder(store: Store, machine: MachineRecord, folder: Path) -> list[str]:
+    """Publish into a folder that has nothing of any store, before anything is judged or decided; return what to say.
+
+    If the store has made tables active, it may be an older one (a copy, or a restored database): no ledger shows
+    otherwise. From then on it does not know which tables are on, as after `recal adopt`.
+    """
+    seen, said = _look(folder), []
+    if seen.pointer is not None or seen.ledger_text is not None or seen.versions:
+        return []
+    known = [item.at for item in store.events(machine) if item.kind in (ADOPTED, RESTORED)]
+    swaps = [item.at for item in store.decisions(machine) if AFTER[item.kind] == "active"]
+    if swaps and not (known and max(known) >= swaps[-1]):  # else this is known, and until when the history counts
+        at = store.now().isoformat(timespec="seconds")
+        said = [f"the folder was empty at {at}, although this store has made tables active; it may be an older store"]
+        store.add_event(ADOPTED, "folder", said[0], machine)
+        logs.warning("empty folder", machine=machine.name, folder=str(folder))
+    publish(store, machine, folder)
+    return said
 
 
 def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:

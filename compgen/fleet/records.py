@@ -18,6 +18,12 @@ from compgen.errors import InputError, nearest
 TableState = Literal["pending", "held", "refused", "superseded", "rejected", "active", "retired"]
 DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "reject", "rollback"]
 
+#: Kinds of events. The clock of the store went back; the message ends with the time of the newest entry.
+CLOCK = "clock"
+#: A machine's folder was given to this store, or was found to be empty: the store does not know which tables are on.
+ADOPTED = "adopted"
+#: The history comes from a backup, whose last entry is of the time that is the subject of the event.
+RESTORED = "restored"
 #: Prefix of a reason that is shown with the tables but does not hold them back.
 RESERVATION = "reservation: "
 

@@ -24,7 +24,7 @@ from compgen.fleet.claims import Claim, ClaimLostError, keep_failure, keep_resul
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import FOLDER, process, without_folder, write_files
-from compgen.fleet.publish import check_folder, is_published, notify, publish, untold
+from compgen.fleet.publish import begin_folder, check_folder, is_published, notify, publish, untold
 from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord, active_of
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
@@ -215,6 +215,7 @@ class _Pass:
         if unchanged is not None:
             return unchanged
         check_folder(self.store, self.machine, self.job.out)
+        self.messages += begin_folder(self.store, self.machine, self.job.out)
         known = self.store.newest_entry(self.machine)
         if known is not None and known > self.store.now():
             behind = known.isoformat(timespec="seconds")

@@ -31,6 +31,7 @@ from compgen.errors import CompgenError, InputError
 from compgen.fleet import database
 from compgen.fleet.database import StoreError, engine_of, first_line, inserted, put_blobs, retried, shown, upgrade
 from compgen.fleet.records import (
+    RESTORED,
     AttemptRecord,
     DecisionRecord,
     EventRecord,
@@ -683,10 +684,12 @@ def _remove_left(folder: Path) -> None:
                 path.unlink()
 
 
-def restore(path: Path, url: str) -> dict[str, int]:
+def restore(path: Path, url: str, *, mark: bool = False) -> dict[str, int]:
     """Fill an empty store from a backup, which is not changed; return the number of rows by table.
 
-    A new SQLite store gets its name when it is complete: a restore that is killed leaves none.
+    A new SQLite store gets its name when it is complete: a restore that is killed leaves none. With ``mark`` the history of
+    every machine gets an event of kind ``RESTORED``, which is not counted: the store does not know what was decided, and
+    loaded into the controls, after the backup.
 
     Raises
     ------
@@ -712,24 +715,42 @@ def restore(path: Path, url: str) -> dict[str, int]:
         with closing(open_store(f"sqlite:///{copy}")) as source:
             if file is None or os.path.lexists(file):
                 with closing(open_store(url)) as target:
-                    return _fill(source, target)
+                    return _fill(source, target, path.name if mark else None)
             try:
                 with _whole_file(file) as target:
-                    return _fill(source, target)
+                    return _fill(source, target, path.name if mark else None)
             except FileExistsError as error:
                 raise InputError(f"the store {shown(url)} was made meanwhile; nothing was restored") from error
             except OSError as error:
                 raise StoreError(f"the store {shown(url)} cannot be written: {error.strerror or error}") from error
 
 
-def _fill(source: Store, target: Store) -> dict[str, int]:
+def _fill(source: Store, target: Store, named: str | None) -> dict[str, int]:
+    """Copy a store into an empty one; with the name of the backup every history says where it comes from."""
     if target.machines():
         raise InputError(f"the store {shown(target.url)} is not empty; restore into a new one")
-    return _copy(source, target)
+    if named is None:
+        return _copy(source, target)
+    ends = [(machine.id, _last_entry(source, machine).isoformat()) for machine in source.machines()]
+    text = f"the history comes from the backup {named}; what came later is not known"
+
+    def note(writing: sa.Connection) -> None:
+        common = {"kind": RESTORED, "message": text, "at": target.now(writing)}
+        for machine_id, end in ends:
+            writing.execute(sa.insert(database.events), {**common, "machine_id": machine_id, "subject": end})
+
+    return _copy(source, target, note)
 
 
-def _copy(source: Store, target: Store) -> dict[str, int]:
-    """Copy all rows of a snapshot, in one transaction."""
+def _last_entry(store: Store, machine: MachineRecord) -> datetime:
+    """Return the time of the last entry about a machine of any kind."""
+    times = [machine.at, *(item.received_at for item in store.measurements(machine))]
+    times += [item.at for item in store.decisions(machine)] + [item.at for item in store.events(machine)]
+    return max(times + [item.at for item in store.attempts(machine)])
+
+
+def _copy(source: Store, target: Store, then: Callable[[sa.Connection], None] = lambda _: None) -> dict[str, int]:
+    """Copy all rows of a snapshot and do ``then``, in one transaction."""
     try:
         with source.snapshot() as reading, target.engine.begin() as writing:
             counts = dict.fromkeys((table.name for table in database.ALL), 0)
@@ -746,6 +767,7 @@ def _copy(source: Store, target: Store) -> dict[str, int]:
                     sequence = sa.func.pg_get_serial_sequence(table.name, "id")
                     newest = sa.select(sa.func.max(table.c.id)).scalar_subquery()
                     writing.execute(sa.select(sa.func.setval(sequence, newest)))
+            then(writing)
             return counts
     except sa.exc.DBAPIError as error:
         place = f"{shown(source.url)} to {shown(target.url)}"
