@@ -287,7 +287,7 @@ class Klipper(SkewControl[KlipperSettings]):
         found: dict[str, list[tuple[int, str, str]]] = {}
         section = None
         for line, text in self._lines(source, strict):
-            if head := re.fullmatch(r"\[skew_correction(?:\s+([^\]]{1,80}))?\]", text):
+            if head := re.fullmatch(r"\[skew_correction(?:\s++([^\]]{1,80}))?\]", text):
                 section = head.group(1) or ""
                 if section in found and strict:
                     raise source.fail(f"the section {text} is given a second time", line)

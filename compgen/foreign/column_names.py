@@ -426,8 +426,11 @@ CHANNEL = re.compile(r"temp_[a-z0-9_]{1,30}")
 #: A column of one run given by --map run3-=COLUMN: number, and direction if given.
 RUN_FIELD = re.compile(r"run(\d{1,3})([+\-]?)")
 _TEMPERATURE = re.compile(r"(?<!at)temp(?!o|late|s$)|\u6e29\u5ea6")
-_BRACKETS = re.compile(r"\s*[\[(<{]\s*([^\])>}]{1,20}?)\s*[\])>}]\s*")
-_SUFFIX = re.compile(r"^(.*?\w)[\s_/,]+([a-zA-Z\u00b0\u00b5\u03bc\"']{1,12}|um/m|mm/m|m{1,2}/min|m{1,2}/s)$")
+_BRACKETS = re.compile(r"[\[(<{]\s*+([^\])>}]{1,20}?)\s*+[\])>}]")
+#: A unit after the words of a name; tried where blanks begin, once for each.
+_SUFFIX = re.compile(
+    r"((?<=[^\W_])|(?<![\w\s/,])[\s/,]*+_)[\s_/,]++([a-zA-Z\u00b0\u00b5\u03bc\"']{1,12}|um/m|mm/m|m{1,2}/min|m{1,2}/s)$"
+)
 
 
 @dataclass(frozen=True)
@@ -464,14 +467,27 @@ def split_name(name: str) -> NamedColumn:
         if unit is None:
             continue
         return NamedColumn(name, _word(f"{name[: bracket.start()]} {name[bracket.end() :]}"), unit)
-    suffix = _SUFFIX.match(name.strip())
+    words, suffix = without_suffix(name)
     if suffix:
-        word = _word(suffix.group(1))
+        word = _word(words)
         quantity = quantity_of(word)
-        unit = known_unit(suffix.group(2)) or (covariate_unit(suffix.group(2), quantity) if quantity else None)
+        unit = known_unit(suffix) or (covariate_unit(suffix, quantity) if quantity else None)
         if unit:
             return NamedColumn(name, word, unit)
     return NamedColumn(name, _word(name), None)
+
+
+def without_suffix(name: str) -> tuple[str, str]:
+    """Return the words of a column's name and what may be its unit behind them; nothing for the unit if there is none.
+
+    >>> without_suffix("Abweichung / \u00b5m"), without_suffix("straightness um/m"), without_suffix("Pos.")
+    (('Abweichung', '\u00b5m'), ('straightness', 'um/m'), ('Pos.', ''))
+    """
+    text = name.strip()
+    found = _SUFFIX.search(text)
+    if found is None or "\n" in text[: found.end(1)]:
+        return text, ""
+    return text[: found.end(1)], found[2]
 
 
 def quantity_of(word: str) -> Quantity | None:
@@ -606,13 +622,13 @@ def motion_in(name: str) -> MotionColumn | None:
     >>> motion_in("Geradheit Y vor [\u00b5m]").error("X"), motion_in("Pitch run 2 - [arcsec]").run.number, motion_in("pitch mean")
     ('EYX', 2, None)
     """
-    unit, suffix = split_name(name).unit, _SUFFIX.match(name.strip())
+    unit, (words_before, suffix) = split_name(name).unit, without_suffix(name)
     within = [bracket for bracket in _BRACKETS.finditer(name) if known_unit(bracket.group(1))]
     text = name
     if unit and within:
         text = f"{name[: within[0].start()]} {name[within[0].end() :]}"
     elif unit and suffix:
-        text = suffix.group(1)
+        text = words_before
     flat = unaccented(text)
     flat = flat if _MOTIONS["error"].search(flat) else flat.replace("_", " ")
     motions = motions_in(flat)

@@ -77,9 +77,10 @@ def channel_of(word: str) -> str:
     """
     rest = _FILLERS.sub("", word)
     for part in (rest, rest.removeprefix("t")):
-        stem, number = re.fullmatch(r"(.*?)(\d*)", part).groups()  # type: ignore[union-attr]
+        stem = part.rstrip("0123456789")
+        number = part[len(stem) :]
         if stem in ("x", "y", "z") and not number:
-            return str(stem)
+            return stem
         name = next((name for name, words in _CHANNEL_WORDS.items() if stem in words), None)
         if name:
             return f"{name}_{number}" if number else name

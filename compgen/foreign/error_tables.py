@@ -167,9 +167,9 @@ def summed_steps(findings: TableFindings, steps: ErrorTable, base_mm: float) -> 
 _PAIRS = {"XY": ("EC0Y", 1.0), "XZ": ("EB0Z", -1.0), "YZ": ("EA0Z", 1.0)}
 _ABOVE_90 = dict(_PAIRS.values())
 _AXIS_WORD = r"(?:[\s\-]?(?:AXIS|ACHSE|AXE|ASSE|EJE))?"
-_BETWEEN = r"(?:WITH RESPECT TO|RELATIVE TO|ZU|TO|\u00c0|A|VS|AND|UND|ET|E|GEGEN|(?<=\s)Y(?=\s))?"
+_BETWEEN = r"(?:WITH RESPECT TO|RELATIVE TO|ZU|TO|\u00c0|A|VS|AND|UND|ET|E|GEGEN|(?<=\s)Y(?=\s))"
 _PAIR = re.compile(
-    rf"(?<![A-Z])([XYZ]){_AXIS_WORD}[\s\-/\u2013_:\u22a5\u27c2]*{_BETWEEN}[\s\-/\u2013_]*([XYZ])(?![A-Z]){_AXIS_WORD}"
+    rf"(?<![A-Z])([XYZ]){_AXIS_WORD}[\s\-/\u2013_:\u22a5\u27c2]*+(?:{_BETWEEN}[\s\-/\u2013_]*+)?([XYZ])(?![A-Z]){_AXIS_WORD}"
 )
 #: EC0Y, E_C0Y, C0Y; a rotation of X (EC0X) has another sign: it is refused.
 _ISO = re.compile(r"(?<![A-Z0-9])(?:E_?([CBA])_?[0O]|([CBA])_?0)_?([XYZ])(?![A-Z0-9])")
@@ -180,11 +180,11 @@ _BESIDE = {
     "length": re.compile(r"length|lange|laenge|(^|\W)over(\W|$)|uber|ueber|longueur|lungh|longitud"),
 }
 _COVERAGE = re.compile(r"(?i)k\s*=\s*(\d+(?:[.,]\d+)?)")
-_NUMBER = r"[+\-\u2212]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][+\-]?\d+)?"
+_NUMBER = r"[+\-\u2212]?(?:\d++(?:[.,]\d*+)?|[.,]\d++)(?:[eE][+\-]?\d++)?"
 #: Value, unit; length, unit; uncertainty; unit: ``12 ± 3 µrad``, ``0,02/300``, ``9 µm / 300 mm``, ``90.001°``.
 _CELL = re.compile(
-    rf"({_NUMBER})\s*([^\d\s/\u00b1+\-.,]+(?:/m)?)?(?:\s*/\s*({_NUMBER})\s*([^\d\s\u00b1+\-.,]+)?)?"
-    rf"(?:\s*(?:\u00b1|\+/?-)\s*({_NUMBER}))?\s*([^\d]*)"
+    rf"({_NUMBER})\s*+([^\d\s/\u00b1+\-.,]++(?:/m)?)?(?:\s*+/\s*+({_NUMBER})\s*+([^\d\s\u00b1+\-.,]++)?)?"
+    rf"(?:\s*+(?:\u00b1|\+/?-)\s*+({_NUMBER}))?\s*+([^\d]*+)"
 )
 #: An angle between two axes differs from 90 degrees by less.
 _MOST_DEG = 0.5

@@ -67,7 +67,9 @@ class DrillingCycle:
 
     def defined_further(self, line: str) -> DrillingCycle:
         """Return the cycle with a further line of its definition, which gives numbers as in ``Q201=-15`` or ``P02 -15``."""
-        found = re.finditer(rf"(Q\d+(?=\s*=)|P\d\d(?=[\s+-]))\s*=?\s*({VALUE})", line.partition(";")[0], re.IGNORECASE)
+        found = re.finditer(
+            rf"(Q\d++(?=\s*+=)|P\d\d(?=[\s+-]))\s*+(?:=\s*+)?({VALUE})", line.partition(";")[0], re.IGNORECASE
+        )
         more = {match[1].upper(): (len(self.lines), *match.span(2), match[2]) for match in found}
         return replace(self, lines=(*self.lines, line), numbers={**self.numbers, **more})
 

@@ -174,9 +174,12 @@ AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "G9"}
 #: Text in the first comment of a corrected program.
 MARK = "CORRECTED BY VOLCOMP"
 
-VALUE = r"[+-]?\s*(?:\d+\.?\d*|\.\d+)"
+# what repeats keeps what it has taken (++, *+): a block that is no word is refused in a time that grows with its length
+VALUE = r"(?:[+-]\s*+)?(?:\d++(?:\.\d*+)?|\.\d++)"
+#: The end of a block within a line, and nothing after it.
+_ENDS = r";[; \t\r]*+$"
 _PARENTHESES = r"\([^()\n]*\)"
-_WORDS = rf"(?P<address>[A-Z])\s*(?P<value>{VALUE})"
+_WORDS = rf"(?P<address>[A-Z])\s*+(?P<value>{VALUE})"
 
 
 @dataclass(frozen=True)
@@ -186,7 +189,7 @@ class Dialect:
     ``codes`` gives the meaning of G codes (and of words in letters), ``refused`` says why others are not followed, ``end``
     names the codes that end a program; ``decimals`` are those of mm and inch. ``comments`` is the pattern of comments,
     ``settings`` of what moves nothing and is more than a word. ``point_needed``: whole numbers without a decimal point
-    may be increments.
+    may be increments. ``semicolon_ends``: ``;`` begins no comment, it ends a block, and nothing follows it in a line.
     """
 
     name: str
@@ -201,6 +204,7 @@ class Dialect:
     end: frozenset[str] = frozenset(("M2", "M30"))
     end_needed: bool = True
     point_needed: bool = False
+    semicolon_ends: bool = False
     work_offset: str = "G54"
     pole: bool = False
     tool_by_number: bool = False
@@ -208,9 +212,12 @@ class Dialect:
 
     def word_pattern(self) -> re.Pattern[str]:
         """Return the pattern of one word: its address and value, or a comment."""
-        return re.compile(
-            rf"\s*(?:{self.words}|(?P<comment>{self.comments}{self.settings and '|'}{self.settings}))", re.IGNORECASE
-        )
+        comments = [
+            self.comments,
+            *([self.settings] if self.settings else []),
+            *([_ENDS] if self.semicolon_ends else []),
+        ]
+        return re.compile(rf"\s*+(?:{self.words}|(?P<comment>{'|'.join(comments)}))", re.IGNORECASE)
 
     def said(self, text: str) -> str:
         """Return ``text`` as a comment block."""
@@ -220,16 +227,16 @@ class Dialect:
 
 #: An address of more than one letter needs its equals sign; CR5 is none. X=IC(5) is 5 from where X is, X=AC(5) from its zero.
 _SIEMENS_WORDS = (
-    r"(?P<address>(?:CR|TURN|[XYZ]1)(?=\s*=)|(?![SM]\d+\s*=)[A-Z])\s*(?:=\s*(?P<mode>AC|IC|DC|ACP|ACN)\s*\(\s*|=?\s*)"
-    rf"(?P<value>{VALUE}|\"[^\"]*\")(?(mode)\s*\))"
+    r"(?P<address>(?:CR|TURN|[XYZ]1)(?=\s*+=)|(?![SM]\d++\s*+=)[A-Z])\s*+(?:=\s*+(?:(?P<mode>AC|IC|DC|ACP|ACN)\s*+\(\s*+)?)?"
+    rf"(?P<value>{VALUE}|\"[^\"]*\")(?(mode)\s*+\))"
 )
 _CALLS = "MSG|GROUP_BEGIN|GROUP_END|GROUP_ADDEND|WORKPIECE|CYCLE832|SETMS|FGROUP|PROTS"
 _ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|JERKLIM|FA|SCC|SVC|S\d|M\d+)"
 #: Calls, axis functions and labels of SINUMERIK that move nothing of X, Y and Z.
 _SIEMENS_SETTINGS = (
-    r"\bMSG\s*\([^\n]*\)"
-    rf"|\b(?:{_CALLS})\s*\((?:\"[^\"\n]*\"|[^()\"\n])*\)|\bCYCLE800\s*\(\s*\)|\bCYCLE832\b(?!\s*\()"
-    rf"|\b{_ASSIGNED}\s*(?:\[\s*\w+\s*\])?\s*=\s*(?:(?:AC|IC|DC|ACP|ACN)\s*\(\s*{VALUE}\s*\)|{VALUE})"
+    r"\bMSG\s*+\([^\n]*\)"
+    rf"|\b(?:{_CALLS})\s*+\((?:\"[^\"\n]*\"|[^()\"\n])*+\)|\bCYCLE800\s*+\(\s*+\)|\bCYCLE832\b(?!\s*+\()"
+    rf"|\b{_ASSIGNED}\s*+(?:\[\s*+\w++\s*+\]\s*+)?=\s*+(?:(?:AC|IC|DC|ACP|ACN)\s*+\(\s*+{VALUE}\s*+\)|{VALUE})"
 )
 DIALECTS = {
     item.name: item
@@ -237,8 +244,9 @@ DIALECTS = {
         Dialect(
             "fanuc",
             _FANUC,
-            _PARENTHESES + r"|;(?=[; \t\r]*(?:\n|$))",
+            _PARENTHESES,
             "({})",
+            semicolon_ends=True,
             point_needed=True,
             # custom macro: system variables 5221 ... are the offsets of G54
             check=(
@@ -272,7 +280,7 @@ DIALECTS = {
             "; {}",
             decimals=(4, 5),
             refused={**REFUSED, **_HEIDENHAIN_REFUSED},
-            words=rf"(?P<address>D[LR](?=\s*[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*(?P<value>{VALUE}|\"[^\"]*\")",
+            words=rf"(?P<address>D[LR](?=\s*+[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*+(?P<value>{VALUE}|\"[^\"]*\")",
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 91, 94, 101, 102, 103, 107, 108, 116, 117, 118,
                                                 120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
             end=frozenset(("M2", "M30", "%")),

@@ -40,6 +40,11 @@ from compgen.programs.subprograms import written_out
 MM_PER_INCH = 25.4
 #: Bytes that are read at a time, and the fewest blocks in a row that are read together.
 BATCH_BYTES, LEAST_RUN = 1 << 18, 12
+#: What a block has where its numbers come from variables or expressions, and those of HEIDENHAIN in addition: Q1, Q2 ...
+_VARIABLE = re.compile(
+    r"[A-Z]++\d*+\s*+(?:=\s*+)?(?:[-+]\s*+)?[#\[]|R\d++\s*+=|[A-Z]++\s*+=\s*+[-+]?[A-Z(]|=", re.IGNORECASE
+)
+_VARIABLE_Q = re.compile(r"[A-Z]+\s*+[-+]?Q\d|Q\d++\s*+=|D\d++\s*+Q", re.IGNORECASE)
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
@@ -671,10 +676,7 @@ class Reader:
             )
         if rest[0] == "$":
             self._fail(f"{rest[:20]!r} is a command for the control, none of a program; give the program alone")
-        variable = r"[A-Z]+\d*\s*=?\s*[-+]?\s*[#\[]|R\d+\s*=|[A-Z]+\s*=\s*[-+]?[A-Z(]|="
-        if dialect.pole:
-            variable += r"|[A-Z]+\s*[-+]?Q\d|Q\d+\s*=|D\d+\s*Q"
-        if rest[0] in "#[" or re.match(variable, rest, re.IGNORECASE):
+        if rest[0] in "#[" or _VARIABLE.match(rest) or (dialect.pole and _VARIABLE_Q.match(rest)):
             self._fail(f"{rest[:20]!r}: variables and expressions are not followed; post the program with numbers")
         if rest[0] in "oO":
             self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")

@@ -21,6 +21,8 @@ R_WORD, P_WORD, COLUMNS = 6, 7, 8
 RADIUS_TOLERANCE_MM = 0.02
 #: The longest block, characters.
 LONGEST_BLOCK = 4096
+#: Semicolons that end a block, with the blanks about them; it begins where such characters begin, so that it is tried once.
+_ENDS = re.compile(rb"(?<![; \t\r])[; \t\r]++(?=\n|\Z)")
 _BLANK, _OTHER, _LETTER, _DIGIT, _POINT, _SIGN = range(6)
 _GROUPS = {"motion": 0, "absolute": 1, "incremental": 1, "plane": 2, "nothing": 3}
 
@@ -68,6 +70,8 @@ class Words:
         text = content
         if b"(" in text or b";" in text:
             text = re.sub(dialect.comments.encode(), _blanked, text, flags=re.IGNORECASE)
+            if dialect.semicolon_ends:
+                text = _ENDS.sub(_blanked, text)
         if dialect.pole:
             text = text.replace(b"*\n", b" \n").replace(b"*\r\n", b" \r\n")
         if siemens:  # one byte that no program contains stands for CR=, the radius of an arc

@@ -20,8 +20,8 @@ from compgen.programs.path import IntArray
 
 #: Calls within calls, and blocks of a program that is written out.
 _DEEPEST, _MOST_BLOCKS = 10, 5_000_000
-_MENTIONED = re.compile(rb"M[ \t]*\+?[ \t]*0*9[78]", re.IGNORECASE)
-_WORD = re.compile(rb"([A-Z])[ \t]*([+-]?[ \t]*(?:\d+\.?\d*|\.\d+))", re.IGNORECASE)
+_MENTIONED = re.compile(rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]", re.IGNORECASE)
+_WORD = re.compile(rb"([A-Z])[ \t]*+((?:[+-][ \t]*+)?(?:\d++(?:\.\d*+)?|\.\d++))", re.IGNORECASE)
 #: What is no code: comments, program names; of FANUC what follows a semicolon is another block, which is refused later.
 _LATER = {
     "fanuc": re.compile(rb"\([^()\n]*\)|<[^<>\n]*>|;[^\n]*"),
