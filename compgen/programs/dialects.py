@@ -180,6 +180,9 @@ VALUE = r"(?:[+-]\s*+)?(?:\d++(?:\.\d*+)?|\.\d++)"
 _ENDS = r";[; \t\r]*+$"
 _PARENTHESES = r"\([^()\n]*\)"
 _WORDS = rf"(?P<address>[A-Z])\s*+(?P<value>{VALUE})"
+#: A word of a tool table of LinuxCNC, and the longest name of a tool.
+_TOOL_WORD = re.compile(r"([TPXYZABCUVWDIJQ])([+-]?(?:\d{1,9}(?:\.\d{0,20})?|\.\d{1,20}))", re.ASCII)
+_LONGEST_NAME = 80
 
 
 @dataclass(frozen=True)
@@ -342,32 +345,50 @@ def codes_that_stay(dialect: Dialect, given: Collection[str]) -> frozenset[str]:
     return frozenset(kept)
 
 
-def read_tools(path: str | Path) -> dict[str, Vector3]:
+def read_tools(path: str | Path, mm_per_unit: float = 1.0) -> dict[str, Vector3]:
     """Read a tool table: offsets X, Y, Z in mm that the control adds, by number or name of the tool.
 
     A CSV file with the columns ``tool, length_mm`` and, if the tool is off-centre, ``x_mm, y_mm``; or a tool table of
-    LinuxCNC in mm (``T1 P1 X0 Y0 Z101.5 D6``).
+    LinuxCNC (``T1 P1 X0 Y0 Z101.5 D6``), whose numbers are in units of its machine of ``mm_per_unit``.
     """
     text = read_text(path)
     first = next((line for line in text.splitlines() if line.strip() and line.strip()[0] not in "#;"), "")
-    if re.match(r"\s*T\d+\s", first):
-        tools = {}
-        for number, line in enumerate(text.splitlines(), 1):
-            words = dict(re.findall(rf"([A-Z])({VALUE})(?=\s|$)", line.split(";")[0].upper()))
-            if "T" not in words:
-                if line.split(";")[0].strip():
-                    raise InputError("expected a line such as T1 P1 Z101.5 D6", file=path, line=number)
-                continue
-            x, y, z = (float(words.get(letter, 0.0)) for letter in "XYZ")
-            tools[str(int(words["T"]))] = (x, y, z)
-        return tools
+    if re.match(r"\s*[TP]\d", first):
+        return _tools_of_linuxcnc(Path(path), text, mm_per_unit)
     table = csv_table(Path(path), text, required=("tool", "length_mm"), optional=("x_mm", "y_mm"))
     names, columns = table.text("tool"), [table.numbers("length_mm")]
     columns += [table.numbers(name) if name in table.columns else 0.0 * columns[0] for name in ("x_mm", "y_mm")]
     found: dict[str, Vector3] = {}
     for row, name in enumerate(names):
-        key = str(int(name)) if name.isdigit() else name.upper()
+        if len(name) > _LONGEST_NAME:
+            raise table.fail(row, "tool", f"expected a number or a name of at most {_LONGEST_NAME} characters")
+        key = str(int(name)) if name.isascii() and name.isdigit() else name.upper()
         if key in found:
             raise table.fail(row, "tool", f"tool {name} appears twice")
         found[key] = (float(columns[1][row]), float(columns[2][row]), float(columns[0][row]))
     return found
+
+
+def _tools_of_linuxcnc(path: Path, text: str, mm_per_unit: float) -> dict[str, Vector3]:
+    """Read lines such as ``T1 P1 X0 Y0 Z101.5 D6 ;comment``: words in any order, each a letter with its number."""
+    tools: dict[str, Vector3] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        words: dict[str, float] = {}
+        for word in line.partition(";")[0].upper().split():
+            known = _TOOL_WORD.fullmatch(word)
+            if known is None or known[1] in words:
+                raise InputError(
+                    f"{visible_line(word)[:20]!r} is not understood; expected a line such as T1 P1 Z101.5 D6",
+                    file=path,
+                    line=number,
+                )
+            words[known[1]] = float(known[2])
+        if words and ("T" not in words or words["T"] != int(words["T"])):
+            raise InputError("expected the number of a tool, in a line such as T1 P1 Z101.5 D6", file=path, line=number)
+        if words:
+            key = f"{words['T']:.0f}"
+            if key in tools:
+                raise InputError(f"tool {key} appears twice", file=path, line=number)
+            x, y, z = (words.get(letter, 0.0) * mm_per_unit for letter in "XYZ")
+            tools[key] = (x, y, z)
+    return tools
