@@ -27,6 +27,7 @@ from compgen.resources import data_folder
 
 Interval = tuple[float, float]
 Vector3 = tuple[float, float, float]
+PartialVector = tuple[float | None, float | None, float | None]
 
 #: Default weight of a coordinate within the work zone, relative to one outside.
 ZONE_WEIGHT = 10.0
@@ -171,6 +172,11 @@ _ONE_NODES = {"oneOf": [{"required": ["nodes"]}, {"required": ["nodes_mm"]}]}
 _WITHIN = {"type": "number", "minimum": -MOST_MM, "maximum": MOST_MM}
 
 
+#: How far a margin can be meant to go, mm.
+_MOST_MARGIN_MM = 100.0
+_margin = toml_files.bounded(f"a length from 0 to {_MOST_MARGIN_MM:g} mm", minimum=0.0, maximum=_MOST_MARGIN_MM)
+
+
 @toml_files.accepts({**toml_files.accepted(toml_files.interval), "items": _WITHIN})
 def _travel(value: object) -> tuple[float, float]:
     """Return the lower and upper end of the travel, mm."""
@@ -186,6 +192,25 @@ def _offset(value: object) -> Vector3:
     x, y, z = toml_files.vector3(value)
     if max(abs(x), abs(y), abs(z)) > MOST_MM:
         raise ValueError("expected components of less than a kilometre; is the unit mm?")
+    return x, y, z
+
+
+@toml_files.accepts(
+    {
+        "anyOf": [
+            {**toml_files.accepted(toml_files.vector3), "items": _WITHIN},
+            toml_files.table_schema(dict.fromkeys(AXES, _WITHIN)),
+        ]
+    }
+)
+def _reference(value: object) -> PartialVector:
+    """Return the position of each axis at its reference point, mm; None along an axis that a table does not name."""
+    if not isinstance(value, dict):
+        return _offset(value)
+    if not value or not set(value) <= set(AXES):
+        raise ValueError("expected three numbers, or a table such as { Z = 500.0 }")
+    x, y, z = (None if value.get(axis) is None else toml_files.number(value[axis]) for axis in AXES)
+    _offset([place or 0.0 for place in (x, y, z)])
     return x, y, z
 
 
@@ -357,11 +382,29 @@ class Machine(Displayed):
         meaning="tool offsets that the machine may carry, lower and upper end by axis, mm",
     )
     copy: Path | None = field(default=None, compare=False, repr=False)
+    reference_position_mm: PartialVector | None = toml_files.setting(
+        _reference,
+        None,
+        meaning="where G28 leads: machine position of the axes at their reference points, mm (machine zero if not stated)",
+    )
+    travel_margin_mm: float = toml_files.setting(
+        _margin,
+        0.0,
+        meaning="how far beyond the travel NC programs may go, mm: the software limits are as far from range_mm, or farther",
+    )
 
     @property
     def file(self) -> Path | None:
         """Where the machine file can be read: ``source``, or a local copy if that is on another computer."""
         return self.copy or self.source
+
+    @property
+    def reference_place_mm(self) -> Vector3:
+        """Where G28 leads along each axis, mm: as stated, or machine zero; nan where that is not within the travel."""
+        stated = self.reference_position_mm or (None, None, None)
+        zero = [0.0 if axis.range_mm[0] <= 0.0 <= axis.range_mm[1] else np.nan for axis in self.axes]
+        x, y, z = (usual if place is None else place for place, usual in zip(stated, zero, strict=True))
+        return x, y, z
 
     @property
     def tool_range(self) -> ToolRange:

@@ -273,8 +273,11 @@ def rank_machines(
     and how its zero is found is no property of the machine.
     """
     groups: dict[Any, list[PartMachine]] = {}
-    for machine in machines:  # without a tool length, the tool is that of the machine file
-        groups.setdefault(machine.model.machine.tool_offset_mm, []).append(machine)
+    for (
+        machine
+    ) in machines:  # without a tool length, the tool is that of the machine file; G28 leads to its reference point
+        own = machine.model.machine
+        groups.setdefault((own.tool_offset_mm, str(own.reference_place_mm)), []).append(machine)
     found = []
     for group in groups.values():
         while group:
@@ -371,7 +374,8 @@ def _outside(machine: PartMachine, reached_mm: FloatArray) -> str:
     """Say where a program leaves the travel of a machine, "" if it does not."""
     for k, axis in enumerate(machine.model.machine.axes):
         (low, high), (least, most) = axis.range_mm, reached_mm[:, k]
-        if least < low - 1e-6 or most > high + 1e-6:
+        slack_mm = machine.model.machine.travel_margin_mm + 1e-6
+        if least < low - slack_mm or most > high + slack_mm:
             where = f"{AXES[k]} goes from {least:.3f} to {most:.3f} mm of the machine"
             return f"{where}, outside its travel {low:g} to {high:g} mm; check --wcs and --tools"
     return ""

@@ -183,6 +183,30 @@ def points_of(moves: Moves, fraction: FloatArray, own: IntArray | None = None) -
     return points
 
 
+def reach_of(moves: Moves) -> tuple[FloatArray, FloatArray]:
+    """Return the least and the largest machine position of each move, (n, 3), mm, also along arcs; nan where it is not corrected.
+
+    An axis that the program has not placed is where the control says, and is not looked at.
+    """
+    least, most = np.array(moves.end_mm), np.array(moves.end_mm)
+    rows = np.flatnonzero(moves.sweep_rad)
+    if len(rows):
+        arcs, index = moves.part(rows), np.arange(len(rows))
+        u, v = _in_plane(arcs, arcs.start_mm)
+        (first, last), begin = _radii(arcs), np.arctan2(v, u)
+        for quarter in range(4):
+            # an arc may be farther out where it is parallel to an axis
+            way = ((0.5 * np.pi * quarter - begin) * np.sign(arcs.sweep_rad)) % (2.0 * np.pi)
+            share = way / np.abs(arcs.sweep_rad)
+            axis = (_FIRST, _SECOND)[quarter % 2][arcs.plane]
+            out = first + share * (last - first)
+            place = arcs.centre_mm[index, axis] + (out if quarter < 2 else -out)
+            place = np.where(share < 1.0, place, arcs.end_mm[index, axis])
+            least[rows, axis] = np.minimum(least[rows, axis], place)
+            most[rows, axis] = np.maximum(most[rows, axis], place)
+    return np.where(moves.corrected, least, np.nan), np.where(moves.corrected, most, np.nan)
+
+
 def _portions(samples: IntArray) -> list[IntArray]:
     """Indices of moves in portions of about _MOST_SAMPLES, so that memory does not grow with their length."""
     every = np.arange(len(samples))

@@ -24,7 +24,7 @@ from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect, codes_that_stay
-from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves
+from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
 from compgen.programs.runs import (
     LONGEST_BLOCK,
     P_WORD,
@@ -120,7 +120,7 @@ class Reader:
         self._pattern = dialect.word_pattern()
         self._name = re.compile(r"\s*([A-Z_][A-Z_0-9]+)\s*(\([^()\n]*\))?", re.IGNORECASE)
         #: How far corrected positions may leave the travel, mm.
-        self.travel_slack_mm = 1e-6
+        self.travel_slack_mm = machine.travel_margin_mm + 1e-6
         self.used_offsets: dict[str, Vector3] = {}
         self.used_tools: dict[str, Vector3] = {}
         self.assumed: dict[str, None] = {}
@@ -142,7 +142,8 @@ class Reader:
         #: Shift of the coordinates by the program: G52, TRANS, G54 of HEIDENHAIN.
         self.shift: Vector3 = (0.0,) * 3
         #: Where the reference points are, mm of the machine: the second is not known; G28.1 and G30.1 store others.
-        self.home = {"G28": [0.0] * 3, "G30": [math.nan] * 3}
+        self._reference = list(machine.reference_place_mm)
+        self.home = {"G28": self._reference, "G30": [math.nan] * 3}
         #: Rotary axes that the program names, with their only position.
         self.rotary: dict[str, float] = {}
         self.last_arc: int | None = None
@@ -1069,12 +1070,22 @@ class Reader:
             self._fail("machine coordinates in incremental blocks are not followed; post G90")
         if self.motion not in (RAPID, FEED):
             self._fail("machine coordinates need G0 or G1")
-        pairs = zip(axes, self.position, strict=True)
-        self._move(RAPID, [p if v is None else v * self.scale for v, p in pairs], corrected=(0, 0, 0))
+        places = [None if value is None else value * self.scale for value in axes]
+        self._assume_reached(places)
+        pairs = zip(places, self.position, strict=True)
+        self._move(RAPID, [p if v is None else v for v, p in pairs], corrected=(0, 0, 0))
         return "keep"
 
+    def _assume_reached(self, places: list[float | None]) -> None:
+        """Say what is taken for granted where a move in machine coordinates, which stays as it is, leaves the travel."""
+        for letter, place, axis in zip("XYZ", places, self.machine.axes, strict=True):
+            low, high = axis.range_mm
+            if place is not None and not low - self.travel_slack_mm <= place <= high + self.travel_slack_mm:
+                text = f"{letter} can go to {place:g} mm of the machine, outside its travel {low:g} to {high:g} mm"
+                self.assumed.setdefault(f"{text}, as the move in machine coordinates asks", None)
+
     def _home(self, axes: list[float | None], home: list[float] | None) -> str:
-        """Go through an intermediate point to the reference point ``home``, which is machine zero if nothing else is stored."""
+        """Go through an intermediate point to the reference point ``home``: that of the machine, or one that was stored."""
         known = home is not None
         named = [axis is not None for axis in axes]
         if not any(named):
@@ -1088,9 +1099,22 @@ class Reader:
             self._move(RAPID, self._target(moving), corrected=(0, 0, 0))
         places = zip(named, home or [math.nan] * 3, self.position, strict=True)
         self._move(RAPID, [there if name else here for name, there, here in places], corrected=(0, 0, 0))
-        if home == [0.0] * 3:
-            self.assumed["the reference point of G28 is machine zero"] = None
+        if home is self._reference:
+            self._assume_reference(named)
         return "keep"
+
+    def _assume_reference(self, named: list[bool]) -> None:
+        """Say what is taken for the reference point of G28 along axes for which the machine file does not state it."""
+        stated = self.machine.reference_position_mm or (None,) * 3
+        left = [k for k in range(3) if named[k] and stated[k] is None]
+        lost = ", ".join("XYZ"[k] for k in left if math.isnan(self._reference[k]))
+        if any(not math.isnan(self._reference[k]) for k in left):
+            self.assumed["the reference point of G28 is machine zero"] = None
+        if lost:
+            self.assumed[
+                f"it does not matter where G28 leads {lost}: machine zero is outside the travel, and the machine file has no "
+                "reference_position_mm"
+            ] = None
 
     def _preset(self, axes: list[float | None]) -> str:
         work, preset, shift = self._offset(), list(self.preset), list(self.shift)
@@ -1293,17 +1317,17 @@ class Reader:
         return "hole"
 
     def _check(self, moves: Moves) -> None:
-        """Refuse positions outside the travel: usually the work offset is wrong."""
-        used = moves.corrected.any(axis=1)
-        ends = np.vstack([self.reached_mm, moves.end_mm[used]])
-        self.reached_mm = np.stack([np.fmin.reduce(ends), np.fmax.reduce(ends)])
-        for k, axis in enumerate(self.machine.axes):
-            low, high = axis.range_mm
-            end = moves.end_mm[:, k]
-            bad = np.flatnonzero(used & ((end < low - self.travel_slack_mm) | (end > high + self.travel_slack_mm)))
-            if len(bad):
-                self._line, self._text = int(moves.line[bad[0]]), ""
-                where = (
-                    f"{'XYZ'[k]} goes to {end[bad[0]]:.3f} mm of the machine, outside its travel {low:g} to {high:g} mm"
-                )
-                self._fail(f"{where}; check --wcs and --tools")
+        """Refuse positions outside the travel, at ends of moves and along arcs: usually the work offset is wrong."""
+        least, most = reach_of(moves)
+        found = np.vstack([self.reached_mm, least, most])
+        self.reached_mm = np.stack([np.fmin.reduce(found), np.fmax.reduce(found)])
+        beyond = np.fmax(self.machine.lower_mm - least, most - self.machine.upper_mm)
+        row, k = (int(place[0]) if len(place) else -1 for place in np.nonzero(beyond > self.travel_slack_mm))
+        if row < 0:
+            return
+        low, high = self.machine.axes[k].range_mm
+        place = least[row, k] if least[row, k] < low else most[row, k]
+        self._line, self._text = int(moves.line[row]), ""
+        way = "" if place == moves.end_mm[row, k] else " within the arc"
+        where = f"{'XYZ'[k]} goes to {place:.3f} mm of the machine{way}, outside its travel {low:g} to {high:g} mm"
+        self._fail(f"{where}; check --wcs and --tools")

@@ -309,3 +309,23 @@ def test_a_doubled_name_and_a_broken_file_do_not_block_the_other_machines(shippe
     saved("name = = 3", "shipped/d.toml")
     with pytest.warns(CompgenWarning, match=r"d\.toml:1"):
         assert load_machine("lathe").source == wanted
+
+
+def test_what_programs_need_of_a_machine(saved):
+    """Where G28 leads is stated, or machine zero; where that is outside the travel it is not known."""
+    text = GOOD.replace("[-800.0, 0.0, 10.0]", "[-800.0, 0.0, 110.0]").replace("[0.0, 350.0]", "[100.0, 350.0]")
+    usual = read_machine(saved(text))
+    assert (usual.reference_position_mm, usual.travel_margin_mm) == (None, 0.0)
+    assert usual.reference_place_mm[:2] == (0.0, 0.0) and np.isnan(usual.reference_place_mm[2])
+    stated = read_machine(saved("reference_position_mm = [-800.0, 1.0, 360.0]\ntravel_margin_mm = 0.5\n" + text))
+    assert (stated.reference_place_mm, stated.travel_margin_mm) == ((-800.0, 1.0, 360.0), 0.5)
+    some = read_machine(saved("reference_position_mm = { Z = 350 }\n" + text))
+    assert some.reference_place_mm == (0.0, 0.0, 350.0)
+    for line, message in (
+        ("reference_position_mm = [0.0, 0.0]", "reference_position_mm"),
+        ("reference_position_mm = { W = 1.0 }", "table such as { Z = 500.0 }"),
+        ("reference_position_mm = { Z = 2e6 }", "less than a kilometre"),
+        ("travel_margin_mm = -1", "from 0 to 100 mm"),
+        ("travel_margin_mm = 101", "from 0 to 100 mm"),
+    ):
+        assert message in refusal(saved(f"{line}\n{text}"))
