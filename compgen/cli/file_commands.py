@@ -19,7 +19,7 @@ from compgen.cli.shared_options import check_settings
 from compgen.cli.terminal import answer, complain, say
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data import toml_files
-from compgen.data.files import OutputFolder
+from compgen.data.files import OutputFolder, name_problem
 from compgen.data.machine import (
     Chain,
     Emphasis,
@@ -270,6 +270,10 @@ def init_command(
     asks = sys.stdin.isatty() and not as_json
     name = name or _asked("Name of the machine", "NAME", asks)
     target = out / f"{re.sub(r'[^A-Za-z0-9._-]', '-', name)}.toml"
+    beside = [path.name for path in out.glob("*.toml")] if out.is_dir() else []
+    problem = name_problem(name) or name_problem(target.name, beside)
+    if problem is not None:
+        raise InputError(f"{name!r} {problem}", field="NAME")
     if target.exists() and not force:
         raise InputError("exists; --force overwrites it", file=target)
     for control in controls:

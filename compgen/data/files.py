@@ -43,6 +43,26 @@ OLD_S, OLD_NAME, OWN_MODE = 7 * 86400.0, re.compile(rf"{FOLDERS}(recal|restore|l
 _locks: dict[Path, int] = {}
 
 
+#: Names that Windows reserves for devices, with any extension and in any case.
+_DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9\u00b9\u00b2\u00b3])", re.IGNORECASE)
+
+
+def name_problem(name: str, others: Iterable[str] = ()) -> str | None:
+    """Say why a name cannot be that of a file or folder beside ``others`` on every system; None if it can.
+
+    >>> name_problem("nul.v2")
+    'is a name that Windows reserves for a device; choose another one'
+    >>> name_problem("Mill", ["mill"])
+    "differs from 'mill' by upper and lower case only; choose another one"
+    """
+    if _DEVICES.fullmatch(name.partition(".")[0].rstrip()):
+        return "is a name that Windows reserves for a device; choose another one"
+    if name != name.rstrip(". "):
+        return "ends with a dot or a blank, which Windows drops; choose another one"
+    same = [other for other in others if other != name and other.casefold() == name.casefold()]
+    return f"differs from {same[0]!r} by upper and lower case only; choose another one" if same else None
+
+
 def sha256_of(content: bytes) -> str:
     """Return the SHA-256 of ``content`` as hexadecimal text."""
     return hashlib.sha256(content).hexdigest()

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import io
 import os
+import re
 import stat
-from collections.abc import Container, Iterable, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from compgen.data.csv_files import MOST_COLUMNS
 from compgen.data.files import sha256_of
@@ -18,9 +22,19 @@ from compgen.errors import InputError, visible
 from compgen.fleet.job import MachineJob, OtherInbox
 from compgen.fleet.records import NewMeasurement
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 #: Comments of a measurement file that give the time of measurement, and the tables that were on (a version, or "none").
 TIME_KEYS = ("measured_at", "date")
 ACTIVE_KEY = "active_table"
+#: Comments that say whose readings they are: of which machine, its serial number, that of the instrument.
+IDENTITY_KEYS = ("machine", "machine_name", "machine_serial", "machine_serial_number", "serial_number")
+#: The same in the head of files of other programs, by the key above.
+_HEAD = re.compile(rb"(machine|machine name|serial no|maschine)\s*[:;=\t]\s*([^\r\n;\t]+)", re.IGNORECASE)
+_HEAD_KEYS = {b"serial no": "machine_serial"}
+#: Lines of such a head, and bytes of an entry of an archive that may be a comment.
+HEAD_LINES, MOST_ENTRY = 60, 4096
 #: Largest number of files of one measurement, and of characters of a comment about it.
 MOST_FILES, LONGEST_COMMENT = 1000, 200
 #: No measurement takes longer, s: a year.
@@ -236,14 +250,75 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
 
 
 def comments_in(content: bytes) -> dict[str, str]:
-    """Return the known comments `# key = value` of a file, cut at a sensible length; the last of a key wins."""
-    said: dict[str, str] = {}
-    for line in content.splitlines():
-        key, equals, value = line.strip().partition(b"=")
-        field = key[1:].strip().decode("utf-8", "replace") if key.startswith(b"#") else ""
-        if equals and field in (*TIME_KEYS, ACTIVE_KEY):
-            said[field] = value.decode("utf-8", "replace").strip()[:LONGEST_COMMENT]
-    return said
+    """Return the known comments `# key = value` of a file, or of an archive, cut at a sensible length."""
+    if content[:4] == b"PK\x03\x04":
+        said = _entries_of_zip(content)
+    elif content[:4] == b"PAR1":
+        said = _entries_of_parquet(content)
+    else:
+        said = {}
+        for line in content.splitlines():  # the last of a key wins
+            key, equals, value = line.strip().partition(b"=")
+            if equals and key.startswith(b"#"):
+                said[key[1:].strip().decode("utf-8", "replace")] = value.decode("utf-8", "replace")
+    known = (*TIME_KEYS, ACTIVE_KEY, *IDENTITY_KEYS)
+    return {key: value.strip()[:LONGEST_COMMENT] for key, value in said.items() if key in known}
+
+
+def _entries_of_zip(content: bytes) -> dict[str, str]:
+    """The single values of an archive of lengths (``*.lengths.npz``) as texts; nothing of any other archive."""
+    entries = _arrays(content, lambda item: item.file_size <= MOST_ENTRY)
+    return {name: str(value) for name, value in entries.items() if value.ndim == 0}
+
+
+def _arrays(content: bytes, wanted: Callable[[zipfile.ZipInfo], bool]) -> dict[str, NDArray[Any]]:
+    """Arrays of a zip archive by name, of those entries that are wanted, and stored as they are; none if it is another one."""
+    import numpy as np  # imported here: few inboxes have archives
+
+    broken = (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError, NotImplementedError)
+    with contextlib.suppress(*broken), zipfile.ZipFile(io.BytesIO(content)) as archive:
+        items = [item for item in archive.infolist()[:MOST_FILES] if item.compress_type == 0 and wanted(item)]
+        read = (np.lib.format.read_array(io.BytesIO(archive.read(item)), allow_pickle=False) for item in items)
+        return {item.filename.removesuffix(".npy"): value for item, value in zip(items, read, strict=True)}
+    return {}
+
+
+def _entries_of_parquet(content: bytes) -> dict[str, str]:
+    try:
+        from pyarrow import ArrowException, parquet
+    except ImportError:  # such a file cannot be read anyway
+        return {}
+    with contextlib.suppress(ArrowException, OSError, ValueError):
+        known = parquet.read_schema(io.BytesIO(content)).metadata or {}
+        return {key.decode("utf-8", "replace"): value.decode("utf-8", "replace") for key, value in known.items()}
+    return {}
+
+
+def whose(contents: Mapping[str, bytes]) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    r"""Return what the files of a measurement say of machine and instrument, by key: in comments, in foreign heads.
+
+    >>> whose({"a.csv": b"# machine = m1\nx_mm\n", "b.rtl": b"MACHINE: Hermle 12\nSERIAL NO: 4711\n"})
+    ({'machine': ['m1']}, {'machine': ['Hermle 12'], 'machine_serial': ['4711']})
+    """
+    comments: dict[str, list[str]] = {}
+    heads: dict[str, list[str]] = {}
+    for content in contents.values():
+        for key, value in comments_in(content).items():
+            if key in IDENTITY_KEYS:
+                _add(comments, key, value)
+        for line in content[: HEAD_LINES * 400].splitlines()[:HEAD_LINES]:
+            found = _HEAD.match(line.strip())
+            if line.startswith(b"MACHINE "):  # of a probing program of ours
+                _add(comments, "machine", line[8:].decode("utf-8", "replace"))
+            elif found is not None:
+                _add(heads, _HEAD_KEYS.get(found[1].lower(), "machine"), found[2].decode("utf-8", "replace"))
+    return comments, heads
+
+
+def _add(said: dict[str, list[str]], key: str, value: str) -> None:
+    text = visible(value.strip()[:LONGEST_COMMENT], flat=True)
+    if text and text not in said.setdefault(key, []):
+        said[key].append(text)
 
 
 def time_in(content: bytes) -> tuple[datetime, str] | None:
@@ -272,13 +347,20 @@ def duration_s(content: bytes) -> float:
     """
     if b"time_s" not in content:
         return 0.0
+    if content[:4] == b"PK\x03\x04":
+        times = _arrays(content, lambda item: item.filename == "time_s.npy" and item.file_size <= len(content))
+        value = times.get("time_s")
+        if value is None or value.dtype.kind not in "iuf" or not value.size:
+            return 0.0
+        lasted = float(value.max() - value.min())
+        return min(lasted, LONGEST_S) if lasted > 0.0 else 0.0
     rows = (line.split(b",") for line in content.splitlines() if line.strip() and not line.startswith(b"#"))
     names = [cell.strip() for cell in next(rows, [])]
     if b"time_s" not in names:
         return 0.0
     column = names.index(b"time_s")
     values = [_number(row[column].decode("ascii", "replace"), 1e12) for row in rows if len(row) > column]
-    known = [value for value in values if value is not None]
+    known = [number for number in values if number is not None]
     return min(max(known) - min(known), LONGEST_S) if known else 0.0
 
 

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
-from compgen.data.files import read_bytes, read_text, sha256_of, write_file
+from compgen.data.files import name_problem, read_bytes, read_text, sha256_of, write_file
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
 from compgen.data.toml_files import Section, accepted, accepts, part_setting, setting, table_setting, take_settings
 from compgen.errors import InputError, nearest
@@ -458,10 +458,13 @@ def job_of(root: Section, path: Path) -> Job:
     store = root.take("store", toml_files.text_of_path, STORE)
     defaults = root.section("defaults", required=False)
     every = root.section("machines", required=False)
-    machines = {}
+    machines: dict[str, MachineJob] = {}
     for name in every.data:
         if not MACHINE_NAME.fullmatch(name):
             raise every.fail(name, "is not a name: letters, digits, '.', '_' and '-', at most 64, are allowed")
+        problem = name_problem(name, machines)
+        if problem is not None:
+            raise every.fail(name, problem)
         machines[name] = _machine(name, every.section(name).again(defaults=defaults), folder)
     if not machines:  # the defaults are checked before there is a machine
         required = dict.fromkeys((item.name for item in fields(MachineJob) if item.metadata.get("required")), "")
@@ -469,16 +472,20 @@ def job_of(root: Section, path: Path) -> Job:
         take_settings(MachineJob, keys, name="", **_mappings(keys), **required)
     root.finish()
     # output folders may not be equal or nested, also not through links and ".."
-    real = {name: Path(os.path.realpath(machine.out)) for name, machine in machines.items()}
+    # and not by upper and lower case only, which some file systems ignore
+    real = {name: Path(os.path.realpath(machine.out).casefold()) for name, machine in machines.items()}
     known = {path: name for name, path in reversed(real.items())}
     for name, out in real.items():
         if known[out] != name:
-            raise every.fail(name, f"has the same folder out as {known[out]} ({out}); give each machine its own")
+            raise every.fail(
+                name, f"has the same folder out as {known[out]} ({machines[name].out}); give each machine its own"
+            )
         around = next((parent for parent in out.parents if parent in known), None)
         if around is not None:
             raise every.fail(
                 name,
-                f"has its folder out ({out}) inside that of {known[around]} ({around}); give each machine a folder of its own, "
+                f"has its folder out ({machines[name].out}) inside that of {known[around]} ({machines[known[around]].out}); give "
+                "each machine a folder of its own, "
                 "not inside another one",
             )
     shared: dict[str, list[OtherInbox]] = {}

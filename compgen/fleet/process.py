@@ -25,7 +25,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.change import Change, change_between
 from compgen.fleet.decisions import active_table
-from compgen.fleet.inbox import holds_one_of
+from compgen.fleet.inbox import holds_one_of, whose
 from compgen.fleet.job import MachineJob, Policy
 from compgen.fleet.records import (
     RESERVATION,
@@ -142,6 +142,46 @@ def judge_twins(judgement: Judgement, case: Case) -> None:
             "its own and remove the file from the wrong one; then reject the version of the wrong machine with `volcomp "
             "recal reject` and approve that of the right one with --override"
         )
+
+
+def judge_identity(judgement: Judgement, case: Case, contents: Mapping[str, bytes]) -> None:
+    """Hold readings that say they are of another machine, or of one with another serial number.
+
+    Comments have to fit; what users of other programs type into the head of a file counts if it names another machine.
+    """
+    comments, heads = whose(contents)
+    job, machine = case.job, case.machine
+    name, files = job.name.casefold(), [path for path in (machine.source, Path(job.machine)) if path is not None]
+    others = {item.name.casefold() for item in case.store.machines()} - {name}
+    own = {name, *({text.casefold() for text in (machine.name, *(path.stem for path in files))} - others)}
+    named = [text for key in ("machine", "machine_name") for text in comments.get(key, [])]
+    named += [text for text in heads.get("machine", []) if text.casefold() in others]
+    for text in dict.fromkeys(named):
+        if text.casefold() not in own:
+            judgement.hold.append(
+                f"the file says that it is of machine {text}, but it came for {job.name} (machine file: {machine.name}). If it "
+                "is of another machine, move it to the inbox of that one and reject this version; if it is of "
+                f"{job.name}, correct the comment, or approve with --override"
+            )
+    serials = comments.get("machine_serial", comments.get("machine_serial_number", heads.get("machine_serial", [])))
+    _judge_serials(judgement, case, "machine", serials)
+    if job.instrument is not None:  # whose constants are in a file of their own
+        _judge_serials(judgement, case, "instrument", comments.get("serial_number", []))
+
+
+def _judge_serials(judgement: Judgement, case: Case, what: str, serials: Sequence[str]) -> None:
+    """Hold if a serial number is not that of the last measurement that gave one, and keep it for the next."""
+    if not serials:
+        return
+    judgement.figures.setdefault(SERIALS, {})[what] = serials[0]
+    known = [table.summary.get(SERIALS, {}).get(what) for table in case.past.tables if table.state != "rejected"]
+    before = next((text for text in reversed(known) if text), serials[0])
+    for text in serials:
+        if text != before:
+            judgement.hold.append(
+                f"the file gives serial number {text} for the {what}, but earlier measurements {before}; if the {what} was "
+                "exchanged, approve with --override"
+            )
 
 
 def _temperature(window_c: tuple[float, float], channels: Mapping[str, Mapping[str, float]]) -> list[str]:
@@ -273,6 +313,8 @@ def _at_reference(machine: Machine, new: ReadTables, active: ReadTables | None) 
 
 # --- the whole pipeline --------------------------------------------------------------------------------------------
 
+#: Key in a version's figures: serial numbers of machine and instrument, as the measurement gives them.
+SERIALS = "serial_numbers"
 #: Files of a run that belong to the identification; with one control they share the folder of the control's files.
 NOT_OF_A_CONTROL = (
     "identified.errors.csv",
@@ -348,7 +390,7 @@ def process(
             language=job.language,
             allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
         )
-        judgement = _judged(case, outcome)
+        judgement = _judged(case, outcome, contents)
         told = [str(item.message) for item in caught if issubclass(item.category, CompgenWarning)]
         judgement.figures["warnings"] = [without_folder(text) for text in told]
         result = _result(Path(folder) / "out", machine, outcome, judgement)
@@ -401,7 +443,7 @@ def machine_now(
 # --- judgement -----------------------------------------------------------------------------------------------------
 
 
-def _judged(case: Case, result: RunResult) -> Judgement:
+def _judged(case: Case, result: RunResult, contents: Mapping[str, bytes]) -> Judgement:
     """Apply all rules, in the order in which a person reads their reasons."""
     judgement, active, policy = Judgement(), ActiveState.of(case), case.job.policy
     latest = None if active is None else active.identification.measured_at
@@ -432,6 +474,7 @@ def _judged(case: Case, result: RunResult) -> Judgement:
     if result.accepted:
         judge_likeness(judgement, case, _identified(result))
     judge_twins(judgement, case)
+    judge_identity(judgement, case, contents)
     return judgement
 
 

@@ -25,7 +25,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 import sqlalchemy as sa
 
 from compgen.data.error_table import ErrorTable, parse_errors
-from compgen.data.files import decoded, folder_beside, sha256_of, working_folder
+from compgen.data.files import decoded, folder_beside, name_problem, sha256_of, working_folder
 from compgen.data.machine import Machine, parse_machine
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import database
@@ -234,6 +234,9 @@ class Store:
         found = self.read(lambda connection: _machine_named(connection, name))
         if found is not None:
             return found
+        problem = name_problem(name, [item.name for item in self.machines()])
+        if problem is not None:  # two job files may share a store
+            raise InputError(f"the store cannot add a machine {name!r}: it {problem}")
         with suppress(sa.exc.IntegrityError):  # another process was faster
             self.write(lambda c: c.execute(sa.insert(database.machines), {"name": name, "at": self.now(c)}))
         return self.machine(name)
