@@ -17,6 +17,10 @@ from compgen.errors import InputError, repeated
 # Positioning runs along single axes (ISO 230-2): ``*.axis.csv``.
 
 
+#: Positions of the other axes, where a line was measured: columns, or comments of the file.
+LINE_COLUMNS = ("line_x_mm", "line_y_mm", "line_z_mm")
+
+
 @dataclass(frozen=True)
 class AxisRuns:
     """Actual minus target position along the moving axis, n readings.
@@ -51,6 +55,13 @@ class AxisRuns:
         """Axes that were measured, ascending."""
         return tuple(int(axis) for axis in np.unique(self.axis))
 
+    def line_mm(self) -> FloatArray:
+        """Positions of all axes (n, 3): that of the moving axis, and of the others as stated, nan where they are not."""
+        none = np.full(len(self), np.nan)
+        found = np.column_stack([self.covariates.get(name, none) for name in LINE_COLUMNS])
+        found[np.arange(len(self)), self.axis] = self.position_mm
+        return found
+
 
 _AXIS_RUNS = Schema(
     (
@@ -59,8 +70,8 @@ _AXIS_RUNS = Schema(
         DIRECTION,
         RUN,
         RUN_DEVIATION,
-        # time, number of the reading in order of time, dwell before it, speed before it
-        Field("covariates", ("time_s", "order", "dwell_s", "feed_mm_min"), presence="covariates"),
+        # time, number of the reading in order of time, dwell before it, speed before it, positions of the other axes
+        Field("covariates", ("time_s", "order", "dwell_s", "feed_mm_min", *LINE_COLUMNS), presence="covariates"),
     )
 )
 
@@ -73,7 +84,25 @@ def read_axis_runs(files: str | Path | Sequence[str | Path]) -> AxisRuns:
     InputError
         for an axis that is not X, Y, Z, a direction that is not 1 or -1, a duplicate reading.
     """
-    return join_axis_runs([AxisRuns(**_AXIS_RUNS.values(table)) for table in _AXIS_RUNS.read_tables(files)])
+    tables = _AXIS_RUNS.read_tables(files)
+    return join_axis_runs([_with_stated_line(AxisRuns(**_AXIS_RUNS.values(table))) for table in tables])
+
+
+def _with_stated_line(runs: AxisRuns) -> AxisRuns:
+    """Return runs of one file with the positions of the other axes that its comments state."""
+    stated = {}
+    for name in LINE_COLUMNS:
+        if name in runs.metadata and name not in runs.covariates:
+            text = runs.metadata[name]
+            try:
+                value = float(text)
+            except ValueError:
+                value = np.nan
+            if not np.isfinite(value):
+                message = f"{text[:40]!r} is not a position; expected a number in mm, e.g. # {name} = -250"
+                raise InputError(message, file=runs.origin[0][0] if runs.origin else None, field=f"comment {name}")
+            stated[name] = np.full(len(runs), value)
+    return replace(runs, covariates={**runs.covariates, **stated}) if stated else runs
 
 
 def join_axis_runs(parts: Sequence[AxisRuns]) -> AxisRuns:

@@ -19,6 +19,7 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
 from compgen.data.names import AXES, ERROR_NAMES
+from compgen.data.prior import PriorSettings, prior_schema, read_prior
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.resources import data_folder
 
@@ -328,7 +329,7 @@ class Machine(Displayed):
     ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
     tables must be most accurate. ``tool_range_mm`` are the ranges of tool offsets, None if its file does not state
     them. ``effects`` keeps the raw ``[effects.NAME]`` sections, which
-    :func:`compgen.effects.active_effects` reads.
+    :func:`compgen.effects.active_effects` reads. ``prior`` is what is assumed of errors that were not measured.
 
     Examples
     --------
@@ -380,6 +381,9 @@ class Machine(Displayed):
         lambda: toml_files.table_schema(dict.fromkeys(AXES, toml_files.accepted(toml_files.interval))),
         None,
         meaning="tool offsets that the machine may carry, lower and upper end by axis, mm",
+    )
+    prior: PriorSettings = toml_files.part_setting(
+        prior_schema, PriorSettings(), meaning="what is assumed of errors that were not measured"
     )
     copy: Path | None = field(default=None, compare=False, repr=False)
     reference_position_mm: PartialVector | None = toml_files.setting(
@@ -507,6 +511,7 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
         section.finish()
         tool_range_mm = x, y, z
     emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
+    prior = read_prior(root.section("prior", required=False))
     root.finish()
     return Machine(
         **stated,
@@ -516,6 +521,7 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
         emphasis=emphasis,
         effects=effects,
         tool_range_mm=tool_range_mm,
+        prior=prior,
     )
 
 

@@ -21,7 +21,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format, may_be_large
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.identification import Identification
+from compgen.identify.identification import Identification, determines_all
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.tracer_lengths import identify
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from compgen.data.circles import Circles
     from compgen.data.deviations import Artefact, Deviations
     from compgen.data.length_archive import LengthArchive
+    from compgen.identify.posterior import Posterior
     from compgen.identify.six_dof import SixDofMeasurement
 
 #: Deviations that are all smaller than this are refused: 100 um written in mm.
@@ -153,8 +154,36 @@ def describe(measurement: Measurement | ErrorTable) -> str:
 def identify_measurement(
     machine: Machine, measurement: Measurement, options: IdentifyOptions | None = None
 ) -> Identification:
-    """Identify from any kind or mixture; InputError for options that belong to another kind."""
+    """Identify from any kind or mixture, with the prior of the machine file; InputError for options of another kind."""
     chosen = options or IdentifyOptions()
+    if isinstance(measurement, MixedMeasurement):
+        return identify_mixed(machine, measurement, chosen, {})
+    alone = _least_squares(machine, measurement, chosen)
+    return known_alone(machine, measurement, alone, chosen)
+
+
+def known_alone(
+    machine: Machine, measurement: OneKind | None, alone: Identification, options: IdentifyOptions
+) -> Identification:
+    """Return the result of one measurement with what the prior of the machine file says of the rest."""
+    learn = machine.prior.learn in ("up", "both")
+    if not machine.prior.is_none and determines_all(
+        machine, alone
+    ):  # what adjusts mixtures is loaded only when it is asked for
+
+        def later() -> Posterior:
+            from compgen.identify.together import Source, posterior_of
+
+            return posterior_of(machine, [Source("", measurement, alone)], options, alone, learn=learn)[0]
+
+        return replace(alone, posterior_source=later)
+    from compgen.identify.together import Source, with_prior
+
+    return with_prior(machine, [Source("", measurement, alone)], alone, options)
+
+
+def _least_squares(machine: Machine, measurement: OneKind, chosen: IdentifyOptions) -> Identification:
+    """Identify what the readings of one kind determine by themselves; InputError for options of another kind."""
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
             raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths")
@@ -172,8 +201,6 @@ def identify_measurement(
     from compgen.identify.positions import identify_artefact, identify_deviations
     from compgen.identify.six_dof import identify_sixdof
 
-    if isinstance(measurement, MixedMeasurement):
-        return identify_mixed(machine, measurement, chosen, {})
     if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
         # deviations that are all zero, or so small that their unit must be another one
         measured = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
@@ -242,7 +269,7 @@ def identify_mixed(
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Artefact, Deviations
     from compgen.identify.six_dof import SixDofMeasurement
-    from compgen.identify.together import Source, identify_together, merge
+    from compgen.identify.together import Source, identify_together, merge, with_prior
     from compgen.identify.tracer_lengths import MIN_STATIONS
 
     parts, plain = [], IdentifyOptions()
@@ -271,7 +298,7 @@ def identify_mixed(
                 if isinstance(part, Lengths) and len(part.stations) < MIN_STATIONS and applicable.stations is None:
                     alone = None
                 else:
-                    alone = identify_measurement(machine, part, applicable)
+                    alone = _least_squares(machine, part, applicable)
         except UndeterminedError:
             if not isinstance(part, Deviations | Artefact | Lengths):
                 raise
@@ -281,8 +308,9 @@ def identify_mixed(
     posed = [part.alone for part in parts if isinstance(part.measurement, SixDofMeasurement)]
     others = [part.alone for part in parts if isinstance(part.measurement, Lengths | Deviations)]
     if len(parts) == 2 and posed and posed[0] is not None and others and others[0] is not None:
-        return merge(machine, others[0], posed[0])
-    return identify_together(machine, parts, options)
+        merged = merge(machine, others[0], posed[0])
+        return with_prior(machine, [Source("", None, merged)], merged, options)
+    return with_prior(machine, parts, identify_together(machine, parts, options), options)
 
 
 # What a later report needs in addition to the results of an identification: the machine file, and the residuals.

@@ -17,16 +17,18 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify.adjust.determined import Observations
+from compgen.identify.adjust.determined import FINEST, USUAL_U, Observations
 from compgen.identify.adjust.unknowns import ErrorParameters, check_axis_travel, check_travel
 from compgen.identify.identification import (
     Identification,
     metadata_of,
     without_adjustment,
 )
+from compgen.identify.posterior import processes_of, root_of
 from compgen.identify.reversal_errors import SIGNIFICANT
-from compgen.kinematics.first_order import c_matrix
+from compgen.kinematics.first_order import c_matrix, coefficients
 
 #: Targets closer than this are the same target, mm.
 SAME_TARGET_MM = 1e-4
@@ -152,6 +154,81 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     )
 
 
+#: Standard uncertainties of the scale of a laser, per mm, and of temperatures that were read with it, or were not, K.
+U_LASER, U_READ_K, U_NOT_READ_K = 1.5e-6, 0.05, 0.3
+#: Expansion of a machine whose file states none, per K.
+USUAL_EXPANSION = 11.5e-6
+
+
+def axis_observations(machine: Machine, layout: ErrorParameters, runs: AxisRuns, prior: PriorSettings) -> Observations:
+    """Return the means of axis runs as readings of the errors of a layout, at the lines where they were measured.
+
+    Along a line away from the zeros of the other axes the angles move the tool as well: E = C P there. Where the file
+    does not say where the line was, it may have been anywhere in the travel, so the prior of the angles, at the root mean
+    square lever, adds to the noise, the same way for neighbouring targets. The zero of each line is unknown; the scale
+    of the laser and the temperature are those of one instrument, so they are common to all lines.
+    """
+    line_mm = runs.line_mm()
+    keys = np.column_stack([runs.axis, np.nan_to_num(np.where(np.eye(3)[runs.axis] > 0, 0.0, line_mm), nan=np.inf)])
+    lines, of_line = np.unique(keys, axis=0, return_inverse=True)
+    designs, values, sigmas, others, places, shows = [], [], [], [], [], []
+    usual = USUAL_U * MM_PER_UM
+    for k in range(len(lines)):
+        rows = of_line.ravel() == k
+        axis, letter = int(lines[k, 0]), AXES[int(lines[k, 0])]
+        curve, _, _ = two_way_mean(runs.position_mm[rows], runs.direction[rows], runs.deviation_mm[rows])
+        count = len(curve.value)
+        at_mm = np.tile(np.where(np.isinf(lines[k, 1:]), 0.0, lines[k, 1:]), (count, 1))
+        at_mm[:, axis] = curve.position_mm
+        unknown = [lever for lever in range(3) if lever != axis and np.isinf(lines[k, 1 + lever])]
+        base = np.where(np.isinf(lines[k, 1:]), machine.reference_point_mm, lines[k, 1:])
+        everywhere = np.tile(base, (count, 1))
+        everywhere[:, axis] = curve.position_mm
+        columns = c_matrix(machine, at_mm)
+        own = np.zeros(len(ERROR_INDEX), dtype=bool)
+        own[[index for name, index in ERROR_INDEX.items() if error_named(name).axis == axis]] = True
+        own[[ERROR_INDEX[name] for name in SQUARENESS_NAMES]] = False  # constant, or along the line: not in its mean
+        design = layout.design(columns * own, layout.bases(everywhere))[:, axis]
+        offset = [np.ones(count)]
+        angles = [f"E{about}{letter}" for about in AXES]
+        for name, process in processes_of(machine, prior, angles).items():
+            terms = coefficients(machine.chain, machine.squareness_reference)
+            levers = {term.lever for term in terms if term.error == name and term.output == axis}
+            square = sum(float(np.mean(np.square(np.linspace(*machine.axes[lever].range_mm, 101))))
+                         for lever in levers if lever in unknown)  # fmt: skip
+            if square:
+                offset += list(np.sqrt(square) * root_of(process.covariance(curve.position_mm, curve.position_mm)).T)
+        designs.append(design)
+        values.append(curve.value)
+        known = np.isfinite(curve.u)
+        sigmas.append(np.where(known, np.maximum(curve.u, FINEST * MM_PER_UM), usual))
+        others.append(np.column_stack(offset))
+        places.append(np.where(np.arange(3) == axis, everywhere, np.nan))
+        shows.append(np.tile([item.error.axis == axis for item in layout.curves], (count, 1)))
+    # proper unknowns: the scale common to all, and the angles of lines nobody stated, each of unit variance
+    expansion = np.mean([axis.expansion_um_per_m_k or 1e6 * USUAL_EXPANSION for axis in machine.axes]) * 1e-6
+    read = any(name.startswith("temp_") for name in runs.covariates)
+    u_scale = float(np.hypot(U_LASER, expansion * (U_READ_K if read else U_NOT_READ_K)))
+    count, width = sum(map(len, values)), 1 + sum(item.shape[1] for item in others)
+    block, row, column = np.zeros((count, width)), 0, 1
+    proper = np.ones(width, dtype=bool)
+    for item, place in zip(others, places, strict=True):
+        block[row : row + len(item), 0] = u_scale * np.nansum(place, axis=1)
+        block[row : row + len(item), column : column + item.shape[1]] = item
+        proper[column] = False
+        row, column = row + len(item), column + item.shape[1]
+    pulls = np.eye(width)[proper]
+    nothing = len(pulls)
+    return Observations(
+        design=np.vstack([*designs, np.zeros((nothing, layout.size))]),
+        others=np.vstack([block, pulls]),
+        value=np.concatenate([*values, np.zeros(nothing)]),
+        sigma=np.concatenate([*sigmas, np.ones(nothing)]),
+        at_mm=np.vstack([*places, np.full((nothing, 3), np.nan)]),
+        shows=np.vstack([*shows, np.zeros((nothing, len(layout.curves)), dtype=bool)]),
+    )
+
+
 # Squareness, reversal and the scales of two axes from circular tests (ballbar; ISO 230-4).
 #
 # The gauge reads the distance of the tool from a pivot; the pivot's position and the zero of the gauge are unknown. At
@@ -264,6 +341,31 @@ def circle_observations(
         sigma=np.ones(len(names)),
         at_mm=np.full((len(names), 3), np.nan),
         shows=np.zeros((len(names), len(layout.curves)), dtype=bool),
+    )
+
+
+def circle_readings(machine: Machine, layout: ErrorParameters, circles: Circles, found: Identification) -> Observations:
+    """Return every reading of circles as one of the errors of a layout: squareness, scales, straightness and angles.
+
+    Centre, zero of the gauge, servo mismatch and reversals are further unknowns. The noise is that which ``found`` has
+    from their residuals, enlarged by the correlation along the path.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)  # said when the circles were identified
+        position_mm = circle_positions(machine, circles)
+    own = ("squareness", "scales", "straightness")
+    others = [column.values for column in _columns(machine, circles, position_mm) if column.kind not in own]
+    errors = layout.design(c_matrix(machine, position_mm), layout.bases(position_mm))
+    moved = np.array(list(PLANES.values()))[circles.plane]
+    in_plane = np.array([[axis in pair for axis in range(3)] for pair in moved.tolist()])
+    axes = [curve.error.axis for curve in layout.curves]
+    return Observations(
+        design=np.einsum("nd,ndp->np", circles.radial(), errors),
+        others=np.column_stack(others),
+        value=circles.deviation_mm,
+        sigma=np.full(len(circles), max(found.u_length_um, FINEST) * MM_PER_UM),
+        at_mm=np.where(in_plane, position_mm, np.nan),
+        shows=in_plane[:, axes],
     )
 
 

@@ -15,16 +15,18 @@ from compgen.data.display import Drawable, Overview, Panel, PlottedLine
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES
+from compgen.data.prior import DETERMINED
 from compgen.errors import UndeterminedError
 from compgen.identify.adjust.propagation import Adjustment, Systematic
 from compgen.identify.adjust.residual_tests import Misfit, ResidualSeries, Whiteness, misfit_of, warn_of_residuals
 from compgen.identify.adjust.robust import Rejected, Segment
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.identify.reversal_errors import Reversal
-from compgen.kinematics.first_order import observable_errors
+from compgen.kinematics.first_order import modelled_errors, observable_errors
 
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
+    from compgen.identify.posterior import Posterior
 
 # The result of an identification, and the contents of ``identify.json``.
 
@@ -84,6 +86,8 @@ class Identification(Drawable):
     reversal_curves : reversals over the position of each axis, if the instrument shows them.
     details : additional figures of the method.
     objections : why no result from these errors may be accepted; empty if there is no such reason.
+    doubts : why a result from these errors is accepted with reservations only.
+    posterior_source : computes ``posterior``.
     misfit : whether the residuals exceed their uncertainty, and what explains them; None if the method does not use an
         uncertainty of the readings.
     counted : number of readings and of used readings, if ``residual_mm`` and ``accepted`` are those of a sample.
@@ -134,6 +138,13 @@ class Identification(Drawable):
     objections: tuple[str, ...] = ()
     misfit: Misfit | None = None
     counted: tuple[int, int] | None = None
+    doubts: tuple[str, ...] = ()
+    posterior_source: Callable[[], Posterior] | None = field(default=None, repr=False)
+
+    @cached_property
+    def posterior(self) -> Posterior | None:
+        """What is known of every error, with the prior of the machine file; None without a prior. Computed on first use."""
+        return None if self.posterior_source is None else self.posterior_source()
 
     @property
     def readings(self) -> int:
@@ -243,6 +254,30 @@ class Identification(Drawable):
             "reading minus model", "residual (um)", (PlottedLine("", number, residual_um),), x_label="reading"
         )
         return [*self.errors.panels(), drawn]
+
+
+def state_names(machine: Machine) -> tuple[str, ...]:
+    """Return the errors that a posterior contains: those of the model, and observable ones that the machine file leaves out."""
+    wanted = {*modelled_errors(machine), *observable_errors(machine)}
+    return tuple(name for name in ERROR_NAMES if name in wanted)
+
+
+def same_nodes(machine: Machine, result: Identification) -> bool:
+    """Whether errors were identified at the nodes of the machine file."""
+    pairs = zip(machine.axes, result.layout.machine.axes, strict=True)
+    return all(np.array_equal(own.nodes_mm, other.nodes_mm) for own, other in pairs)
+
+
+def determines_all(machine: Machine, result: Identification) -> bool:
+    """Whether the readings alone determine every error of the machine, each node to better than a third of its prior."""
+    if not result.has_covariance or not set(state_names(machine)) <= set(result.errors.names):
+        return False
+    if not same_nodes(machine, result) or result.details.get("tied_nodes_mm") or result.method == "together":
+        return False
+    largest = {name: machine.prior.size(name) * DETERMINED for name in result.errors.names}
+    values = [(name, curve.u) for name, curve in result.errors.curves.items()]
+    values += [(name, np.array([u])) for name, (_, u) in result.errors.squareness.items()]
+    return all(bool((u < largest[name]).all()) for name, u in values)
 
 
 def uncertainty_scale(reduced_chi_square: float, u_source: str) -> float:

@@ -9,7 +9,7 @@ at the targets that were measured.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -24,7 +24,7 @@ from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.determined import (
     FAINT,
@@ -38,7 +38,7 @@ from compgen.identify.adjust.determined import (
 from compgen.identify.adjust.residual_tests import misfit_of
 from compgen.identify.adjust.robust import Rejected, fit_accepted
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
-from compgen.identify.axis_tests import circle_observations
+from compgen.identify.axis_tests import axis_observations, circle_observations, circle_readings
 from compgen.identify.covariance import (
     error_design,
     error_values,
@@ -48,7 +48,10 @@ from compgen.identify.covariance import (
 )
 from compgen.identify.identification import (
     Identification,
+    determines_all,
     not_among,
+    same_nodes,
+    state_names,
     table_of_values,
     uncertainty_scale,
     without_adjustment,
@@ -56,6 +59,16 @@ from compgen.identify.identification import (
 )
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import artefact_observations, position_observations
+from compgen.identify.posterior import (
+    MOST_LEVELS,
+    Information,
+    Posterior,
+    reading_levels,
+    solve_posterior,
+    spans_of,
+    state_layout,
+    with_information,
+)
 from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.many_points import full_grid
@@ -108,6 +121,26 @@ class Source:
             )
         return Observations.of_curves(layout, self.alone.errors)
 
+    def readings(
+        self, machine: Machine, layout: ErrorParameters, options: IdentifyOptions, around: FloatArray
+    ) -> Observations:
+        """Return what it says about the state of a posterior: as :meth:`observed`, but with everything that moved the tool.
+
+        Axis runs enter with the angles along their lines and the scale of their laser, circles reading by reading. Lengths
+        that were adjusted with other nodes than those of the machine enter reading by reading, too.
+        """
+        if isinstance(self.measurement, AxisRuns):
+            return axis_observations(machine, layout, self.measurement, machine.prior)
+        if isinstance(self.measurement, Circles) and self.alone is not None:
+            return circle_readings(machine, layout, self.measurement, self.alone)
+        if isinstance(self.measurement, Lengths) and not (self.alone and same_nodes(machine, self.alone)):
+            return length_observations(machine, layout, self.measurement, options, around)
+        if isinstance(self.measurement, Deviations) and self.alone is not None and self.alone.adjustment is not None:
+            known = joint_covariance(self.alone)
+            values = self.alone.errors.values()
+            return Observations.of_values(layout, known.error, known.position_mm, values, known.errors_covariance)
+        return self.observed(machine, layout, options, around)
+
     def _as_alone(self, found: Observations) -> Observations:
         """Readings without those rejected alone, with the uncertainties found alone; calibration data follow and stay."""
         if self.alone is None:
@@ -156,6 +189,166 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
     if direct and len(listed) == len(set(listed)):
         return _joined(machine, parts, known)
     return _adjusted(machine, parts, options)
+
+
+# The posterior: what the readings and the prior of the machine file say together.
+
+
+def posterior_of(
+    machine: Machine, parts: Sequence[Source], options: IdentifyOptions, result: Identification, *, learn: bool
+) -> tuple[Posterior, tuple[Information, ...]]:
+    """Return the posterior of several measurements, and what each of them says about its state.
+
+    ``result`` are errors close enough to linearise about.
+    """
+    names = state_names(machine)
+    places = [_places_mm(part) for part in parts]
+    levels = [
+        reading_levels(axis, np.concatenate([np.zeros(0), *(place[k] for place in places)]))
+        for k, axis in enumerate(machine.axes)
+    ]
+    layout = state_layout(machine, levels, names)
+    known = {name for name, _ in layout.columns()}
+    errors, around = result.errors, np.zeros(layout.size)
+    for curve in layout.curves:
+        name = curve.error.name
+        if name in errors.curves and np.isfinite(errors.curves[name].value).all():
+            around[curve.columns] = errors.curves[name].at(curve.nodes_mm[curve.free.argmax(axis=0)])
+    for name, columns in layout.columns():
+        if name in errors.squareness and name in known:
+            around[columns] = errors.squareness[name][0]
+    # about approximate errors, and where these were poor, about the better ones
+    for again in (True, False):
+        found = [part.readings(machine, layout, options, around) for part in parts]
+        information = tuple(Information.of(item) for item in found)
+        solved = solve_posterior(machine, layout, information, spans_of(found), learn=learn and not again)
+        moves = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
+        if again and not moves:
+            if learn:
+                solved = solve_posterior(machine, layout, information, spans_of(found), learn=True)
+            break
+        around = solved.mean
+    return solved, information
+
+
+def _places_mm(part: Source) -> list[FloatArray]:
+    """Positions of each axis at which a measurement read the errors."""
+    measured = part.measurement
+    if isinstance(measured, Lengths | Deviations):
+        return list(measured.position_mm.T)
+    if isinstance(measured, Artefact):
+        return list(np.where(np.isnan(measured.measured_mm), measured.nominal_mm, measured.measured_mm).T)
+    if isinstance(measured, Circles):
+        return [np.linspace(0.0, 1.0, 2 * MOST_LEVELS)] * 3  # scattered
+    found = [np.zeros(0)] * 3
+    if part.alone is not None:
+        for name, curve in part.alone.errors.curves.items():
+            axis = error_named(name).axis
+            found[axis] = np.concatenate([found[axis], curve.position_mm])
+    return found
+
+
+def with_prior(
+    machine: Machine, parts: Sequence[Source], result: Identification, options: IdentifyOptions
+) -> Identification:
+    """Return a result with what is known of every error: from the readings, or from the prior of the machine file.
+
+    Errors that the readings alone determine keep their least-squares values; of the others the posterior mean is listed
+    where a reading shows them. What no reading shows is not listed; ``posterior`` has it.
+    """
+    if machine.prior.is_none:
+        return _without_prior(machine, parts, result, options)
+    if determines_all(machine, result):
+        learn = machine.prior.learn in ("up", "both")
+        return replace(result, posterior_source=lambda: posterior_of(machine, parts, options, result, learn=learn)[0])
+    found, information = posterior_of(machine, parts, options, result, learn=True)
+    whole = _kept(machine, parts, result, options, found)
+    listed = [name for name in ERROR_NAMES if name in found.shown or name in whole]
+    if not listed:
+        raise UndeterminedError("the readings show none of the machine's errors better than the prior does", [])
+    curves, squareness, positions = {}, {}, []
+    for name in listed:
+        own = result.errors.curves.get(name)
+        if name in SQUARENESS_NAMES:
+            at = np.array([np.nan])
+            mean = found.curve(name, at)
+            value = result.errors.squareness[name][0] if name in whole else float(mean.value[0])
+            squareness[name] = (value, float(mean.u[0]))
+        else:
+            at = _output_mm(machine, name, own, whole=name in whole)
+            mean = found.curve(name, at)
+            kept = np.isin(at, own.position_mm) if own is not None and name in whole else np.zeros(len(at), dtype=bool)
+            curves[name] = Curve(at, np.where(kept, own.at(at) if own is not None else 0.0, mean.value), mean.u)
+        positions.append(at)
+    order = [name for name in ERROR_NAMES if name in curves or name in squareness]
+    errors = ErrorTable(curves, squareness, result.errors.metadata)
+    assert list(errors.names) == order
+    factor = found.values_factor(order, positions)
+    if factor.shape[1] > factor.shape[0]:
+        factor = np.transpose(np.linalg.qr(factor.T)[1])
+    agreement = _agreement(machine, parts, information, found) if len(parts) > 1 else {}
+    objections, doubts = _disagreements(agreement)
+    return replace(
+        result,
+        errors=errors,
+        unobservable=tuple(text for text in result.unobservable if text.partition(":")[0] not in order),
+        worst_u=worst_uncertainty(errors),
+        layout=error_parameters(machine, errors.names),
+        adjustment=None,
+        systematic=None,
+        values_factor=factor,
+        posterior_source=lambda: found,
+        objections=(*result.objections, *objections),
+        doubts=(*result.doubts, *doubts),
+        details={
+            **result.details,
+            **({"en": agreement} if len(parts) > 1 else {}),
+            "posterior_means": [name for name in order if name not in whole],
+        },
+    )
+
+
+def _kept(
+    machine: Machine, parts: Sequence[Source], result: Identification, options: IdentifyOptions, found: Posterior
+) -> set[str]:
+    """Errors whose least-squares values stay: the readings alone determine them, to a third of the prior."""
+    layout = error_parameters(machine, modelled_errors(machine))
+    around = np.zeros(layout.size)
+    observed = []
+    for part in parts:
+        if isinstance(part.measurement, Circles) and part.alone is not None:
+            observed.append(circle_readings(machine, layout, part.measurement, part.alone))
+        else:
+            observed.append(part.observed(machine, layout, options, around))
+    determined = _determined_errors(layout, stacked(observed), SHOWS)
+    kept = set()
+    for name in determined & set(found.determined) & set(result.errors.names):
+        if name in result.errors.curves:
+            position_mm = result.errors.curves[name].position_mm
+            low, high = found.processes[name].zero_mm[0], found.processes[name].zero_mm[-1]
+            if position_mm[0] > low + 1e-6 or position_mm[-1] < high - 1e-6:
+                continue  # its zero is beyond what was measured
+        kept.add(name)
+    return kept
+
+
+def _output_mm(machine: Machine, name: str, own: Curve | None, *, whole: bool) -> FloatArray:
+    """Positions at which a curve is written: those measured, and the nodes of the machine where nothing was measured."""
+    axis = machine.axes[error_named(name).axis]
+    if own is None:
+        return axis.nodes_mm
+    at = own.position_mm
+    low, high = (at[0] - 1e-6, at[-1] + 1e-6) if whole else (np.inf, -np.inf)
+    more = axis.nodes_mm[(axis.nodes_mm < low) | (axis.nodes_mm > high)]
+    more = more[[bool(np.abs(at - value).min() > 1e-6) for value in more]]
+    return np.sort(np.concatenate([at, more]))
+
+
+def _without_prior(
+    machine: Machine, parts: Sequence[Source], result: Identification, options: IdentifyOptions
+) -> Identification:
+    """Return a result without a prior: what the readings do not determine has no uncertainty, and that is said."""
+    return result
 
 
 def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
@@ -285,7 +478,8 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
     fitting = [
         readings.kept(accepted[start : start + len(readings)]) for readings, start in zip(found, starts, strict=False)
     ]
-    agreement = _agreement(layout, parts, fitting, solution)
+    # with a prior the posteriors are compared: least squares takes what is not read as zero
+    agreement = _agreement_without_prior(layout, parts, fitting, solution) if machine.prior.is_none else {}
     freedom, sigma = solution.freedom, np.concatenate([readings.sigma for readings in found])
     reduced = float(np.sum((solution.residual / sigma)[accepted] ** 2)) / freedom if freedom > 0 else 1.0
     u_scale = uncertainty_scale(reduced, "stated")
@@ -377,6 +571,49 @@ def _as_adjusted(
 
 
 def _agreement(
+    machine: Machine, parts: Sequence[Source], information: Sequence[Information], found: Posterior
+) -> dict[str, dict[str, float]]:
+    """Largest E_n number of each error between the readings of one part and all others, by name of the part.
+
+    What a part changes in the posterior of the others, m - m_0, has the covariance S_0 - S. The coverage factor is chosen
+    to give the probability of a false alarm for all values of a part together.
+    """
+    from scipy.special import stdtrit  # imported here: slow to load
+
+    layout, whole, result = found.layout, np.einsum("ij,ij->i", found.factor, found.factor), {}
+    for k in range(len(parts)) if len(parts) > 2 else range(1):
+        rest = [item for j, item in enumerate(information) if j != k]
+        other = with_information(found, rest)
+        less = np.einsum("ij,ij->i", other.factor, other.factor)
+        gained = less - whole
+        seen = gained > SHARED * less
+        with np.errstate(invalid="ignore", divide="ignore"):
+            ratio = np.where(seen, np.abs(found.mean - other.mean) / np.sqrt(gained), 0.0)
+        factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(int(np.count_nonzero(seen)), 1)))
+        result[parts[k].name] = {
+            name: float(ratio[columns].max(initial=0.0)) / factor
+            for name, columns in layout.columns()
+            if seen[columns].any()
+        }
+    return result
+
+
+def _disagreements(agreement: Mapping[str, Mapping[str, float]]) -> tuple[list[str], list[str]]:
+    """Return objections to parts that contradict the others, and reservations about those that nearly do."""
+    objections, doubts = [], []
+    for name, numbers in agreement.items():
+        over = {error: value for error, value in numbers.items() if value > 1.0}
+        if not over:
+            continue
+        listed = ", ".join(f"{error} ({value:.1f})" for error, value in over.items())
+        text = f"{name} disagrees with the other measurements beyond the uncertainty of both in {listed} (En, 1 is the limit); "
+        text += "check calibration, set-up, signs and the time between the measurements"
+        (objections if max(over.values()) > CONTRADICTS else doubts).append(text)
+        warnings.warn(text, CompgenWarning, stacklevel=5)
+    return objections, doubts
+
+
+def _agreement_without_prior(
     layout: ErrorParameters, parts: Sequence[Source], found: Sequence[Observations], solution: Determined
 ) -> dict[str, dict[str, float]]:
     """Largest E_n number of each error between one part alone and all others, by name of the part.
@@ -452,6 +689,10 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
 
 #: Probability of a false report that two measurements disagree.
 FALSE_ALARM = 0.05
+#: E_n number from which a disagreement is a contradiction; between 1 and this it is a reservation.
+CONTRADICTS = 1.5
+#: A value is shared by two parts if one of them takes this share of the variance that the other leaves.
+SHARED = 0.01
 #: Degrees of freedom of a stated scatter.
 MANY = 1e6
 #: Levels of the other axes at which the motion of the tool is compared.
