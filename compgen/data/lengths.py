@@ -205,6 +205,10 @@ class Points(Displayed):
         """Return the number of points."""
         return len(self.position_mm)
 
+    def tools(self, rows: slice) -> FloatArray | None:
+        """Tool offsets of some of the points, None for that of the machine file."""
+        return None if self.tool_mm is None else self.tool_mm[rows]
+
     def overview(self) -> Overview:
         """Number of points, and their bounding box."""
         return Overview(f"{len(self)} points", ("axis", "from (mm)", "to (mm)"), ranges_of(self.position_mm))

@@ -141,6 +141,20 @@ class PriorSettings:
         """Return the prior with larger sizes."""
         return replace(self, factor=(self.factor[0] * curves, self.factor[1] * squareness))
 
+    def stated(self) -> dict[str, Any]:
+        """Return the keys of the section, with the factors that the readings raised; see :meth:`from_stated`."""
+        keys = {key: getattr(self, key) for key in ("class_name", *_SIZES, "learn")}
+        return {**{key: value for key, value in keys.items() if value is not None}, "single": dict(self.single),
+                "factor": list(self.factor)}  # fmt: skip
+
+    @classmethod
+    def from_stated(cls, keys: Mapping[str, Any]) -> PriorSettings:
+        """Return the prior whose :meth:`stated` keys are given; ValueError for others."""
+        known = {item.name for item in fields(cls)}
+        if not set(keys) <= known:
+            raise ValueError(f"{', '.join(sorted(set(keys) - known))}: no key of a prior")
+        return cls(**{**keys, "factor": tuple(keys.get("factor", (1.0, 1.0)))})
+
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``prior`` of ``identify.json`` and ``result.json``."""
         if self.is_none:

@@ -8,12 +8,14 @@ itself is never formed.
 from __future__ import annotations
 
 import io
+import json
 import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +33,13 @@ from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
 from compgen.kinematics.first_order import c_matrix
 
+if TYPE_CHECKING:
+    from compgen.identify.posterior import Posterior
+
 FILE_NAME = "identified.covariance.npz"
 FORMAT = "compgen covariance 1"
+#: Least standard uncertainty of a stated value, um and urad.
+FINEST = 1e-3
 #: Points whose rows of C B are computed together.
 CHUNK = 1024
 _MEMBERS = ("format", "machine", "errors_sha256", "error", "position_mm", "unit", "station", "setup", "factor")
@@ -50,6 +57,8 @@ class Covariance(Displayed):
     factor : shape (k + 3 S + g, r); ``factor @ factor.T`` is the covariance: error values, then x, y, z of every
         station, then dead lengths.
     machine, errors_sha256 : name of the machine, and SHA-256 of its errors file ("" for none).
+    posterior : what is known of every error, also of those that the errors file does not list; None if it follows from
+        the errors file and the prior of the machine file (:func:`posterior_with`).
     """
 
     error: tuple[str, ...]
@@ -59,6 +68,7 @@ class Covariance(Displayed):
     factor: FloatArray
     machine: str = ""
     errors_sha256: str = ""
+    posterior: StoredPosterior | None = None
 
     @property
     def stations(self) -> tuple[str, ...]:
@@ -128,7 +138,10 @@ def covariance_from_factor(
 def joint_covariance(result: Identification) -> Covariance:
     """Return the covariance of all identified values, including systematic inputs."""
     if result.values_factor is not None:
-        return covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
+        found = covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
+        if "posterior_means" not in result.details or result.posterior is None:
+            return found
+        return replace(found, posterior=result.posterior.stored())
     if result.adjustment is None:
         raise ValueError("this identification has no joint covariance")
     factor = result.adjustment.covariance_factor()
@@ -173,6 +186,87 @@ def covariance_or_independent(
         return covariance
     u = errors.uncertainties()
     return covariance_of_values(errors, np.diag(u), machine) if len(u) and np.isfinite(u).all() else None
+
+
+def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance | None) -> Posterior | None:
+    """Return what is known of every error of a machine: what was identified with a table, or the table and the prior.
+
+    None without a prior (``class = "none"``), and if an uncertainty of the table is unknown: then nothing can be said.
+    """
+    if covariance is not None and covariance.posterior is not None:
+        return covariance.posterior.of(machine)
+    if machine.prior.is_none:
+        return None
+    known = covariance_or_independent(errors, covariance, machine.name)
+    if known is None:
+        return None
+    from compgen.identify.posterior import posterior_of_values  # not needed where errors are only identified
+
+    factor = known.errors_factor
+    if covariance is None:
+        unit = np.array([error_named(name).si_per_unit for name in known.error])
+        factor = np.diag(np.maximum(errors.uncertainties(), FINEST * unit))
+    return posterior_of_values(machine, known.error, known.position_mm, errors.values(), factor)
+
+
+@dataclass(frozen=True)
+class StoredPosterior:
+    """A posterior without its machine, as a covariance file keeps it.
+
+    ``levels_mm`` are the levels of the state on X, Y and Z; ``names`` the errors, ``sizes`` (errors, 3) of each the size
+    and the scale of its prior and its rough part; ``mean`` (p,) and ``factor`` (p, r) of the state; ``spans_mm`` (3, 2)
+    where the readings were; ``prior`` the section of the machine file, with what was raised.
+    """
+
+    levels_mm: tuple[FloatArray, FloatArray, FloatArray]
+    names: tuple[str, ...]
+    sizes: FloatArray
+    mean: FloatArray
+    factor: FloatArray
+    spans_mm: FloatArray
+    prior: dict[str, Any]
+
+    def of(self, machine: Machine) -> Posterior:
+        """Return the posterior of the errors of this machine."""
+        from compgen.identify.posterior import restored
+
+        return restored(machine, self)
+
+    def members(self) -> dict[str, NDArray[np.generic]]:
+        """Return the members of the file."""
+        levels = {f"posterior_levels_{letter}_mm": at for letter, at in zip("xyz", self.levels_mm, strict=True)}
+        return {
+            **levels,
+            "posterior_names": np.array(self.names),
+            "posterior_sizes": self.sizes,
+            "posterior_mean": self.mean,
+            "posterior_factor": self.factor,
+            "posterior_spans_mm": self.spans_mm,
+            "posterior_prior": np.array(json.dumps(self.prior)),
+        }
+
+    @classmethod
+    def from_members(cls, members: dict[str, NDArray[np.generic]]) -> StoredPosterior | None:
+        """Return what a file contains; None if it has no posterior; ValueError for parts that do not match."""
+        if "posterior_names" not in members:
+            return None
+        try:
+            numbers = {
+                key: np.asarray(members[f"posterior_{key}"], dtype=np.float64)
+                for key in ("sizes", "mean", "factor", "spans_mm", *(f"levels_{letter}_mm" for letter in "xyz"))
+            }
+            names = tuple(str(name) for name in members["posterior_names"].ravel())
+            prior = json.loads(str(members["posterior_prior"]))
+        except KeyError as error:
+            raise ValueError(f"{error.args[0]} is missing") from error
+        finite = all(np.isfinite(array).all() for key, array in numbers.items() if key != "spans_mm")
+        shapes = numbers["sizes"].shape == (len(names), 3) and numbers["factor"].shape[:1] == numbers["mean"].shape
+        known = all(name in ERROR_INDEX for name in names) and isinstance(prior, dict)
+        if not (finite and shapes and known and numbers["spans_mm"].shape == (3, 2)):
+            raise ValueError("the parts of the posterior do not match")
+        x, y, z = (numbers[f"levels_{letter}_mm"] for letter in "xyz")
+        others = numbers["sizes"], numbers["mean"], numbers["factor"], numbers["spans_mm"]
+        return cls((x, y, z), names, *others, prior)
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------
@@ -230,12 +324,17 @@ def predict_uncertainty(machine: Machine, covariance: Covariance, points: Points
     covariance : of the identified errors.
     points : the points, with their tool offsets if they have any.
     """
-    factor = covariance.errors_factor
     u = np.empty((len(points), 3))
+    if covariance.posterior is not None:
+        known = covariance.posterior.of(machine)
+        for first in range(0, len(points), CHUNK):
+            rows = slice(first, first + CHUNK)
+            u[rows] = np.sqrt(known.field(points.position_mm[rows], points.tools(rows)).variance)
+        return u
+    factor = covariance.errors_factor
     for first in range(0, len(points), CHUNK):
         rows = slice(first, first + CHUNK)
-        tool_mm = None if points.tool_mm is None else points.tool_mm[rows]
-        spread = error_design(machine, covariance, points.position_mm[rows], tool_mm) @ factor
+        spread = error_design(machine, covariance, points.position_mm[rows], points.tools(rows)) @ factor
         u[rows] = np.sqrt(np.einsum("nij,nij->ni", spread, spread))
     return u
 
@@ -275,6 +374,7 @@ def format_covariance(covariance: Covariance, errors_text: str) -> bytes:
         "station": np.array(covariance.station),
         "setup": covariance.setup,
         "factor": covariance.factor,
+        **({} if covariance.posterior is None else covariance.posterior.members()),
     }
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
@@ -353,6 +453,7 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
             factor=np.asarray(members["factor"], dtype=np.float64),
             machine=str(members["machine"]),
             errors_sha256=str(members["errors_sha256"]),
+            posterior=StoredPosterior.from_members(members),
         )
     except (ValueError, TypeError) as error:
         raise InputError(

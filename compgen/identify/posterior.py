@@ -18,14 +18,18 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.prior import DETERMINED, PriorSettings
-from compgen.identify.adjust.determined import Observations
+from compgen.errors import InputError
+from compgen.identify.adjust.determined import LEVER_MM, Observations
 from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identify.covariance import StoredPosterior
+from compgen.identify.identification import state_names
 from compgen.kinematics.first_order import c_matrix
 
 #: Correlation lengths of the smooth and of the rough part, as shares of the travel, and the size of the rough part
@@ -33,6 +37,8 @@ from compgen.kinematics.first_order import c_matrix
 SMOOTH_LENGTH, ROUGH_LENGTH, ROUGH = 0.3, 0.03, 0.1
 #: Levels of an axis for readings at scattered positions, and the most that readings on a grid may have.
 SCATTERED, MOST_LEVELS = 31, 60
+#: An error of this size, mm at a lever of a metre, that the readings would not notice is not shown by them.
+NOTHING_MM = 1.0
 #: Levels closer than this are one, mm.
 SAME_MM = 1e-4
 #: Added to the diagonal of a prior covariance, relative to it, against rounding.
@@ -44,8 +50,8 @@ LISTED_CURVE, LISTED_SQUARENESS = 0.75, 0.95
 OF_MACHINE, OF_KIND, OF_CURVE = 0.4, 0.3, 0.4
 #: Standard deviation of the logarithm of the rough part, and its least size.
 OF_ROUGH, LEAST_ROUGH = 0.7, 0.05
-#: Steps of the search for the amplitudes.
-LEARNING_STEPS = 12
+#: Steps of the search for the amplitudes, and the gain of the logarithm of the likelihood that ends it.
+LEARNING_STEPS, ENOUGH_LEARNT = 12, 0.05
 #: Readings whose residuals exceed their noise by this factor get more of it, and everything is adjusted again so often.
 TOO_LARGE, PASSES = 1.3, 3
 #: rms of what is determined over its prior beyond which a machine is worse than its class: of one curve, of all.
@@ -181,12 +187,14 @@ class _Solved:
     mean: FloatArray
     factor: FloatArray
     root: FloatArray
-    half: FloatArray
     evidence: float
 
 
 def _solve(layout: ErrorParameters, processes: Mapping[str, Process], sizes: FloatArray, known: Information) -> _Solved:
-    """The posterior of the state; ``sizes`` are the standard deviations of the squareness errors."""
+    """The posterior of the state; ``sizes`` are the standard deviations of the squareness errors.
+
+    Errors that no reading shows are independent of all others, so they keep the root of their prior.
+    """
     root = np.zeros((layout.size, layout.size))
     for curve in layout.curves:
         at = _state_positions(curve.free, curve.nodes_mm)
@@ -195,13 +203,26 @@ def _solve(layout: ErrorParameters, processes: Mapping[str, Process], sizes: Flo
         root[curve.columns, curve.columns] = np.linalg.cholesky(block)
     first = layout.size - len(layout.squareness)
     root[np.arange(first, layout.size), np.arange(first, layout.size)] = sizes
-    inner = root.T @ known.matrix @ root
-    inner[np.diag_indices(layout.size)] += 1.0
+    seen = _seen(layout, known)
+    own = root[np.ix_(seen, seen)]
+    inner = own.T @ known.matrix[np.ix_(seen, seen)] @ own
+    inner[np.diag_indices(len(inner))] += 1.0
     half = np.linalg.cholesky(0.5 * (inner + inner.T))
-    factor = np.linalg.solve(half, root.T).T
-    mean = factor @ (factor.T @ known.vector)
-    evidence = -float(np.log(np.diag(half)).sum()) + 0.5 * float(known.vector @ mean)
-    return _Solved(mean, factor, root, half, evidence)
+    shown = np.linalg.solve(half, own.T).T
+    factor, mean = root.copy(), np.zeros(layout.size)
+    factor[np.ix_(seen, seen)] = shown
+    mean[seen] = shown @ (shown.T @ known.vector[seen])
+    evidence = -float(np.log(np.diag(half)).sum()) + 0.5 * float(known.vector[seen] @ mean[seen])
+    return _Solved(mean, factor, root, evidence)
+
+
+def _seen(layout: ErrorParameters, known: Information) -> NDArray[np.bool_]:
+    """Which unknowns belong to errors that some reading shows, (size,)."""
+    seen, strength = np.zeros(layout.size, dtype=bool), np.diag(known.matrix)
+    for name, columns in layout.columns():
+        size = 1.0 if error_named(name).kind == "linear" else 1.0 / LEVER_MM
+        seen[columns] = bool((strength[columns] * (size * NOTHING_MM) ** 2).max(initial=0.0) > 1.0)
+    return seen
 
 
 def _state_positions(free: FloatArray, nodes_mm: FloatArray) -> FloatArray:
@@ -210,34 +231,51 @@ def _state_positions(free: FloatArray, nodes_mm: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class FieldSpread:
-    """What is not known of E over points: ``factor`` (n, 3, r) of the part that the state resolves, and what it does not.
+class _Between:
+    """Variation of one curve between the levels of the state: ``column`` (n, 3) of C, ``level`` (n,) of each point.
 
-    ``between`` are, for each curve, the rows (points) of a factor of the variation between the levels of the state, and
-    the columns of C that carry it.
+    ``left`` (m, m) is the covariance at the levels of the points.
     """
 
+    column: FloatArray
+    level: NDArray[np.int64]
+    left: FloatArray
+
+
+@dataclass(frozen=True)
+class FieldSpread:
+    """What is not known of E over n points: ``factor`` (n, 3, r) of what the state resolves, and what is between its levels."""
+
     factor: FloatArray
-    between: tuple[tuple[FloatArray, FloatArray], ...]
+    between: tuple[_Between, ...]
 
     @property
     def variance(self) -> FloatArray:
         """Variance of each component, (n, 3), mm^2."""
         total = np.einsum("nij,nij->ni", self.factor, self.factor)
-        for column, rows in self.between:
-            total = total + column**2 * np.einsum("nr,nr->n", rows, rows)[:, None]
+        for item in self.between:
+            total = total + item.column**2 * np.maximum(np.diag(item.left), 0.0)[item.level, None]
         return np.asarray(total)
 
     def draws(self, count: int, seed: int) -> FloatArray:
         """Return joint deviations of E from its mean, (count, n, 3), mm."""
         random = np.random.default_rng(seed)
         n, _, r = self.factor.shape
-        flat = self.factor.reshape(3 * n, r) @ random.standard_normal((r, count))
-        found = flat.T.reshape(count, n, 3)
-        for column, rows in self.between:
-            values = random.standard_normal((count, rows.shape[1])) @ rows.T
-            found = found + values[:, :, None] * column[None]
+        found = (self.factor.reshape(3 * n, r) @ random.standard_normal((r, count))).T.reshape(count, n, 3)
+        for item in self.between:
+            root = root_of(item.left)
+            values = (random.standard_normal((count, root.shape[1])) @ root.T)[:, item.level]
+            for output in np.flatnonzero(item.column.any(axis=0)):
+                found[:, :, output] += values * item.column[:, output]
         return np.asarray(found)
+
+    def u_of(self, weight: FloatArray) -> float:
+        """Standard uncertainty of the sum of weights (n, 3) times E over the points."""
+        square = float(np.sum(np.einsum("nk,nkr->r", weight, self.factor) ** 2))
+        for item in self.between:
+            at_level = np.bincount(item.level, np.sum(weight * item.column, axis=1), minlength=len(item.left))
+            square += max(float(at_level @ item.left @ at_level), 0.0)
+        return float(np.sqrt(square))
 
 
 @dataclass(frozen=True)
@@ -250,7 +288,7 @@ class Posterior:
     prior : the sizes in use, with what the readings raised.
     processes : the prior of each curve, with its learnt size.
     names : the errors, curves and squareness, in the order of the state.
-    mean, factor : of the state (p,), (p, r): the covariance is factor factor'; mm and rad.
+    state, factor : mean of the state (p,) and a factor (p, r) of its covariance, factor factor'; mm and rad.
     spans_mm : lowest and highest position of the readings that show the curves of each axis; nan if there are none.
     worse : errors that are larger than their class lets expect, with the ratio.
     """
@@ -260,7 +298,7 @@ class Posterior:
     processes: Mapping[str, Process]
     squareness_sd: Mapping[str, float]
     names: tuple[str, ...]
-    mean: FloatArray
+    state: FloatArray
     factor: FloatArray
     spans_mm: FloatArray
     worse: Mapping[str, float] = field(default_factory=dict)
@@ -285,11 +323,11 @@ class Posterior:
         columns = dict(self.layout.columns())[name]
         if name in SQUARENESS_NAMES:
             u = np.linalg.norm(self.factor[columns], axis=1)
-            return Curve(np.zeros(1), self.mean[columns], u)
+            return Curve(np.zeros(1), self.state[columns], u)
         position_mm = np.asarray(position_mm, dtype=np.float64)
         weights, left = self.rows(name, position_mm)
         square = np.einsum("ij,ij->i", *(2 * [weights @ self.factor[columns]])) + np.maximum(np.diag(left), 0.0)
-        return Curve(position_mm, weights @ self.mean[columns], np.sqrt(square))
+        return Curve(position_mm, weights @ self.state[columns], np.sqrt(square))
 
     def values_factor(self, names: Sequence[str], position_mm: Sequence[FloatArray]) -> FloatArray:
         """Return a factor of the joint covariance of errors at positions, their rows one after another."""
@@ -337,7 +375,7 @@ class Posterior:
         """Return what is not known of E = C P at points (n, 3) with tool offsets (n, 3), (3,) or that of the machine."""
         matrix = c_matrix(self.machine, position_mm, tool_mm)
         spread = np.zeros((len(position_mm), 3, self.factor.shape[1]))
-        between: list[tuple[FloatArray, FloatArray]] = []
+        between: list[_Between] = []
         for name, columns in self.layout.columns():
             column = matrix[:, :, ERROR_INDEX[name]]
             if name in SQUARENESS_NAMES:
@@ -346,13 +384,13 @@ class Posterior:
                 levels, of = np.unique(position_mm[:, error_named(name).axis], return_inverse=True)
                 weights, left = self.rows(name, levels)
                 rows = (weights @ self.factor[columns])[of.ravel()]
-                between.append((column, root_of(left)[of.ravel()]))
+                between.append(_Between(column, of.ravel(), left))
             for output in np.flatnonzero(column.any(axis=0)):
                 spread[:, output] += column[:, output, None] * rows
         between += self._other_tools(matrix, position_mm)
         return FieldSpread(spread, tuple(between))
 
-    def _other_tools(self, matrix: FloatArray, position_mm: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    def _other_tools(self, matrix: FloatArray, position_mm: FloatArray) -> list[_Between]:
         """Errors that one tool cannot show, for the part of the lever by which a tool differs from that of the machine."""
         more = matrix - c_matrix(self.machine, position_mm)
         names = [n for n in ERROR_NAMES if n not in self.names and np.abs(more[:, :, ERROR_INDEX[n]]).max() > 1e-6]
@@ -360,8 +398,28 @@ class Posterior:
         found = []
         for name, process in processes.items():
             levels, of = np.unique(position_mm[:, error_named(name).axis], return_inverse=True)
-            found.append((more[:, :, ERROR_INDEX[name]], root_of(process.covariance(levels, levels))[of.ravel()]))
+            found.append(_Between(more[:, :, ERROR_INDEX[name]], of.ravel(), process.covariance(levels, levels)))
         return found
+
+    def mean(self, position_mm: FloatArray, without: Sequence[str] = ()) -> FloatArray:
+        """Return the mean of E = C P at points (n, 3), mm, of all errors but those named."""
+        names = [
+            name for name in self.names if name not in without and self.state[dict(self.layout.columns())[name]].any()
+        ]
+        table = self.mean_table(names)
+        return np.asarray(np.einsum("nij,nj->ni", c_matrix(self.machine, position_mm), table.at(position_mm)))
+
+    def stored(self) -> StoredPosterior:
+        """Return it as a covariance file keeps it."""
+        x, y, z = (axis.nodes_mm for axis in self.machine.axes)
+        sizes = [
+            (self.squareness_sd[name], 0.0, 0.0)
+            if name in SQUARENESS_NAMES
+            else (self.processes[name].s, self.processes[name].scale, self.processes[name].rough)
+            for name in self.names
+        ]
+        prior = self.prior.stated()
+        return StoredPosterior((x, y, z), self.names, np.array(sizes), self.state, self.factor, self.spans_mm, prior)
 
     def mean_table(self, names: Sequence[str]) -> ErrorTable:
         """Return the means of errors at the levels of the state."""
@@ -380,6 +438,53 @@ def root_of(covariance: FloatArray) -> FloatArray:
     values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     used = values > 1e-10 * max(float(values[-1]), 1e-300)
     return np.asarray(directions[:, used] * np.sqrt(values[used]))
+
+
+def posterior_of_values(
+    machine: Machine, names: Sequence[str], position_mm: FloatArray, value: FloatArray, factor: FloatArray
+) -> Posterior:
+    """Return the posterior of a machine of which error values are known (k,), with a factor (k, r) of their covariance.
+
+    Values whose errors the chain does not show are left out. The sizes of the machine file stay, but for a machine that is
+    worse than its class.
+    """
+    own = set(state_names(machine))
+    rows = np.array([name in own for name in names], dtype=bool)
+    kept = [name for name in names if name in own]
+    at, axis = position_mm[rows], np.array([error_named(name).axis for name in kept])
+    curves = np.array([name not in SQUARENESS_NAMES for name in kept], dtype=bool)
+    places = [at[curves & (axis == k)] if kept else np.zeros(0) for k in range(3)]
+    within = [np.clip(place, *item.range_mm) for place, item in zip(places, machine.axes, strict=True)]
+    layout = state_layout(machine, [np.unique(np.round(place, 6)) for place in within], state_names(machine))
+    spans = np.array([[place.min(), place.max()] if len(place) else [np.nan, np.nan] for place in within])
+    if not kept:
+        return solve_posterior(machine, layout, (), spans, learn=False)
+    part = factor[rows]
+    read = Observations.of_values(layout, kept, at, value[rows], part @ part.T)
+    return solve_posterior(machine, layout, (Information.of(read),), spans, learn=False)
+
+
+def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
+    """Return the posterior that a covariance file keeps, for its machine."""
+    layout = state_layout(machine, stored.levels_mm, stored.names)
+    if layout.size != len(stored.mean):
+        raise InputError(
+            f"the covariance file belongs to another travel than that of machine {machine.name!r}; identify the errors again"
+        )
+    prior = PriorSettings.from_stated(stored.prior)
+    sizes = dict(zip(stored.names, stored.sizes.tolist(), strict=True))
+    usual = processes_of(machine, prior, stored.names)
+    processes = {
+        name: replace(item, s=sizes[name][0], scale=sizes[name][1], rough=sizes[name][2])
+        for name, item in usual.items()
+    }
+    squareness = {name: size[0] for name, size in sizes.items() if name in SQUARENESS_NAMES}
+    columns = [name for name, _ in layout.columns()]
+    if columns != list(stored.names):
+        raise InputError("the errors of the covariance file are not in their usual order; identify the errors again")
+    return Posterior(
+        layout.machine, prior, processes, squareness, stored.names, stored.mean, stored.factor, stored.spans_mm
+    )
 
 
 # --- sizes that the readings change ---------------------------------------------------------------------------------
@@ -410,61 +515,59 @@ def _learnt(
     The maximum of marginal likelihood times hyperprior over the logarithm of each amplitude; amplitudes only grow unless
     ``learn`` is "both". The variance of what is not known of an amplitude widens its error (``exp(2 v)``).
     """
-    names = [name for name, _ in layout.columns()]
-    columns = [span for _, span in layout.columns()]
-    precision = np.linalg.inv(_hyperprior(names))
+    seen = _seen(layout, known)
+    every = [name for name, _ in layout.columns()]
+    shown = [name for name, span in layout.columns() if seen[span].any()]
+    spans = {name: span for name, span in layout.columns() if seen[span].any()}
+    covariance = _hyperprior(every)
+    at_shown = np.array([every.index(name) for name in shown])
+    precision = np.linalg.inv(covariance[np.ix_(at_shown, at_shown)])
     low = -np.inf if prior.learn == "both" else 0.0
-    log_size = np.zeros(len(names))
+    starts = np.cumsum([0, *(span.stop - span.start for span in spans.values())])[:-1]
+    information, vector = known.matrix[np.ix_(seen, seen)], known.vector[seen]
 
-    def grown(at: FloatArray) -> tuple[dict[str, Process], FloatArray]:
+    def grown(at: FloatArray, names: Sequence[str]) -> tuple[dict[str, Process], FloatArray]:
         factor = dict(zip(names, np.exp(at).tolist(), strict=True))
-        larger = {
-            name: replace(item, s=item.s * factor[name], scale=item.scale * factor[name])
-            for name, item in processes.items()
-        }
-        return larger, sizes * np.array([factor[name] for name in layout.squareness])
+        larger = dict(processes) | {name: _grown(processes[name], factor[name]) for name in names if name in processes}
+        return larger, sizes * np.array([factor.get(name, 1.0) for name in layout.squareness])
 
-    def value_and_gradient(at: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        solved = _solve(layout, *grown(at), known)
-        rest = known.vector - known.matrix @ solved.mean
-        # Q = H - H S H, with K Q by blocks: tr(Q K_i) = tr over the block of H K - H S H K
-        reduced = known.matrix @ solved.factor
-        quadratic = known.matrix - reduced @ reduced.T
-        gradient, scaled = np.empty(len(names)), []
-        for k, span in enumerate(columns):
-            root = solved.root[span, span]
-            pulled = root.T @ rest[span]
-            inner = root.T @ quadratic[span, span] @ root
-            gradient[k] = float(pulled @ pulled) - float(np.trace(inner))
-            scaled.append(root)
-        whole = solved.root.T @ quadratic @ solved.root
-        starts = np.array([span.start for span in columns])
-        fisher = np.add.reduceat(np.add.reduceat(whole**2, starts, axis=0), starts, axis=1) * 2.0
+    def value_and_slopes(at: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Logarithm of the likelihood times the hyperprior, its gradient, and Fisher's information of the likelihood."""
+        solved = _solve(layout, *grown(at, shown), known)
+        root = solved.root[np.ix_(seen, seen)]
+        reduced = information @ solved.factor[np.ix_(seen, seen)]
+        inner = root.T @ (information - reduced @ reduced.T) @ root  # L' Q L with Q = H - H S H
+        pulled = root.T @ (vector - information @ solved.mean[seen])
+        gradient = np.add.reduceat(pulled**2 - np.diag(inner), starts)
+        fisher = 2.0 * np.add.reduceat(np.add.reduceat(inner**2, starts, axis=0), starts, axis=1)
         return solved.evidence - 0.5 * float(at @ precision @ at), gradient - precision @ at, fisher
 
-    value, gradient, fisher = value_and_gradient(log_size)
+    log_size = np.zeros(len(shown))
+    value, gradient, fisher = value_and_slopes(log_size)
     for _ in range(LEARNING_STEPS):
         free = (log_size > low + 1e-9) | (gradient > 0)
         if not free.any() or np.abs(gradient[free]).max() < 0.05:
             break
-        step = np.zeros(len(names))
+        step = np.zeros(len(shown))
         step[free] = np.linalg.solve((fisher + precision)[np.ix_(free, free)], gradient[free])
-        size = float(np.abs(step).max())
-        step *= min(1.0, 1.0 / size)
+        step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-300))
         for _ in range(4):  # a step that makes it less likely is halved
             trial = np.maximum(log_size + step, low)
-            found = value_and_gradient(trial)
+            found = value_and_slopes(trial)
             if found[0] >= value - 1e-6:
                 break
             step *= 0.5
         else:
             break
-        done = found[0] - value < 0.01
+        done = found[0] - value < ENOUGH_LEARNT
         log_size, (value, gradient, fisher) = trial, found
         if done:
             break
-    open_variance = np.diag(np.linalg.inv(fisher + precision))
-    return grown(log_size + open_variance)  # exp(2 v) in variance
+    # what is not shown follows by the hyperprior, and what stays open about an amplitude widens its error
+    after = np.linalg.inv(fisher + precision)
+    follow = covariance[:, at_shown] @ precision
+    spread = covariance - follow @ covariance[at_shown] + follow @ after @ follow.T
+    return grown(follow @ log_size + np.diag(spread), every)  # exp(2 v) in variance
 
 
 # --- the posterior of readings --------------------------------------------------------------------------------------
@@ -483,31 +586,35 @@ def solve_posterior(
     Sources whose residuals exceed their noise get more of it; a machine that is worse than its class gets larger sizes,
     and ``worse`` says so. With ``learn`` the readings change the size of each error (unless the machine file says no).
     """
-    names = tuple(name for name, _ in layout.columns())
-    prior, parts = machine.prior, list(information)
-    worse: dict[str, float] = {}
-    for _ in range(PASSES + 6):
-        processes = processes_of(machine, prior, names)
-        sizes = np.array([prior.size(name) for name in layout.squareness])
+    names, prior, parts = tuple(name for name, _ in layout.columns()), machine.prior, list(information)
+    usual = processes_of(machine, prior, names)
+    of_class = {name: prior.size(name) for name in layout.squareness}
+    own: dict[str, float] = {}
+    for _ in range(PASSES):
+        larger = processes_of(machine, prior, names) | {n: _grown(usual[n], own[n]) for n in own if n in usual}
+        sizes = np.array([of_class[n] * own[n] if n in own else prior.size(n) for n in layout.squareness])
         known = _sum(parts, layout.size)
-        solved = _solve(layout, processes, sizes, known)
-        found = _posterior(machine, layout, prior, processes, sizes, solved, spans_mm)
-        larger, ratios = _beyond_class(found)
-        if larger != (1.0, 1.0) and max(prior.factor) < 1e4:
-            worse = {**ratios, **worse}
-            prior = prior.raised(*larger)
-            continue
+        solved = _solve(layout, larger, sizes, known)
+        found = _posterior(layout, prior, larger, sizes, solved, spans_mm)
+        ratios = _over_class(found, usual, of_class)
+        raised = machine.prior.raised(*_raises(ratios))
         noisier = [_excess(item, solved) for item in parts]
-        if max(noisier, default=1.0) <= TOO_LARGE:
-            break
         parts = [
             item.scaled(factor) if factor > TOO_LARGE else item for item, factor in zip(parts, noisier, strict=True)
         ]
+        if set(ratios) == set(own) and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
+            break
+        own, prior = {name: max(1.0, ratio) for name, ratio in ratios.items()}, raised
     if learn and prior.learn != "no" and parts:
-        processes, sizes = _learnt(layout, prior, processes, sizes, known)
-        solved = _solve(layout, processes, sizes, known)
-        found = _posterior(machine, layout, prior, processes, sizes, solved, spans_mm)
-    return replace(found, worse=worse)
+        larger, sizes = _learnt(layout, prior, larger, sizes, known)
+        solved = _solve(layout, larger, sizes, known)
+        found = _posterior(layout, prior, larger, sizes, solved, spans_mm)
+    return replace(found, worse=_worse(ratios))
+
+
+def _grown(process: Process, factor: float) -> Process:
+    """A process whose smooth part is larger; what is rough between the readings has the size of the class."""
+    return replace(process, s=process.s * factor, scale=process.scale * factor, rough=process.rough / factor)
 
 
 def with_information(found: Posterior, information: Sequence[Information]) -> Posterior:
@@ -515,7 +622,7 @@ def with_information(found: Posterior, information: Sequence[Information]) -> Po
     sizes = np.array([found.squareness_sd[name] for name in found.layout.squareness])
     known = _sum(information, found.layout.size)
     solved = _solve(found.layout, found.processes, sizes, known)
-    return replace(found, mean=solved.mean, factor=solved.factor)
+    return replace(found, state=solved.mean, factor=solved.factor)
 
 
 def _sum(parts: Sequence[Information], size: int) -> Information:
@@ -536,7 +643,6 @@ def _excess(item: Information, solved: _Solved) -> float:
 
 
 def _posterior(
-    machine: Machine,
     layout: ErrorParameters,
     prior: PriorSettings,
     processes: Mapping[str, Process],
@@ -544,42 +650,45 @@ def _posterior(
     solved: _Solved,
     spans_mm: FloatArray,
 ) -> Posterior:
-    return Posterior(
-        layout.machine,
-        prior,
-        dict(processes),
-        dict(zip(layout.squareness, sizes.tolist(), strict=True)),
-        tuple(name for name, _ in layout.columns()),
-        solved.mean,
-        solved.factor,
-        spans_mm,
-    )
+    names = tuple(name for name, _ in layout.columns())
+    squareness = dict(zip(layout.squareness, sizes.tolist(), strict=True))
+    return Posterior(layout.machine, prior, dict(processes), squareness, names, solved.mean, solved.factor, spans_mm)
 
 
-def _beyond_class(found: Posterior) -> tuple[tuple[float, float], dict[str, float]]:
-    """Factors by which the sizes of curves and squareness are too small, 1 or RAISE, and the ratios that show it.
-
-    Only determined errors count. The scale of an axis is part of its prior.
-    """
-    ratios: dict[str, float] = {}
+def _over_class(found: Posterior, usual: Mapping[str, Process], of_class: Mapping[str, float]) -> dict[str, float]:
+    """Size of each determined error over what its class lets expect, rms along the travel."""
+    ratios = {}
     for name in found.determined:
-        if name in SQUARENESS_NAMES:
-            ratios[name] = abs(float(found.curve(name, np.zeros(1)).value[0])) / found.squareness_sd[name]
+        if name in of_class:
+            ratios[name] = abs(float(found.curve(name, np.zeros(1)).value[0])) / of_class[name]
             continue
         at = np.linspace(*found.machine.axes[error_named(name).axis].range_mm, SCATTERED)
-        of_prior = float(np.sqrt(np.mean(found.processes[name].sd(at) ** 2)))
-        ratios[name] = float(np.sqrt(np.mean(found.curve(name, at).value ** 2))) / of_prior
-    factors = []
-    beyond: dict[str, float] = {}
+        ratios[name] = float(np.sqrt(np.mean(found.curve(name, at).value ** 2) / np.mean(usual[name].sd(at) ** 2)))
+    return ratios
+
+
+def _worse(ratios: Mapping[str, float]) -> dict[str, float]:
+    """Errors that show a machine worse than its class: one far beyond it, or curves and squareness each together."""
+    found: dict[str, float] = {}
     for is_squareness in (False, True):
         own = {name: value for name, value in ratios.items() if (name in SQUARENESS_NAMES) == is_squareness}
-        together = float(np.sqrt(np.mean(np.square(list(own.values()))))) if len(own) > 1 else 0.0
         over = {name: value for name, value in own.items() if value > WORSE_CURVE}
-        if together > WORSE_ALL and not over:
+        if len(own) > 1 and not over and np.sqrt(np.mean(np.square(list(own.values())))) > WORSE_ALL:
             over = {name: value for name, value in own.items() if value > WORSE_ALL}
-        beyond |= over
-        factors.append(RAISE if over else 1.0)
-    return (factors[0], factors[1]), beyond
+        found |= over
+    return found
+
+
+def _raises(ratios: Mapping[str, float]) -> tuple[float, float]:
+    """Factors of the sizes of curves and of squareness with which the machine is no longer worse than its class."""
+    worse, factors = _worse(ratios), []
+    for is_squareness in (False, True):
+        largest = max(
+            (value for name, value in worse.items() if (name in SQUARENESS_NAMES) == is_squareness), default=0.0
+        )
+        steps = np.ceil(np.log(largest / WORSE_CURVE) / np.log(RAISE)) if largest > WORSE_CURVE else float(largest > 0)
+        factors.append(float(RAISE**steps))
+    return factors[0], factors[1]
 
 
 # --- words ----------------------------------------------------------------------------------------------------------

@@ -227,7 +227,7 @@ def posterior_of(
             if learn:
                 solved = solve_posterior(machine, layout, information, spans_of(found), learn=True)
             break
-        around = solved.mean
+        around = solved.state
     return solved, information
 
 
@@ -588,7 +588,7 @@ def _agreement(
         gained = less - whole
         seen = gained > SHARED * less
         with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.where(seen, np.abs(found.mean - other.mean) / np.sqrt(gained), 0.0)
+            ratio = np.where(seen, np.abs(found.state - other.state) / np.sqrt(gained), 0.0)
         factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(int(np.count_nonzero(seen)), 1)))
         result[parts[k].name] = {
             name: float(ratio[columns].max(initial=0.0)) / factor
