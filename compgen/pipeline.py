@@ -32,6 +32,7 @@ from compgen.identify.any_measurement import (
     evidence_files,
     identify_measurement,
     identify_mixed,
+    known_alone,
 )
 from compgen.identify.options import StatedNumbers
 from compgen.identify.reversal_errors import SIGNIFICANT
@@ -304,7 +305,7 @@ def identify_bare(
     from compgen.tables.active import without_active
 
     if active is None and isinstance(measurement, ErrorTable):
-        return given_errors(machine, measurement)
+        return known_alone(machine, None, given_errors(machine, measurement), options or IdentifyOptions())
     if active is None and isinstance(measurement, MixedMeasurement):
         tables_of = {name: part for name, part in measurement.parts if isinstance(part, ErrorTable)}
         # the arms of a square count where nothing else shows a squareness
@@ -458,8 +459,11 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     smoothing = fit_options or FitOptions()
-    if smoothing.smoothness is None and "tied_nodes_mm" in identification.details:
-        # of few readings the curves are strongly correlated: each smoothed alone, they would no longer fit together
+    if smoothing.smoothness is None and (
+        "tied_nodes_mm" in identification.details or identification.details.get("posterior_means")
+    ):
+        # of few readings the curves are strongly correlated: each smoothed alone, they would no longer fit together; the
+        # mean of a posterior is as smooth as the prior lets expect
         smoothing = replace(smoothing, smoothness=0.0)
     fitted = fit(machine, identification.errors, smoothing, covariance=known)
     reversal = identified_reversal(identification)
@@ -487,7 +491,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         )  # else they are wrong
         found = tables.measurement_objections(identification, taken, allow_misfit=allow_misfit)
         reasons = dict.fromkeys([*verification.reasons, *tables.blocking_reasons(found)])
-        verification = replace(verification, objections=found, reasons=tuple(reasons))
+        verification = replace(verification, objections=(*verification.objections, *found), reasons=tuple(reasons))
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
         extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language, read)

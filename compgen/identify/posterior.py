@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Axis, Machine
-from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.prior import DETERMINED, PriorSettings
 from compgen.errors import InputError
 from compgen.identify.adjust.determined import LEVER_MM, Observations
@@ -31,6 +32,7 @@ from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.identify.covariance import StoredPosterior
 from compgen.identify.identification import state_names
 from compgen.kinematics.first_order import c_matrix
+from compgen.kinematics.many_points import full_grid
 
 #: Correlation lengths of the smooth and of the rough part, as shares of the travel, and the size of the rough part
 #: relative to the smooth one. Any smooth kernel without a rough part is too sure between readings and beyond them.
@@ -712,6 +714,31 @@ def assumed_text(found: Posterior) -> str:
         return f"every error was measured; between the readings the prior of {which} holds"
     parts = [f"{kind} up to {size:.3g} {unit}" for kind, (size, unit) in sizes.items()]
     return f"assumed for what was not measured: {', '.join(parts)} (k = 2, {which})"
+
+
+def not_measured(found: Posterior, listed: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return the errors that are not listed: the standard deviation assumed, its unit, and what it costs over the volume, um."""
+    levels = [np.linspace(*axis.range_mm, 5) for axis in found.machine.axes]
+    at_mm = full_grid(levels).reshape(-1, 3)
+    matrix, entries = c_matrix(found.machine, at_mm), {}
+    for name in found.names:
+        if name in listed:
+            continue
+        column = matrix[:, :, ERROR_INDEX[name]]
+        size = found.squareness_sd[name] if name in SQUARENESS_NAMES else None
+        sd = (
+            np.full(len(at_mm), size)
+            if size is not None
+            else found.processes[name].sd(at_mm[:, error_named(name).axis])
+        )
+        cost_mm = float(np.sqrt(np.mean(np.sum(column**2, axis=1) * sd**2)))
+        unit = error_named(name).unit
+        entries[name] = {
+            "assumed_sd": found.prior.size_um(name),
+            "unit": unit,
+            "rms_over_volume_um": cost_mm / MM_PER_UM,
+        }
+    return entries
 
 
 def worse_text(found: Posterior) -> str:

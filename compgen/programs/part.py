@@ -16,7 +16,7 @@ from compgen.data.files import read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
-from compgen.identify.covariance import Covariance, error_design
+from compgen.identify.covariance import Covariance, error_design, posterior_with
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
@@ -418,12 +418,21 @@ class _Evaluated:
             u = np.nan
             if machine.covariance is not None and vectors[0] is not None:
                 _, weight = item.value(vectors[0][rows])
-                samples = item.samples
-                design = error_design(machine.model.machine, machine.covariance, samples.position_mm, samples.tool_mm)
-                u = float(np.linalg.norm(np.einsum("nk,nkp->p", weight, design) @ machine.covariance.errors_factor))
+                u = _u_of_feature(machine, item.samples, weight)
             values = (error, after, corrected, both, u * per)
             found.append(Feature(item.name, item.quantity, item.line, item.nominal, item.unit, *values))
         return tuple(found)
+
+
+def _u_of_feature(machine: PartMachine, samples: Samples, weight: FloatArray) -> float:
+    """Standard uncertainty of a figure whose derivatives by the errors at n samples are weights (n, 3), mm."""
+    model, covariance = machine.model, machine.covariance
+    assert covariance is not None
+    posterior = posterior_with(model.machine, model.errors, covariance)
+    if posterior is not None:
+        return posterior.field(samples.position_mm, samples.tool_mm).u_of(weight)
+    design = error_design(model.machine, covariance, samples.position_mm, samples.tool_mm)
+    return float(np.linalg.norm(np.einsum("nk,nkp->p", weight, design) @ covariance.errors_factor))
 
 
 class _Followed:

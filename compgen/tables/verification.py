@@ -7,10 +7,13 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
+from math import erf, sqrt
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.controls import AnyController, SourceFile, controller_named
 from compgen.controls.shared.base import Monomial, Term
@@ -21,10 +24,11 @@ from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.names import COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenWarning, InputError, one_line, um_text
-from compgen.identify.covariance import Covariance, covariance_or_independent, error_design
+from compgen.identify.covariance import Covariance, covariance_or_independent, error_design, posterior_with
 from compgen.identify.identification import Identification
+from compgen.identify.posterior import Posterior, assumed_text, not_measured, worse_text
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, observable_errors, tool_of
 from compgen.kinematics.many_points import blocks, volumetric_error
@@ -91,7 +95,7 @@ class Coverage:
     Parameters
     ----------
     observable : names of the errors that can be distinguished on this machine with one tool.
-    determined : those of them in the errors file.
+    determined : those of them in the errors file, known to a third of what is assumed without a measurement.
     left_out : those that ``errors`` in the machine file excludes from the model.
     """
 
@@ -134,10 +138,11 @@ def _kind(name: str) -> str:
     return "angles" if error.kind == "angular" else "squareness"
 
 
-def coverage_of(machine: Machine, errors: ErrorTable) -> Coverage:
-    """Return how many of the machine's observable errors an error table contains."""
+def coverage_of(machine: Machine, errors: ErrorTable, posterior: Posterior | None = None) -> Coverage:
+    """Return how many of the machine's observable errors an error table contains, and the posterior counts as determined."""
     observable = observable_errors(machine)
-    known = tuple(name for name in observable if name in errors.names)
+    enough = errors.names if posterior is None else posterior.determined
+    known = tuple(name for name in observable if name in errors.names and name in enough)
     listed = machine.errors if isinstance(machine.errors, tuple) else ERROR_NAMES
     return Coverage(observable, known, tuple(name for name in observable if name not in listed))
 
@@ -169,20 +174,132 @@ class FigureUncertainty:
         }
 
 
+#: Points of the volume over which the joint draws are made, and how many draws.
+DRAWN_POINTS, DRAWS = 400, 400
+#: Seed of the draws: the same tables have the same verdict.
+DRAW_SEED = 20_261_123
+#: The probability of a smaller error from which tables are accepted, and from which they are accepted as doubtful.
+PROBABLE, DOUBTFUL = 0.975, 0.8
+#: An eighth of the volume counts as worse if its error grows by this share and this much, um, with this probability.
+WORSE_SHARE, WORSE_UM, WORSE_PROBABILITY = 0.1, 0.5, 0.05
+#: Share of the travel that the readings of an axis with tables must span.
+SPANNED = 0.8
+
+
+@dataclass(frozen=True)
+class ProbableGain:
+    """How the machine will be with and without tables, as far as readings and prior tell: from joint draws of its errors.
+
+    Parameters
+    ----------
+    probability_as_it_stands, probability_rigid_removed : that the error (rms over the volume) is smaller with the tables,
+        with the reference point fixed, and with the best-fit rigid motion removed.
+    before_um, after_um : rms of the error over the volume: median, and limits that it is below and above with 97.5 %.
+    worse_eighths : eighths of the volume, by their place, that probably get worse.
+    short_axes : axes with tables of which the readings span too little, with the share of the travel.
+    assumed, machine_worse : what was assumed of errors that no reading determines; in words.
+    prior, not_measured : the sizes assumed, and the errors that are not listed, with what is assumed of them.
+    """
+
+    probability_as_it_stands: float
+    probability_rigid_removed: float
+    before_um: tuple[float, float, float]
+    after_um: tuple[float, float, float]
+    worse_eighths: tuple[str, ...]
+    short_axes: tuple[tuple[str, float], ...]
+    assumed: str
+    machine_worse: str = ""
+    prior: Mapping[str, Any] = field(default_factory=dict)
+    not_measured: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def probability_better(self) -> float:
+        """Probability that the machine gets better, the smaller of both frames."""
+        return min(self.probability_as_it_stands, self.probability_rigid_removed)
+
+    @property
+    def only_after_new_setup(self) -> bool:
+        """Whether the machine gets better for sure only if the workpiece is set up again."""
+        return self.probability_as_it_stands < PROBABLE <= self.probability_rigid_removed
+
+    @property
+    def reservations(self) -> Iterator[Objection]:
+        """Why tables that probably make the machine better are accepted with reservations only."""
+        p = self.probability_better
+        if p < PROBABLE and not self.only_after_new_setup:
+            text = (
+                f"whether the machine gets better is doubtful (probability {100.0 * p:.0f} %): too little was measured"
+            )
+            yield Objection("doubtful", text)
+        elif self.after_um[2] >= self.before_um[1]:
+            text = (
+                f"the error may be {um_text(self.after_um[2])} um rms after and {um_text(self.before_um[1])} before "
+                "(97.5 % limits): what was not measured is as large as what the tables correct"
+            )
+            yield Objection("bounds_overlap", text)
+        if self.worse_eighths:
+            places = "; ".join(self.worse_eighths[:3]) + (" and more" if len(self.worse_eighths) > 3 else "")
+            yield Objection("worse_eighth", f"a part of the volume probably gets worse: {places}")
+        if self.short_axes:
+            parts = ", ".join(f"{axis} {100.0 * share:.0f} %" for axis, share in self.short_axes)
+            text = f"the readings span too little of the travel of axes with tables ({parts}; {100.0 * SPANNED:.0f} % needed)"
+            yield Objection("short_span", text)
+
+    @property
+    def reason(self) -> str:
+        """Why the tables are not accepted; empty if they probably make the machine better."""
+        p = self.probability_better
+        if p >= DOUBTFUL or self.only_after_new_setup:
+            return ""
+        return (
+            f"the machine probably does not get better (probability {100.0 * p:.0f} %, {100.0 * DOUBTFUL:.0f} % needed): "
+            f"{um_text(self.before_um[0])} um rms before, {um_text(self.after_um[0])} after, with what was not measured; "
+            "measure more of it"
+        )
+
+    @property
+    def text(self) -> str:
+        """Before and after with their limits, in one clause."""
+        (before, low, high), (after, _, most) = self.before_um, self.after_um
+        numbers = f"{um_text(before)} um rms ({um_text(low)} to {um_text(high)}), after {um_text(after)}, at most {um_text(most)}"
+        return f"with what was not measured: before {numbers}"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the object ``probable`` of ``result.json``."""
+        return {
+            "probability_as_it_stands": self.probability_as_it_stands,
+            "probability_rigid_motion_removed": self.probability_rigid_removed,
+            "before_rms_um": dict(zip(("median", "low", "high"), self.before_um, strict=True)),
+            "after_rms_um": dict(zip(("median", "low", "high"), self.after_um, strict=True)),
+            "worse_eighths": list(self.worse_eighths),
+            "short_axes": dict(self.short_axes),
+            "assumed": self.assumed,
+            "machine_worse_than_class": self.machine_worse or None,
+        }
+
+
+def _some(position_mm: FloatArray, most: int) -> NDArray[np.int64]:
+    """Up to ``most`` of the points (n, 3), evenly chosen."""
+    return np.unique(np.linspace(0, len(position_mm) - 1, most).astype(np.int64))
+
+
 @kept
 def figure_uncertainty(
     machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
 ) -> FigureUncertainty | None:
-    """Return the uncertainty of the figures over points (n, 3) due to the errors; None if it is unknown.
+    """Return the uncertainty of the figures over points (n, 3) due to all errors of the machine; None if it is unknown.
 
-    Without a joint covariance the standard uncertainties of the values are used, as if independent.
+    With a prior it includes errors that nobody measured, and what the curves do between the readings and beyond them.
+    Without one it is that of the errors of the table; their values are independent where there is no joint covariance.
     """
     known = covariance_or_independent(errors, covariance, machine.name)
     if known is None:
         return None
+    posterior = posterior_with(machine, errors, covariance)
+    if posterior is not None:
+        return _posterior_uncertainty(machine, posterior, position_mm)
     most = max(50, min(UNCERTAINTY_POINTS, MOST_NUMBERS // (3 * max(len(known.error), 1))))
-    places = np.unique(np.linspace(0, len(position_mm) - 1, most).astype(int))
-    chosen = position_mm[places]
+    chosen = position_mm[_some(position_mm, most)]
     design, factor = error_design(machine, known, chosen), known.errors_factor
     spread = np.empty((len(chosen), 3, factor.shape[1]))
     for output in range(3):  # most errors move one axis
@@ -194,6 +311,100 @@ def figure_uncertainty(
         u_um = Difference(np.zeros(len(flat)), factor).u_size / MM_PER_UM
         found += [COVERAGE * rms(u_um), COVERAGE * float(u_um.max())]
     return FigureUncertainty(*found)
+
+
+def _posterior_uncertainty(machine: Machine, posterior: Posterior, position_mm: FloatArray) -> FigureUncertainty:
+    """Expanded uncertainty of the figures from the posterior; a rigid motion takes nothing from what is between levels."""
+    chosen = position_mm[_some(position_mm, DRAWN_POINTS)]
+    spread = posterior.field(chosen)
+    flat = spread.factor.reshape(3 * len(chosen), -1)
+    left = small_motion(chosen + tool_of(machine, None)).taken_out(flat).reshape(spread.factor.shape)
+    found: list[float] = []
+    for part in (spread, replace(spread, factor=left)):
+        u_um = np.sqrt(part.variance.sum(axis=1)) / MM_PER_UM
+        found += [COVERAGE * rms(u_um), COVERAGE * float(u_um.max())]
+    return FigureUncertainty(*found)
+
+
+def probable_gain(
+    machine: Machine,
+    errors: ErrorTable,
+    posterior: Posterior,
+    position_mm: FloatArray,
+    before_mm: FloatArray,
+    after_mm: FloatArray,
+) -> ProbableGain:
+    """Return how the errors of a machine with and without tables compare, over joint draws of its posterior.
+
+    Parameters
+    ----------
+    errors : those that were identified; the tables compensate them.
+    posterior : of all errors of the machine.
+    position_mm : n points over the volume (n, 3), with the errors of the tool tip that the identified errors cause there
+        without and with the tables, ``before_mm`` and ``after_mm`` (n, 3).
+    """
+    some = _some(position_mm, DRAWN_POINTS)
+    at_mm = position_mm[some]
+    draws = posterior.field(at_mm).draws(DRAWS, DRAW_SEED) + posterior.mean(at_mm, without=errors.names)
+    before, after = before_mm[some] + draws, after_mm[some] + draws
+    # the squares of both differ by a linear function of the errors, so the probability follows from mean and variance
+    motion = small_motion(at_mm + tool_of(machine, None))
+    frames = []
+    for remove in (False, True):
+        one, two = before.reshape(DRAWS, -1), after.reshape(DRAWS, -1)
+        if remove:
+            one, two = motion.taken_out(one.T).T, motion.taken_out(two.T).T
+        gain = np.sum(one**2, axis=1) - np.sum(two**2, axis=1)
+        spread = float(gain.std())
+        frames.append(
+            0.5 * (1.0 + erf(float(gain.mean()) / (spread * sqrt(2.0)))) if spread > 0 else float(gain.mean() > 0)
+        )
+
+    def limits(errors_mm: FloatArray) -> tuple[float, float, float]:
+        each = np.sqrt(np.mean(np.sum(errors_mm**2, axis=2), axis=1)) / MM_PER_UM
+        low, median, high = np.quantile(each, [0.025, 0.5, 0.975]).tolist()
+        return median, low, high
+
+    return ProbableGain(
+        frames[0],
+        frames[1],
+        limits(before),
+        limits(after),
+        tuple(_worse_eighths(machine, at_mm, before, after)),
+        tuple(_short_axes(machine, errors, posterior)),
+        assumed_text(posterior),
+        worse_text(posterior),
+        posterior.prior.as_dict(),
+        not_measured(posterior, errors.names),
+    )
+
+
+def _worse_eighths(machine: Machine, at_mm: FloatArray, before_mm: FloatArray, after_mm: FloatArray) -> Iterator[str]:
+    """Name the eighths of the volume whose error grows by more than a tenth with more than 5 % probability."""
+    middle = 0.5 * (machine.lower_mm + machine.upper_mm)
+    for corner in product((False, True), repeat=3):
+        rows = ((at_mm > middle) == np.array(corner)).all(axis=1)
+        if not rows.any():
+            continue
+        one, two = (
+            np.sqrt(np.mean(np.sum(part[:, rows] ** 2, axis=2), axis=1)) / MM_PER_UM for part in (before_mm, after_mm)
+        )
+        share = float(np.mean(two > (1.0 + WORSE_SHARE) * one + WORSE_UM))
+        if share > WORSE_PROBABILITY:
+            place = ", ".join(
+                f"{axis} {'above' if high else 'below'} {at:g}"
+                for axis, high, at in zip(AXES, corner, middle, strict=True)
+            )
+            yield f"{place} mm ({100.0 * share:.0f} %)"
+
+
+def _short_axes(machine: Machine, errors: ErrorTable, posterior: Posterior) -> Iterator[tuple[str, float]]:
+    """Axes with curves of whose travel the readings span too little, with the share."""
+    for axis in sorted({error_named(name).axis for name in errors.curves}):
+        low, high = posterior.spans_mm[axis].tolist()
+        share = (high - low) / machine.axes[axis].length_mm if high >= low else 1.0
+        if share < SPANNED:
+            yield AXES[axis], share
 
 
 # --- the measurement -----------------------------------------------------------------------------------------------
@@ -219,6 +430,8 @@ def measurement_objections(
 def _objections(result: Identification, taken_away_um: float | None) -> Iterator[Objection]:
     for text in result.objections:
         yield Objection("contradiction", text, blocking=True)
+    for text in result.doubts:
+        yield Objection("disagreement", text)
     misfit = result.misfit
     if misfit is not None:
         for cause in misfit.causes:
@@ -521,6 +734,7 @@ class Verification(Drawable):
     uncertainty: FigureUncertainty | None = None
     next_command: str = ""
     tools: str = ""
+    gain: ProbableGain | None = None
 
     @property
     def accepted(self) -> bool:
@@ -545,7 +759,7 @@ class Verification(Drawable):
             found.append("partial")
         if self.objections or self.reservations:
             found.append("accepted_with_reservations")
-        if self.worse_as_it_stands:
+        if self.worse_as_it_stands or (self.gain is not None and self.gain.only_after_new_setup):
             found.append("better_after_new_setup")
         if not self.accepted:
             found.append("not_accepted")
@@ -565,6 +779,11 @@ class Verification(Drawable):
                 f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the "
                 f"workpiece removed it goes from {um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
             )
+        elif self.gain is not None and self.gain.only_after_new_setup:
+            said.append(
+                "better only after the workpiece is set up again: without that the machine gets better with a probability of "
+                f"{100.0 * self.gain.probability_as_it_stands:.0f} % only"
+            )
         parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
         if parts:
             said.append(f"accepted with reservations: {'; '.join(parts)}")
@@ -583,7 +802,8 @@ class Verification(Drawable):
         bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")
         if self.volumetric:
             return f"the error over the volume goes from {change} ({bounds})"
-        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is unknown"
+        over_volume = "the error over the volume is unknown" if self.gain is None else self.gain.text
+        return f"the effect of the measured errors alone goes from {change} ({bounds}); {over_volume}"
 
     @property
     def _beyond_text(self) -> str:
@@ -602,6 +822,8 @@ class Verification(Drawable):
     def notes(self) -> tuple[str, ...]:
         """What else the user should know about accepted tables."""
         notes = [*self.reservations, *self.safety.warnings]
+        if self.gain is not None:
+            notes += [text for text in (self.gain.assumed, self.gain.machine_worse) if text]
         if self.partial:
             notes.append(self._beyond_text)
         if self.after.max_um > self.before.max_um + 0.05 and not self.worse_as_it_stands:
@@ -630,6 +852,10 @@ class Verification(Drawable):
             "after": self.after.as_dict(),
             "before_rigid_motion_removed": self.before_rigid_removed.as_dict(),
             "after_rigid_motion_removed": self.after_rigid_removed.as_dict(),
+            "probability_better": None if self.gain is None else self.gain.probability_better,
+            "probable": None if self.gain is None else self.gain.as_dict(),
+            "prior": {"class": "none"} if self.gain is None else dict(self.gain.prior),
+            "not_measured": {} if self.gain is None else dict(self.gain.not_measured),
             "after_uncertainty": None if self.uncertainty is None else self.uncertainty.as_dict(),
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
@@ -729,6 +955,9 @@ def verify(
     same = points is None and reversal is None and not control.by_direction(tables.tables)
     on_grid = (correction, rigid_removed[1]) if same else None
     safety, reasons = reasons_against(machine, tables, judge, limits, reversal, on_grid=on_grid)
+    posterior = posterior_with(machine, errors, covariance)
+    gain = None if posterior is None else probable_gain(machine, errors, posterior, where.position_mm, before, after)
+    improbable = [gain.reason] if gain is not None and gain.reason else []
     useless = _useless_reasons(
         machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed
     )
@@ -745,12 +974,12 @@ def verify(
         },
         points=len(where),
         files=tables.files,
-        reasons=tuple(dict.fromkeys([*useless, *reasons])),
+        reasons=tuple(dict.fromkeys([*useless, *reasons, *improbable])),
         reservations=(
             *control.reservations(tables.tables),
             *control.left_out(errors),
         ),
-        measured=coverage_of(machine, errors),
+        measured=coverage_of(machine, errors, posterior),
         safety=safety,
         position_mm=where.position_mm,
         error_before_mm=before,
@@ -758,6 +987,8 @@ def verify(
         machine=machine.name,
         uncertainty=figure_uncertainty(machine, errors, where.position_mm, covariance),
         tools=machine.tool_range_text,
+        objections=() if gain is None else tuple(gain.reservations),
+        gain=gain,
     )
 
 
