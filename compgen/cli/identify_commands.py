@@ -16,6 +16,7 @@ from compgen.cli.shared_options import (
     machine_argument,
     mapper,
     measurements_argument,
+    prior_option,
     stated_options,
 )
 from compgen.cli.terminal import progress, stdout
@@ -57,6 +58,7 @@ from compgen.report.terminal import fit_table
 
 @click.command("identify")
 @machine_argument
+@prior_option
 @measurements_argument
 @instrument_option
 @stated_options

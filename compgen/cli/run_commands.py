@@ -21,6 +21,7 @@ from compgen.cli.shared_options import (
     limits_option,
     machine_argument,
     measurements_argument,
+    prior_option,
     sample_options,
     stated_options,
     templates_option,
@@ -126,6 +127,7 @@ def report_written(folder: Path, language: str, known: KnownTables | None = None
 
 @click.command("run")
 @machine_argument
+@prior_option
 @emphasis_options
 @measurements_argument
 @controller_option(multiple=True)

@@ -212,6 +212,22 @@ def emphasised(machine: Machine, zone: str | None, zone_weight: float | None, to
     return replace(machine, emphasis=Emphasis(zone_mm, weight, tools_mm))
 
 
+def prior_option(command: Command) -> Command:
+    """Add --prior, which overrides the section [prior] of the machine file. Below machine_argument."""
+
+    @functools.wraps(command)
+    def wrapper(*args: Any, machine: Machine, prior: str | None, **options: Any) -> Any:
+        chosen = machine.prior if prior is None else machine.prior.with_class(prior)
+        return command(*args, machine=replace(machine, prior=chosen), **options)
+
+    return click.option(
+        "--prior",
+        metavar="CLASS",
+        help="How large errors are assumed that were not measured: precision, general (default), large, router, printer, "
+        "or none; overrides [prior] of the machine file.",
+    )(wrapper)  # type: ignore[return-value]
+
+
 def tool_offset(option: str, text: str) -> Vector3:
     """Read a tool offset X,Y,Z in mm."""
     try:

@@ -21,6 +21,7 @@ from compgen.cli.shared_options import (
     limits_option,
     machine_argument,
     points_option,
+    prior_option,
     reversal_option,
     sample_options,
     templates_option,
@@ -270,6 +271,7 @@ def read_command(
 
 @click.command("verify")
 @machine_argument
+@prior_option
 @emphasis_options
 @click.argument("tables", nargs=-1, required=True, type=PATH)
 @controller_option()

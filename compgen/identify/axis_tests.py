@@ -124,7 +124,7 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     letters = ", ".join(AXES[axis] for axis in runs.axes)
     warnings.warn(
         f"positioning runs of {letters} show {', '.join(errors.names)} along the line that was measured; angular errors, "
-        "straightness and squareness were not measured and are taken as zero",
+        "straightness and squareness were not measured",
         CompgenWarning,
         stacklevel=2,
     )

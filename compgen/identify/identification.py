@@ -214,6 +214,7 @@ class Identification(Drawable):
             "condition": self.condition,
             "iterations": self.iterations,
             "identified": list(self.errors.names),
+            **self._assumptions(),
             "unobservable": list(self.unobservable),
             "rejected": [asdict(item) for item in self.rejected],
             "segments": [item.summary() for item in self.segments],
@@ -233,6 +234,22 @@ class Identification(Drawable):
             **({"steps": dict(self.steps)} if self.steps else {}),
             **({self.method: dict(self.details)} if self.details else {}),
             **({"objections": list(self.objections)} if self.objections else {}),
+        }
+
+    def _assumptions(self) -> dict[str, Any]:
+        """What was assumed of errors that no reading determines; of a result that has all of them, the sizes only."""
+        prior = self.layout.machine.prior
+        if "posterior_means" not in self.details or self.posterior is None:
+            return {"prior": prior.as_dict(), "not_measured": {}, "determined": list(self.errors.names)}
+        from compgen.identify.posterior import assumed_text, not_measured, worse_text
+
+        found = self.posterior
+        return {
+            "prior": found.prior.as_dict(),
+            "assumed": assumed_text(found),
+            "machine_worse_than_class": worse_text(found) or None,
+            "determined": [name for name in found.determined if name in self.errors.names],
+            "not_measured": not_measured(found, self.errors.names),
         }
 
     def overview(self) -> Overview:

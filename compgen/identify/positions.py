@@ -145,7 +145,7 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
     if texts:
         warnings.warn(
             f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
-            "neighbours by smoothness, with the uncertainty of an extrapolation; --range from-data uses only what was measured",
+            "neighbours by smoothness, with the uncertainty of an extrapolation",
             CompgenWarning,
             stacklevel=3,
         )
@@ -267,7 +267,7 @@ def _free_pose_result(
         -solution.residual, readings.sigma_mm, accepted, source, solution.rank, solution.freedom, too_few=too_few
     )
     errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
-    ambiguous = "part of it cannot be separated from the pose, the scale or other errors; u leaves that part out"
+    ambiguous = "part of it cannot be separated from the pose, the scale or other errors"
     return replace(
         _result(adjusted, errors, solution.layout, deviations, readings.row, readings.component),
         unobservable=(
@@ -397,7 +397,7 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
         unobservable=(
             *not_among(errors, "no reading shows it"),
             *(
-                f"{name}: part of it cannot be separated from the pose, the artefact or other errors; u leaves that part out"
+                f"{name}: part of it cannot be separated from the pose, the artefact or other errors"
                 for name in solution.partly
             ),
         ),

@@ -318,7 +318,7 @@ class Posterior:
         inner, across = process.covariance(at, at), process.covariance(position_mm, at)
         inner[np.diag_indices(len(at))] *= 1.0 + JITTER
         weights = np.linalg.solve(inner, across.T).T
-        return weights, process.covariance(position_mm, position_mm) - weights @ across.T
+        return np.asarray(weights), process.covariance(position_mm, position_mm) - weights @ across.T
 
     def curve(self, name: str, position_mm: FloatArray) -> Curve:
         """Return mean and standard uncertainty of an error at positions (m,); of a squareness at one position."""

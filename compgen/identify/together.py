@@ -272,26 +272,41 @@ def with_prior(
         if name in SQUARENESS_NAMES:
             at = np.array([np.nan])
             mean = found.curve(name, at)
-            value = result.errors.squareness[name][0] if name in whole else float(mean.value[0])
-            squareness[name] = (value, float(mean.u[0]))
+            value, u = float(mean.value[0]), float(mean.u[0])
+            if name in whole:  # as it was stated or measured
+                value, stated = result.errors.squareness[name]
+                u = max(u, stated) if np.isfinite(stated) else u
+            squareness[name] = (value, u)
         else:
             at = _output_mm(machine, name, own, whole=name in whole)
             mean = found.curve(name, at)
-            kept = np.isin(at, own.position_mm) if own is not None and name in whole else np.zeros(len(at), dtype=bool)
-            curves[name] = Curve(at, np.where(kept, own.at(at) if own is not None else 0.0, mean.value), mean.u)
+            if own is not None and name in whole:
+                kept = np.isin(at, own.position_mm)
+                least = np.where(kept, np.nan_to_num(np.interp(at, own.position_mm, own.u)), 0.0)
+                mean = Curve(at, np.where(kept, own.at(at), mean.value), np.maximum(mean.u, least))
+            curves[name] = mean
         positions.append(at)
-    order = [name for name in ERROR_NAMES if name in curves or name in squareness]
     errors = ErrorTable(curves, squareness, result.errors.metadata)
-    assert list(errors.names) == order
-    factor = found.values_factor(order, positions)
+    factor = found.values_factor(listed, positions)
     if factor.shape[1] > factor.shape[0]:
         factor = np.transpose(np.linalg.qr(factor.T)[1])
+    size, u = np.linalg.norm(factor, axis=1), errors.uncertainties()
+    factor = factor * np.where(size > 0, u / np.where(size > 0, size, 1.0), 1.0)[:, None]
+    own_names = set(result.errors.names)
+    left = {name for name in result.errors.names if name not in listed}
     agreement = _agreement(machine, parts, information, found) if len(parts) > 1 else {}
     objections, doubts = _disagreements(agreement)
     return replace(
         result,
         errors=errors,
-        unobservable=tuple(text for text in result.unobservable if text.partition(":")[0] not in order),
+        unobservable=(
+            *(
+                text
+                for text in result.unobservable
+                if text.partition(":")[0] not in {*left, *(set(listed) - own_names)}
+            ),
+            *(f"{name}: the readings show little of it" for name in ERROR_NAMES if name in left),
+        ),
         worst_u=worst_uncertainty(errors),
         layout=error_parameters(machine, errors.names),
         adjustment=None,
@@ -303,7 +318,7 @@ def with_prior(
         details={
             **result.details,
             **({"en": agreement} if len(parts) > 1 else {}),
-            "posterior_means": [name for name in order if name not in whole],
+            "posterior_means": [name for name in listed if name not in whole],
         },
     )
 
@@ -348,7 +363,27 @@ def _without_prior(
     machine: Machine, parts: Sequence[Source], result: Identification, options: IdentifyOptions
 ) -> Identification:
     """Return a result without a prior: what the readings do not determine has no uncertainty, and that is said."""
-    return result
+    if result.adjustment is not None or not result.errors.names:
+        return result
+    layout = error_parameters(machine, modelled_errors(machine))
+    observed = stacked([part.observed(machine, layout, options, np.zeros(layout.size)) for part in parts])
+    names, at = result.errors.labels()
+    rows = layout.value_rows(names, at)
+    open_values = ~determined_values(layout, observed, rows) & np.any(rows, axis=1)
+    if not open_values.any():
+        return result
+    u = np.where(open_values, np.nan, result.errors.uncertainties())
+    lost = dict.fromkeys(name for name, missing in zip(names, open_values.tolist(), strict=True) if missing)
+    return replace(
+        result,
+        errors=result.errors.with_values(u=u),
+        values_factor=None,
+        worst_u={},
+        unobservable=(
+            *result.unobservable,
+            *(f"{name}: not determined everywhere; its u is not known" for name in lost),
+        ),
+    )
 
 
 def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identification]) -> Identification:
@@ -380,7 +415,7 @@ def _joined(machine: Machine, parts: Sequence[Source], known: Sequence[Identific
         worst_u=worst_uncertainty(errors) if whole else {},
         layout=error_parameters(machine, errors.names),
         values_factor=np.hstack(factors) if whole else None,
-        details={"parts": [part.summary() for part in parts], "within_circles": _within_circles(parts)},
+        details={"parts": [part.summary() for part in parts]},
     )
 
 
@@ -454,21 +489,6 @@ def _with_known_curves(layout: ErrorParameters, found: Sequence[Observations], k
     return replace(found[k], design=design)
 
 
-def _within_circles(
-    parts: Sequence[Source], layout: ErrorParameters | None = None, found: Sequence[Observations] = ()
-) -> list[str]:
-    """Squareness that circles show, unless the straightness of both axes is taken into account by their readings."""
-    names: list[str] = []
-    for k, part in enumerate(parts):
-        if isinstance(part.measurement, Circles) and part.alone is not None:
-            curves = () if layout is None else layout.curves
-            taken = {curve.error.name for curve in curves if found[k].design[:, curve.columns].any()}
-            for name in part.alone.errors.squareness:
-                one, other = (AXES[axis] for axis in range(3) if axis != error_named(name).direction)
-                names += [name] if {f"E{one}{other}", f"E{other}{one}"} - taken else []
-    return names
-
-
 def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOptions) -> Identification:
     """One least-squares adjustment of everything, and how the parts agree."""
     layouts = [part.alone.layout for part in parts if part.alone is not None and part.alone.adjustment is not None]
@@ -530,7 +550,7 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
             *not_among(shown, "no reading shows it"),
             *hardly.values(),
             *(
-                f"{name}: part of it cannot be separated from other unknowns; u leaves that part out"
+                f"{name}: part of it cannot be separated from other unknowns"
                 for name in solution.partly
                 if name not in hardly
             ),
@@ -544,7 +564,6 @@ def _adjusted(machine: Machine, parts: Sequence[Source], options: IdentifyOption
         values_factor=factor,
         details={
             "parts": [part.summary() for part in adjusted],
-            "within_circles": _within_circles(parts, layout, found),
             "en": agreement,
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
@@ -600,7 +619,8 @@ def _agreement(
 
 def _disagreements(agreement: Mapping[str, Mapping[str, float]]) -> tuple[list[str], list[str]]:
     """Return objections to parts that contradict the others, and reservations about those that nearly do."""
-    objections, doubts = [], []
+    objections: list[str] = []
+    doubts: list[str] = []
     for name, numbers in agreement.items():
         over = {error: value for error, value in numbers.items() if value > 1.0}
         if not over:

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
 #: Further reasons and rejected readings are in the JSON files only.
 MOST_VERDICT_REASONS = 10
-_WITHIN_CIRCLES = "squareness within the circles: bent guides make it differ over the whole travel, beyond u"
 
 
 def identification_table(result: Identification) -> Group:
@@ -71,9 +70,7 @@ def identification_table(result: Identification) -> Group:
             )
         disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
                     for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
-        local = result.details.get("within_circles", ())
-        bent = [f"{', '.join(local)}: {_WITHIN_CIRCLES}"] if local else []
-        return Group(Text("\n".join([*listed, quality, *bent, *disagree])), _errors_table(result))
+        return Group(Text("\n".join([*listed, quality, *disagree, *_assumed(result)])), _errors_table(result))
     counted = {
         "deviations": "components of measured positions used",
         "artefact": "probed coordinates used",
@@ -105,12 +102,19 @@ def identification_table(result: Identification) -> Group:
         for item in result.details.get("unknowns", ())
         if item["what"] in ("reversal", "scales", "servo mismatch")
     ]
-    if result.method == "circles" and result.errors.squareness:
-        lines.append(_WITHIN_CIRCLES)
     if result.method == "merged":
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
-    return Group(Text("\n".join(lines)), _errors_table(result))
+    return Group(Text("\n".join([*lines, *_assumed(result)])), _errors_table(result))
+
+
+def _assumed(result: Identification) -> list[str]:
+    """Return what was assumed of errors that no reading determines, and whether the machine is worse than its class."""
+    if "posterior_means" not in result.details or result.posterior is None:  # the readings determine every error
+        return []
+    from compgen.identify.posterior import assumed_text, worse_text
+
+    return [text for text in (assumed_text(result.posterior), worse_text(result.posterior)) if text]
 
 
 def _errors_table(result: Identification) -> Table:
