@@ -290,8 +290,8 @@ def with_prior(
     factor = found.values_factor(listed, positions)
     if factor.shape[1] > factor.shape[0]:
         factor = np.transpose(np.linalg.qr(factor.T)[1])
-    size, u = np.linalg.norm(factor, axis=1), errors.uncertainties()
-    factor = factor * np.where(size > 0, u / np.where(size > 0, size, 1.0), 1.0)[:, None]
+    size, known_u = np.linalg.norm(factor, axis=1), errors.uncertainties()
+    factor = factor * np.where(size > 0, known_u / np.where(size > 0, size, 1.0), 1.0)[:, None]
     own_names = set(result.errors.names)
     left = {name for name in result.errors.names if name not in listed}
     agreement = _agreement(machine, parts, information, found) if len(parts) > 1 else {}
