@@ -199,11 +199,22 @@ def number_text(value: object, digits: int = 3, missing: str = "–") -> str:
     return f"{value:.{digits}f}"
 
 
-def um_text(value: float | None, whole_from: float = 1000.0) -> str:
+def um_text(value: float | None, whole_from: float = 1000.0, u_um: float | None = None) -> str:
     """A figure in um: two decimals below 10, none from ``whole_from`` on, a dash for None.
+
+    With an expanded uncertainty ``u_um``, of which two digits count, no more decimals than these; a figure that is then zero
+    is said to be smaller than the last digit.
 
     >>> um_text(0.157), um_text(42.34), um_text(1714.6), um_text(None)
     ('0.16', '42.3', '1715', '–')
+    >>> um_text(42.34, u_um=16.3), um_text(0.157, u_um=3.26), um_text(0.002, u_um=6.1)
+    ('42', '0.2', '<0.1')
     """
     size = 0.0 if value is None else abs(value)
-    return number_text(value, 2 if size < 9.995 else 1 if size < whole_from - 0.05 else 0)
+    digits = 2 if size < 9.995 else 1 if size < whole_from - 0.05 else 0
+    if value is None or u_um is None or not (math.isfinite(u_um) and u_um > 0.0):
+        return number_text(value, digits)
+    digits = min(digits, max(0, 1 - math.floor(math.log10(u_um))))
+    if 0.0 < size < 0.5 * 10.0**-digits:
+        return f"<{10.0**-digits:g}"
+    return number_text(value, digits)

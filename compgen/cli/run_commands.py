@@ -212,7 +212,7 @@ def run_command(
     if as_json:
         print_json({**result.summary(), "report": None if report is None else str(report)})
     else:
-        stdout.print(identification_table(result.identification))
+        stdout.print(identification_table(result.identification, assumed=False))
         stdout.print(verification_table([item.verification for item in result.results]))
         for item in result.results:
             say_paths(item.paths)

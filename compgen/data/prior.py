@@ -12,6 +12,14 @@ from compgen.errors import InputError, nearest
 
 #: Size of the errors of each class, relative to a machining centre within the tolerances of ISO 10791-2 and -4.
 CLASSES = {"precision": 1.0 / 3.0, "general": 1.0, "large": 3.0, "router": 20.0, "printer": 20.0}
+#: The classes as a shop says it.
+CLASS_WORDS = {
+    "precision": "precision jig borer",
+    "general": "machining centre",
+    "large": "large portal",
+    "router": "hobby router",
+    "printer": "printer",
+}
 #: The class of a machine whose file states none.
 USUAL_CLASS = "general"
 #: No prior: what is not measured stays without a statement.
@@ -101,6 +109,17 @@ class PriorSettings:
     def stated_class(self) -> str:
         """The class in use."""
         return self.class_name or USUAL_CLASS
+
+    @property
+    def class_text(self) -> str:
+        """The class in words: by whom it was stated, and by how much the readings raised it."""
+        text = f"class {self.stated_class}, {CLASS_WORDS.get(self.stated_class, 'nothing is assumed')}"
+        if self.class_name is None:
+            text += ", as the machine file states none"
+        larger = [
+            f"{what} {x:.3g} times" for what, x in zip(("curves", "squareness"), self.factor, strict=True) if x > 1
+        ]
+        return text + (f"; raised: {', '.join(larger)}" if larger else "")
 
     def _of_class(self, key: str) -> float:
         own = getattr(self, key)

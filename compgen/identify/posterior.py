@@ -709,36 +709,46 @@ def assumed_text(found: Posterior) -> str:
         if name not in found.determined:
             kind, unit = words[_kind_of(name)], error_named(name).unit
             sizes[kind] = max(sizes.get(kind, (0.0, unit)), (2.0 * found.prior.size_um(name), unit))
-    which = f"class {found.prior.stated_class}" + ("" if found.prior.class_name else " (the machine file states none)")
+    which = found.prior.class_text
     if not sizes:
-        return f"every error was measured; between the readings the prior of {which} holds"
+        return f"every error was measured; assumed between the readings: {which}"
     parts = [f"{kind} up to {size:.3g} {unit}" for kind, (size, unit) in sizes.items()]
-    return f"assumed for what was not measured: {', '.join(parts)} (k = 2, {which})"
+    return f"assumed for what was not measured: {', '.join(parts)} (k = 2; {which})"
 
 
 def not_measured(found: Posterior, listed: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return the errors that are not listed: the standard deviation assumed, its unit, and what it costs over the volume, um."""
-    levels = [np.linspace(*axis.range_mm, 5) for axis in found.machine.axes]
-    at_mm = full_grid(levels).reshape(-1, 3)
-    matrix, entries = c_matrix(found.machine, at_mm), {}
-    for name in found.names:
-        if name in listed:
-            continue
-        column = matrix[:, :, ERROR_INDEX[name]]
-        size = found.squareness_sd[name] if name in SQUARENESS_NAMES else None
-        sd = (
-            np.full(len(at_mm), size)
-            if size is not None
-            else found.processes[name].sd(at_mm[:, error_named(name).axis])
-        )
-        cost_mm = float(np.sqrt(np.mean(np.sum(column**2, axis=1) * sd**2)))
-        unit = error_named(name).unit
+    entries = {}
+    for name, cost_um in _costs_um(found, [name for name in found.names if name not in listed], prior=True).items():
         entries[name] = {
             "assumed_sd": found.prior.size_um(name),
-            "unit": unit,
-            "rms_over_volume_um": cost_mm / MM_PER_UM,
+            "unit": error_named(name).unit,
+            "rms_over_volume_um": cost_um,
         }
     return entries
+
+
+def not_determined_um(found: Posterior) -> dict[str, float]:
+    """Return the errors that are not determined with what their u does to the tool, rms over the volume, largest first."""
+    costs = _costs_um(found, [name for name in found.names if name not in found.determined])
+    return dict(sorted(costs.items(), key=lambda item: -item[1]))
+
+
+def _costs_um(found: Posterior, names: Sequence[str], *, prior: bool = False) -> dict[str, float]:
+    """What is not known of errors, at the tool: rms over the volume, um; with ``prior`` as if nothing had been measured."""
+    levels = [np.linspace(*axis.range_mm, 5) for axis in found.machine.axes]
+    at_mm = full_grid(levels).reshape(-1, 3)
+    matrix, costs = c_matrix(found.machine, at_mm), {}
+    for name in names:
+        column = matrix[:, :, ERROR_INDEX[name]]
+        axis = error_named(name).axis
+        if name in SQUARENESS_NAMES:
+            sd = np.full(5, found.squareness_sd[name] if prior else found.curve(name, np.zeros(1)).u[0])
+        else:
+            sd = found.processes[name].sd(levels[axis]) if prior else found.curve(name, levels[axis]).u
+        at_points = np.interp(at_mm[:, axis], levels[axis], sd)
+        costs[name] = float(np.sqrt(np.mean(np.sum(column**2, axis=1) * at_points**2))) / MM_PER_UM
+    return costs
 
 
 def worse_text(found: Posterior) -> str:
@@ -749,14 +759,9 @@ def worse_text(found: Posterior) -> str:
         f"{name} ({ratio:.1f} times)" for name, ratio in sorted(found.worse.items(), key=lambda x: -x[1])[:4]
     )
     more = f" and {len(found.worse) - 4} more" if len(found.worse) > 4 else ""
-    raised = [
-        f"{what} by {factor:.3g}"
-        for what, factor in zip(("curves", "squareness"), found.prior.factor, strict=True)
-        if factor > 1.0
-    ]
     return (
         f"the machine is worse than its class {found.prior.stated_class!r}: {listed}{more} of what the class lets expect; "
-        f"assumed sizes are raised ({', '.join(raised)}). State class or sizes in [prior] of the machine file"
+        "larger errors are assumed. State class or sizes in [prior] of the machine file"
     )
 
 

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 MOST_VERDICT_REASONS = 10
 
 
-def identification_table(result: Identification) -> Group:
-    """Return the summary of an identification."""
+def identification_table(result: Identification, *, assumed: bool = True) -> Group:
+    """Return the summary of an identification; with ``assumed`` also what is assumed of errors that were not measured."""
     if result.method == "sixdof":
         parts = [
             f"{name}: mode {item['mode']}, {item['runs']} runs, {item['positions']} positions"
@@ -70,7 +70,10 @@ def identification_table(result: Identification) -> Group:
             )
         disagree = [f"{name} against the others: largest En {max(en.values()):.2f} ({max(en, key=lambda key: en[key])})"
                     for name, en in result.details.get("en", {}).items() if en]  # fmt: skip
-        return Group(Text("\n".join([*listed, quality, *disagree, *_assumed(result)])), _errors_table(result))
+        return Group(
+            Text("\n".join([*listed, quality, *disagree, *(_assumed(result) if assumed else [])])),
+            _errors_table(result),
+        )
     counted = {
         "deviations": "components of measured positions used",
         "artefact": "probed coordinates used",
@@ -105,7 +108,7 @@ def identification_table(result: Identification) -> Group:
     if result.method == "merged":
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
-    return Group(Text("\n".join([*lines, *_assumed(result)])), _errors_table(result))
+    return Group(Text("\n".join([*lines, *(_assumed(result) if assumed else [])])), _errors_table(result))
 
 
 def _assumed(result: Identification) -> list[str]:
@@ -197,18 +200,88 @@ def _uncertainty(results: Sequence[Verification]) -> str:
 
 
 def verification_table(results: Sequence[Verification]) -> Group:
-    """Return before and after for every control, read from its files, and why tables were not accepted."""
-    volumetric = all(item.volumetric for item in results)
-    what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
-    title = f"{what}, max / rms in um, as read back from the files"
+    """Return before and after for every control, read from its files, and why tables were not accepted.
+
+    What is assumed of errors that were not measured is the same for all of them, and is said once.
+    """
+    table = _probable_table(results) if all(item.gain is not None for item in results) else _file_table(results)
+    common = list(dict.fromkeys(text for item in results for text in item.assumptions))
+    notes: list[Text] = []
+    for item in results:
+        notes += _notes(item, common)
+        if item.next_command:
+            notes.append(Text(f"{item.controller}: next: {one_line(item.next_command)}"))
+        if item.uncorrected_um:
+            u_um = None if item.uncertainty is None else item.uncertainty.max_um
+            left = {name: um_text(value, u_um=u_um) for name, value in item.uncorrected_um.items()}
+            named = [f"{name} {text} um" for name, text in left.items() if not text.startswith("<")]
+            more = f" and {len(left) - 8} more" if len(named) > 8 else ""
+            if named:
+                notes.append(Text(f"{item.controller} leaves uncorrected: {', '.join(named[:8])}{more}"))
+    judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
+    return Group(table, *(Text(text) for text in (*judged, *common)), *notes)
+
+
+def _notes(item: Verification, common: Sequence[str]) -> list[Text]:
+    """Return the verdict on the tables of a control in a sentence, then what else is said of them."""
+    style, notes = VERDICTS[item.state][1], []
+    if item.accepted:
+        notes.append(Text(f"{item.controller}: {item.headline}", "" if item.state == "accepted" else style))
+    notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_VERDICT_REASONS]]
+    if len(item.reasons) > MOST_VERDICT_REASONS:
+        notes.append(
+            Text(f"{item.controller}: and {len(item.reasons) - MOST_VERDICT_REASONS} more in result.json", "red")
+        )
+    if item.accepted:
+        said = dict.fromkeys([*item.said_against, *item.notes])
+        notes += [Text(f"  {text}", "yellow") for text in said if text not in common and text not in item.headline]
+    return notes
+
+
+def _table_of_controls(title: str, *headings: str) -> Table:
     table = Table(
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
     table.add_column("control", overflow="fold", min_width=12)
-    for heading in ("before", "after", "before*", "after*", "at best"):
+    for heading in headings:
         table.add_column(heading, justify="right", overflow="fold", min_width=6)
     table.add_column("verdict", no_wrap=True, min_width=9)
-    notes: list[Text] = []
+    return table
+
+
+def _probable_table(results: Sequence[Verification]) -> Group:
+    """Return before and after with the limits that measurement and prior leave."""
+    title = "tool tip error over the volume, um rms, with what was not measured (97.5 % limits)"
+    table = _table_of_controls(title, "before", "after", "at most", "after*", "at most*", "by the files", "at best")
+    for item in results:
+        assert item.gain is not None
+        before, low, high, after, most = item.gain.rounded
+        _, _, _, after_rigid, most_rigid = item.gain.rounded_rigid
+        known = item.uncertainty
+        left = "–" if known is None else f"{um_text(item.after.max_um, u_um=known.max_um)} / "
+        left += "" if known is None else um_text(item.after.rms_um, u_um=known.rms_um)
+        table.add_row(
+            item.controller,
+            f"{before} ({low} to {high})",
+            *(after, most, after_rigid, most_rigid, left),
+            um_text(item.unrepresentable_um, u_um=None if known is None else known.max_um),
+            Text(*VERDICTS[item.state]),
+        )
+    legend = (
+        "before, after: with the reference point fixed; after*: with the best-fit rigid motion of the workpiece removed; by the "
+        "files: largest / rms that the tables, read back, leave of the errors found; at best: the largest with the best "
+        "possible table of this control"
+    )
+    return Group(table, Text(legend))
+
+
+def _file_table(results: Sequence[Verification]) -> Group:
+    """Return before and after of the errors found, as read back from the files: nothing is known of other errors."""
+    volumetric = all(item.volumetric for item in results)
+    what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
+    table = _table_of_controls(
+        f"{what}, max / rms in um, as read back from the files", "before", "after", "before*", "after*", "at best"
+    )
     for item in results:
         table.add_row(
             item.controller,
@@ -219,31 +292,11 @@ def verification_table(results: Sequence[Verification]) -> Group:
             um_text(item.unrepresentable_um),
             Text(*VERDICTS[item.state]),
         )
-        if item.accepted and item.state != "accepted":
-            notes.append(Text(f"{item.controller}: {item.headline}", VERDICTS[item.state][1]))
-        notes += [Text(f"{item.controller}: {reason}", "red") for reason in item.reasons[:MOST_VERDICT_REASONS]]
-        if len(item.reasons) > MOST_VERDICT_REASONS:
-            notes.append(
-                Text(f"{item.controller}: and {len(item.reasons) - MOST_VERDICT_REASONS} more in result.json", "red")
-            )
-        notes += [
-            Text(f"{item.controller}: {note}", "yellow")
-            for note in item.notes
-            if item.accepted and note not in item.headline
-        ]
-        if item.next_command:
-            notes.append(Text(f"{item.controller}: next: {one_line(item.next_command)}"))
-        if item.uncorrected_um:
-            listed = ", ".join(f"{name} {um_text(value)} um" for name, value in list(item.uncorrected_um.items())[:8])
-            more = f" and {len(item.uncorrected_um) - 8} more" if len(item.uncorrected_um) > 8 else ""
-            notes.append(Text(f"{item.controller} leaves uncorrected: {listed}{more}"))
-    notes += [Text(_uncertainty(results))] if results else []
     legend = (
         "before, after: with the reference point fixed; before*, after*: with the best-fit rigid motion of the "
         "workpiece removed; at best: the largest error with the best possible table of this control"
     )
-    judged = dict.fromkeys(f"every entry was judged with the machine's tool and {item.tools}" for item in results)
-    return Group(table, Text(legend), *(Text(text) for text in judged), *notes)
+    return Group(table, Text(legend), *([Text(_uncertainty(results))] if results else []))
 
 
 # Readable summaries of accuracy figures, and of before against after.

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from math import erf, sqrt
+from math import erf, nan, sqrt
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +28,7 @@ from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_nam
 from compgen.errors import CompgenWarning, InputError, one_line, um_text
 from compgen.identify.covariance import Covariance, covariance_or_independent, error_design, posterior_with
 from compgen.identify.identification import Identification
-from compgen.identify.posterior import Posterior, assumed_text, not_measured, worse_text
+from compgen.identify.posterior import Posterior, assumed_text, not_determined_um, not_measured, worse_text
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, observable_errors, tool_of
 from compgen.kinematics.many_points import blocks, volumetric_error
@@ -68,6 +68,15 @@ RESIDUAL_SHARE = 1.0 / 3.0
 WORSE_FROM_UM = 0.01
 #: Points at which the uncertainty over the volume is evaluated, and numbers kept in memory for it.
 UNCERTAINTY_POINTS, MOST_NUMBERS = 1500, 20_000_000
+#: Verdicts on accepted tables in words.
+VERDICT_WORDS = {
+    "accepted": "accepted",
+    "partial": "partial",
+    "accepted_with_reservations": "accepted with reservations",
+    "better_after_new_setup": "better only after the workpiece is set up again",
+}
+#: Codes of what is said against tables because too little was measured.
+DOUBT_CODES = ("doubtful", "bounds_overlap", "worse_eighth", "short_span")
 #: Codes of the objections that `--allow-misfit` overrides.
 MISFIT_CODES = ("residual_too_large", "step_between_runs", "step_between_blocks", "step_between_files", "step", "drift")
 
@@ -97,11 +106,13 @@ class Coverage:
     observable : names of the errors that can be distinguished on this machine with one tool.
     determined : those of them in the errors file, known to a third of what is assumed without a measurement.
     left_out : those that ``errors`` in the machine file excludes from the model.
+    partly : those in the errors file of which more than a third of what was assumed is still unknown.
     """
 
     observable: tuple[str, ...]
     determined: tuple[str, ...]
     left_out: tuple[str, ...] = ()
+    partly: tuple[str, ...] = ()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -113,11 +124,9 @@ class Coverage:
         """Return in words what was measured."""
         kinds = list(dict.fromkeys(_kind(name) for name in self.determined))
         known, observable = len(self.determined), len(self.observable)
-        if len(kinds) == 1:
-            return f"{kinds[0]} only, {known} of {observable} errors measured"
-        if len(kinds) == 2:
-            return f"{kinds[0]} and {kinds[1]} only, {known} of {observable} errors measured"
-        return f"{known} of {observable} errors measured"
+        what = f"{' and '.join(kinds)} only, " if len(kinds) in (1, 2) else ""
+        more = f", {len(self.partly)} more in part" if self.partly else ""
+        return f"{what}{known} of {observable} errors measured{more}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``measured`` of ``result.json``."""
@@ -127,6 +136,7 @@ class Coverage:
             "text": self.text,
             "errors": list(self.determined),
             "missing": list(self.missing),
+            "in_part": list(self.partly),
             "left_out_by_machine_file": list(self.left_out),
         }
 
@@ -144,7 +154,8 @@ def coverage_of(machine: Machine, errors: ErrorTable, posterior: Posterior | Non
     enough = errors.names if posterior is None else posterior.determined
     known = tuple(name for name in observable if name in errors.names and name in enough)
     listed = machine.errors if isinstance(machine.errors, tuple) else ERROR_NAMES
-    return Coverage(observable, known, tuple(name for name in observable if name not in listed))
+    partly = tuple(name for name in observable if name in errors.names and name not in known)
+    return Coverage(observable, known, tuple(name for name in observable if name not in listed), partly)
 
 
 # --- uncertainty ---------------------------------------------------------------------------------------------------
@@ -184,6 +195,8 @@ PROBABLE, DOUBTFUL = 0.975, 0.8
 WORSE_SHARE, WORSE_UM, WORSE_PROBABILITY = 0.1, 0.5, 0.05
 #: Share of the travel that the readings of an axis with tables must span.
 SPANNED = 0.8
+#: Errors that are not known, of which more are counted only.
+NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -199,6 +212,8 @@ class ProbableGain:
     short_axes : axes with tables of which the readings span too little, with the share of the travel.
     assumed, machine_worse : what was assumed of errors that no reading determines; in words.
     prior, not_measured : the sizes assumed, and the errors that are not listed, with what is assumed of them.
+    before_rigid_um, after_rigid_um : as ``before_um`` and ``after_um``, with the best-fit rigid motion removed.
+    open_um : what is not known of the errors that are not determined: rms over the volume, um, the largest first.
     """
 
     probability_as_it_stands: float
@@ -211,6 +226,9 @@ class ProbableGain:
     machine_worse: str = ""
     prior: Mapping[str, Any] = field(default_factory=dict)
     not_measured: Mapping[str, Any] = field(default_factory=dict)
+    before_rigid_um: tuple[float, float, float] = (nan, nan, nan)
+    after_rigid_um: tuple[float, float, float] = (nan, nan, nan)
+    open_um: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def probability_better(self) -> float:
@@ -232,9 +250,10 @@ class ProbableGain:
             )
             yield Objection("doubtful", text)
         elif self.after_um[2] >= self.before_um[1]:
+            _, low, _, _, most = self.rounded
             text = (
-                f"the error may be {um_text(self.after_um[2])} um rms after and {um_text(self.before_um[1])} before "
-                "(97.5 % limits): what was not measured is as large as what the tables correct"
+                f"the error may be {most} um rms after and {low} before (97.5 % limits): what was not measured is as large as "
+                "what the tables correct"
             )
             yield Objection("bounds_overlap", text)
         if self.worse_eighths:
@@ -253,16 +272,33 @@ class ProbableGain:
             return ""
         return (
             f"the machine probably does not get better (probability {100.0 * p:.0f} %, {100.0 * DOUBTFUL:.0f} % needed): "
-            f"{um_text(self.before_um[0])} um rms before, {um_text(self.after_um[0])} after, with what was not measured; "
-            "measure more of it"
+            f"{self.text}; measure more of it"
         )
 
     @property
     def text(self) -> str:
         """Before and after with their limits, in one clause."""
-        (before, low, high), (after, _, most) = self.before_um, self.after_um
-        numbers = f"{um_text(before)} um rms ({um_text(low)} to {um_text(high)}), after {um_text(after)}, at most {um_text(most)}"
-        return f"with what was not measured: before {numbers}"
+        before, low, high, after, most = self.rounded
+        return f"before {before} um rms ({low} to {high}), after {after}, at most {most}"
+
+    @property
+    def rounded(self) -> tuple[str, str, str, str, str]:
+        """Before, its limits, after and its upper limit, um rms, as far as they are known."""
+        return rounded_limits(self.before_um, self.after_um)
+
+    @property
+    def rounded_rigid(self) -> tuple[str, str, str, str, str]:
+        """The same with the best-fit rigid motion removed."""
+        return rounded_limits(self.before_rigid_um, self.after_rigid_um)
+
+    @property
+    def open_text(self) -> str:
+        """What is not known, the most expensive first; empty if every error is determined."""
+        if not self.open_um:
+            return ""
+        named = ", ".join(f"{name} {um_text(value)} um" for name, value in list(self.open_um.items())[:NAMED])
+        more = f" and {len(self.open_um) - NAMED} more" if len(self.open_um) > NAMED else ""
+        return f"not known: {named}{more} (u, rms over the volume)"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``probable`` of ``result.json``."""
@@ -271,6 +307,11 @@ class ProbableGain:
             "probability_rigid_motion_removed": self.probability_rigid_removed,
             "before_rms_um": dict(zip(("median", "low", "high"), self.before_um, strict=True)),
             "after_rms_um": dict(zip(("median", "low", "high"), self.after_um, strict=True)),
+            "before_rms_rigid_motion_removed_um": dict(
+                zip(("median", "low", "high"), self.before_rigid_um, strict=True)
+            ),
+            "after_rms_rigid_motion_removed_um": dict(zip(("median", "low", "high"), self.after_rigid_um, strict=True)),
+            "not_determined_rms_um": dict(self.open_um),
             "worse_eighths": list(self.worse_eighths),
             "short_axes": dict(self.short_axes),
             "assumed": self.assumed,
@@ -278,9 +319,20 @@ class ProbableGain:
         }
 
 
+def rounded_limits(
+    before: tuple[float, float, float], after: tuple[float, float, float]
+) -> tuple[str, str, str, str, str]:
+    """Median and limits of before, median and upper limit of after: as many digits as the width of each says something."""
+    of_before, of_after = before[2] - before[1], after[2] - after[1]
+    one, low, high = (um_text(value, u_um=of_before) for value in before)
+    return one, low, high, um_text(after[0], u_um=of_after), um_text(after[2], u_um=of_after)
+
+
 def _some(position_mm: FloatArray, most: int) -> NDArray[np.int64]:
-    """Up to ``most`` of the points (n, 3), evenly chosen."""
-    return np.unique(np.linspace(0, len(position_mm) - 1, most).astype(np.int64))
+    """Up to ``most`` of the points (n, 3); by chance, because every k-th point of a grid may lie on a few planes."""
+    if len(position_mm) <= most:
+        return np.arange(len(position_mm))
+    return np.sort(np.random.default_rng(DRAW_SEED).choice(len(position_mm), most, replace=False))
 
 
 @kept
@@ -333,6 +385,7 @@ def probable_gain(
     position_mm: FloatArray,
     before_mm: FloatArray,
     after_mm: FloatArray,
+    rms_um: Sequence[float] = (),
 ) -> ProbableGain:
     """Return how the errors of a machine with and without tables compare, over joint draws of its posterior.
 
@@ -342,6 +395,8 @@ def probable_gain(
     posterior : of all errors of the machine.
     position_mm : n points over the volume (n, 3), with the errors of the tool tip that the identified errors cause there
         without and with the tables, ``before_mm`` and ``after_mm`` (n, 3).
+    rms_um : of these over all points, before and after, then both with the best-fit rigid motion removed: the draws are
+        made at some of the points only.
     """
     some = _some(position_mm, DRAWN_POINTS)
     at_mm = position_mm[some]
@@ -349,34 +404,49 @@ def probable_gain(
     before, after = before_mm[some] + draws, after_mm[some] + draws
     # the squares of both differ by a linear function of the errors, so the probability follows from mean and variance
     motion = small_motion(at_mm + tool_of(machine, None))
-    frames = []
+    frames, sizes = [], []
     for remove in (False, True):
         one, two = before.reshape(DRAWS, -1), after.reshape(DRAWS, -1)
         if remove:
             one, two = motion.taken_out(one.T).T, motion.taken_out(two.T).T
+        for drawn, own in ((one, before_mm[some]), (two, after_mm[some])):
+            left = own.reshape(1, -1)
+            left = motion.taken_out(left.T).T if remove else left
+            beside = rms_um[len(sizes)] ** 2 - _squares_um(left)[0] if rms_um else 0.0
+            sizes.append(_limits_um(_squares_um(drawn) + beside))
         gain = np.sum(one**2, axis=1) - np.sum(two**2, axis=1)
         spread = float(gain.std())
         frames.append(
             0.5 * (1.0 + erf(float(gain.mean()) / (spread * sqrt(2.0)))) if spread > 0 else float(gain.mean() > 0)
         )
 
-    def limits(errors_mm: FloatArray) -> tuple[float, float, float]:
-        each = np.sqrt(np.mean(np.sum(errors_mm**2, axis=2), axis=1)) / MM_PER_UM
-        low, median, high = np.quantile(each, [0.025, 0.5, 0.975]).tolist()
-        return median, low, high
-
     return ProbableGain(
         frames[0],
         frames[1],
-        limits(before),
-        limits(after),
+        sizes[0],
+        sizes[1],
         tuple(_worse_eighths(machine, at_mm, before, after)),
         tuple(_short_axes(machine, errors, posterior)),
         assumed_text(posterior),
         worse_text(posterior),
         posterior.prior.as_dict(),
         not_measured(posterior, errors.names),
+        sizes[2],
+        sizes[3],
+        not_determined_um(posterior),
     )
+
+
+def _squares_um(errors_mm: FloatArray) -> FloatArray:
+    """Mean squares over the points of errors (draws, 3 n), um^2."""
+    return np.asarray(3.0 * np.mean(errors_mm**2, axis=1) / MM_PER_UM**2)
+
+
+def _limits_um(squares_um: FloatArray) -> tuple[float, float, float]:
+    """Median and limits (97.5 % each) of the rms of draws, um, from their mean squares."""
+    each = np.sqrt(np.maximum(squares_um, 0.0))
+    low, median, high = np.quantile(each, [0.025, 0.5, 0.975]).tolist()
+    return median, low, high
 
 
 def _worse_eighths(machine: Machine, at_mm: FloatArray, before_mm: FloatArray, after_mm: FloatArray) -> Iterator[str]:
@@ -771,39 +841,47 @@ class Verification(Drawable):
         if not self.accepted:
             first, more = self.reasons[0], len(self.reasons) - 1
             return f"not accepted: {first} (and {more} more)" if more else f"not accepted: {first}"
-        said = []
         if self.worse_as_it_stands:
             before, after = self.before_rigid_removed, self.after_rigid_removed
-            said.append(
+            said = (
                 f"better only after the workpiece is set up again: without that the error grows from "
                 f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms; with the best-fit rigid motion of the "
                 f"workpiece removed it goes from {um_text(before.rms_um)} to {um_text(after.rms_um)} um rms"
             )
-        elif self.gain is not None and self.gain.only_after_new_setup:
-            said.append(
-                "better only after the workpiece is set up again: without that the machine gets better with a probability of "
-                f"{100.0 * self.gain.probability_as_it_stands:.0f} % only"
+            return said if self.volumetric else f"{said}; {self.measured.text}"
+        if self.gain is not None and self.gain.only_after_new_setup:
+            verdict = (
+                "better only after the workpiece is set up again (as it stands with a probability of "
+                f"{100.0 * self.gain.probability_as_it_stands:.0f} %)"
             )
-        parts = [*(item.text for item in self.objections if not item.blocking), *self.reservations]
-        if parts:
-            said.append(f"accepted with reservations: {'; '.join(parts)}")
+        else:
+            verdict = VERDICT_WORDS[self.state]
         parts = [] if self.volumetric else [self.measured.text]
-        parts += [self._beyond_text] if self.partial else []
-        if parts:
-            figure = "" if self.worse_as_it_stands else f"; {self.figure}"
-            said.append(f"partial: {'; '.join(parts)}{figure}")
-        return "; ".join(said) or f"accepted: {self.figure}"
+        parts += [self.figure, *([self._beyond_text] if self.partial else [])]
+        against = self.said_against
+        if against:
+            parts.append(against[0] + (f" (and {len(against) - 1} more)" if len(against) > 1 else ""))
+        return f"{verdict}: {'; '.join(parts)}"
+
+    @property
+    def said_against(self) -> tuple[str, ...]:
+        """Why accepted tables are accepted with reservations: what speaks against the measurement first."""
+        objections = [item for item in self.objections if not item.blocking]
+        objections.sort(key=lambda item: item.code in DOUBT_CODES)
+        return tuple(dict.fromkeys((*(item.text for item in objections), *self.reservations)))
 
     @property
     def figure(self) -> str:
-        """What the tables do, in one figure: rms over the volume, with the uncertainty of the measurement."""
+        """What the tables do, in one figure: rms over the volume, with its limits."""
+        if self.gain is not None:
+            before, low, high, after, most = self.gain.rounded
+            return f"the error over the volume goes from {before} um rms ({low} to {high}) to {after}, at most {most}"
         change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
         known = "not known" if self.uncertainty is None else f"{um_text(self.uncertainty.rms_um)} um"
         bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")
         if self.volumetric:
             return f"the error over the volume goes from {change} ({bounds})"
-        over_volume = "the error over the volume is unknown" if self.gain is None else self.gain.text
-        return f"the effect of the measured errors alone goes from {change} ({bounds}); {over_volume}"
+        return f"the effect of the measured errors alone goes from {change} ({bounds}); the error over the volume is unknown"
 
     @property
     def _beyond_text(self) -> str:
@@ -822,8 +900,7 @@ class Verification(Drawable):
     def notes(self) -> tuple[str, ...]:
         """What else the user should know about accepted tables."""
         notes = [*self.reservations, *self.safety.warnings]
-        if self.gain is not None:
-            notes += [text for text in (self.gain.assumed, self.gain.machine_worse) if text]
+        notes += self.assumptions
         if self.partial:
             notes.append(self._beyond_text)
         if self.after.max_um > self.before.max_um + 0.05 and not self.worse_as_it_stands:
@@ -832,6 +909,13 @@ class Verification(Drawable):
                 "by a rigid motion of the workpiece"
             )
         return tuple(notes)
+
+    @property
+    def assumptions(self) -> list[str]:
+        """What is assumed, what is not known, and whether the machine is worse than its class: the same for every control."""
+        if self.gain is None:
+            return []
+        return [text for text in (self.gain.assumed, self.gain.open_text, self.gain.machine_worse) if text]
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``result.json``."""
@@ -956,7 +1040,12 @@ def verify(
     on_grid = (correction, rigid_removed[1]) if same else None
     safety, reasons = reasons_against(machine, tables, judge, limits, reversal, on_grid=on_grid)
     posterior = posterior_with(machine, errors, covariance)
-    gain = None if posterior is None else probable_gain(machine, errors, posterior, where.position_mm, before, after)
+    sizes = [item.rms_um for item in (*figures, *rigid_removed)]
+    gain = (
+        None
+        if posterior is None
+        else probable_gain(machine, errors, posterior, where.position_mm, before, after, sizes)
+    )
     improbable = [gain.reason] if gain is not None and gain.reason else []
     useless = _useless_reasons(
         machine, tables, points_mm=(grid_mm, judge.line_mm), figures=figures, removed=rigid_removed
