@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from compgen.cli.shared_options import covariance_of, machine_argument, open_mac
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
 from compgen.data.files import OutputFolder, json_text, sha256_of_file
-from compgen.data.machine import Machine, Vector3
+from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.effects import effects_reversal
 from compgen.errors import InputError, number_text
 from compgen.foreign import open_errors
@@ -29,7 +29,10 @@ if TYPE_CHECKING:
 WCS_HELP = (
     "Work offset: machine position of its zero in mm, e.g. G54=-400,150,-220 (several times for several offsets)."
 )
-TOOLS_HELP = "Tool lengths: CSV with tool, length_mm and optionally x_mm, y_mm; or a tool table of LinuxCNC in mm."
+TOOLS_HELP = (
+    "Tool lengths: CSV with tool, length_mm and optionally x_mm, y_mm; or a tool table of LinuxCNC, in machine_units of "
+    "the machine file (mm)."
+)
 
 
 def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
@@ -49,7 +52,7 @@ def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
 
 
 def program_options(command: Command) -> Command:
-    """Add what a program needs to be read; the command receives ``setup``, ``errors`` and ``reversal``."""
+    """Add what a program needs to be read; the command receives ``setup`` (of a machine), ``errors`` and ``reversal``."""
 
     @functools.wraps(command)
     def wrapper(
@@ -62,7 +65,11 @@ def program_options(command: Command) -> Command:
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
-        setup = Setup(_wcs(wcs), read_tools(tools) if tools else {}, block_delete, codes, tool_offset("--gauge", gauge))
+
+        def setup(machine: Machine) -> Setup:
+            lengths = read_tools(tools, MM_PER_UNIT[machine.units]) if tools else {}
+            return Setup(_wcs(wcs), lengths, block_delete, codes, tool_offset("--gauge", gauge))
+
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
@@ -112,7 +119,7 @@ def _model(machine: Machine, errors: Path | None, reversal: Path | None, only: s
 @json_option
 def correct_command(
     machine: Machine,
-    setup: Setup,
+    setup: Callable[[Machine], Setup],
     errors: Path,
     reversal: Path | None,
     only: str | None,
@@ -155,7 +162,7 @@ def correct_command(
             program,
             out,
             options,
-            setup,
+            setup(machine),
             errors_file=(name, sha256_of_file(errors)),
             show=show,
             language=language,
@@ -259,7 +266,7 @@ def _of_fleet(file: Path, name: str) -> tuple[PartMachine, list[PartMachine], li
 def part_command(
     machine: str,
     machines: tuple[Path, ...],
-    setup: Setup,
+    setup: Callable[[Machine], Setup],
     errors: Path | None,
     reversal: Path | None,
     program: Path,
@@ -311,16 +318,17 @@ def part_command(
         own = PartMachine(model.machine.name, model, covariance_or_independent(model.errors, covariance), read)
     if uncertainty and own.covariance is None:
         raise InputError("has no uncertainties; identify the errors again, or leave out --uncertainty", file=errors)
+    known = setup(own.model.machine)
     with progress(quiet=as_json) as show:
         how = CorrectOptions(dialect=options.dialect) if correct else None
         found = predict_part(
-            own.model, program, options.dialect, setup,
+            own.model, program, options.dialect, known,
             covariance=own.covariance, tables=own.tables, correct=how, show=show,
         )  # fmt: skip
         found = replace(found, machine=own.name)
         # a table that is to be judged does not run yet; those of a fleet do
         now = own if fleet is not None else replace(own, tables=None)
-        ranked = rank_machines([now, *others], program, options.dialect, setup, show=show) if others else []
+        ranked = rank_machines([now, *others], program, options.dialect, known, show=show) if others else []
     data = found.as_dict()
     if ranked:
         data["machines"] = [item.ranked() for item in ranked]

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
+from compgen.data.machine import MM_PER_UNIT, Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import (
     accepted,
@@ -38,6 +39,7 @@ from compgen.data.toml_files import (
 )
 from compgen.errors import InputError
 
+T = TypeVar("T")
 # Text for LinuxCNC: lines one by one, so garbage of any size fails at the first wrong line; numbers; units.
 
 
@@ -46,13 +48,19 @@ _NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d
 _BLANK = re.compile(r"[ \t\r\n]*+")
 #: Number of characters quoted from a wrong word.
 SHOWN = 40
-#: Length of a machine unit, [TRAJ] LINEAR_UNITS: everything that LinuxCNC reads is in machine units.
-MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 
 
 def units_setting(meaning: str) -> Any:
-    """Declare ``machine_units``: [TRAJ] LINEAR_UNITS of the machine, ``"mm"`` (the default) or ``"inch"``."""
+    """Declare ``machine_units``: [TRAJ] LINEAR_UNITS, in which LinuxCNC reads all numbers, ``"mm"`` or ``"inch"``.
+
+    The default is that of the machine, or mm (:func:`with_units`).
+    """
     return setting(choice(*MM_PER_UNIT), "mm", meaning=meaning)
+
+
+def with_units(settings: T, section: toml_files.Section, machine: Machine) -> T:
+    """Return settings of a control with the unit that the machine states, unless its section does."""
+    return toml_files.unless_stated(settings, section, machine_units=machine.machine_units or "mm")
 
 
 def check_size(source: SourceFile, most: int) -> None:
@@ -387,6 +395,11 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
     name = "linuxcnc-comp"
     settings_class = CompSettings
     bidirectional = True
+
+    @classmethod
+    def check_settings(cls, settings: CompSettings, section: toml_files.Section, machine: Machine) -> CompSettings:
+        """Take the unit of the machine, unless the section states it."""
+        return with_units(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return X(x), Y(y), Z(z) with rows where the curves need them."""

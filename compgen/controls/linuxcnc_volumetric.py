@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.controls.linuxcnc_comp import (
-    MM_PER_UNIT,
     SHOWN,
     check_size,
     lines_of,
     number_in,
     units_setting,
     whole_in,
+    with_units,
 )
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
 from compgen.controls.shared.grids import equidistant_grid, loss_setting, trilinear
@@ -28,7 +28,7 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
-from compgen.data.machine import Vector3
+from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.data.names import AXES, ERROR_INDEX, error_named
 from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
@@ -620,6 +620,13 @@ class LinuxcncVolumetric(Controller[VolumetricSettings, VolTable]):
     name = "linuxcnc-volumetric"
     settings_class = VolumetricSettings
     at_axes = True
+
+    @classmethod
+    def check_settings(
+        cls, settings: VolumetricSettings, section: toml_files.Section, machine: Machine
+    ) -> VolumetricSettings:
+        """Take the unit of the machine, unless the section states it."""
+        return with_units(settings, section, machine)
 
     def basis(self, errors: ErrorTable) -> list[Term]:
         """Return one term per error on equidistant nodes; the module evaluates E = C P; a grid also fits products."""

@@ -26,6 +26,7 @@ from compgen.controls.shared.terms import one_dimensional_terms, product_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
+from compgen.data.machine import MM_PER_UNIT
 from compgen.data.names import AXES
 from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
@@ -33,8 +34,6 @@ from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid
 
 _MOST_CHARACTERS = 20_000_000
-#: Length of a unit of the file.
-MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 #: KMotion takes so many rows and columns.
 KMOTION_MOST = 4000
 

@@ -163,6 +163,8 @@ ASSUMED_TOOL_MM: Vector3 = (100.0, 100.0, 200.0)
 CHAINS: tuple[str, ...] = tuple(f"W{''.join(order)}T" for order in permutations("FXYZ"))
 
 
+#: Length of a unit in which a control may keep its numbers.
+MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 #: Longest travel and offset of a machine, mm.
 MOST_MM = 1e6
 #: A travel below this is asked about, mm.
@@ -391,6 +393,11 @@ class Machine(Displayed):
         None,
         meaning="where G28 leads: machine position of the axes at their reference points, mm (machine zero if not stated)",
     )
+    machine_units: str | None = toml_files.setting(
+        toml_files.choice(*MM_PER_UNIT),
+        None,
+        meaning="unit in which the control keeps its offsets and tables, mm (if not stated) or inch: LINEAR_UNITS of LinuxCNC",
+    )
     travel_margin_mm: float = toml_files.setting(
         _margin,
         0.0,
@@ -409,6 +416,25 @@ class Machine(Displayed):
         zero = [0.0 if axis.range_mm[0] <= 0.0 <= axis.range_mm[1] else np.nan for axis in self.axes]
         x, y, z = (usual if place is None else place for place, usual in zip(stated, zero, strict=True))
         return x, y, z
+
+    @property
+    def units(self) -> str:
+        """Unit in which the control keeps its work offsets: as the machine states, or its control for its tables; else mm.
+
+        Raises
+        ------
+        InputError
+            if sections of controls state both.
+        """
+        tables = {name: section.data.get("machine_units") for name, section in self.controllers.items()}
+        stated = {unit: name for name, unit in tables.items() if unit in MM_PER_UNIT}
+        if self.machine_units is None and len(stated) > 1:
+            raise InputError(
+                f"[controllers.{stated['mm']}] is in mm, [controllers.{stated['inch']}] in inch; state it for the machine",
+                file=self.source,
+                field="machine_units",
+            )
+        return self.machine_units or next(iter(stated), "mm")
 
     @property
     def tool_range(self) -> ToolRange:
@@ -488,6 +514,10 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
     axes_section.finish()
     controllers_section = root.section("controllers", required=False)
     controllers = {key: controllers_section.section(key) for key in controllers_section.data}
+    units = stated.get("machine_units")
+    for section in controllers.values():
+        if units is not None and section.data.get("machine_units", units) != units:
+            raise section.fail("machine_units", f"the machine states {units!r}; leave it out here, or state the same")
     effects_section = root.section("effects", required=False)
     effects = {key: effects_section.section(key) for key in effects_section.data}
     for axis_name, axis, reference_mm in zip(

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, json_text, read_bytes, sha256_of_file, working_folder
-from compgen.data.machine import Machine
+from compgen.data.machine import MM_PER_UNIT, Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
 from compgen.errors import InputError
@@ -38,13 +38,15 @@ from compgen.programs.path import (
     path_deviations,
 )
 from compgen.programs.reader import MM_PER_INCH, PECK_REST_MM, Batch, Reader, Setup, SingleBlock
-from compgen.programs.runs import P_WORD, R_WORD, Run
+from compgen.programs.runs import LONGEST_BLOCK, P_WORD, R_WORD, Run
 from compgen.resources import LANGUAGES, program_version
 
 #: G codes of drilling cycles.
 _CYCLE_CODES = frozenset((73.0, 74.0, 76.0, *map(float, range(81, 90))))
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
+#: Characters of a comment in the first lines of a corrected program.
+LONGEST_COMMENT = 90
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
 
 
@@ -81,6 +83,9 @@ class ProgramCorrection:
     file: str = ""
     errors: tuple[str, str] = ("", "")
     notes: tuple[str, ...] = ()
+    #: Unit in which the control keeps its work offsets, and those that the program itself cannot check.
+    machine_units: str = "mm"
+    unchecked: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -102,6 +107,8 @@ class ProgramCorrection:
             **self.counts,
             "work_offsets_mm": {name: list(value) for name, value in self.work_offsets_mm.items()},
             "tools_mm": {name: list(value) for name, value in self.tools_mm.items()},
+            "machine_units": self.machine_units,
+            "offsets_not_checked": list(self.unchecked),
             "assumed": list(self.assumed),
             "notes": list(self.notes),
             "tolerance_um": self.tolerance_um,
@@ -843,29 +850,63 @@ class _ReadBack:
 
 def header_lines(dialect: Dialect, result: ProgramCorrection, end: str) -> list[str]:
     """Return the comment blocks of a corrected program, and blocks that stop it where a work offset is another one."""
-    offsets = [f"{name} = {x:.4f} {y:.4f} {z:.4f}" for name, (x, y, z) in result.work_offsets_mm.items()]
-    tools = [f"{name} = {z:.4f}" for name, (_, _, z) in result.tools_mm.items()]
     said = [
         f"{MARK} {program_version()} FOR MACHINE {result.machine}",
         f"ERRORS {result.errors[0]} SHA256 {result.errors[1][:16]}",
-        f"WORK OFFSETS MM {', '.join(offsets) or 'none'}",
-        f"TOOL LENGTHS MM {', '.join(tools) or 'none'}",
+        *_offsets_said(result.work_offsets_mm, result.machine_units),
+        *_listed("TOOL LENGTHS MM", [f"{name} = {z:.4f}" for name, (_, _, z) in result.tools_mm.items()]),
         f"TOLERANCE UM {result.tolerance_um:g}",
+        *(_listed("NOT CHECKED BY THIS PROGRAM", result.unchecked) if result.unchecked else ()),
         "ONLY FOR THIS MACHINE AND THIS CLAMPING POSITION",
     ]
     blocks = [dialect.said(text) for text in said]
+    inch = result.machine_units == "inch"
     label = 9000
     for name, offset in result.work_offsets_mm.items():
-        number = re.fullmatch(r"G5([4-9])", name)
-        if not (dialect.check and number):
+        register = dialect.register(name)
+        if name in result.unchecked or register is None:
             continue
         for k, value in enumerate(offset):
             label += 1
-            variable = 5221 + 20 * (int(number[1]) - 4) + k
-            names = {"variable": variable, "value": f"{value:.4f}", "label": label, "name": name}
-            names |= {"number": int(number[1]) - 3, "axis": AXES[k]}
+            own = f"{value / MM_PER_INCH:.6f}" if inch else f"{value:.4f}"
+            names = {"variable": register + k, "value": own, "within": dialect.check_within[inch], "label": label}
+            names |= {"name": name, "number": register, "axis": AXES[k]}
             blocks += [line.format(**names) for line in dialect.check]
     return [block + end for block in blocks]
+
+
+def _offsets_said(offsets_mm: Mapping[str, tuple[float, float, float]], units: str) -> list[str]:
+    """Work offsets in mm, and as a control in inch shows them."""
+    lines = []
+    for unit in dict.fromkeys(("mm", units)):
+        scale, digits = MM_PER_UNIT[unit], 4 if unit == "mm" else 6
+        texts = [
+            f"{name} = {' '.join(f'{value / scale:.{digits}f}' for value in offset)}"
+            for name, offset in offsets_mm.items()
+        ]
+        lines += _listed(f"WORK OFFSETS {unit.upper()}", texts)
+    return lines
+
+
+def _listed(what: str, texts: Sequence[str]) -> list[str]:
+    """Texts after what they are, in lines that no control finds too long."""
+    lines = [what]
+    for k, text in enumerate(texts or ["none"]):
+        if k and len(lines[-1]) + len(text) > LONGEST_COMMENT:
+            lines.append(what)
+        lines[-1] += (", " if lines[-1] != what else " ") + text
+    return lines
+
+
+def _head_of(stream: BinaryIO, dialect: Dialect) -> int:
+    """Where the lines end that a control demands before all others; comments may stand between them."""
+    head, plain, place = dialect.head(), dialect.without_words(), stream.tell()
+    while line := stream.readline(LONGEST_BLOCK):
+        if head.match(line):
+            place = stream.tell()
+        elif not plain.fullmatch(line):
+            break
+    return place
 
 
 def correct_program(
@@ -982,6 +1023,8 @@ def correct_program(
             ("" if not reasons else REJECTED_PREFIX) + source.name,
             errors_file,
             tuple(notes),
+            model.machine.units,
+            tuple(name for name in reader.used_offsets if not dialect.check or dialect.register(name) is None),
         )
         final = work / "program"
         with source.open("rb") as stream:
@@ -989,13 +1032,9 @@ def correct_program(
         eol = "\r\n" if head.endswith(b"\r\n") else "\n"
         with body.open("rb") as stream, final.open("wb") as target:
             if not unchanged:
-                for _ in range(2):  # the header follows % and the number of the program
-                    place = stream.tell()
-                    line = stream.readline()
-                    if not re.match(rb"\s*(%|[O:]\d|N\d+\s*%)", line):
-                        stream.seek(place)
-                        break
-                    target.write(line)
+                place = _head_of(stream, dialect)
+                stream.seek(0)
+                target.write(stream.read(place))
                 target.write("".join(header_lines(dialect, result, eol)).encode("latin-1"))
             shutil.copyfileobj(stream, target)
         folder.add_file(result.file, final)
@@ -1017,6 +1056,7 @@ def preflight(result: ProgramCorrection) -> str:
     points = [
         f"This program is for the machine {result.machine} and this clamping position only.",
         f"Work offsets at the control are those of the correction: {'; '.join(offsets) or 'none was used'}.",
+        *_checks_said(result),
         f"Tool lengths at the control are those of the correction: {'; '.join(tools) or 'none was used'}.",
         "Tables of the control that correct the same errors are switched off, were active during the measurement, or were "
         "given with --active.",
@@ -1032,6 +1072,22 @@ def preflight(result: ProgramCorrection) -> str:
         f"{after['ends_max_um']:.2f} um."
     )
     return "\n".join([f"# Before you run {result.file}", "", figures, "", *(f"- [ ] {text}" for text in points), ""])
+
+
+def _checks_said(result: ProgramCorrection) -> list[str]:
+    """Say which work offsets the program checks, and what else must not shift its coordinates."""
+    dialect = dialect_named(result.dialect)
+    checked = [name for name in result.work_offsets_mm if name not in result.unchecked]
+    texts = []
+    if checked:
+        within = dialect.check_within[result.machine_units == "inch"]
+        texts.append(
+            f"The first blocks of the program stop it where X, Y or Z of {', '.join(checked)} differ by more than {within} "
+            f"{result.machine_units}, the unit in which the control keeps them (machine_units of the machine file)."
+        )
+    if result.unchecked:
+        texts.append(f"Compare by hand, since the program does not check it: {', '.join(result.unchecked)}.")
+    return [*texts, f"Nothing else shifts the coordinates: {dialect.beside}."]
 
 
 def model_of(

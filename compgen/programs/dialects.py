@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+import unicodedata
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -212,6 +213,16 @@ class Dialect:
     pole: bool = False
     tool_by_number: bool = False
     check: Sequence[str] = ()
+    #: What ``check`` asks for a work offset by its name: the variable of X, or the number of a frame; None if it has none.
+    register: Callable[[str], int | None] = lambda _: None
+    #: Largest difference that ``check`` lets pass, mm and inch.
+    check_within: tuple[str, str] = ("0.001", "0.00004")
+    #: Lines that a control demands before all others, beside % and the number of the program.
+    first: str = ""
+    #: Whether the control counts in the units of its machine until the program says which.
+    starts_in_its_units: bool = True
+    #: What else may shift the coordinates at the control, and is not checked.
+    beside: str = ""
 
     def word_pattern(self) -> re.Pattern[str]:
         """Return the pattern of one word: its address and value, or a comment."""
@@ -224,8 +235,19 @@ class Dialect:
 
     def said(self, text: str) -> str:
         """Return ``text`` as a comment block."""
-        clean = "".join(c if c.isalnum() or c in " .,:;=+-_/%" else " " for c in text)
+        plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
+        clean = "".join(c if c.isalnum() or c in " .,:;=+-_/%" else " " for c in plain)
         return self.comment.format(clean.replace(";", ",").upper())
+
+    def head(self) -> re.Pattern[bytes]:
+        """Return the pattern of a line that has to stay before all others: %, the number or name of the program."""
+        first = rf"|{self.first}" if self.first else ""
+        return re.compile(rf"\s*+(?:(?:N\d+\s*+)?%|[O:]\d|<[^<>]*+>{first})".encode(), re.IGNORECASE)
+
+    def without_words(self) -> re.Pattern[bytes]:
+        """Return the pattern of a line with nothing but comments."""
+        end = "|;" if self.semicolon_ends else ""
+        return re.compile(rf"(?:\s|{self.comments}{end})*+".encode(), re.IGNORECASE)
 
 
 #: An address of more than one letter needs its equals sign; CR5 is none. X=IC(5) is 5 from where X is, X=AC(5) from its zero.
@@ -241,6 +263,32 @@ _SIEMENS_SETTINGS = (
     rf"|\b(?:{_CALLS})\s*+\((?:\"[^\"\n]*\"|[^()\"\n])*+\)|\bCYCLE800\s*+\(\s*+\)|\bCYCLE832\b(?!\s*+\()"
     rf"|\b{_ASSIGNED}\s*+(?:\[\s*+\w++\s*+\]\s*+)?=\s*+(?:(?:AC|IC|DC|ACP|ACN)\s*+\(\s*+{VALUE}\s*+\)|{VALUE})"
 )
+
+
+def _register_of_fanuc(name: str) -> int | None:
+    """System variable of X of a work offset: G54 to G59, G54.1 P1 to P300; of Haas G110 to G129 and G154 P1 to P99."""
+    kind, _, text = name.partition("P")
+    number = int(text) if text.isdigit() and len(text) < 5 else 0
+    if kind == "G54.1" and 1 <= number <= 300:
+        return (7001 if number <= 48 else 14001) + 20 * (number - 1)
+    if kind == "G154" and 1 <= number <= 99:
+        return 7001 + 20 * (number - 1) if number <= 20 else 14401 + 20 * (number - 21)
+    names = {**{f"G{54 + k}": 5221 + 20 * k for k in range(6)}, **{f"G{110 + k}": 7001 + 20 * k for k in range(20)}}
+    return names.get(name)
+
+
+def _register_of_linuxcnc(name: str) -> int | None:
+    """Parameter of X of a work offset: G54 to G59.3."""
+    names = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
+    return 5221 + 20 * names.index(name) if name in names else None
+
+
+def _register_of_siemens(name: str) -> int | None:
+    """Number of the settable frame: G54 to G57 (to G59 of small controls), G505 to G599."""
+    number = int(name[1:]) if name[1:].isdigit() else 0
+    return number - 53 if 54 <= number <= 59 else number - 500 if 505 <= number <= 599 else None
+
+
 DIALECTS = {
     item.name: item
     for item in (
@@ -252,8 +300,11 @@ DIALECTS = {
             semicolon_ends=True,
             point_needed=True,
             # custom macro: system variables 5221 ... are the offsets of G54
+            register=_register_of_fanuc,
+            check_within=("0.001", "0.00006"),  # the last decimal of an offset is 0.0001 inch
+            beside="the external offset (EXT, #5201 to #5203) is 0",
             check=(
-                "IF[ABS[#{variable}-[{value}]]LE0.001]GOTO{label}",
+                "IF[ABS[#{variable}-[{value}]]LE{within}]GOTO{label}",
                 "#3000=1({name} IS NOT THAT OF THE CORRECTION)",
                 "N{label}",
             ),
@@ -269,8 +320,11 @@ DIALECTS = {
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 17, 70)),
             end=frozenset(("M2", "M17", "M30")),
             tool_by_number=True,
+            first=r";\s*+\$",  # the path of an archive: ;$PATH=/_N_WKS_DIR
+            register=_register_of_siemens,
+            beside="fine offsets, rotations and the basic offset are 0",
             check=(
-                "IF ABS($P_UIFR[{number},{axis},TR]-({value}))<=0.001 GOTOF VC{label}",
+                "IF ABS($P_UIFR[{number},{axis},TR]-({value}))<={within} GOTOF VC{label}",
                 'MSG("{name} is not that of the correction")',
                 "M30",
                 "VC{label}:",
@@ -288,6 +342,8 @@ DIALECTS = {
                                                 120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
             end=frozenset(("M2", "M30", "%")),
             work_offset="PRESET",
+            starts_in_its_units=False,
+            beside="the datum has no basic rotation",
             pole=True,
             tool_by_number=True,
         ),
@@ -299,13 +355,23 @@ DIALECTS = {
             decimals=(5, 6),
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, *range(50, 54), *range(61, 69))),
             end=frozenset(("M2", "M30", "%")),
+            register=_register_of_linuxcnc,
+            beside="offsets of G92 and the rotation of the coordinate system (R of G10 L2) are 0",
             check=(
-                "o<volcomp{label}> if [ABS[#{variable}-[{value}]] GT 0.001]",
+                "o<volcomp{label}> if [ABS[#{variable}-[{value}]] GT {within}]",
                 "(abort, {name} is not that of the correction)",
                 "o<volcomp{label}> endif",
             ),
         ),
-        Dialect("grbl", _GRBL, _PARENTHESES + r"|;[^\n]*", "({})", end_needed=False),
+        Dialect(
+            "grbl",
+            _GRBL,
+            _PARENTHESES + r"|;[^\n]*",
+            "({})",
+            end_needed=False,
+            starts_in_its_units=False,
+            beside="the offset of G92 is 0",
+        ),
     )
 }  # fmt: skip
 

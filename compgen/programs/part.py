@@ -277,7 +277,7 @@ def rank_machines(
         machine
     ) in machines:  # without a tool length, the tool is that of the machine file; G28 leads to its reference point
         own = machine.model.machine
-        groups.setdefault((own.tool_offset_mm, str(own.reference_place_mm)), []).append(machine)
+        groups.setdefault((own.tool_offset_mm, str(own.reference_place_mm), own.units), []).append(machine)
     found = []
     for group in groups.values():
         while group:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.machine import Machine, Vector3
+from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect, codes_that_stay
@@ -135,7 +135,9 @@ class Reader:
         self.initial_z, self.initial_offset = math.nan, 0.0
         self._begins_series = False
         self.cycle_peck, self.to_r_level = 0.0, dialect.name == "linuxcnc"
-        self.plane, self.scale, self.absolute, self.centre_absolute = 2, 1.0, True, False
+        self.plane, self.absolute, self.centre_absolute = 2, True, False
+        #: mm per unit of length of the program: that of the control until G20 or G21.
+        self.scale = MM_PER_UNIT[machine.units] if dialect.starts_in_its_units else 1.0
         self.feed, self.offset_name = "minute", ""
         self._unit_known = False
         self.work, self.preset, self.length = (0.0,) * 3, (0.0,) * 3, (0.0,) * 3
@@ -992,7 +994,7 @@ class Reader:
                 self.assumed["without a tool length the tool is that of the machine file"] = None
             if not self._unit_known:
                 self._unit_known = True
-                self.assumed["lengths are in mm"] = None
+                self.assumed[f"lengths are in {'inch' if self.scale == MM_PER_INCH else 'mm'}"] = None
         if {"done", "dwell", "blank"} & set(single):
             return "keep"
         if self.dialect.pole and "L" in values and not {"label", "tool definition"} & set(single):

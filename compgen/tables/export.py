@@ -262,6 +262,10 @@ def export(
     own = _with_backlash(control, control.context(tables), rest)
     said = [*control.reservations(tables), *control.left_out(errors)]
     said += [*machine.emphasis.notes, *(effects.advice_of_effects(machine) if machine.effects else [])]
+    if machine.machine_units == "inch" and not hasattr(control.settings, "machine_units"):
+        said.append(
+            'the machine file states machine_units = "inch"; this control reads its tables in the units of its own keys'
+        )
     own = {**own, "warnings": [*own["warnings"], *said]}
     common = export_context(machine, errors, controller, provenance or Provenance(), reversal)
     files = render_files(card, {**common, **own}, templates)

@@ -1,13 +1,18 @@
 """What a program needs of its machine: tool tables, travel, reference point, units, and the block that checks the set-up."""
 
 import re
+import shutil
 
 import numpy as np
 import pytest
-from programs.test_correct import moves_of, run, shift
+from programs import test_rs274 as rs274
+from programs.test_correct import PLAIN, moves_of, run, shift
 
+from compgen.controls import CONTROLLERS
+from compgen.data.machine import read_machine
 from compgen.errors import InputError
 from compgen.programs import Setup, read_tools
+from compgen.programs.dialects import DIALECTS
 from compgen.programs.path import points_of
 from machines import machine_of
 
@@ -133,3 +138,169 @@ def test_an_arc_may_leave_the_travel_between_its_ends(blocks, leaves):
     said = float(re.search(r"X goes to ([\d.]+) mm", caught.value.message)[1])
     assert said == pytest.approx(farthest, abs=2e-3)
     assert caught.value.line == 3
+
+
+# --- the block that checks the set-up: units, place, further work offsets --------------------------------------------
+
+needs_rs274 = pytest.mark.skipif(shutil.which("rs274") is None, reason="LinuxCNC is not installed (rs274 missing)")
+INCH = {"machine_units": "inch"}
+
+
+@needs_rs274
+@pytest.mark.parametrize("unit", ["G20", "G21", "", "%\nO12 (PLATE)\nG20"])
+@pytest.mark.parametrize("stated", [INCH, {"settings": {"linuxcnc-volumetric": INCH}}])
+def test_a_corrected_program_runs_on_a_machine_in_inch(tmp_path, unit, stated):
+    """The interpreter without INI file is in inches; a program that does not say its unit is then, too."""
+    scale = 1.0 if "G21" in unit else 25.4
+    text = f"{unit} G90 G17 G54\nG0 X0 Y0 Z1\nG1 X{50 / scale:.6f} F100\nG55\nG0 X0 Y0 Z0\nG1 X{60 / scale:.6f}\nM2\n"
+    text = text.replace("G20 G90", "G20\nG90") + "%\n" * unit.startswith("%")
+    machine = machine_of([(-600.0, 600.0), (-500.0, 500.0), (-400.0, 200.0)], 9, **stated)
+    result, corrected = run(tmp_path, text, shift(x=254.0), setup=rs274.SETUP, machine=machine)
+    assert result.accepted
+    program = tmp_path / "out" / "p.nc"
+    ends = [end[0] for feed, end, _ in rs274.canonical(program, tmp_path) if feed]
+    assert ends == pytest.approx([(50 - 0.254) / scale, (60 - 0.254) / scale], abs=1e-4)
+    assert any("lengths are in inch" in text for text in result.assumed) == (not unit)
+    # 2.5 um beside: stopped; 0.5 um: what a control keeps in its last decimal
+    for k, moved in ((0, 12.7025), (1, 12.7005)):
+        program.write_text(corrected.replace(f"[{12.7 / 25.4:.6f}]", f"[{moved / 25.4:.6f}]"))
+        rs274.canonical(program, tmp_path, stopped=k == 0)
+
+
+@needs_rs274
+@pytest.mark.parametrize("name", ["G56", "G59.1", "G59.3"])
+def test_all_work_offsets_of_linuxcnc_are_checked(tmp_path, monkeypatch, name):
+    names = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
+    offsets = {one: (2.0 * k, 1.0, -50.0) for k, one in enumerate(names)}
+    text = f"G21 G90 G17 {name}\nG0 X0 Y0 Z1\nG1 X50 F100\nM2\n"
+    machine = machine_of([(-600.0, 600.0), (-500.0, 500.0), (-400.0, 200.0)], 9, **INCH)
+    result, _ = run(tmp_path, text, shift(x=10.0), setup=Setup(offsets), machine=machine)
+    assert result.unchecked == ()
+    monkeypatch.setattr(rs274, "OFFSETS_MM", offsets)
+    rs274.canonical(tmp_path / "out" / "p.nc", tmp_path)
+    monkeypatch.setattr(rs274, "OFFSETS_MM", {**offsets, name: (*offsets[name][:2], -50.01)})
+    rs274.canonical(tmp_path / "out" / "p.nc", tmp_path, stopped=True)
+
+
+@needs_rs274
+def test_many_tools_and_offsets_do_not_make_a_line_too_long(tmp_path, monkeypatch):
+    """LinuxCNC takes 255 characters in a line; a machine and a file may have any name."""
+    names = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")
+    offsets, tools = {name: (1.0, 1.0, -150.0) for name in names}, {f"{k}": (0.0, 0.0, 50.0 + k) for k in range(1, 41)}
+    blocks = [f"T{k} M6\nG43 H{k}\n{names[k % 9]}\nG0 X0 Y0 Z9\nG1 X5 F100" for k in range(1, 41)]
+    machine = machine_of([(-600.0, 600.0)] * 3, 9, name="Fräse 加工中心 (1)", **INCH)
+    text = "\n".join(["G21 G90 G17 G54", *blocks, "M2", ""])
+    _, corrected = run(tmp_path, text, shift(x=10.0), setup=Setup(offsets, tools), machine=machine)
+    head = corrected[: corrected.index("o<volcomp9001>")]
+    assert max(map(len, head.splitlines())) <= 110
+    assert "FOR MACHINE FRASE" in head and "40 = 90.0000" in head.replace("T40", "40")
+    assert re.findall(r"G59\.3 = [\d. -]+", head) == [
+        "G59.3 = 1.0000 1.0000 -150.0000",
+        "G59.3 = 0.039370 0.039370 -5.905512",
+    ]
+    monkeypatch.setattr(rs274, "OFFSETS_MM", offsets)
+    monkeypatch.setattr(rs274, "TOOLS_MM", tools)
+    rs274.interpreted(tmp_path / "out" / "p.nc", tmp_path)
+
+
+BODY = "G90 G17\nG0 X0. Y0. Z0.\nG1 X50. F100\nM30\n"
+HEADS = {
+    "fanuc": [
+        "%\nO12(PLATE)\n", "%\n\n(PLATE)\n(OF 1998)\nO0012\n", "\n%\n", "%\n<PLATE>\n", "O12\n", ":12;\n", "%\no12\n",
+        "%PLATE\nO12;\n", "N1 %\nO3\n", "",
+    ],
+    "linuxcnc": ["%\n", "\n\n%\n", "%\nO12 (PLATE)\n", "\n%\n(PLATE) ; of 1998\nO12\n", ""],
+    "siemens": [
+        "%_N_PLATE_MPF\n;$PATH=/_N_WKS_DIR\n", "%_N_PLATE_MPF\n\n; PLATE\n; $PATH=/_N_MPF_DIR\n", ";$PATH=/_N_MPF_DIR\n",
+        "%_N_PLATE_MPF\n", "",
+    ],
+    "heidenhain-iso": ["%PLATE G71 *\n", "N0 %PLATE G71 *\n"],
+    "grbl": ["%\n", ""],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+@pytest.mark.parametrize(("dialect", "head"), [(dialect, head) for dialect, heads in HEADS.items() for head in heads])
+def test_what_a_control_demands_to_be_first_stays_first(tmp_path, dialect, head, end):
+    """% and the number of the program, the path of an archive; comments after them follow the header, as does the program."""
+    comment = "; a" if dialect in ("siemens", "heidenhain-iso") else "(a)"
+    unit = {"siemens": "G71 ", "heidenhain-iso": ""}.get(dialect, "G21 ")
+    text = f"{head}{comment}\n{unit}{BODY}" + "%\n" * ("%" in head and dialect == "fanuc")
+    text = text.replace("M30", "N9 %PLATE G71 *") if dialect == "heidenhain-iso" else text
+    result, corrected = run(tmp_path, text.replace("\n", end), shift(x=10.0), dialect, PLAIN)
+    assert result.accepted
+    first = head.replace("\n", end)
+    assert corrected.startswith(first + DIALECTS[dialect].comment.format("CORRECTED BY VOLCOMP")[:-1])
+    assert corrected.index("CORRECTED BY") < corrected.index(comment) < corrected.index("X49.99")
+    assert end == "\n" or corrected.count("\n") == corrected.count("\r\n")
+
+
+CHECKED = [
+    ("fanuc", "G54.1 P1", "G54.1P1", 7001), ("fanuc", "G54.1 P48", "G54.1P48", 7941),
+    ("fanuc", "G54 P49", "G54.1P49", 14961), ("fanuc", "G54.1 P300", "G54.1P300", 19981),
+    ("fanuc", "G110", "G110", 7001), ("fanuc", "G129", "G129", 7381),
+    ("fanuc", "G154 P20", "G154P20", 7381), ("fanuc", "G154 P21", "G154P21", 14401), ("fanuc", "G154 P99", "G154P99", 15961),
+    ("fanuc", "G59", "G59", 5321), ("fanuc", "G54.1 P301", "G54.1P301", None),
+    ("siemens", "G54", "G54", 1), ("siemens", "G57", "G57", 4), ("siemens", "G505", "G505", 5), ("siemens", "G599", "G599", 99),
+    ("linuxcnc", "G59.2", "G59.2", 5361),
+    ("heidenhain-iso", "", "PRESET", None), ("grbl", "G55", "G55", None),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("dialect", "code", "name", "register"), CHECKED)
+@pytest.mark.parametrize("units", ["mm", "inch"])
+def test_every_work_offset_is_checked_or_said_not_to_be(tmp_path, dialect, code, name, register, units):
+    """By hand: -19.685039 inch are -500 mm. The variables are those of the manuals."""
+    unit = {"siemens": "G71", "heidenhain-iso": "%A G71 *\n"}.get(dialect, "G21")
+    text = f"{unit} {code} {BODY}".replace("M30", "N9 %A G71 *" if unit[0] == "%" else "M30")
+    machine = machine_of([(-600.0, 600.0)] * 3, 9, machine_units=units)
+    result, corrected = run(tmp_path, text, shift(x=10.0), dialect, Setup({name: (-500.0, 0.0, 6.35)}), machine=machine)
+    listed = (tmp_path / "out" / "preflight.md").read_text()
+    found = result.as_dict()
+    assert (found["machine_units"], found["offsets_not_checked"]) == (units, [] if register else [name])
+    assert f"WORK OFFSETS MM {name} = -500.0000 0.0000 6.3500" in corrected
+    assert (f"WORK OFFSETS INCH {name} = -19.685039 0.000000 0.250000" in corrected) == (units == "inch")
+    if register is None:
+        assert f"NOT CHECKED BY THIS PROGRAM {name}" in corrected
+        assert f"Compare by hand, since the program does not check it: {name}." in listed
+        assert not re.search(r"^(IF|o<)", corrected, re.MULTILINE)
+        return
+    x, z = ("-19.685039", "0.250000") if units == "inch" else ("-500.0000", "6.3500")
+    within = {"mm": "0.001", "inch": "0.00006" if dialect == "fanuc" else "0.00004"}[units]
+    expected = {
+        "fanuc": [f"IF[ABS[#{register}-[{x}]]LE{within}]GOTO9001", f"IF[ABS[#{register + 2}-[{z}]]LE{within}]GOTO9003"],
+        "linuxcnc": [f"o<volcomp9001> if [ABS[#{register}-[{x}]] GT {within}]"],
+        "siemens": [
+            f"IF ABS($P_UIFR[{register},X,TR]-({x}))<={within} GOTOF VC9001",
+            f"$P_UIFR[{register},Z,TR]-({z}))",
+        ],
+    }[dialect]
+    assert all(line in corrected for line in expected), corrected
+    assert f"where X, Y or Z of {name} differ by more than {within} {units}" in listed
+
+
+def test_units_of_a_machine_rule_its_tables_and_contradictions_are_refused(tmp_path):
+    file = tmp_path / "m.toml"
+    axes = "".join(f"[axes.{axis}]\nrange_mm = [0, 100]\nnodes = 3\n" for axis in "XYZ")
+    for top, own, expected in (
+        ("", {}, "mm"),
+        ('machine_units = "inch"\n', {}, "inch"),
+        ("", {"linuxcnc-comp": "inch"}, "inch"),
+        ('machine_units = "inch"\n', {"linuxcnc-comp": "inch"}, "inch"),
+    ):
+        sections = "".join(f'[controllers.{name}]\nmachine_units = "{unit}"\n' for name, unit in own.items())
+        file.write_text(f'name = "m"\nchain = "WXYFZT"\n{top}{axes}{sections}')
+        machine = read_machine(file)
+        assert machine.units == expected
+        assert CONTROLLERS["linuxcnc-comp"].read_settings(machine).machine_units == expected
+        units = CONTROLLERS["linuxcnc-volumetric"].read_settings(machine).machine_units
+        assert units == ("inch" if top else "mm")
+    two = (
+        '[controllers.linuxcnc-comp]\nmachine_units = "mm"\n[controllers.linuxcnc-volumetric]\nmachine_units = "inch"\n'
+    )
+    file.write_text(f'name = "m"\nchain = "WXYFZT"\nmachine_units = "inch"\n{axes}{two}')
+    with pytest.raises(InputError, match="the machine states 'inch'"):
+        read_machine(file)
+    file.write_text(f'name = "m"\nchain = "WXYFZT"\n{axes}{two}')
+    with pytest.raises(InputError, match=r"\[controllers.linuxcnc-comp\] is in mm, .* state it for the machine"):
+        read_machine(file).units  # noqa: B018
