@@ -6,7 +6,7 @@ import math
 import re
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -36,6 +36,7 @@ from compgen.programs.path import (
     kept_directions,
     lengths_of,
     path_deviations,
+    reach_of,
 )
 from compgen.programs.reader import MM_PER_INCH, PECK_REST_MM, Batch, Reader, Setup, SingleBlock
 from compgen.programs.runs import LONGEST_BLOCK, P_WORD, R_WORD, Run
@@ -45,6 +46,10 @@ from compgen.resources import LANGUAGES, program_version
 _CYCLE_CODES = frozenset((73.0, 74.0, 76.0, *map(float, range(81, 90))))
 #: A coordinate is rewritten if it changes by more than this part of its last decimal.
 _HALF = 0.5 + 1e-6
+#: Positions that differ by less are the same: sums of rounded numbers.
+SAME_MM = 1e-6
+#: How many blocks that lead beyond the travel are listed.
+MOST_LISTED, MOST_IN_PREFLIGHT = 100, 20
 #: Characters of a comment in the first lines of a corrected program.
 LONGEST_COMMENT = 90
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
@@ -62,6 +67,22 @@ class CorrectOptions:
     decimals: int | None = option(
         None, "Decimals of rewritten coordinates (default: those of the dialect, 3 to 6).", within=(1, 9)
     )
+
+
+@dataclass(frozen=True)
+class BeyondTravel:
+    """A block of a corrected program that leads beyond the travel: at its end, or within an arc."""
+
+    line: int
+    axis: str
+    position_mm: float
+    beyond_mm: float
+    #: Whether the program leads beyond the travel there, too.
+    by_program: bool
+    block: str
+
+    def __str__(self) -> str:
+        return f"line {self.line}: {self.axis} {self.position_mm:.3f} mm of the machine"
 
 
 @dataclass(frozen=True)
@@ -86,6 +107,9 @@ class ProgramCorrection:
     #: Unit in which the control keeps its work offsets, and those that the program itself cannot check.
     machine_units: str = "mm"
     unchecked: tuple[str, ...] = ()
+    #: How many blocks lead beyond the travel, and those that do by most.
+    blocks_beyond: int = 0
+    beyond: tuple[BeyondTravel, ...] = ()
 
     @property
     def accepted(self) -> bool:
@@ -109,6 +133,7 @@ class ProgramCorrection:
             "tools_mm": {name: list(value) for name, value in self.tools_mm.items()},
             "machine_units": self.machine_units,
             "offsets_not_checked": list(self.unchecked),
+            "beyond_travel": {"blocks": self.blocks_beyond, "largest": [asdict(item) for item in self.beyond]},
             "assumed": list(self.assumed),
             "notes": list(self.notes),
             "tolerance_um": self.tolerance_um,
@@ -771,6 +796,58 @@ Follow = Callable[[Moves, IntArray, Moves, FloatArray, FloatArray], None]
 
 
 @dataclass
+class _Travel:
+    """Collects the blocks of a corrected program that lead beyond the travel, those that do by most first."""
+
+    machine: Machine
+    count: int = 0
+    found: list[BeyondTravel] = field(default_factory=list)
+
+    def add(self, wanted: Moves, read: Moves, origin: IntArray, text: bytes, first: int) -> None:
+        """Look at moves as they were read back from a text that begins in line ``first``; ``origin`` is that of the program."""
+        beyond, place = self._beyond(read)
+        leads = (np.abs(read.end_mm - read.start_mm) > SAME_MM) | (place != read.end_mm)  # along the axis, or by an arc
+        rows, axes = np.nonzero((beyond > SAME_MM) & (leads | np.isnan(read.start_mm)))
+        if not len(rows):
+            return
+        self.count += len(np.unique(origin[rows]))
+        before = self._beyond(wanted)[0] > SAME_MM
+        own = {(int(wanted.line[row]), int(k)) for row, k in zip(*np.nonzero(before), strict=True)}
+        blocks, taken = text.decode("latin-1").split("\n"), set[tuple[int, int]]()
+        for j in np.argsort(-beyond[rows, axes], kind="stable").tolist():
+            row, k = int(rows[j]), int(axes[j])
+            if len(taken) >= MOST_LISTED or (at := (int(origin[row]), k)) in taken:
+                continue
+            taken.add(at)
+            far = float(beyond[row, k]), float(place[row, k])
+            block = blocks[int(read.line[row]) - first].strip()
+            self.found.append(BeyondTravel(at[0], AXES[k], far[1], far[0], at in own, block))
+        self.found = sorted(self.found, key=lambda item: -item.beyond_mm)[:MOST_LISTED]
+
+    def _beyond(self, moves: Moves) -> tuple[FloatArray, FloatArray]:
+        """How far each move leads beyond the travel of each axis, and where to, (n, 3), mm; nan for what is not corrected."""
+        least, most = reach_of(moves)
+        low, high = self.machine.lower_mm - least, most - self.machine.upper_mm
+        return np.fmax(low, high), np.where(low > high, least, most)
+
+    def said(self) -> tuple[str, str]:
+        """Why the corrected program is refused, and what else to know; nothing for either if there is nothing to say."""
+        if not self.found:
+            return "", ""
+        margin_mm, worst = self.machine.travel_margin_mm, self.found[0]
+        listed = ", ".join(map(str, self.found[:3])) + (", ..." if self.count > 3 else "")
+        what = "1 block leads" if self.count == 1 else f"{self.count} blocks lead"
+        text = f"{what} beyond the travel, by up to {worst.beyond_mm:.3f} mm ({listed})"
+        if worst.beyond_mm <= margin_mm + SAME_MM:
+            return "", f"{text}, within travel_margin_mm = {margin_mm:g} of the machine file"
+        return (
+            f"{text}: clamp the workpiece farther inside, leave an axis as it is (--only), or state travel_margin_mm in the "
+            f"machine file (now {margin_mm:g}) if the software limits of the control are farther out",
+            "",
+        )
+
+
+@dataclass
 class _ReadBack:
     """Adds up the deviations of the program and of the corrected one, batch by batch."""
 
@@ -779,10 +856,14 @@ class _ReadBack:
     step_mm: float
     before: PathFigures = field(default_factory=PathFigures)
     after: PathFigures = field(default_factory=PathFigures)
+    travel: _Travel = field(init=False)
     lines: int = 0
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
     broken: str = ""
     follow: Follow | None = None
+
+    def __post_init__(self) -> None:
+        self.travel = _Travel(self.model.machine)
 
     def add(self, wanted: Moves, text: bytes, origins: IntArray, pieces: Pieces) -> None:
         """Read corrected blocks and compare them with the moves that are wanted.
@@ -791,6 +872,7 @@ class _ReadBack:
         """
         read = self.reader.batch(text, self.lines + 1).moves
         origin = origins[read.line - self.lines - 1]
+        self.travel.add(wanted, read, origin, text, self.lines + 1)
         self.lines += len(origins)
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
         directions = np.vstack([self.direction, ended[:-1]])[: len(wanted)], ended
@@ -1001,7 +1083,10 @@ def correct_program(
                 f"the deviation is not smaller: {before.normal_rms_mm / MM_PER_UM:.2f} um rms before, "
                 f"{after.normal_rms_mm / MM_PER_UM:.2f} um rms after"
             )
-        notes = []
+        check.travel.found = [replace(item, line=reader.in_file(item.line)) for item in check.travel.found]
+        refused, note = check.travel.said()
+        reasons += [refused] if refused else []
+        notes = [note] if note else []
         if in_cycle and after.normal_mm > enough_mm:
             notes.append(
                 f"line {after.normal_line}: a drilling cycle has one X and Y, here those that are right at its depth; the stroke "
@@ -1025,6 +1110,8 @@ def correct_program(
             tuple(notes),
             model.machine.units,
             tuple(name for name in reader.used_offsets if not dialect.check or dialect.register(name) is None),
+            check.travel.count,
+            tuple(check.travel.found),
         )
         final = work / "program"
         with source.open("rb") as stream:
@@ -1063,6 +1150,7 @@ def preflight(result: ProgramCorrection) -> str:
         "The machine is warm, as it was during the measurement.",
         *(f"It was assumed that {text}." for text in result.assumed),
         *(text[0].upper() + text[1:] + "." for text in result.notes),
+        *_beyond_said(result),
         "Compare with the original by `diff`, and let the program run in the air first.",
     ]
     before, after = result.before.as_dict(), result.after.as_dict()
@@ -1072,6 +1160,21 @@ def preflight(result: ProgramCorrection) -> str:
         f"{after['ends_max_um']:.2f} um."
     )
     return "\n".join([f"# Before you run {result.file}", "", figures, "", *(f"- [ ] {text}" for text in points), ""])
+
+
+def _beyond_said(result: ProgramCorrection) -> list[str]:
+    """List blocks that lead beyond the travel, each with its text."""
+    if not result.beyond:
+        return []
+    rows = [
+        f"    - line {item.line}: {item.axis} {item.position_mm:.4f} mm of the machine, {item.beyond_mm:.4f} mm beyond the travel"
+        f"{', where the program leads, too' if item.by_program else ', by the correction'}: `{item.block.replace('`', ' ')}`"
+        for item in result.beyond[:MOST_IN_PREFLIGHT]
+    ]
+    more = result.blocks_beyond - len({item.line for item in result.beyond[:MOST_IN_PREFLIGHT]})
+    rows += [f"    - and {more} more blocks; correction.json lists up to {MOST_LISTED}"] if more > 0 else []
+    head = "The software limits of the control let these blocks pass, which lead beyond the travel of the machine file:"
+    return ["\n".join([head, *rows])]
 
 
 def _checks_said(result: ProgramCorrection) -> list[str]:

@@ -9,6 +9,7 @@ from programs import test_rs274 as rs274
 from programs.test_correct import PLAIN, moves_of, run, shift
 
 from compgen.controls import CONTROLLERS
+from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import read_machine
 from compgen.errors import InputError
 from compgen.programs import Setup, read_tools
@@ -304,3 +305,101 @@ def test_units_of_a_machine_rule_its_tables_and_contradictions_are_refused(tmp_p
     file.write_text(f'name = "m"\nchain = "WXYFZT"\n{axes}{two}')
     with pytest.raises(InputError, match=r"\[controllers.linuxcnc-comp\] is in mm, .* state it for the machine"):
         read_machine(file).units  # noqa: B018
+
+
+# --- what the correction moves beyond the travel ----------------------------------------------------------------------
+
+EDGE = (-600.0, 0.0, 0.0)
+
+
+def at_the_edge(dialect, blocks, setup=EDGE):
+    """A program whose X 0 is the end of the travel, in a dialect."""
+    unit, end = {"siemens": ("G71", "M30"), "heidenhain-iso": ("%A G71 *\n", "N9 %A G71 *")}.get(
+        dialect, ("G21", "M30")
+    )
+    offset = "" if dialect == "heidenhain-iso" else "G54"
+    text = f"{unit} G90 G17 {offset}\nG0 X50. Y0. Z0.\n{blocks}\n{end}\n"
+    return text.replace("\n\n", "\n"), Setup({"G54": setup, "PRESET": setup}, {"1": (0.0, 0.0, 0.0)})
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("blocks", ["G1 X10. F100\nX0.\nY20.", "G0 X0.\nG1 Y20. F100"])
+def test_a_program_that_the_correction_takes_beyond_the_travel_is_refused(tmp_path, dialect, blocks):
+    """The machine goes 129 um too far to plus, so that X 0 of the program becomes -600.129 mm: by cuts and by rapid moves."""
+    text, setup = at_the_edge(dialect, blocks)
+    result, _ = run(tmp_path, text, shift(x=129.0), dialect, setup)
+    assert not result.accepted and result.file == "NOT-ACCEPTED-p.nc"
+    line = next(k for k, block in enumerate(text.splitlines(), 1) if "X0." in block)
+    assert result.reasons == (
+        f"1 block leads beyond the travel, by up to 0.129 mm (line {line}: X -600.129 mm of the machine): clamp the workpiece "
+        "farther inside, leave an axis as it is (--only), or state travel_margin_mm in the machine file (now 0) if the software "
+        "limits of the control are farther out",
+    )
+    listed = (tmp_path / "out" / "preflight.md").read_text()
+    assert f"line {line}: X -600.1290 mm of the machine, 0.1290 mm beyond the travel, by the correction: `" in listed
+    assert result.as_dict()["beyond_travel"]["largest"][0]["block"].split("X")[1].startswith("-0.129")
+    # to the other side the correction leads inward, and an axis that is not corrected stays
+    assert run(tmp_path, text, shift(x=-129.0), dialect, setup)[0].accepted
+    stays, _ = run(tmp_path, text, shift(x=129.0, y=50.0), dialect, setup, only="Y,Z")
+    assert stays.blocks_beyond == 0
+
+
+def test_a_margin_of_the_machine_lets_them_pass_and_they_are_listed(tmp_path):
+    text, setup = at_the_edge("fanuc", "G1 X10. F100\nX0.\nY20.\nX0.05 Y30.\nX30.")
+    errors = ErrorTable({"EXX": Curve(np.array([-700.0, 700.0]), np.full(2, 0.129), np.zeros(2))})
+    machine = machine_of([(-600.0, 600.0), (-500.0, 500.0), (-400.0, 200.0)], 9, travel_margin_mm=0.2)
+    result, _ = run(tmp_path, text, errors, "fanuc", setup, machine=machine)
+    assert result.accepted and result.blocks_beyond == 2
+    found = [(item.line, round(item.beyond_mm, 3), item.by_program) for item in result.beyond]
+    assert found == [(4, 0.129, False), (6, 0.079, False)]
+    assert result.notes[0] == (
+        "2 blocks lead beyond the travel, by up to 0.129 mm (line 4: X -600.129 mm of the machine, line 6: X -600.079 mm of the "
+        "machine), within travel_margin_mm = 0.2 of the machine file"
+    )
+    # the program itself may use the margin, too
+    result, _ = run(tmp_path, text.replace("X0.\n", "X-0.05\n"), errors, "fanuc", setup, machine=machine)
+    assert result.accepted and [item.by_program for item in result.beyond] == [True, False]
+    assert (
+        "beyond the travel, where the program leads, too: `X-0.179`" in (tmp_path / "out" / "preflight.md").read_text()
+    )
+    with pytest.raises(InputError, match="outside its travel -600 to 600 mm"):
+        run(tmp_path, text.replace("X0.\n", "X-0.21\n"), errors, "fanuc", setup, machine=machine)
+    result, _ = run(tmp_path, text.replace("X0.\n", "X-0.1\n"), errors, "fanuc", setup, machine=machine)
+    assert result.reasons[0].startswith("2 blocks lead beyond the travel, by up to 0.229 mm (line 4: X -600.229")
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_an_arc_whose_ends_stay_inside_may_leave_the_travel_by_its_correction(tmp_path, dialect):
+    """A semicircle about X 30 with the radius 30 touches the end of the travel; the correction moves it 10 um beyond."""
+    centre = "I+30. J+0.\nG3 X30. Y-30." if dialect == "heidenhain-iso" else "G3 X30. Y-30. I0. J-30."
+    text, setup = at_the_edge(dialect, f"G0 X30. Y30.\n{centre} F100\nG1 X50.")
+    result, _ = run(tmp_path, text, shift(x=10.0), dialect, setup)
+    assert len(result.reasons) == 1 and result.blocks_beyond == 1
+    assert (result.beyond[0].axis, round(result.beyond[0].position_mm, 3)) == ("X", -600.010)
+    assert "G3" in text.splitlines()[result.beyond[0].line - 1]
+
+
+def test_holes_and_all_axes_are_held_against_the_travel(tmp_path):
+    """Z from -400 mm: the depth of a hole; Y by an increment; the many blocks of a face, of which some are listed."""
+    text, setup = at_the_edge(
+        "fanuc", "G99 G81 X20. Z-100. R5. F90\nX30.\nG80\nG0 Z10.\nG91 G1 Y-500. F9\nG90 Y0.", (0.0, 0.0, -300.0)
+    )
+    result, _ = run(tmp_path, text, shift(y=7.0, z=33.0), "fanuc", setup)
+    assert {(item.axis, item.line, round(item.beyond_mm, 3)) for item in result.beyond} == {
+        ("Z", 3, 0.033),
+        ("Z", 4, 0.033),
+        ("Y", 7, 0.007),
+    }
+    many = "\n".join(f"G1 X1. Y{k}. F90\nX0." for k in range(135))
+    text, setup = at_the_edge("linuxcnc", many)
+    result, _ = run(tmp_path, text, shift(x=20.0), setup=setup)
+    assert (result.blocks_beyond, len(result.beyond)) == (135, 100)
+    assert (
+        "    - and 115 more blocks; correction.json lists up to 100" in (tmp_path / "out" / "preflight.md").read_text()
+    )
+
+
+def test_blocks_of_a_subprogram_have_the_lines_of_the_file(tmp_path):
+    text, setup = at_the_edge("fanuc", "M98 P7 L2\nM30\nO7\nG1 X5. F90\nX0.\nX9.\nM99")
+    result, _ = run(tmp_path, text.replace("M99\nM30", "M99"), shift(x=10.0), "fanuc", setup)
+    assert {item.line for item in result.beyond} == {7} and "line 7: X -600.010 mm" in result.reasons[0]
