@@ -54,8 +54,9 @@ OF_MACHINE, OF_KIND, OF_CURVE = 0.4, 0.3, 0.4
 OF_ROUGH, LEAST_ROUGH = 0.7, 0.05
 #: Steps of the search for the amplitudes, and the gain of the logarithm of the likelihood that ends it.
 LEARNING_STEPS, ENOUGH_LEARNT = 12, 0.05
-#: Readings whose residuals exceed their noise by this factor get more of it, and everything is adjusted again so often.
-TOO_LARGE, PASSES = 1.3, 3
+#: Readings whose residuals exceed their noise by this factor get more of it, and everything is adjusted again so often;
+#: fewer degrees of freedom than this say nothing about their noise.
+TOO_LARGE, PASSES, FEW_FREE = 1.3, 3, 10
 #: rms of what is determined over its prior beyond which a machine is worse than its class: of one curve, of all.
 WORSE_CURVE, WORSE_ALL = 2.2, 1.5
 #: Factor by which the sizes of a class grow until the machine is no longer worse than it.
@@ -582,17 +583,19 @@ def solve_posterior(
     spans_mm: FloatArray,
     *,
     learn: bool,
+    passes: int = PASSES,
 ) -> Posterior:
     """Return the posterior of the state of a layout (:func:`state_layout`) from the information of several sources.
 
     Sources whose residuals exceed their noise get more of it; a machine that is worse than its class gets larger sizes,
-    and ``worse`` says so. With ``learn`` the readings change the size of each error (unless the machine file says no).
+    and ``worse`` says so; ``passes`` limits how often. With ``learn`` the readings change the size of each error, unless the
+    machine file says no.
     """
     names, prior, parts = tuple(name for name, _ in layout.columns()), machine.prior, list(information)
     usual = processes_of(machine, prior, names)
     of_class = {name: prior.size(name) for name in layout.squareness}
     own: dict[str, float] = {}
-    for _ in range(PASSES):
+    for _ in range(passes):
         larger = processes_of(machine, prior, names) | {n: _grown(usual[n], own[n]) for n in own if n in usual}
         sizes = np.array([of_class[n] * own[n] if n in own else prior.size(n) for n in layout.squareness])
         known = _sum(parts, layout.size)
@@ -641,7 +644,7 @@ def _excess(item: Information, solved: _Solved) -> float:
     left = item.square_sum - 2.0 * float(solved.mean @ item.vector) + float(solved.mean @ item.matrix @ solved.mean)
     shown = item.matrix @ solved.factor
     effective = item.freedom - float(np.einsum("ij,ij->", shown, solved.factor))
-    return float(np.sqrt(max(left, 0.0) / max(effective, 1.0)))
+    return float(np.sqrt(max(left, 0.0) / effective)) if effective >= FEW_FREE else 1.0
 
 
 def _posterior(

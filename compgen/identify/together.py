@@ -71,6 +71,7 @@ from compgen.identify.posterior import (
 )
 from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
+from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import full_grid
 
 
@@ -201,6 +202,13 @@ def posterior_of(
 
     ``result`` are errors close enough to linearise about.
     """
+    with one_thread():
+        return _posterior_of(machine, parts, options, result, learn=learn)
+
+
+def _posterior_of(
+    machine: Machine, parts: Sequence[Source], options: IdentifyOptions, result: Identification, *, learn: bool
+) -> tuple[Posterior, tuple[Information, ...]]:
     names = state_names(machine)
     places = [_places_mm(part) for part in parts]
     levels = [
@@ -217,18 +225,15 @@ def posterior_of(
     for name, columns in layout.columns():
         if name in errors.squareness and name in known:
             around[columns] = errors.squareness[name][0]
-    # about approximate errors, and where these were poor, about the better ones
-    for again in (True, False):
-        found = [part.readings(machine, layout, options, around) for part in parts]
-        information = tuple(Information.of(item) for item in found)
-        solved = solve_posterior(machine, layout, information, spans_of(found), learn=learn and not again)
-        moves = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
-        if again and not moves:
-            if learn:
-                solved = solve_posterior(machine, layout, information, spans_of(found), learn=True)
-            break
-        around = solved.state
-    return solved, information
+    found = [part.readings(machine, layout, options, around) for part in parts]
+    information = [Information.of(item) for item in found]
+    moves = [k for k, part in enumerate(parts) if isinstance(part.measurement, Deviations | Artefact | Lengths)]
+    if moves:  # poses and stations: once more about better errors than those of least squares
+        around = solve_posterior(machine, layout, information, spans_of(found), learn=False, passes=1).state
+        for k in moves:
+            found[k] = parts[k].readings(machine, layout, options, around)
+            information[k] = Information.of(found[k])
+    return solve_posterior(machine, layout, information, spans_of(found), learn=learn), tuple(information)
 
 
 def _places_mm(part: Source) -> list[FloatArray]:
@@ -262,6 +267,9 @@ def with_prior(
         learn = machine.prior.learn in ("up", "both")
         return replace(result, posterior_source=lambda: posterior_of(machine, parts, options, result, learn=learn)[0])
     found, information = posterior_of(machine, parts, options, result, learn=True)
+    if result.method in ("sixdof", "merged"):  # six errors of an axis at once, in the gauge of the instrument
+        details = {**result.details, "posterior_means": []}
+        return replace(result, posterior_source=lambda: found, details=details)
     whole = _kept(machine, parts, result, options, found)
     listed = [name for name in ERROR_NAMES if name in found.shown or name in whole]
     if not listed:
@@ -275,15 +283,15 @@ def with_prior(
             value, u = float(mean.value[0]), float(mean.u[0])
             if name in whole:  # as it was stated or measured
                 value, stated = result.errors.squareness[name]
-                u = max(u, stated) if np.isfinite(stated) else u
+                u = float(_as_stated(np.array([u]), np.array([stated]))[0])
             squareness[name] = (value, u)
         else:
             at = _output_mm(machine, name, own, whole=name in whole)
             mean = found.curve(name, at)
             if own is not None and name in whole:
                 kept = np.isin(at, own.position_mm)
-                least = np.where(kept, np.nan_to_num(np.interp(at, own.position_mm, own.u)), 0.0)
-                mean = Curve(at, np.where(kept, own.at(at), mean.value), np.maximum(mean.u, least))
+                stated_u = np.where(kept, np.interp(at, own.position_mm, own.u), np.nan)
+                mean = Curve(at, np.where(kept, own.at(at), mean.value), _as_stated(mean.u, stated_u))
             curves[name] = mean
         positions.append(at)
     errors = ErrorTable(curves, squareness, result.errors.metadata)
@@ -323,10 +331,20 @@ def with_prior(
     )
 
 
+def _as_stated(u: FloatArray, stated: FloatArray) -> FloatArray:
+    """Uncertainties of values that stay, (n,): those stated or found where the prior hardly changes them."""
+    same = np.isfinite(stated) & (np.abs(stated - u) <= NEARLY * u)
+    return np.where(same, stated, u)
+
+
 def _kept(
     machine: Machine, parts: Sequence[Source], result: Identification, options: IdentifyOptions, found: Posterior
 ) -> set[str]:
-    """Errors whose least-squares values stay: the readings alone determine them, to a third of the prior."""
+    """Errors whose least-squares values stay: the readings alone determine them everywhere, to a third of the prior.
+
+    Where the readings are not at the nodes, least squares are off by what the curve bends between the nodes: then the
+    posterior mean is better.
+    """
     layout = error_parameters(machine, modelled_errors(machine))
     around = np.zeros(layout.size)
     observed = []
@@ -335,14 +353,20 @@ def _kept(
             observed.append(circle_readings(machine, layout, part.measurement, part.alone))
         else:
             observed.append(part.observed(machine, layout, options, around))
-    determined = _determined_errors(layout, stacked(observed), SHOWS)
+    names, at = result.errors.labels()
+    rows = layout.value_rows(names, at)
+    determined = determined_values(layout, stacked(observed), rows) | ~np.any(rows, axis=1)
     kept = set()
-    for name in determined & set(found.determined) & set(result.errors.names):
+    for name, values in result.errors.rows().items():
+        if name not in found.determined or not determined[values].all():
+            continue
         if name in result.errors.curves:
-            position_mm = result.errors.curves[name].position_mm
+            curve, mean = result.errors.curves[name], found.curve(name, at[values])
             low, high = found.processes[name].zero_mm[0], found.processes[name].zero_mm[-1]
-            if position_mm[0] > low + 1e-6 or position_mm[-1] < high - 1e-6:
+            if curve.position_mm[0] > low + 1e-6 or curve.position_mm[-1] < high - 1e-6:
                 continue  # its zero is beyond what was measured
+            if np.any(np.abs(curve.value - mean.value) > MOST_OFF * mean.u + 1e-6 * found.processes[name].s):
+                continue
         kept.add(name)
     return kept
 
@@ -709,6 +733,10 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
 
 #: Probability of a false report that two measurements disagree.
 FALSE_ALARM = 0.05
+#: Standard uncertainties stay as they were stated if the posterior ones differ by at most this share.
+NEARLY = 0.1
+#: Least-squares values stay where they are within so many standard uncertainties of the posterior mean.
+MOST_OFF = 1.0
 #: E_n number from which a disagreement is a contradiction; between 1 and this it is a reservation.
 CONTRADICTS = 1.5
 #: A value is shared by two parts if one of them takes this share of the variance that the other leaves.

@@ -212,8 +212,8 @@ def determined_values(
     rest = design - explained @ (explained.T @ design)
     size = np.linalg.norm(rest, axis=0)
     scale = np.where(size > SHOWS * size.max(initial=1e-300), size, size.max(initial=1e-300))
-    _, values, right = np.linalg.svd(rest / scale, full_matrices=False)
-    directions = right[values > least * values.max(initial=1e-300)].T
+    _, values, right = np.linalg.svd(np.linalg.qr(rest / scale, mode="r"))  # fewer rows, the same directions
+    directions = right[: len(values)][values > least * values.max(initial=1e-300)].T
     scaled = rows * unit / scale
     outside = np.linalg.norm(scaled - scaled @ directions @ directions.T, axis=1)
     size = np.linalg.norm(scaled, axis=1)
