@@ -50,8 +50,8 @@ JITTER = 1e-9
 LISTED_CURVE, LISTED_SQUARENESS = 0.75, 0.95
 #: Standard deviations of the logarithm of the amplitude: of the machine, of a kind of errors, of one error.
 OF_MACHINE, OF_KIND, OF_CURVE = 0.4, 0.3, 0.4
-#: Standard deviation of the logarithm of the rough part, and its least size.
-OF_ROUGH, LEAST_ROUGH = 0.7, 0.05
+#: Standard deviation of the logarithm of the size of the rough part, the factors that are tried, and the fewest levels.
+OF_ROUGH, ROUGH_STEPS, FEW_LEVELS = 0.7, np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 5
 #: Steps of the search for the amplitudes, and the gain of the logarithm of the likelihood that ends it.
 LEARNING_STEPS, ENOUGH_LEARNT = 12, 0.05
 #: Readings whose residuals exceed their noise by this factor get more of it, and everything is adjusted again so often;
@@ -610,11 +610,52 @@ def solve_posterior(
         if set(ratios) == set(own) and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
             break
         own, prior = {name: max(1.0, ratio) for name, ratio in ratios.items()}, raised
+    rough = _rough(found)
+    if rough:
+        larger = larger | {name: replace(larger[name], rough=share) for name, share in rough.items()}
+        solved = _solve(layout, larger, sizes, known)
+        found = _posterior(layout, prior, larger, sizes, solved, spans_mm)
     if learn and prior.learn != "no" and parts:
         larger, sizes = _learnt(layout, prior, larger, sizes, known)
         solved = _solve(layout, larger, sizes, known)
         found = _posterior(layout, prior, larger, sizes, solved, spans_mm)
     return replace(found, worse=_worse(ratios))
+
+
+def _rough(found: Posterior) -> dict[str, float]:
+    """Size of the rough part of each determined curve, relative to its smooth part, where another one is more likely.
+
+    Values at neighbouring positions that jump show a curve that is rough between them, too: backlash of a scale, a screw
+    whose period the nodes do not resolve. What the readings say of one curve is its posterior without its prior,
+    H = S^-1 - K^-1 and b = S^-1 m; the size is the maximum of likelihood times hyperprior over a few sizes.
+    """
+    columns, shares = dict(found.layout.columns()), {}
+    for curve in found.layout.curves:
+        name = curve.error.name
+        own = columns[name]
+        at = _state_positions(curve.free, curve.nodes_mm)
+        process = found.processes[name]
+        if found.shares[name] > DETERMINED or len(at) < FEW_LEVELS:
+            continue
+        prior = process.covariance(at, at)
+        prior[np.diag_indices(len(at))] *= 1.0 + JITTER
+        inverse = np.linalg.inv(found.factor[own] @ found.factor[own].T + JITTER * np.diag(np.diag(prior)))
+        values, directions = np.linalg.eigh(inverse - np.linalg.inv(prior))
+        matrix = (directions * np.maximum(values, 0.0)) @ directions.T
+        vector = inverse @ found.state[own]
+        likely = []
+        for share in process.rough * ROUGH_STEPS:
+            root = np.linalg.cholesky(
+                replace(process, rough=float(share)).covariance(at, at) + 1e-14 * np.diag(np.diag(prior))
+            )
+            half = np.linalg.cholesky(root.T @ matrix @ root + np.eye(len(at)))
+            gained = np.linalg.solve(half, root.T @ vector)
+            likely.append(0.5 * float(gained @ gained) - float(np.log(np.diag(half)).sum()))
+        likely = np.array(likely) - 0.5 * (np.log(ROUGH_STEPS) / OF_ROUGH) ** 2
+        best = int(np.argmax(likely))
+        if best != int(np.argmax(ROUGH_STEPS == 1.0)):
+            shares[name] = float(process.rough * ROUGH_STEPS[best])
+    return shares
 
 
 def _grown(process: Process, factor: float) -> Process:

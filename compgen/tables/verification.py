@@ -328,6 +328,18 @@ def rounded_limits(
     return one, low, high, um_text(after[0], u_um=of_after), um_text(after[2], u_um=of_after)
 
 
+#: Points of a calculation that depends on none.
+_NO_POINTS = np.zeros((0, 3))
+
+
+@kept
+def _known(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
+) -> Posterior | None:
+    """:func:`posterior_with`, once for all controls."""
+    return posterior_with(machine, errors, covariance)
+
+
 def _some(position_mm: FloatArray, most: int) -> NDArray[np.int64]:
     """Up to ``most`` of the points (n, 3); by chance, because every k-th point of a grid may lie on a few planes."""
     if len(position_mm) <= most:
@@ -347,7 +359,7 @@ def figure_uncertainty(
     known = covariance_or_independent(errors, covariance, machine.name)
     if known is None:
         return None
-    posterior = posterior_with(machine, errors, covariance)
+    posterior = _known(machine, errors, _NO_POINTS, covariance)
     if posterior is not None:
         return _posterior_uncertainty(machine, posterior, position_mm)
     most = max(50, min(UNCERTAINTY_POINTS, MOST_NUMBERS // (3 * max(len(known.error), 1))))
@@ -1039,7 +1051,7 @@ def verify(
     same = points is None and reversal is None and not control.by_direction(tables.tables)
     on_grid = (correction, rigid_removed[1]) if same else None
     safety, reasons = reasons_against(machine, tables, judge, limits, reversal, on_grid=on_grid)
-    posterior = posterior_with(machine, errors, covariance)
+    posterior = _known(machine, errors, _NO_POINTS, covariance)
     sizes = [item.rms_um for item in (*figures, *rigid_removed)]
     gain = (
         None
