@@ -225,6 +225,7 @@ class StoredPosterior:
     factor: FloatArray
     spans_mm: FloatArray
     prior: dict[str, Any]
+    follows_table: bool = True
 
     def of(self, machine: Machine) -> Posterior:
         """Return the posterior of the errors of this machine."""
@@ -243,6 +244,7 @@ class StoredPosterior:
             "posterior_factor": self.factor,
             "posterior_spans_mm": self.spans_mm,
             "posterior_prior": np.array(json.dumps(self.prior)),
+            "posterior_follows_table": np.array(self.follows_table),
         }
 
     @classmethod
@@ -266,7 +268,7 @@ class StoredPosterior:
             raise ValueError("the parts of the posterior do not match")
         x, y, z = (numbers[f"levels_{letter}_mm"] for letter in "xyz")
         others = numbers["sizes"], numbers["mean"], numbers["factor"], numbers["spans_mm"]
-        return cls((x, y, z), names, *others, prior)
+        return cls((x, y, z), names, *others, prior, bool(members.get("posterior_follows_table", True)))
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------

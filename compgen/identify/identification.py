@@ -31,6 +31,10 @@ if TYPE_CHECKING:
 # The result of an identification, and the contents of ``identify.json``.
 
 
+#: Readings closer to a node than this are at it, mm.
+AT_NODE_MM = 1e-2
+
+
 @dataclass(frozen=True)
 class StationResult:
     """One station and set-up: position and dead length with standard uncertainties, mm, and residual RMS in um.
@@ -283,6 +287,16 @@ def same_nodes(machine: Machine, result: Identification) -> bool:
     """Whether errors were identified at the nodes of the machine file."""
     pairs = zip(machine.axes, result.layout.machine.axes, strict=True)
     return all(np.array_equal(own.nodes_mm, other.nodes_mm) for own, other in pairs)
+
+
+def at_nodes(machine: Machine, position_mm: FloatArray) -> bool:
+    """Whether all positions (n, 3) are at the nodes of the machine: then its curves have the values that were read."""
+    for k, axis in enumerate(machine.axes):
+        nearest = np.clip(np.searchsorted(axis.nodes_mm, position_mm[:, k]), 1, len(axis.nodes_mm) - 1)
+        away = np.minimum(position_mm[:, k] - axis.nodes_mm[nearest - 1], axis.nodes_mm[nearest] - position_mm[:, k])
+        if np.abs(away).max(initial=0.0) > AT_NODE_MM:
+            return False
+    return True
 
 
 def determines_all(machine: Machine, result: Identification) -> bool:

@@ -50,8 +50,9 @@ JITTER = 1e-9
 LISTED_CURVE, LISTED_SQUARENESS = 0.75, 0.95
 #: Standard deviations of the logarithm of the amplitude: of the machine, of a kind of errors, of one error.
 OF_MACHINE, OF_KIND, OF_CURVE = 0.4, 0.3, 0.4
-#: Standard deviation of the logarithm of the size of the rough part, the factors that are tried, and the fewest levels.
-OF_ROUGH, ROUGH_STEPS, FEW_LEVELS = 0.7, np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 5
+#: Standard deviations of the logarithm of the size of the rough part, of a machine and of one curve about it; the factors
+#: that are tried, and the fewest levels of a curve that say something about it.
+OF_ROUGH, OF_ROUGH_CURVE, ROUGH_STEPS, FEW_LEVELS = 0.7, 0.4, 2.0 ** np.arange(-1.0, 5.5, 0.5), 5
 #: Steps of the search for the amplitudes, and the gain of the logarithm of the likelihood that ends it.
 LEARNING_STEPS, ENOUGH_LEARNT = 12, 0.05
 #: Readings whose residuals exceed their noise by this factor get more of it, and everything is adjusted again so often;
@@ -294,6 +295,7 @@ class Posterior:
     state, factor : mean of the state (p,) and a factor (p, r) of its covariance, factor factor'; mm and rad.
     spans_mm : lowest and highest position of the readings that show the curves of each axis; nan if there are none.
     worse : errors that are larger than their class lets expect, with the ratio.
+    follows_table : whether the errors that were listed with it have its gauge; those of a six-DOF instrument do not.
     """
 
     machine: Machine
@@ -305,6 +307,7 @@ class Posterior:
     factor: FloatArray
     spans_mm: FloatArray
     worse: Mapping[str, float] = field(default_factory=dict)
+    follows_table: bool = True
 
     @cached_property
     def layout(self) -> ErrorParameters:
@@ -404,13 +407,16 @@ class Posterior:
             found.append(_Between(more[:, :, ERROR_INDEX[name]], of.ravel(), process.covariance(levels, levels)))
         return found
 
-    def mean(self, position_mm: FloatArray, without: Sequence[str] = ()) -> FloatArray:
-        """Return the mean of E = C P at points (n, 3), mm, of all errors but those named."""
-        names = [
-            name for name in self.names if name not in without and self.state[dict(self.layout.columns())[name]].any()
-        ]
-        table = self.mean_table(names)
-        return np.asarray(np.einsum("nij,nj->ni", c_matrix(self.machine, position_mm), table.at(position_mm)))
+    def mean_beyond(self, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
+        """Return the mean of E = C P at points (n, 3) minus that of an error table, mm: what the table does not have.
+
+        Of errors in another gauge only those that the table does not list.
+        """
+        names = [name for name in self.names if self.follows_table or name not in errors.names]
+        listed = errors.only(*names) if self.follows_table else ErrorTable({}, {}, {})
+        own = self.mean_table([name for name in names if self.state[dict(self.layout.columns())[name]].any()])
+        difference = own.at(position_mm) - listed.at(position_mm)
+        return np.asarray(np.einsum("nij,nj->ni", c_matrix(self.machine, position_mm), difference))
 
     def stored(self) -> StoredPosterior:
         """Return it as a covariance file keeps it."""
@@ -422,7 +428,8 @@ class Posterior:
             for name in self.names
         ]
         prior = self.prior.stated()
-        return StoredPosterior((x, y, z), self.names, np.array(sizes), self.state, self.factor, self.spans_mm, prior)
+        state = self.state, self.factor, self.spans_mm
+        return StoredPosterior((x, y, z), self.names, np.array(sizes), *state, prior, self.follows_table)
 
     def mean_table(self, names: Sequence[str]) -> ErrorTable:
         """Return the means of errors at the levels of the state."""
@@ -486,8 +493,9 @@ def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
     if columns != list(stored.names):
         raise InputError("the errors of the covariance file are not in their usual order; identify the errors again")
     return Posterior(
-        layout.machine, prior, processes, squareness, stored.names, stored.mean, stored.factor, stored.spans_mm
-    )
+        layout.machine, prior, processes, squareness, stored.names, stored.mean, stored.factor, stored.spans_mm,
+        follows_table=stored.follows_table,
+    )  # fmt: skip
 
 
 # --- sizes that the readings change ---------------------------------------------------------------------------------
@@ -610,7 +618,7 @@ def solve_posterior(
         if set(ratios) == set(own) and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
             break
         own, prior = {name: max(1.0, ratio) for name, ratio in ratios.items()}, raised
-    rough = _rough(found)
+    rough = _rough(found) if passes > 1 else {}
     if rough:
         larger = larger | {name: replace(larger[name], rough=share) for name, share in rough.items()}
         solved = _solve(layout, larger, sizes, known)
@@ -623,39 +631,41 @@ def solve_posterior(
 
 
 def _rough(found: Posterior) -> dict[str, float]:
-    """Size of the rough part of each determined curve, relative to its smooth part, where another one is more likely.
+    """Size of the rough part of curves, relative to their smooth parts, where another one is more likely than the usual.
 
-    Values at neighbouring positions that jump show a curve that is rough between them, too: backlash of a scale, a screw
-    whose period the nodes do not resolve. What the readings say of one curve is its posterior without its prior,
-    H = S^-1 - K^-1 and b = S^-1 m; the size is the maximum of likelihood times hyperprior over a few sizes.
+    Values at neighbouring positions that jump show curves that are rough between them, too: jumps, a screw whose period
+    the readings do not resolve. First one factor for all determined curves, then one for each of them about it. What the
+    readings say of a curve is its posterior without its prior: H = S^-1 - K^-1, b = S^-1 m.
     """
-    columns, shares = dict(found.layout.columns()), {}
+    columns, likely = dict(found.layout.columns()), dict[str, FloatArray]()
     for curve in found.layout.curves:
-        name = curve.error.name
-        own = columns[name]
+        name, own = curve.error.name, columns[curve.error.name]
         at = _state_positions(curve.free, curve.nodes_mm)
-        process = found.processes[name]
         if found.shares[name] > DETERMINED or len(at) < FEW_LEVELS:
             continue
+        process = found.processes[name]
         prior = process.covariance(at, at)
-        prior[np.diag_indices(len(at))] *= 1.0 + JITTER
-        inverse = np.linalg.inv(found.factor[own] @ found.factor[own].T + JITTER * np.diag(np.diag(prior)))
-        values, directions = np.linalg.eigh(inverse - np.linalg.inv(prior))
-        matrix = (directions * np.maximum(values, 0.0)) @ directions.T
-        vector = inverse @ found.state[own]
-        likely = []
-        for share in process.rough * ROUGH_STEPS:
-            root = np.linalg.cholesky(
-                replace(process, rough=float(share)).covariance(at, at) + 1e-14 * np.diag(np.diag(prior))
-            )
-            half = np.linalg.cholesky(root.T @ matrix @ root + np.eye(len(at)))
+        tiny = JITTER * np.diag(np.diag(prior))
+        inverse = np.linalg.inv(found.factor[own] @ found.factor[own].T + tiny)
+        values, directions = np.linalg.eigh(inverse - np.linalg.inv(prior + tiny))
+        shows = (directions * np.maximum(values, 0.0)) @ directions.T
+        vector, found_of = inverse @ found.state[own], []
+        for step in ROUGH_STEPS:
+            root = np.linalg.cholesky(replace(process, rough=process.rough * step).covariance(at, at) + tiny)
+            half = np.linalg.cholesky(root.T @ shows @ root + np.eye(len(at)))
             gained = np.linalg.solve(half, root.T @ vector)
-            likely.append(0.5 * float(gained @ gained) - float(np.log(np.diag(half)).sum()))
-        likely = np.array(likely) - 0.5 * (np.log(ROUGH_STEPS) / OF_ROUGH) ** 2
-        best = int(np.argmax(likely))
-        if best != int(np.argmax(ROUGH_STEPS == 1.0)):
-            shares[name] = float(process.rough * ROUGH_STEPS[best])
-    return shares
+            found_of.append(0.5 * float(gained @ gained) - float(np.log(np.diag(half)).sum()))
+        likely[name] = np.array(found_of)
+    if not likely:
+        return {}
+    size = np.log(ROUGH_STEPS)
+    common = size[np.argmax(sum(likely.values()) - 0.5 * (size / OF_ROUGH) ** 2)]
+    chosen = {
+        name: size[np.argmax(each - 0.5 * ((size - common) / OF_ROUGH_CURVE) ** 2)] for name, each in likely.items()
+    }
+    of_machine = max(float(common), 0.0)  # of what was not measured
+    factors = {name: float(np.exp(chosen.get(name, of_machine))) for name in found.processes}
+    return {name: found.processes[name].rough * factor for name, factor in factors.items() if factor != 1.0}
 
 
 def _grown(process: Process, factor: float) -> Process:

@@ -48,7 +48,7 @@ from compgen.identify.covariance import (
 )
 from compgen.identify.identification import (
     Identification,
-    determines_all,
+    at_nodes,
     not_among,
     same_nodes,
     state_names,
@@ -134,8 +134,14 @@ class Source:
             return axis_observations(machine, layout, self.measurement, machine.prior)
         if isinstance(self.measurement, Circles) and self.alone is not None:
             return circle_readings(machine, layout, self.measurement, self.alone)
-        if isinstance(self.measurement, Lengths) and not (self.alone and same_nodes(machine, self.alone)):
-            return length_observations(machine, layout, self.measurement, options, around)
+        lengths = self.measurement
+        if isinstance(lengths, Lengths) and not (
+            self.alone and same_nodes(machine, self.alone) and at_nodes(machine, lengths.position_mm)
+        ):
+            kept = np.ones(len(lengths), dtype=bool) if self.alone is None else self.alone.accepted
+            rows = np.flatnonzero(kept)
+            few = lengths.part(rows[:: 1 + len(rows) // MOST_LENGTHS])
+            return length_observations(machine, layout, few, options, around)
         if isinstance(self.measurement, Deviations) and self.alone is not None and self.alone.adjustment is not None:
             known = joint_covariance(self.alone)
             values = self.alone.errors.values()
@@ -263,13 +269,11 @@ def with_prior(
     """
     if machine.prior.is_none:
         return _without_prior(machine, parts, result, options)
-    if determines_all(machine, result):
-        learn = machine.prior.learn in ("up", "both")
-        return replace(result, posterior_source=lambda: posterior_of(machine, parts, options, result, learn=learn)[0])
     found, information = posterior_of(machine, parts, options, result, learn=True)
     if result.method in ("sixdof", "merged"):  # six errors of an axis at once, in the gauge of the instrument
         details = {**result.details, "posterior_means": []}
-        return replace(result, posterior_source=lambda: found, details=details)
+        apart = replace(found, follows_table=False)
+        return replace(result, posterior_source=lambda: apart, details=details)
     whole = _kept(machine, parts, result, options, found)
     listed = [name for name in ERROR_NAMES if name in found.shown or name in whole]
     if not listed:
@@ -283,7 +287,7 @@ def with_prior(
             value, u = float(mean.value[0]), float(mean.u[0])
             if name in whole:  # as it was stated or measured
                 value, stated = result.errors.squareness[name]
-                u = float(_as_stated(np.array([u]), np.array([stated]))[0])
+                u = float(_as_stated(np.hypot([u], [value - mean.value[0]]), np.array([stated]))[0])
             squareness[name] = (value, u)
         else:
             at = _output_mm(machine, name, own, whole=name in whole)
@@ -291,7 +295,8 @@ def with_prior(
             if own is not None and name in whole:
                 kept = np.isin(at, own.position_mm)
                 stated_u = np.where(kept, np.interp(at, own.position_mm, own.u), np.nan)
-                mean = Curve(at, np.where(kept, own.at(at), mean.value), _as_stated(mean.u, stated_u))
+                values = np.where(kept, own.at(at), mean.value)
+                mean = Curve(at, values, _as_stated(np.hypot(mean.u, values - mean.value), stated_u))
             curves[name] = mean
         positions.append(at)
     errors = ErrorTable(curves, squareness, result.errors.metadata)
@@ -345,6 +350,8 @@ def _kept(
     Where the readings are not at the nodes, least squares are off by what the curve bends between the nodes: then the
     posterior mean is better.
     """
+    if result.adjustment is not None and same_nodes(machine, result):  # of full rank
+        return set(result.errors.names)
     layout = error_parameters(machine, modelled_errors(machine))
     around = np.zeros(layout.size)
     observed = []
@@ -733,6 +740,8 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
 
 #: Probability of a false report that two measurements disagree.
 FALSE_ALARM = 0.05
+#: Of more lengths at scattered positions only some are used for the posterior: it needs a row of the state for each.
+MOST_LENGTHS = 8000
 #: Standard uncertainties stay as they were stated if the posterior ones differ by at most this share.
 NEARLY = 0.1
 #: Least-squares values stay where they are within so many standard uncertainties of the posterior mean.

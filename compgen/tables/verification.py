@@ -412,7 +412,7 @@ def probable_gain(
     """
     some = _some(position_mm, DRAWN_POINTS)
     at_mm = position_mm[some]
-    draws = posterior.field(at_mm).draws(DRAWS, DRAW_SEED) + posterior.mean(at_mm, without=errors.names)
+    draws = posterior.field(at_mm).draws(DRAWS, DRAW_SEED) + posterior.mean_beyond(errors, at_mm)
     before, after = before_mm[some] + draws, after_mm[some] + draws
     # the squares of both differ by a linear function of the errors, so the probability follows from mean and variance
     motion = small_motion(at_mm + tool_of(machine, None))
