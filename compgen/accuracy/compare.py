@@ -53,8 +53,8 @@ from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
-from compgen.kinematics.first_order import observable_errors, tool_of
-from compgen.kinematics.gauge import LEVER_MM, gauge_changes, gauge_directions, gauge_part
+from compgen.kinematics.first_order import tool_of
+from compgen.kinematics.gauge import common_gauge_part
 
 # The same points before and after: matched, or refused with the difference, or aligned as the user chooses.
 
@@ -315,21 +315,8 @@ def in_common_gauge(source: ErrorSource) -> ErrorSource:
 
     Angular errors that one tool does not show are left unchanged: they are known from another source.
     """
-    machine, errors = source.machine, source.errors
-    shown = observable_errors(machine)
-    names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
-    values, factor = errors.values(), source.factor
-    changes = gauge_changes(gauge_directions(machine, names), *errors.labels())
-    # removes from the values what the common gauge makes zero; angles times a lever, mm
-    blocks = [np.zeros((0, len(values)))]
-    for name in (name for name in names if name in errors.curves):
-        error, axis = error_named(name), machine.axes[error_named(name).axis]
-        where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
-        block = np.zeros((len(where), len(values)))
-        lever = 1.0 if error.kind == "linear" else LEVER_MM
-        block[:, errors.rows()[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
-        blocks.append(block)
-    part = gauge_part(changes, np.vstack(blocks))
+    errors, factor = source.errors, source.factor
+    values, part = errors.values(), common_gauge_part(source.machine, errors)
     factor = None if factor is None else factor - part @ factor
     return replace(source, errors=errors.with_values(values - part @ values), factor=factor)
 
@@ -503,7 +490,7 @@ def compare_errors(before: ErrorSource, after: ErrorSource, options: CompareOpti
         for different errors or positions, unless the options say how to align them.
     """
     chosen = options or CompareOptions()
-    first, second, text = paired_errors(before, after, chosen.align)
+    first, second, text = paired_errors(before.measured, after.measured, chosen.align)
     machine, cut = first.machine, []
     lower, upper = machine.lower_mm, machine.upper_mm
     for name, curve in first.errors.curves.items():

@@ -128,22 +128,22 @@ def error_figures(source: ErrorSource, line: str = "ls") -> dict[str, Figure]:
     depends on constants in a table, nor straightness and squareness together on lines in it.
     """
     found = {}
-    for name in source.errors.curves:
+    for name in source.shown.curves:
         found[name] = _curve_figure(source, name, line)
-    for name in source.errors.squareness:
+    for name in source.shown.squareness:
         found[name] = squareness_figure(source, name, line)
     return found
 
 
 def straightness_figures(source: ErrorSource) -> dict[str, dict[str, Figure]]:
     """Return every straightness of the table against each of the three reference lines: by error, then by line."""
-    names = [name for name in source.errors.curves if error_named(name).is_straightness]
-    several = [name for name in names if len(source.errors.curves[name].value) > 1]
+    names = [name for name in source.shown.curves if error_named(name).is_straightness]
+    several = [name for name in names if len(source.shown.curves[name].value) > 1]
     return {name: {line: _curve_figure(source, name, line) for line in LINES} for name in several}
 
 
 def _curve_figure(source: ErrorSource, name: str, line: str) -> Figure:
-    error, curve = error_named(name), source.errors.curves[name]
+    error, curve = error_named(name), source.shown.curves[name]
     if error.is_straightness and len(curve.value) > 1:
         value, weight = straightness(curve.position_mm, curve.value, line)
         meaning = f"straightness {name}, reference line: {LINES[line]}; ISO 230-1"
@@ -172,7 +172,7 @@ def squareness_figure(source: ErrorSource, name: str, line: str = "ls") -> Figur
     column = c_matrix(source.machine, unit, np.zeros(3))[0, :, ERROR_INDEX[name]]
     factor = 1.0 / column[component] if column[component] else -1.0  # squareness_reference = "Y": dY = -X EC0Y
     for curve_name in (f"E{AXES[component]}{AXES[axis]}", f"E{AXES[across]}{AXES[other]}"):
-        curve = source.errors.curves.get(curve_name)
+        curve = source.shown.curves.get(curve_name)
         if curve is None or len(curve.value) < 2:
             continue
         weights = factor * slope_weights(curve.position_mm, line, curve.value)
@@ -254,7 +254,7 @@ def orientation_figures(source: ErrorSource) -> dict[str, Figure]:
         present = [name for name in names if name in source.errors.curves]
         value, gradient = 0.0, None
         for name in present:
-            curve = source.errors.curves[name]
+            curve = source.shown.curves.get(name, source.errors.curves[name])
             value += float(np.ptp(curve.value))
             part = source.value_gradient(name, range_weight(curve.value))
             gradient = part if gradient is None else gradient + part
@@ -412,6 +412,8 @@ def _both_ways(
 
 #: Points of the volume, and of the smaller grid for pairs of points.
 MOST_POINTS, MOST_IN_PAIRS = 20_000, 1_750
+#: The same for each of many draws.
+DRAWN_POINTS = (1_750, 216)
 
 Groups = Mapping[str, Mapping[str, Figure]]
 
@@ -461,18 +463,30 @@ class Accuracy(Drawable):
 
 
 def volume_fields(
-    machine: Machine, sources: tuple[ErrorSource, ...], alignment: Alignment
+    machine: Machine,
+    sources: tuple[ErrorSource, ...],
+    alignment: Alignment,
+    most: tuple[int, int] = (MOST_POINTS, MOST_IN_PAIRS),
 ) -> list[tuple[ErrorField, ErrorField]]:
     """Return for each source its aligned field over the volume, and over the smaller grid of the pairs.
 
-    All have the same points: the nodes of all curves within the travel and the middles between them.
+    All have the same points: the nodes of all curves within the travel and the middles between them, at ``most`` so many.
     """
-    curves = [(error_named(name).axis, curve) for source in sources for name, curve in source.errors.curves.items()]
+    curves = [(error_named(name).axis, curve) for source in sources for name, curve in source.shown.curves.items()]
+    nodes = any(source.undetermined for source in sources)  # curves that were not measured are in between, too
     x, y, z = (
-        np.unique(np.concatenate([machine.axes[k].range_mm, *(c.position_mm for axis, c in curves if axis == k)]))
+        np.unique(
+            np.concatenate(
+                [
+                    machine.axes[k].range_mm,
+                    *([machine.axes[k].nodes_mm] if nodes else []),
+                    *(c.position_mm for axis, c in curves if axis == k),
+                ]
+            )
+        )
         for k in range(3)
     )
-    grids = [grid_points(machine, volume_grid(machine, (x, y, z), n).levels_mm) for n in (MOST_POINTS, MOST_IN_PAIRS)]
+    grids = [grid_points(machine, volume_grid(machine, (x, y, z), n).levels_mm) for n in most]
     fields = [[aligned(machine, source.field(points), alignment) for points in grids] for source in sources]
     return [(full, pairs) for full, pairs in fields]
 
@@ -493,10 +507,39 @@ def accuracy_of_errors(
     groups = {"volume": volume_figures(full, pairs), **groups_of_errors(source, line)}
     straight = straightness_figures(source)
     groups["straightness"] = {f"{name} {kind}": x for name, kinds in straight.items() for kind, x in kinds.items()}
+    if source.undetermined and source.known:
+        groups = _over_draws(source, groups, alignment, line)
     if reversal is not None and reversal.curves is not None:
         groups["reversal"] = reversal_figures(source, reversal.curves)
     said = () if reversal is None else (reversal.text,)
-    return Accuracy(groups, (*statements_of(source.machine, full, line), *said))
+    return Accuracy(groups, (*source.assumed, *statements_of(source.machine, full, line), *said))
+
+
+def _over_draws(
+    source: ErrorSource, groups: Mapping[str, Mapping[str, Figure]], alignment: Alignment, line: str
+) -> dict[str, dict[str, Figure]]:
+    """Return the figures with mean and standard deviation over machines that measurement and prior allow, where these differ.
+
+    A range, or a largest length, is no linear function of the errors: of an error of which nothing is known the mean is
+    zero, but not its range. Where the mean over the draws is within the uncertainty of the figure, the figure stays.
+    """
+    values: dict[tuple[str, str], list[float]] = {(group, key): [] for group, part in groups.items() for key in part}
+    for one in source.drawn():
+        ((full, pairs),) = volume_fields(source.machine, (one,), alignment, DRAWN_POINTS)
+        found = {"volume": volume_figures(full, pairs), **groups_of_errors(one, line)}
+        for group, part in found.items():
+            for key, item in part.items():
+                values[group, key].append(item.value)
+    result: dict[str, dict[str, Figure]] = {}
+    for group, part in groups.items():
+        result[group] = {}
+        for key, item in part.items():
+            drawn = np.array(values[group, key])
+            if len(drawn) and not abs(drawn.mean() - item.value) <= item.u:
+                meaning = f"{item.meaning.partition(', here ')[0]}; mean over what the measurement and the prior allow"
+                item = replace(item, value=float(drawn.mean()), u=float(drawn.std(ddof=1)), meaning=meaning)
+            result[group][key] = item
+    return result
 
 
 def groups_of_errors(source: ErrorSource, line: str) -> dict[str, dict[str, Figure]]:

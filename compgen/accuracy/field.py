@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,12 +19,13 @@ from compgen.data.comparison import (
     without_rigid_motion,
 )
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, hat_matrix
+from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, ERRORS, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
-from compgen.identify.covariance import Covariance, covariance_or_independent
+from compgen.identify.covariance import Covariance, covariance_or_independent, posterior_with
+from compgen.identify.posterior import Posterior, assumed_text, worse_text
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, factor, tool_of
 from compgen.kinematics.many_points import blocks, full_grid, volumetric_error
@@ -417,13 +418,19 @@ def _largest_pairs(field: ErrorField, block: int = 64) -> tuple[tuple[int, int],
 Correction = Callable[[Points], FloatArray]
 
 
+#: Draws of the errors where what is not known of them is as large as they are, and the seed of these.
+DRAWS, DRAW_SEED = 128, 20_261_124
+
+
 @dataclass(frozen=True)
 class ErrorSource:
     """Errors of a machine; ``factor`` (k, r) has F F^T as the covariance of the k values in the order of the table.
 
     ``factor`` is None if the uncertainty is unknown. ``correction`` is what active tables add: the field is then that
     of the machine with them. ``exact`` uses the exact model, for fields that are compared with measured ones; so does a
-    correction.
+    correction. ``given`` is what was measured, None for all of the table: of other errors, and between and beyond the
+    positions measured, the table has what a prior says. ``given_factor`` is the factor of its own values. ``assumed`` are
+    sentences on the prior; ``undetermined`` says that figures need draws, since what is not known is not small beside them.
     """
 
     machine: Machine
@@ -431,6 +438,38 @@ class ErrorSource:
     factor: FloatArray | None = None
     correction: Correction | None = None
     exact: bool = False
+    given: ErrorTable | None = None
+    given_factor: FloatArray | None = None
+    assumed: tuple[str, ...] = ()
+    undetermined: bool = False
+
+    @property
+    def measured(self) -> ErrorSource:
+        """The same source with what was measured alone, and the uncertainty of that."""
+        if self.given is None:
+            return self
+        return ErrorSource(self.machine, self.given, self.given_factor, self.correction, self.exact)
+
+    @property
+    def shown(self) -> ErrorTable:
+        """The errors that were measured, at the positions where they were; values and uncertainties of the source."""
+        if self.given is None:
+            return self.errors
+        curves = {}
+        for name, curve in self.given.curves.items():
+            whole, at_mm = self.errors.curves[name], curve.position_mm
+            curves[name] = Curve(at_mm, whole.at(at_mm), np.interp(at_mm, whole.position_mm, whole.u))
+        squareness = {name: self.errors.squareness[name] for name in self.given.squareness}
+        return ErrorTable(curves, squareness, self.errors.metadata)
+
+    def drawn(self, count: int = DRAWS) -> Iterator[ErrorSource]:
+        """Yield machines that the measurement and the prior allow: the same source with errors drawn from their covariance."""
+        if self.factor is None:
+            return
+        random, values = np.random.default_rng(DRAW_SEED), self.errors.values()
+        for _ in range(count):
+            moved = values + self.factor @ random.standard_normal(self.factor.shape[1])
+            yield replace(self, errors=self.errors.with_values(moved), factor=None)
 
     @property
     def known(self) -> bool:
@@ -478,8 +517,10 @@ class ErrorSource:
         return spread
 
     def value_gradient(self, name: str, weight: FloatArray) -> FloatArray:
-        """Derivative (k,) of sum(weight * values of one error)."""
+        """Derivative (k,) of sum(weight * values of one error), at the positions where it was measured."""
         gradient = np.zeros(len(self.errors.values()))
+        if self.given is not None and name in self.given.curves:
+            weight = weight @ hat_matrix(self.errors.curves[name].position_mm, self.given.curves[name].position_mm)
         gradient[self.errors.rows()[name]] = weight
         return gradient
 
@@ -491,14 +532,82 @@ class ErrorSource:
 
 
 def error_source(
-    machine: Machine, errors: ErrorTable, covariance: Covariance | None = None, correction: Correction | None = None
+    machine: Machine,
+    errors: ErrorTable,
+    covariance: Covariance | None = None,
+    correction: Correction | None = None,
+    *,
+    prior: bool = True,
+    posterior: Posterior | None = None,
 ) -> ErrorSource:
-    """Return a source; without a covariance the values of the table are independent, with their uncertainties.
+    """Return a source: the errors of the table, and of all others what the prior of the machine says of them.
 
-    The uncertainty is known only if every value has one.
+    The uncertainty is known only if every value of the table has one. Without a covariance its values are independent.
+
+    Parameters
+    ----------
+    machine, errors, covariance : the errors, and their joint covariance if there is one.
+    correction : what active tables add.
+    prior : False leaves the source with the errors of the table alone, and the uncertainties of their values.
+    posterior : of all errors, where it is known already.
     """
     known = covariance_or_independent(errors, covariance)
-    return ErrorSource(machine, errors, None if known is None else known.errors_factor, correction)
+    plain = ErrorSource(machine, errors, None if known is None else known.errors_factor, correction)
+    if not prior or known is None:
+        return plain
+    found = posterior or posterior_with(machine, errors, covariance)
+    return plain if found is None else _completed(plain, found)
+
+
+def _completed(source: ErrorSource, found: Posterior) -> ErrorSource:
+    """Source with all errors of a machine: values as given, the rest from the posterior, all with its uncertainty.
+
+    Curves get the levels of the posterior as nodes, so that their uncertainty is that between and beyond the readings.
+    Errors that one tool does not show stay as they are.
+    """
+    errors = source.errors
+    curves, squareness = dict(errors.curves), dict(errors.squareness)
+    at_mm: dict[str, FloatArray] = {}
+    for name in found.names:
+        if name in SQUARENESS_NAMES:
+            at_mm[name] = np.full(1, np.nan)
+            if name not in squareness:
+                mean = found.curve(name, np.zeros(1))
+                squareness[name] = float(mean.value[0]), float(mean.u[0])
+            continue
+        own, levels = curves.get(name), found.machine.axes[error_named(name).axis].nodes_mm
+        if own is not None:
+            apart = np.abs(levels[:, None] - own.position_mm[None, :]).min(axis=1) > _SAME_MM
+            levels = np.sort(np.concatenate([own.position_mm, levels[apart]]))
+        at_mm[name], mean = levels, found.curve(name, levels)
+        curves[name] = mean if own is None else Curve(levels, own.at(levels), mean.u)
+    table = ErrorTable(curves, squareness, errors.metadata)
+    names = [name for name in table.names if name in at_mm]
+    of_posterior, rows = found.values_factor(names, [at_mm[name] for name in names]), table.rows()
+    kept = [name for name in table.names if name not in at_mm]
+    beside = sum(rows[name].stop - rows[name].start for name in kept)
+    factor = np.zeros((len(table.values()), of_posterior.shape[1] + beside))
+    first, column = 0, of_posterior.shape[1]
+    u = table.uncertainties()
+    for name in table.names:
+        count = rows[name].stop - rows[name].start
+        if name in at_mm:
+            factor[rows[name], : of_posterior.shape[1]] = of_posterior[first : first + count]
+            first += count
+        else:
+            factor[rows[name], column : column + count] = np.diag(u[rows[name]])
+            column += count
+    shown = set(found.determined)
+    said = [assumed_text(found), worse_text(found)]
+    return replace(
+        source,
+        errors=table.with_values(u=np.linalg.norm(factor, axis=1)),
+        factor=factor,
+        given=errors,
+        given_factor=source.factor,
+        assumed=tuple(text for text in said if text),
+        undetermined=not set(found.names) <= shown,
+    )
 
 
 def grid_points(machine: Machine, levels_mm: tuple[FloatArray, ...]) -> FloatArray:

@@ -64,7 +64,8 @@ class Side:
     """One side as read: ``kind`` in words, and the data of that kind.
 
     ``deviations`` and ``lengths`` are identified when errors are requested (:meth:`errors`); ``readings`` are those of
-    ``runs``; ``predicted`` is a field at points.
+    ``runs``; ``predicted`` is a field at points. ``source`` has the errors that were measured, ``whole`` makes one that
+    also has what is assumed of all others.
     """
 
     machine: Machine
@@ -80,6 +81,7 @@ class Side:
     predicted: ErrorField | None = None
     reversal: KnownReversal = NOT_KNOWN
     u_um: float | None = None
+    whole: Callable[[], ErrorSource] | None = None
 
     def errors(self) -> Side:
         """Return the side with a source of errors: identified if it is a measurement, with its warnings."""
@@ -90,7 +92,12 @@ class Side:
             raise InputError(f"contains {self.kind}, which do not determine the errors of the machine", file=self.path)
         chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
         found = identify_measurement(self.machine, measurement, chosen)
-        return replace(self, source=_source_of(self.machine, found), reversal=identified_reversal(found))
+        return replace(
+            self,
+            source=_source_of(self.machine, found),
+            reversal=identified_reversal(found),
+            whole=lambda: _source_of(self.machine, found, prior=True),
+        )
 
     def measured(self) -> MeasuredField:
         """Return measured positions as a field."""
@@ -126,8 +133,15 @@ def read_side(
     header = names_in_header(text)
     if is_exchange_text(text) or set(ERROR_COLUMNS) <= header:
         errors = read_error_file(source)
-        known = error_source(machine, errors, covariance_named_by(source, errors))
-        return Side(machine, source, "errors", source=known, reversal=reversal_beside(source))
+        covariance = covariance_named_by(source, errors)
+        return Side(
+            machine,
+            source,
+            "errors",
+            source=error_source(machine, errors, covariance, prior=False),
+            reversal=reversal_beside(source),
+            whole=lambda: error_source(machine, errors, covariance),
+        )
     if set(PREDICTED_COLUMNS) <= header:
         return Side(machine, source, "predicted errors at points", predicted=_read_predicted(machine, source))
     if {"diagonal", "deviation_um"} <= header or source.name.lower().endswith(".diagonals.csv"):
@@ -135,7 +149,13 @@ def read_side(
     holds_sixdof = "y_qd1_mm" in header
     measurement = reader([source], instrument if holds_sixdof else None)
     if isinstance(measurement, ErrorTable):
-        return Side(machine, source, "errors", source=error_source(machine, measurement))
+        return Side(
+            machine,
+            source,
+            "errors",
+            source=error_source(machine, measurement, prior=False),
+            whole=lambda: error_source(machine, measurement),
+        )
     if isinstance(measurement, AxisRuns):
         return Side(machine, source, "axis runs", runs=axis_statistics(measurement), readings=measurement)
     if isinstance(measurement, Circles):
@@ -145,12 +165,19 @@ def read_side(
     if isinstance(measurement, Lengths):
         return Side(machine, source, "tracer lengths", lengths=measurement)
     found = identify_measurement(machine, measurement)
-    known = _source_of(machine, found)
-    return Side(machine, source, "six-DOF readings", source=known, reversal=identified_reversal(found))
+    return Side(
+        machine,
+        source,
+        "six-DOF readings",
+        source=_source_of(machine, found),
+        reversal=identified_reversal(found),
+        whole=lambda: _source_of(machine, found, prior=True),
+    )
 
 
-def _source_of(machine: Machine, found: Identification) -> ErrorSource:
-    return error_source(machine, found.errors, joint_covariance(found) if found.has_covariance else None)
+def _source_of(machine: Machine, found: Identification, *, prior: bool = False) -> ErrorSource:
+    known = joint_covariance(found) if found.has_covariance else None
+    return error_source(machine, found.errors, known, prior=prior, posterior=found.posterior if prior else None)
 
 
 def _read_predicted(machine: Machine, path: Path) -> ErrorField:

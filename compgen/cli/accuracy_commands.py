@@ -20,7 +20,7 @@ from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_diagonals, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
 from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option
-from compgen.cli.shared_options import instrument_option, machine_argument
+from compgen.cli.shared_options import instrument_option, machine_argument, prior_option
 from compgen.cli.terminal import answer, progress
 from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine
@@ -100,6 +100,7 @@ def _reader(axis: str | None, *paths: Path) -> Reader:
 
 @click.command("accuracy")
 @machine_argument
+@prior_option
 @click.argument("file", type=PATH)
 @evaluation_options("align")
 @click.option(
@@ -159,8 +160,8 @@ def accuracy_command(
             found = accuracy_of_circles(side.circles)
         else:
             known = side.errors()
-            assert known.source is not None
-            found = accuracy_of_errors(known.source, options.alignment or "axes", options.line, known.reversal)
+            assert known.whole is not None
+            found = accuracy_of_errors(known.whole(), options.alignment or "axes", options.line, known.reversal)
     data = {**found.summary(), "inputs": _inputs(machine, side.path)}
     files = {"accuracy.txt": _plain(accuracy_table(found))}
     rows = rows_with_tolerance(found, dict(tolerances))

@@ -32,6 +32,7 @@ from compgen.identify.adjust.propagation import Contribution, Systematic, System
 from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.identification import Identification, table_of_values, worst_uncertainty
 from compgen.kinematics.first_order import c_matrix
+from compgen.kinematics.gauge import common_gauge_part
 
 if TYPE_CHECKING:
     from compgen.identify.posterior import Posterior
@@ -206,7 +207,11 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
     if covariance is None:
         unit = np.array([error_named(name).si_per_unit for name in known.error])
         factor = np.diag(np.maximum(errors.uncertainties(), FINEST * unit))
-    return posterior_of_values(machine, known.error, known.position_mm, errors.values(), factor)
+    part, values = (
+        common_gauge_part(machine, errors),
+        errors.values(),
+    )  # a table of another program may have another gauge
+    return posterior_of_values(machine, known.error, known.position_mm, values - part @ values, factor - part @ factor)
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ import numpy as np
 
 from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, error_named
-from compgen.kinematics.first_order import c_matrix, tool_of
+from compgen.kinematics.first_order import c_matrix, observable_errors, tool_of
 from compgen.kinematics.many_points import full_grid
 
 #: Lever arm at which an angle counts: 1 urad is equivalent to 1 um.
@@ -104,6 +104,27 @@ def gauge_part(changes: FloatArray, conditions: FloatArray) -> FloatArray:
     used = scale > 1e-12 * scale.max(initial=0.0)
     amounts = np.linalg.pinv(effect[:, used] / scale[used], rcond=1e-10) / scale[used][:, None]
     return np.asarray(changes[:, used] @ (amounts @ conditions))
+
+
+def common_gauge_part(machine: Machine, errors: ErrorTable) -> FloatArray:
+    """Matrix (k, k) that gives the part of a table's values (k,) to be removed so that it is in the gauge of all results.
+
+    Straightness is then zero at both ends of the travel, positioning and angles are zero at the reference point, and the rest
+    is in the squareness. Angular errors that one tool does not show stay: they are known from another source.
+    """
+    shown = observable_errors(machine)
+    names = [n for n in errors.names if n in shown and (n in errors.squareness or len(errors.curves[n].value) > 1)]
+    changes = gauge_changes(gauge_directions(machine, names), *errors.labels())
+    # what the gauge makes zero; angles times a lever, mm
+    blocks = [np.zeros((0, len(errors.values())))]
+    for name in (name for name in names if name in errors.curves):
+        error, axis = error_named(name), machine.axes[error_named(name).axis]
+        where = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
+        block = np.zeros((len(where), len(errors.values())))
+        lever = 1.0 if error.kind == "linear" else LEVER_MM
+        block[:, errors.rows()[name]] = lever * hat_matrix(errors.curves[name].position_mm, np.array(where))
+        blocks.append(block)
+    return gauge_part(changes, np.vstack(blocks))
 
 
 def curve_weights(error: Sequence[str]) -> FloatArray:

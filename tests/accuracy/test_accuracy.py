@@ -3,6 +3,7 @@
 import csv
 import io
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,12 +23,14 @@ from compgen.accuracy import (
     volume_figures,
 )
 from compgen.accuracy.evaluate import diagonal_deviation, diagonal_points, squareness_figure, volume_fields
-from compgen.accuracy.field import ErrorField, grid_points, unknown_spread
+from compgen.accuracy.field import ErrorField, ErrorSource, grid_points, unknown_spread
 from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import read_machine
 from compgen.data.names import CURVE_NAMES, error_named
+from compgen.data.prior import PriorSettings
 from compgen.errors import InputError
 from compgen.kinematics import c_matrix, volumetric_error
+from compgen.kinematics.first_order import observable_errors
 from compgen.report.terminal import accuracy_table
 
 EXACT = 1e-9
@@ -362,7 +365,7 @@ def test_uncertainties_of_a_volume_are_what_sampled_errors_scatter(mill, alignme
     errors, u_um = random_errors(mill, 11), 0.02
     known = random_errors(mill, 11, u_um)
     rng = np.random.default_rng(12)
-    source = error_source(mill, known)
+    source = error_source(mill, known, prior=False)
     points = grid_points(mill, tuple(np.linspace(*axis.range_mm, 4) for axis in mill.axes))
     stated = volume_figures(aligned(mill, source.field(points), alignment))
     keys = ("V_X", "V_Y", "V_Z", "max", "rms", "difference", "length")
@@ -387,7 +390,7 @@ def test_uncertainties_of_a_volume_are_what_sampled_errors_scatter(mill, alignme
 def test_the_covariance_of_values_counts_not_only_their_own_uncertainties(box):
     errors = box_errors(0.5)
     count = 16
-    together = error_source(box, errors)
+    together = error_source(box, errors, prior=False)
     common = type(together)(box, errors, np.full((count, 1), 0.5e-3))  # all values move as one
     assert together.u_of(together.value_gradient("EXX", np.array([-1.0, 0, 0, 0, 1.0]))) == pytest.approx(
         0.5e-3 * 2**0.5
@@ -489,3 +492,79 @@ def test_all_volume_fields_of_a_comparison_stand_at_the_same_points(mill):
     sources = (error_source(mill, random_errors(mill, 1)), error_source(mill, random_errors(mill, 2)))
     (first, _), (second, _) = volume_fields(mill, sources, "axes")
     assert np.array_equal(first.position_mm, second.position_mm)
+
+
+# --- errors that were not measured ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def squareness_only(tmp_path_factory):
+    """A machine of which three squareness errors were measured, to 2 urad, and its figures."""
+    machine = machine_of(tmp_path_factory.mktemp("open"), [(0.0, 400.0), (0.0, 300.0), (0.0, 200.0)])
+    known = ErrorTable({}, {"EC0Y": (30e-6, 2e-6), "EB0Z": (-20e-6, 2e-6), "EA0Z": (10e-6, 2e-6)})
+    return machine, known, accuracy_of_errors(error_source(machine, known))
+
+
+def drawn_machine(machine, known, rng):
+    """The squareness as measured, all curves drawn from the prior of class general, as docs/method.md states it."""
+    curves = {}
+    for name in observable_errors(machine):
+        error = error_named(name)
+        if error.kind == "squareness":
+            continue
+        axis = machine.axes[error.axis]
+        x, length = axis.nodes_mm, axis.length_mm
+        size = 12e-6 if error.kind == "angular" else 2.5e-3 if error.is_straightness else 6e-3
+        d = np.sqrt(5.0) * np.abs(x[:, None] - x[None, :]) / (0.3 * length)
+        rough = 0.01 * np.exp(-np.abs(x[:, None] - x[None, :]) / (0.03 * length))
+        kernel = size**2 * ((1.0 + d + d * d / 3.0) * np.exp(-d) + rough)
+        value = np.linalg.cholesky(kernel + 1e-12 * size**2 * np.eye(len(x))) @ rng.standard_normal(len(x))
+        if error.is_straightness:
+            share = (x - x[0]) / length
+            value = value - (1.0 - share) * value[0] - share * value[-1]
+        else:
+            value = value - value[0]  # the reference point is the lower end
+            if error.kind == "linear":
+                value = value + 15e-6 * rng.standard_normal() * x
+        curves[name] = Curve(x, value, np.zeros(len(x)))
+    square = {name: (value + u * rng.standard_normal(), 0.0) for name, (value, u) in known.squareness.items()}
+    return ErrorTable(curves, square)
+
+
+def test_figures_of_a_machine_that_was_hardly_measured_hold_what_the_class_lets_expect(squareness_only):
+    """Z from three squareness errors alone was 0.00 +- 0.00; figures of drawn machines lie within U."""
+    machine, known, found = squareness_only
+    volume, rng = found.groups["volume"], np.random.default_rng(8)
+    points = grid_points(machine, tuple(np.linspace(*axis.range_mm, 5) for axis in machine.axes))
+    within = dict.fromkeys(("V_X", "V_Y", "V_Z", "rms", "max", "difference"), 0)
+    count = 150
+    for _ in range(count):
+        source = ErrorSource(machine, drawn_machine(machine, known, rng))
+        figures = volume_figures(aligned(machine, source.field(points), "axes"))
+        for key in within:
+            within[key] += abs(figures[key].value - volume[key].value) <= volume[key].expanded
+    assert all(number >= 0.9 * count for number in within.values()), within
+    assert volume["V_Z"].value > 1.0 and volume["V_Z"].u > 1.0
+    assert set(found.groups["errors"]) == {"EC0Y", "EB0Z", "EA0Z"}, "errors that nobody measured are not listed"
+    assert found.groups["errors"]["EC0Y"].value == pytest.approx(30.0)
+    assert found.groups["errors"]["EC0Y"].u == pytest.approx(2.0, rel=0.05)
+    assert any(text.startswith("assumed for what was not measured") for text in found.statements)
+
+
+def test_without_a_prior_only_the_table_counts(squareness_only):
+    machine, known, _ = squareness_only
+    bare = replace(machine, prior=PriorSettings(class_name="none"))
+    found = accuracy_of_errors(error_source(bare, known))
+    assert found.groups["volume"]["rms"].u < 1.0
+    assert not any("assumed" in text for text in found.statements)
+
+
+def test_a_machine_that_was_measured_keeps_its_values(mill):
+    """Values as those of the table; the uncertainty also has what a curve does between its nodes."""
+    errors = random_errors(mill, 21, 0.1)
+    plain, whole = (accuracy_of_errors(error_source(mill, errors, prior=prior)) for prior in (False, True))
+    assert {group: set(part) for group, part in plain.groups.items()} == {g: set(p) for g, p in whole.groups.items()}
+    for group, part in plain.groups.items():
+        for key, item in part.items():
+            assert whole.groups[group][key].value == pytest.approx(item.value, rel=1e-9, abs=1e-9), (group, key)
+    assert whole.groups["volume"]["rms"].u >= 0.5 * plain.groups["volume"]["rms"].u

@@ -216,7 +216,7 @@ def test_different_positions_are_refused_and_interpolated_only_when_told(machine
 def test_interpolated_uncertainties_follow_the_covariance(machine):
     from compgen.accuracy.compare import resampled
 
-    source = error_source(machine, errors_of(machine, u_um=0.4))
+    source = error_source(machine, errors_of(machine, u_um=0.4), prior=False)
     nodes = {"EXX": np.array([-250.0])}  # half way between -300 and -200
     middle = resampled(source, ["EXX"], nodes)
     assert middle.errors.curves["EXX"].u[0] == pytest.approx(0.4e-3 / math.sqrt(2.0))

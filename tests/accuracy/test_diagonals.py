@@ -448,7 +448,7 @@ def box_source(machine):
     curves = {}
     for name, edge, value in zip(("EXX", "EYY", "EZZ"), BOX_MM, (0.010, -0.020, 0.030), strict=True):
         curves[name] = Curve(np.array([0.0, edge]), np.array([0.0, value]), np.full(2, 1e-4))
-    return error_source(machine, ErrorTable(curves, {"EC0Y": (10e-6, 1e-7)}))
+    return error_source(machine, ErrorTable(curves, {"EC0Y": (10e-6, 1e-7)}), prior=False)
 
 
 def test_a_reversal_beside_errors_gives_both_directions_of_axes_and_diagonals(machine):
