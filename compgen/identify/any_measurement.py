@@ -21,7 +21,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format, may_be_large
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.propagation import SystematicInputs
-from compgen.identify.identification import Identification, determines_all
+from compgen.identify.identification import Identification, at_nodes, determines_all
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.tracer_lengths import identify
 
@@ -167,10 +167,9 @@ def known_alone(
 ) -> Identification:
     """Return the result of one measurement with what the prior of the machine file says of the rest."""
     learn = machine.prior.learn in ("up", "both")
-    if not machine.prior.is_none and determines_all(
-        machine, alone
-    ):  # what adjusts mixtures is loaded only when it is asked for
-
+    on_nodes = not isinstance(measurement, Lengths) or at_nodes(machine, measurement.position_mm)
+    if not machine.prior.is_none and on_nodes and determines_all(machine, alone):
+        # what adjusts mixtures is loaded only when it is asked for
         def later() -> Posterior:
             from compgen.identify.together import Source, posterior_of
 

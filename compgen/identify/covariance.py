@@ -138,17 +138,18 @@ def covariance_from_factor(
 
 def joint_covariance(result: Identification) -> Covariance:
     """Return the covariance of all identified values, including systematic inputs."""
+    own = "posterior_means" in result.details and result.posterior is not None
+    posterior = result.posterior.stored() if own and result.posterior is not None else None
     if result.values_factor is not None:
         found = covariance_of_values(result.errors, result.values_factor, result.layout.machine.name)
-        if "posterior_means" not in result.details or result.posterior is None:
-            return found
-        return replace(found, posterior=result.posterior.stored())
+        return replace(found, posterior=posterior)
     if result.adjustment is None:
         raise ValueError("this identification has no joint covariance")
     factor = result.adjustment.covariance_factor()
     if result.systematic is not None:
         factor = np.hstack([factor, result.systematic.response])
-    return covariance_from_factor(result.layout, factor, [(item.station, item.setup) for item in result.stations])
+    stations = [(item.station, item.setup) for item in result.stations]
+    return replace(covariance_from_factor(result.layout, factor, stations), posterior=posterior)
 
 
 def covariance_of_values(errors: ErrorTable, factor: FloatArray, machine: str = "") -> Covariance:

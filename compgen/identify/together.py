@@ -274,7 +274,8 @@ def with_prior(
         details = {**result.details, "posterior_means": []}
         apart = replace(found, follows_table=False)
         return replace(result, posterior_source=lambda: apart, details=details)
-    whole = _kept(machine, parts, result, options, found)
+    full = result.adjustment is not None and same_nodes(machine, result)
+    whole = set(result.errors.names) if full else _kept(machine, parts, result, options, found)
     listed = [name for name in ERROR_NAMES if name in found.shown or name in whole]
     if not listed:
         raise UndeterminedError("the readings show none of the machine's errors better than the prior does", [])
@@ -321,10 +322,8 @@ def with_prior(
             *(f"{name}: the readings show little of it" for name in ERROR_NAMES if name in left),
         ),
         worst_u=worst_uncertainty(errors),
-        layout=error_parameters(machine, errors.names),
-        adjustment=None,
-        systematic=None,
-        values_factor=factor,
+        layout=result.layout if full else error_parameters(machine, errors.names),
+        **({} if full else {"adjustment": None, "systematic": None, "values_factor": factor}),
         posterior_source=lambda: found,
         objections=(*result.objections, *objections),
         doubts=(*result.doubts, *doubts),
@@ -350,8 +349,6 @@ def _kept(
     Where the readings are not at the nodes, least squares are off by what the curve bends between the nodes: then the
     posterior mean is better.
     """
-    if result.adjustment is not None and same_nodes(machine, result):  # of full rank
-        return set(result.errors.names)
     layout = error_parameters(machine, modelled_errors(machine))
     around = np.zeros(layout.size)
     observed = []
