@@ -65,8 +65,8 @@ class _Call:
 
         A :class:`Projector` among ``more`` has a digest of its own.
         """
-        model = (machine.chain.name, machine.squareness_reference, machine.tool_offset_mm, kernel_choice())
-        model = (*model, machine.prior, machine.reference_point_mm, [axis.range_mm for axis in machine.axes])
+        geometry = machine.reference_point_mm, [axis.range_mm for axis in machine.axes], machine.prior
+        model = (machine.chain.name, machine.squareness_reference, machine.tool_offset_mm, geometry, kernel_choice())
         sizes = [(name, len(curve.position_mm)) for name, curve in errors.curves.items()]
         digest = hashlib.sha256(repr((model, sizes, dict(errors.squareness), position_mm.shape)).encode())
         for curve in errors.curves.values():

@@ -416,7 +416,8 @@ def probable_gain(
     before, after = before_mm[some] + draws, after_mm[some] + draws
     # the squares of both differ by a linear function of the errors, so the probability follows from mean and variance
     motion = small_motion(at_mm + tool_of(machine, None))
-    frames, sizes = [], []
+    frames: list[float] = []
+    sizes: list[tuple[float, float, float]] = []
     for remove in (False, True):
         one, two = before.reshape(DRAWS, -1), after.reshape(DRAWS, -1)
         if remove:
