@@ -101,14 +101,15 @@ def judge_measurement(
 def judge_misfit(judgement: Judgement, result: RunResult) -> None:
     """Hold back tables with a large misfit, and note what else keeps the verdict from a plain "accepted".
 
-    A person may approve despite a misfit, as `--allow-misfit` does; residuals that only exceed their uncertainty are
-    shown.
+    A person may approve despite a misfit, as `--allow-misfit` does, and tables of which it is doubtful that they make the
+    machine better; residuals that only exceed their uncertainty are shown.
     """
     for item in result.results:
         found = item.verification
         if not found.accepted:
             continue
-        misfit = [objection.text for objection in found.objections if objection.code in MISFIT_CODES]
+        waits = (*MISFIT_CODES, "doubtful")
+        misfit = [objection.text for objection in found.objections if objection.code in waits]
         judgement.hold += [text for text in misfit if text not in judgement.hold]
         measured = found.objections or not found.volumetric or found.worse_as_it_stands
         if measured and not misfit:
