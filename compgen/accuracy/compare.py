@@ -545,7 +545,9 @@ def compare_fields(
     statements = [text, f"alignment: {sides[0].alignment}"]
     if gone:
         names = ", ".join(f"d{axis}" for axis, there in zip("xyz", measured, strict=True) if there)
-        statements.append(f"only {names} were measured; the other components are taken as zero")
+        statements.append(
+            f"only {names} were measured; of the other components nothing is known, and the figures leave them out"
+        )
     statements += uncertainty_statements(*known)
     decisive = tuple(("volume", key) for key in DECISIVE_VOLUME)
     return Comparison("positions", paired_figures(groups[0], groups[1]), decisive, tuple(statements))

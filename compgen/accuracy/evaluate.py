@@ -327,7 +327,10 @@ def reversal_beside(path: Path) -> KnownReversal:
         )
     where = " and ".join([*([named.name] if named else []), *(["identify.json"] if curves else [])])
     curves |= {} if named is None else read_reversal(named).curves
-    return KnownReversal(ReversalCurves(curves), f"reversal: {where}; a missing direction is taken as zero")
+    return KnownReversal(
+        ReversalCurves(curves),
+        f"reversal: {where}; a direction without one is left out",
+    )
 
 
 def reversal_figures(source: ErrorSource, reversal: ReversalCurves) -> dict[str, Figure]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +21,7 @@ from compgen.cli.common import (
     out_option,
     print_json,
 )
-from compgen.cli.shared_options import machine_argument
+from compgen.cli.shared_options import machine_argument, prior_option
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors
@@ -31,6 +32,8 @@ from compgen.effects import active_effects, displacement_of, readings_of_points
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
 from compgen.identify import IdentifyOptions, predict_uncertainty, read_covariance
+from compgen.identify.covariance import covariance_or_independent, posterior_with
+from compgen.identify.posterior import assumed_text
 from compgen.kinematics import predict
 from compgen.kinematics.many_points import full_grid
 from compgen.plan import (
@@ -365,6 +368,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
 
 @click.command("predict")
 @machine_argument
+@prior_option
 @click.argument("errors", type=PATH)
 @click.option("--points", required=True, type=PATH, help="*.points.csv (mm).")
 @click.option("--out", required=True, metavar="FILE", type=PATH, help="CSV file for the result.")
@@ -374,7 +378,8 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
     is_flag=False,
     flag_value="",
     metavar="[FILE]",
-    help="Add standard uncertainties; FILE is the covariance (default: the file that ERRORS names).",
+    help="Add standard uncertainties, with what is assumed of errors that were not measured; FILE is the covariance "
+    "(default: the file that ERRORS names, or else u_value of ERRORS).",
 )
 @json_option
 def predict_command(
@@ -385,7 +390,7 @@ def predict_command(
     ERRORS is an *.errors.csv file (um, urad). With --exact the effects of the machine file that move the tip are added
     if the points have their columns (approach_x ..., temp_..., time_s, feed_mm_min, load_kg). FILE gets the points plus
     ex_um, ey_um, ez_um, and with --uncertainty u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that
-    volcomp identify wrote.
+    volcomp identify wrote, or from u_value of ERRORS, and from the prior of the machine.
 
     \b
     Example:
@@ -393,16 +398,21 @@ def predict_command(
     """
     where = read_points(points)
     table = open_errors(errors)
-    covariance = None
+    covariance, assumed = None, ""
     if uncertainty is not None:  # empty: the file that the errors file names
         name = table.metadata.get("covariance")
-        if not uncertainty and name is None:
+        if uncertainty or name is not None:
+            covariance = read_covariance(uncertainty or errors.parent / str(name), errors)
+        covariance = covariance_or_independent(table, covariance, machine.name)
+        if covariance is None:
             raise InputError(
-                "refers to no covariance file (# covariance = ...), which --uncertainty needs; only files of volcomp "
-                "identify and run do: give the file with --uncertainty FILE",
+                "refers to no covariance file (# covariance = ...), and not every value has a u_value: --uncertainty needs one "
+                "of both; give the covariance with --uncertainty FILE",
                 file=errors,
             )
-        covariance = read_covariance(uncertainty or errors.parent / str(name), errors)
+        known = posterior_with(machine, table, covariance)
+        covariance = replace(covariance, posterior=None if known is None else known.stored())
+        assumed = "" if known is None else assumed_text(known)
     error_mm = predict(machine, table, where, exact=exact)
     if exact:
         error_mm = error_mm + _effects_mm(machine, where)
@@ -416,12 +426,15 @@ def predict_command(
     write_file(out, format_points(where, columns, {"machine": machine.name, "model": model}))
     figures = residuals(error_mm)
     if as_json:
-        print_json({"points": len(where), "model": model, **figures.as_dict(), **extra, "file": str(out)})
+        print_json(
+            {"points": len(where), "model": model, **figures.as_dict(), **extra, "prior": assumed, "file": str(out)}
+        )
     else:
         text = f"{len(where)} points, {model}: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um -> {out}"
         say(text)
         if extra:
             stdout.print(f"largest standard uncertainty: x, y, z {', '.join(f'{u:.3f}' for u in extra.values())} um")
+            stdout.print(assumed or "no prior: what was not measured is not in this uncertainty")
     return 0
 
 

@@ -9,9 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import numpy as np
 
 from compgen.cli.common import PATH, Command, json_option, language_option, options_of, out_option
-from compgen.cli.shared_options import covariance_of, machine_argument, open_machine, path_option, tool_offset
+from compgen.cli.shared_options import (
+    covariance_of,
+    machine_argument,
+    open_machine,
+    path_option,
+    prior_option,
+    prior_value,
+    tool_offset,
+    with_prior_class,
+)
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
 from compgen.data.files import OutputFolder, json_text, sha256_of_file
@@ -102,8 +112,17 @@ def _model(machine: Machine, errors: Path | None, reversal: Path | None, only: s
     return model_of(machine, open_errors(errors), both, only)
 
 
+def _not_measured(model: ExactModel, errors: Path) -> list[str]:
+    """Say what is assumed of errors that were not measured: a corrected program does not correct them."""
+    from compgen.programs import PartMachine
+
+    known = covariance_or_independent(model.errors, covariance_of(errors, model.errors, None, independent=False))
+    return PartMachine(model.machine.name, model, known).notes(np.zeros((0, 3)))
+
+
 @click.command("correct")
 @machine_argument
+@prior_option
 @click.argument("program", type=PATH)
 @program_options
 @options_of(CorrectOptions, "options")
@@ -148,6 +167,7 @@ def correct_command(
     if bool(active) != (active_controller is not None):
         raise InputError("--active and --active-controller belong together; give both")
     model = _model(machine, errors, reversal, only)
+    remarks = _not_measured(model, errors)
     name = errors.name
     if active:
         from compgen.programs.part import CompensatedModel
@@ -166,10 +186,11 @@ def correct_command(
             errors_file=(name, sha256_of_file(errors)),
             show=show,
             language=language,
+            remarks=remarks,
         )
     for reason in result.reasons:
         complain(f"not acceptable: {reason}", "red")
-    found = result.as_dict()
+    found = {**result.as_dict(), "prior": model.machine.prior.as_dict()}
     rows = [
         (name, f"{found['before'][key]:.2f}", f"{found['after'][key]:.2f}")
         for name, key in (
@@ -257,6 +278,7 @@ def _of_fleet(file: Path, name: str) -> tuple[PartMachine, list[PartMachine], li
     is_flag=True,
     help="Also with the program as `volcomp correct` writes it; with --tables also with one that corrects what they leave.",
 )
+@prior_value
 @click.option("--also", multiple=True, metavar="MACHINE=ERRORS", help=ALSO_HELP)
 @path_option("--fleet", FLEET_HELP, metavar="JOB")
 @click.option("--machines", multiple=True, type=PATH, help="Additional folder with machine files (several times).")
@@ -275,6 +297,7 @@ def part_command(
     tables: tuple[Path, ...],
     controller: str | None,
     correct: bool,
+    prior: str | None,
     also: tuple[str, ...],
     fleet: Path | None,
     out: Path | None,
@@ -308,7 +331,8 @@ def part_command(
         own, others, missing = _of_fleet(fleet, machine)
         notes += [f"no identified errors in the store: {', '.join(missing)}"] if missing else []
     else:
-        model, others = _model(open_machine(machine, machines, used=(controller,)), errors, reversal), _also(also)
+        own_machine = with_prior_class(open_machine(machine, machines, used=(controller,)), prior)
+        model, others = _model(own_machine, errors, reversal), _also(also)
         covariance = covariance_of(Path(str(errors)), model.errors, None, independent=False)
         read = None
         if tables:

@@ -217,15 +217,23 @@ def prior_option(command: Command) -> Command:
 
     @functools.wraps(command)
     def wrapper(*args: Any, machine: Machine, prior: str | None, **options: Any) -> Any:
-        chosen = machine.prior if prior is None else machine.prior.with_class(prior)
-        return command(*args, machine=replace(machine, prior=chosen), **options)
+        return command(*args, machine=with_prior_class(machine, prior), **options)
 
-    return click.option(
-        "--prior",
-        metavar="CLASS",
-        help="How large errors are assumed that were not measured: precision, general (default), large, router, printer, "
-        "or none; overrides [prior] of the machine file.",
-    )(wrapper)  # type: ignore[return-value]
+    return prior_value(wrapper)  # type: ignore[return-value]
+
+
+#: The option alone; the command receives ``prior``, the name of a class or None.
+prior_value = click.option(
+    "--prior",
+    metavar="CLASS",
+    help="How large errors are assumed that were not measured: precision, general (default), large, router, printer, "
+    "or none; overrides [prior] of the machine file.",
+)
+
+
+def with_prior_class(machine: Machine, prior: str | None) -> Machine:
+    """Return the machine with the prior of a class, without one as it is."""
+    return machine if prior is None else replace(machine, prior=machine.prior.with_class(prior))
 
 
 def tool_offset(option: str, text: str) -> Vector3:

@@ -102,7 +102,8 @@ def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArra
     if before or after:  # add nodes with the end values at travel ends that the curve does not reach
         warnings.warn(
             f"{name} is known from {given.position_mm[0]:g} to {given.position_mm[-1]:g} mm, but {AXES[axis]} travels "
-            f"from {low:g} to {high:g} mm; its end values are used beyond",
+            f"from {low:g} to {high:g} mm; beyond that nothing was measured: its end values stand there, and only U of the "
+            "verification says how far they may be wrong",
             CompgenWarning,
             stacklevel=4,
         )

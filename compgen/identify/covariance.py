@@ -195,10 +195,10 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
 
     None without a prior (``class = "none"``), and if an uncertainty of the table is unknown: then nothing can be said.
     """
-    if covariance is not None and covariance.posterior is not None:
-        return covariance.posterior.of(machine)
     if machine.prior.is_none:
         return None
+    if covariance is not None and covariance.posterior is not None:
+        return covariance.posterior.of(machine)
     known = covariance_or_independent(errors, covariance, machine.name)
     if known is None:
         return None
@@ -208,10 +208,8 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
     if covariance is None:
         unit = np.array([error_named(name).si_per_unit for name in known.error])
         factor = np.diag(np.maximum(errors.uncertainties(), FINEST * unit))
-    part, values = (
-        common_gauge_part(machine, errors),
-        errors.values(),
-    )  # a table of another program may have another gauge
+    # a table of another program may have another gauge
+    part, values = common_gauge_part(machine, errors), errors.values()
     return posterior_of_values(machine, known.error, known.position_mm, values - part @ values, factor - part @ factor)
 
 

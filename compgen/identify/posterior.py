@@ -788,6 +788,30 @@ def not_determined_um(found: Posterior) -> dict[str, float]:
     return dict(sorted(costs.items(), key=lambda item: -item[1]))
 
 
+def open_shares(found: Posterior, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> dict[str, float]:
+    """Return the share of the variance of E over points (n, 3) of each error that is not determined, the largest first.
+
+    Errors that one tool does not show count with the part of the lever by which the tools differ from that of the machine.
+    """
+    spread = found.field(position_mm, tool_mm)
+    matrix, total = c_matrix(found.machine, position_mm, tool_mm), float(spread.variance.sum())
+    shares: dict[str, float] = {}
+    for name in found.names:
+        if name in found.determined or total <= 0.0:
+            continue
+        column = matrix[:, :, ERROR_INDEX[name]]
+        at, of = np.unique(position_mm[:, error_named(name).axis], return_inverse=True)
+        u = found.curve(name, at).u
+        u = u if name in SQUARENESS_NAMES else u[of.ravel()]
+        shares[name] = float(np.sum(column**2 * (u**2)[:, None])) / total
+    known = FieldSpread(spread.factor, tuple(spread.between[: len(found.processes)]))
+    beyond = 1.0 - float(known.variance.sum()) / total if total > 0.0 else 0.0
+    if beyond > 1e-6:
+        shares["angles that only another tool shows"] = beyond
+    whole = sum(shares.values())
+    return {name: value / max(whole, 1.0) for name, value in sorted(shares.items(), key=lambda item: -item[1])}
+
+
 def _costs_um(found: Posterior, names: Sequence[str], *, prior: bool = False) -> dict[str, float]:
     """What is not known of errors, at the tool: rms over the volume, um; with ``prior`` as if nothing had been measured."""
     levels = [np.linspace(*axis.range_mm, 5) for axis in found.machine.axes]

@@ -361,7 +361,9 @@ def remedies(machine: Machine, lengths: Lengths, options: IdentifyOptions, *, em
             )
             has = ", ".join(str(len(axis.nodes_mm)) for axis in machine.axes)
             found.append(
-                f"{counts} nodes fit these readings (the machine file has {has}): set nodes there, or use --nodes from-data"
+                f"{counts} nodes fit these readings (the machine file has {has}): set nodes there, or use "
+                "--nodes from-data (where nothing was read curves are then extrapolated, and their u grows; readings over the "
+                "whole travel are better)"
             )
     return found
 

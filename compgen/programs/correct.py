@@ -991,7 +991,7 @@ def _head_of(stream: BinaryIO, dialect: Dialect) -> int:
     return place
 
 
-def correct_program(
+def correct_program(  # noqa: PLR0913  (options by keyword)
     model: ExactModel,
     program: str | Path,
     out: str | Path,
@@ -1002,6 +1002,7 @@ def correct_program(
     show: Callable[[str], None] = lambda _: None,
     language: str = LANGUAGES[0],
     follow: Follow | None = None,
+    remarks: Sequence[str] = (),
 ) -> ProgramCorrection:
     """Correct an NC program for one machine and write it to the folder ``out``, with ``correction.json``.
 
@@ -1019,6 +1020,7 @@ def correct_program(
     show : called with the step that is running.
     language : of the preflight list, ``"en"`` or ``"de"``; program and JSON stay in English.
     follow : called with the moves of each batch, wanted and as read back, see :data:`Follow`.
+    remarks : further notes, such as what was not measured and is therefore not corrected.
     """
     source, dialect = Path(program), dialect_named(options.dialect)
     decimals = dialect.decimals if options.decimals is None else (options.decimals, options.decimals)
@@ -1107,7 +1109,7 @@ def correct_program(
             tuple(reasons),
             ("" if not reasons else REJECTED_PREFIX) + source.name,
             errors_file,
-            tuple(notes),
+            (*notes, *remarks),
             model.machine.units,
             tuple(name for name in reader.used_offsets if not dialect.check or dialect.register(name) is None),
             check.travel.count,

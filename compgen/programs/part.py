@@ -17,6 +17,7 @@ from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, error_design, posterior_with
+from compgen.identify.posterior import Posterior, assumed_text, open_shares, worse_text
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
@@ -39,6 +40,8 @@ from compgen.tables import ReadTables
 BEND_SAMPLES = 101
 #: Distance of samples along the path, mm.
 STEP_MM = 2.0
+#: Errors that are named where many were not measured, and points of the path at which they are compared.
+NAMED, SHARE_POINTS = 3, 200
 #: Points of the picture: of more, every second, every fourth ... is left out.
 MOST_POINTS = 6000
 #: What is evaluated, in the order of the fields of a feature.
@@ -143,6 +146,29 @@ class PartMachine:
         """The machine with its tables active."""
         model = self.model
         return CompensatedModel(model.machine, model.errors, model.reversal, model.only, self.tables)
+
+    @functools.cached_property
+    def posterior(self) -> Posterior | None:
+        """What is known of all errors, also of those that were not measured; None without uncertainties or a prior."""
+        if self.covariance is None:
+            return None
+        return posterior_with(self.model.machine, self.model.errors, self.covariance)
+
+    def notes(self, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> list[str]:
+        """Say what was not measured, and its share of what is not known at points (n, 3) with their tools."""
+        if self.covariance is None:
+            return ["the errors have no uncertainties, so that of the part is not known"]
+        if self.posterior is None:
+            return ["no prior: the uncertainty has nothing of errors that were not measured"]
+        found = [assumed_text(self.posterior), worse_text(self.posterior)]
+        shares = open_shares(self.posterior, position_mm, tool_mm) if len(position_mm) else {}
+        if shares:
+            named = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in list(shares.items())[:NAMED])
+            found.append(
+                f"errors that were not measured, or hardly, make {100.0 * sum(shares.values()):.0f} % of what is not known of "
+                f"the part (variance of the tool along its path), most of all {named}"
+            )
+        return [text for text in found if text]
 
 
 @dataclass(frozen=True)
@@ -351,6 +377,7 @@ def _on_machines(
             for reason in (one.reasons if one is not None else ())
         ]
         position_mm, deviation_mm = points.points(tables=after is not None)
+        notes += machine.notes(*_some_of(evaluated.samples, position_mm))
         result = PartPrediction(
             machine.name,
             source.name,
@@ -379,6 +406,13 @@ def _outside(machine: PartMachine, reached_mm: FloatArray) -> str:
             where = f"{AXES[k]} goes from {least:.3f} to {most:.3f} mm of the machine"
             return f"{where}, outside its travel {low:g} to {high:g} mm; check --wcs and --tools"
     return ""
+
+
+def _some_of(samples: Samples, path_mm: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+    """Points (n, 3) of the part, of its features with their tools if it has any, else of its path."""
+    position_mm, tool_mm = (samples.position_mm, samples.tool_mm) if len(samples.position_mm) else (path_mm, None)
+    rows = np.unique(np.linspace(0, max(len(position_mm) - 1, 0), SHARE_POINTS).astype(np.int64))[: len(position_mm)]
+    return position_mm[rows], None if tool_mm is None else np.broadcast_to(tool_mm, position_mm.shape)[rows]
 
 
 class _Evaluated:
@@ -428,7 +462,7 @@ def _u_of_feature(machine: PartMachine, samples: Samples, weight: FloatArray) ->
     """Standard uncertainty of a figure whose derivatives by the errors at n samples are weights (n, 3), mm."""
     model, covariance = machine.model, machine.covariance
     assert covariance is not None
-    posterior = posterior_with(model.machine, model.errors, covariance)
+    posterior = machine.posterior
     if posterior is not None:
         return posterior.field(samples.position_mm, samples.tool_mm).u_of(weight)
     design = error_design(model.machine, covariance, samples.position_mm, samples.tool_mm)

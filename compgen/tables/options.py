@@ -565,8 +565,8 @@ def missing_notes(errors: ErrorTable) -> list[str]:
     if not missing:
         return []
     return [
-        f"not in the errors file, so assumed zero: {', '.join(missing)}; with a tool offset other than the one "
-        "used in the measurement, some of them act, too"
+        f"not measured, so no table corrects them: {', '.join(missing)}; what they may do is in the uncertainty of run and "
+        "verify, also with other tool offsets than the one used in the measurement"
     ]
 
 

@@ -24,7 +24,7 @@ from compgen.identify import (
     read_covariance,
 )
 from compgen.identify.adjust.problem import length_problem
-from compgen.identify.covariance import FILE_NAME, error_values, format_covariance
+from compgen.identify.covariance import FILE_NAME, error_values, format_covariance, posterior_with
 from compgen.kinematics import exact_error, modelled_errors, volumetric_error
 from compgen.pipeline import identification_files, provenance_of
 
@@ -468,7 +468,11 @@ def test_predict_adds_three_columns(call, files, small_machine, small_machine_fi
     u_um = np.array([row.split(",")[-3:] for row in rows], dtype=float)
     covariance = read_covariance(out / FILE_NAME, errors)
     positions = Points(np.array([[-300.0, -100.0, -240.0], [200.0, 300.0, 0.0], [-50.0, 100.0, -40.0]]))
-    assert np.allclose(u_um, 1e3 * predict_uncertainty(small_machine, covariance, positions), rtol=0, atol=1e-6)
+    known = posterior_with(small_machine, read_errors(errors), covariance)
+    assert known is not None
+    assert np.allclose(u_um, 1e3 * np.sqrt(known.field(positions.position_mm).variance), rtol=0, atol=1e-6)
+    least = 1e3 * predict_uncertainty(small_machine, covariance, positions)  # of the values at the nodes alone
+    assert (u_um > least - 1e-3).all()
     assert json.loads(stdout)["u_x_max_um"] == pytest.approx(u_um[:, 0].max(), abs=1e-6)
     assert u_um[0, 0] > 0.5e-6 * 250e3  # at least the wavelength's part over 250 mm
     assert summary["systematic"]["wavelength_ppm"]["u"] == 0.5
@@ -483,7 +487,9 @@ def test_predict_refuses_a_covariance_of_other_errors(call, files, small_machine
     assert call("fit", small_machine_file, out / "identified.errors.csv", "--out", out)[0] == 0
     target = tmp_path / "never.csv"
     words = ("--points", points, "--out", target)
-    code, _, stderr = call("predict", small_machine_file, out / "fitted.errors.csv", *words, "--uncertainty")
+    bare = tmp_path / "bare.errors.csv"  # neither a covariance nor uncertainties
+    bare.write_text("error,position_mm,value,u_value\nEXX,-300,0,\nEXX,200,10,\n")
+    code, _, stderr = call("predict", small_machine_file, bare, *words, "--uncertainty")
     assert (code, "refers to no covariance file" in stderr) == (2, True)
     words = (*words, "--uncertainty", out / FILE_NAME)
     code, _, stderr = call("predict", small_machine_file, out / "fitted.errors.csv", *words)

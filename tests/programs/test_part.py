@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import compgen
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.files import json_text
 from compgen.data.names import AXES
+from compgen.data.prior import PriorSettings
 from compgen.errors import InputError
 from compgen.identify.covariance import covariance_of_values
 from compgen.kinematics import exact_error
@@ -46,10 +48,15 @@ M30
 """
 
 
-def predicted(tmp_path, errors, **more):
+def unassuming():
+    """The mill without a prior: only errors that are given have an uncertainty."""
+    return replace(mill(), prior=PriorSettings(class_name="none"))
+
+
+def predicted(tmp_path, errors, machine=mill, **more):
     program = tmp_path / "part<1>.nc"
     program.write_text(PART)
-    found = predict_part(model_of(mill(), errors, None), program, "fanuc", SETUP, **more)
+    found = predict_part(model_of(machine(), errors, None), program, "fanuc", SETUP, **more)
     return found, {(item.name, item.quantity): item for item in found.features}
 
 
@@ -137,11 +144,11 @@ def milled(plane=2):
     return "\n".join(["".join(words.get(c, c) for c in line) for line in lines] + ["G0 " + words["C"] + "5", "M2", ""])
 
 
-def of_milled(tmp_path, errors, plane=2, **more):
+def of_milled(tmp_path, errors, plane=2, machine=mill, **more):
     program = tmp_path / "milled.ngc"
     program.write_text(milled(plane))
     found = predict_part(
-        model_of(mill(), errors, None), program, "linuxcnc", Setup({"G54": (150.0, 90.0, -60.0)}), **more
+        model_of(machine(), errors, None), program, "linuxcnc", Setup({"G54": (150.0, 90.0, -60.0)}), **more
     )
     return {(item.name, item.quantity): item for item in found.features}
 
@@ -280,8 +287,8 @@ def test_the_uncertainty_is_the_scatter_of_machines_drawn_from_it(tmp_path, make
     factor = u[:, None] * generator.normal(size=(len(u), 12)) / np.sqrt(12)
     covariance = covariance_of_values(errors, np.hstack([factor, np.diag(0.3 * u)]))
     stated = {
-        **predicted(tmp_path, errors, covariance=covariance)[1],
-        **of_milled(tmp_path, errors, covariance=covariance),
+        **predicted(tmp_path, errors, unassuming, covariance=covariance)[1],
+        **of_milled(tmp_path, errors, machine=unassuming, covariance=covariance),
     }
     drawn = []
     for _ in range(300):
@@ -431,3 +438,49 @@ def test_a_program_that_cannot_be_followed_is_refused(tmp_path):
     with pytest.raises(InputError, match="cutter radius") as caught:
         predict_part(model_of(mill(), ErrorTable(), None), program, "fanuc", SETUP)
     assert caught.value.line == 12
+
+
+# --- errors that were not measured ---------------------------------------------------------------------------------
+
+
+def positioning_only():
+    """Positioning of X, Y, Z known to 0.5 um, nothing else."""
+    curves = {}
+    for axis, letter in zip(mill().axes, AXES, strict=True):
+        at = axis.nodes_mm
+        curves[f"E{letter}{letter}"] = Curve(at, 20e-6 * (at - at[0]), np.full(len(at), 0.5e-3))
+    errors = ErrorTable(curves, {})
+    return errors, covariance_of_values(errors, np.diag(errors.uncertainties()))
+
+
+def test_what_was_not_measured_is_said_and_is_in_the_uncertainty_of_the_part(tmp_path):
+    errors, covariance = positioning_only()
+    found, features = predicted(tmp_path, errors, covariance=covariance)
+    assert any("assumed for what was not measured" in text for text in found.notes)
+    (share,) = (float(re.search(r"make (\d+) %", text)[1]) for text in found.notes if "what is not known" in text)
+    assert 50.0 < share <= 100.0
+    angles = [item.u for (_, quantity), item in features.items() if quantity == "angle"]
+    assert min(angles) > 30.0, "an angle of the part follows squareness: 40 urad are assumed of it"
+    bare, there = predicted(tmp_path, errors, unassuming, covariance=covariance)
+    assert any(text.startswith("no prior") for text in bare.notes)
+    assert all(there[key].u <= item.u + 1e-9 for key, item in features.items())
+
+
+def test_a_part_of_errors_without_uncertainties_says_so(tmp_path):
+    errors, _ = positioning_only()
+    found, _ = predicted(tmp_path, errors)
+    assert any("have no uncertainties" in text for text in found.notes)
+
+
+def test_a_tool_longer_than_the_measured_one_is_less_certain(tmp_path):
+    """What was measured with the tool of the machine file says less of one that is 200 mm longer."""
+    errors, covariance = positioning_only()
+    program = tmp_path / "part.nc"
+    program.write_text(PART)
+    model = model_of(mill(), errors, None)
+    sizes = {}
+    for longer_mm in (0.0, 200.0):
+        setup = Setup({"G54": (100.0, 100.0, -80.0)}, {"1": (0.0, 0.0, 20.0 + longer_mm)}, gauge_mm=(0.0, 0.0, -50.0))
+        found = predict_part(model, program, "fanuc", setup, covariance=covariance)
+        sizes[longer_mm] = max(item.u for item in found.features if item.quantity == "flatness" or item.unit == "um")
+    assert sizes[200.0] >= sizes[0.0]

@@ -175,7 +175,9 @@ def limitations(source: ResultFolder) -> list[str]:
     found = list(ALWAYS) if source.controls else list(ALWAYS[1:])
     identify = source.identify
     if identify.get("unobservable"):
-        found.append(f"Not observable and set to zero: {'; '.join(map(str, identify['unobservable']))}.")
+        found.append(
+            f"Not in the errors found, so no table corrects it: {'; '.join(map(str, identify['unobservable']))}."
+        )
     if identify and not identify.get("systematic"):
         found.append(
             "No systematic input (wavelength, temperature, target, drift) was stated; the uncertainties include none."
