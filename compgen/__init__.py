@@ -6,7 +6,14 @@ Each stage is a function on plain data, without side effects: :func:`load_machin
 Each name is loaded on first use: a program that needs only one does not wait for the rest.
 """
 
+import os
 import sys
+
+# ``python -m compgen`` looks for modules in the working folder first, where there may be anybody's files: a ``numpy.py``, or a
+# plug-in that looks installed. Python names the module "-m" until it has found it.
+if sys.argv[:1] == ["-m"] and not sys.flags.safe_path and os.path.join(sys.path[0], __name__) not in __path__:
+    del sys.path[0]
+
 import warnings
 from types import ModuleType
 from typing import Any

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import re
+import unicodedata
 from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -186,6 +187,16 @@ def one_line(text: object) -> str:
     if flat.isascii() and flat.isprintable():  # the usual case, and much faster
         return flat
     return "".join(char if " " <= char <= "~" else "?" for char in flat)
+
+
+def program_text(text: object) -> str:
+    """Return ``text`` with what may stand in a comment or message of an NC program: nothing that ends it or acts.
+
+    >>> program_text("mill (5%) G0; #1=2")
+    'mill  5   G0   1=2'
+    """
+    plain = unicodedata.normalize("NFKD", str(text)).encode("ascii", "ignore").decode()
+    return "".join(char if char.isalnum() or char in " .,:=+-_/" else " " for char in plain)
 
 
 def number_text(value: object, digits: int = 3, missing: str = "–") -> str:

@@ -25,12 +25,15 @@ def data_folder(kind: str) -> Path:
 
 
 def cache_folder(kind: str) -> Path:
-    """Folder for what can be made again, in the user's cache folder; nothing is written next to the program."""
+    """Folder for what can be made again, in the user's cache folder; nothing is written next to the program.
+
+    Some of it is code that is loaded again, so the environment cannot name a folder below the working folder.
+    """
     if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA") or str(Path.home() / "AppData" / "Local")
+        base, usual = Path(os.environ.get("LOCALAPPDATA", "")), Path.home() / "AppData" / "Local"
     else:
-        base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "compgen" / kind
+        base, usual = Path(os.environ.get("XDG_CACHE_HOME", "")), Path.home() / ".cache"
+    return (base if base.is_absolute() else usual) / "compgen" / kind
 
 
 #: Languages of pages and of lists for the machine; the first one is that of the program.

@@ -21,6 +21,14 @@ def few_lengths():
     return path.name, "".join([*comments, lines[head], *lines[head + 1 :: 3]]).encode()
 
 
+def until(done):
+    """Wait until something has happened."""
+    end = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 class Site:
     """The workbench in a test client, with one open project."""
 

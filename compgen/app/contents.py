@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import tomllib
@@ -15,7 +16,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from compgen.app.project import Measurement, Project, ProjectState, Step, command_line
+from compgen.app.project import Measurement, Project, ProjectState
+from compgen.app.steps import ANSWERS, PROGRAM_FIELDS, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -30,7 +32,6 @@ from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.errors import CompgenError, CompgenWarning, InputError
-from compgen.fit.bounds import FitOptions
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.kinematics import exact_error
 from compgen.kinematics.many_points import full_grid
@@ -197,7 +198,7 @@ def measurement_shown(path: Path, answers: Sequence[str], key: str) -> tuple[Seq
     """Return pictures of a measurement file and what was measured; nothing of one that is too large or cannot be read."""
     try:
         stat = path.stat()
-        if stat.st_size > LARGEST_DRAWN:
+        if stat.st_size > LARGEST_DRAWN or not path.is_file():  # a pipe has no end
             return (), None
         return _drawn(path, (stat.st_mtime_ns, stat.st_size), tuple(answers), key)
     except (OSError, CompgenError):
@@ -239,9 +240,7 @@ class Question:
     choices: Sequence[AnswerChoice]
 
 
-_OPTION = re.compile(
-    r"--(axis|unit|sign|error|dates|directions|decimal|zero-runs|plane|radius-mm|map|ignore|sheet|base-length|kind)\b"
-)
+_OPTION = re.compile(rf"--({'|'.join(ANSWERS)})\b")
 _FIXED = {
     "axis": AXES,
     "dates": ("dmy", "mdy", "ymd"),
@@ -536,6 +535,8 @@ def volume_pictures(step: Step, folder: Path) -> Sequence[Picture]:
     paths = [path for path in (folder / "volume.csv",) if path.is_file()]
     paths = paths or [path for side in sides for path in (side / "machine.toml", side / "identified.errors.csv")]
     try:
+        if not all(path.is_file() for path in paths):
+            return ()
         stats = [path.stat() for path in paths]
         return _volume_drawn(tuple(paths), tuple((stat.st_mtime_ns, stat.st_size) for stat in stats), step.number)
     except (OSError, CompgenError):
@@ -583,15 +584,17 @@ def shrink_picture(rows: Sequence[tuple[str, FloatArray | Sequence[float]]]) -> 
 def machine_problem(path: Path) -> str:
     """Return why a machine file cannot be read, "" if it can."""
     try:
-        tomllib.loads(read_text(path))
-    except (InputError, tomllib.TOMLDecodeError) as error:
+        tomllib.loads(machine_text(path))
+    except (InputError, ValueError, RecursionError) as error:
         return str(error)
     return ""
 
 
-def is_answer(word: str) -> bool:
-    """Whether a word is an option of ``volcomp import`` with a value that a file's question may have."""
-    return re.fullmatch(rf"{_OPTION.pattern}=[^\x00-\x1f]{{1,100}}", word) is not None
+def machine_text(path: Path) -> str:
+    """Return the text of a machine file; InputError if there is none, or something that is not a file."""
+    if not path.is_file():
+        raise InputError("no such file; choose the machine again", file=path)
+    return read_text(path)
 
 
 def gap_picture(diagnosis: Mapping[str, Any]) -> Markup:
@@ -615,7 +618,9 @@ def machine_page(project: Project, state: ProjectState) -> dict[str, Any]:
     machine, text, problem = state.machine, "", ""
     path = machine_file(project, state)
     if path is not None:
-        text, problem = read_text(path), machine_problem(path)
+        problem = machine_problem(path)
+        with contextlib.suppress(InputError):  # the problem says so
+            text = machine_text(path)
     parsed = {} if problem or not text else tomllib.loads(text)
     chain = str(parsed.get("chain", ""))
     controls = [name for name in parsed.get("controllers", {}) if name in CONTROLLERS]
@@ -727,14 +732,10 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     }  # fmt: skip
 
 
-#: Options of the fit that a form has.
-FIT_FIELDS = tuple(item.name.replace("_", "-") for item in fields(FitOptions))
-
-
 def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return the tables that were made, the controls side by side, and verified backups."""
     path = machine_file(project, state)
-    parsed = {} if path is None or machine_problem(path) else tomllib.loads(read_text(path))
+    parsed = {} if path is None or machine_problem(path) else tomllib.loads(machine_text(path))
     runs = [step for step in state.steps if step.kind == "run"]
     results = [
         {
@@ -765,11 +766,6 @@ def tables_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "sampled": sorted(name for name in CONTROLLERS if CONTROLLERS[name].sample_setting),
         "cards": [load_format(name) for name in sorted(CONTROLLERS)],
     }  # fmt: skip
-
-
-#: What one types for an NC program, and which of it only its correction takes: options of ``volcomp correct``.
-CORRECT_FIELDS = ("tolerance-um", "shortest-mm", "decimals", "only")
-PROGRAM_FIELDS = ("dialect", "wcs", "gauge", "keep-unknown", "tables", *CORRECT_FIELDS)
 
 
 def control_files(project: Project, step: Step) -> list[str]:
@@ -866,7 +862,7 @@ def project_page(project: Project, state: ProjectState) -> dict[str, Any]:
     recorded = {step.folder for step in state.steps}
     left = [item.name for item in sorted(project.folder.iterdir()) if re.match(r"\d+-", item.name)]
     path = machine_file(project, state)
-    parsed = {} if path is None or machine_problem(path) else tomllib.loads(read_text(path))
+    parsed = {} if path is None or machine_problem(path) else tomllib.loads(machine_text(path))
     return {
         "steps": [(step, [command_line(words) for words in step.commands]) for step in reversed(state.steps)],
         "files": {step.number: list(project.files_of(step)) for step in state.steps},

@@ -7,10 +7,12 @@ list, so no part of an address is used as a path.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
 import json
 import math
+import os
 import re
 import secrets
 import signal
@@ -19,7 +21,7 @@ import threading
 import time
 import traceback
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,13 +40,14 @@ from flask import (
     send_file,
 )
 from jinja2 import StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from werkzeug.exceptions import Forbidden, HTTPException
 from werkzeug.routing import IntegerConverter
 from werkzeug.wrappers import Response as BaseResponse
 
 from compgen.app import contents
 from compgen.app.project import (
+    DEVICES,
     GIVEN,
     JOB,
     PROJECT,
@@ -53,20 +56,19 @@ from compgen.app.project import (
     Project,
     ProjectState,
     Runner,
-    Step,
     StepTask,
-    command_line,
     file_name,
     not_written,
 )
+from compgen.app.steps import CORRECT_FIELDS, FIT_FIELDS, PROGRAM_FIELDS, Step, answer, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data.charts import LABEL
-from compgen.data.files import json_text, read_text, write_file
+from compgen.data.files import json_text, read_text, working_folder, write_file
 from compgen.data.language import texts_of
 from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
-from compgen.errors import CompgenError, InputError, number_text
+from compgen.errors import CompgenError, InputError, number_text, visible
 from compgen.fleet.dashboard.guard import (
     HEADERS,
     check_host,
@@ -147,12 +149,16 @@ class OpenPages:
 
 @dataclass
 class Workbench:
-    """Everything that exists as long as the program runs; ``ticket`` is the token of the first address, used once."""
+    """Everything that exists as long as the program runs.
+
+    ``ticket`` is the token of the first address, used once; ``first_page`` a private file that leads the browser there.
+    """
 
     settings: DashboardSettings
     language: str = LANGUAGES[0]
     projects: list[Runner] = field(default_factory=list)
     ticket: str | None = field(default_factory=lambda: secrets.token_urlsafe(32))
+    first_page: Path | None = None
     session: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     csrf: str = field(default_factory=lambda: secrets.token_urlsafe(32))
     open_pages: OpenPages = field(default_factory=OpenPages)
@@ -161,6 +167,7 @@ class Workbench:
     def open(self, folder: str | Path) -> int:
         """Open a project and return its number; one that is open keeps its number."""
         project = Project.open(folder)
+        _check_modules(project.folder)
         with self.lock:
             for number, runner in enumerate(self.projects, start=1):
                 if runner.project.folder == project.folder:
@@ -173,6 +180,18 @@ class Workbench:
         """Stop what runs."""
         for runner in self.projects:
             runner.stop()
+
+
+def _check_modules(folder: Path) -> None:
+    """Refuse the folder of a project in which this process looks for Python modules: a file in it would be run."""
+    for part in sys.path:
+        place = Path(part or ".").resolve()
+        if place.is_relative_to(folder) and not place.is_relative_to(Path(sys.prefix).resolve()):
+            raise InputError(
+                f"Python looks for modules in {place} (PYTHONPATH names it, or the program was started there by `python -m`), so "
+                "a file in this project would be run; start `volcomp app` in another folder, without it in PYTHONPATH",
+                file=folder,
+            )
 
 
 def _recent_file() -> Path:
@@ -191,7 +210,7 @@ def recent_projects() -> list[Path]:
 def _remember(folder: Path) -> None:
     known = [folder, *(item for item in recent_projects() if item != folder)]
     try:
-        write_file(_recent_file(), json_text([str(item) for item in known[:10]]))
+        write_file(_recent_file(), json_text([str(item) for item in known[:10]]), private=True)
     except InputError:  # a folder that nobody may write to
         return
 
@@ -223,8 +242,18 @@ def _page(number: int, name: str, code: int = 200, **more: Any) -> tuple[str, in
                  "program": any(state.is_current(step) for step in state.steps if step.kind == "correct"),
                  "after": state.last("compare") is not None, "project": False},
     }  # fmt: skip
-    shown |= contents.SHOWN[name](runner.project, state)
-    return render_template(f"{name}.html", **(shown | more)), code
+    try:
+        shown |= contents.SHOWN[name](runner.project, state)
+        return render_template(f"{name}.html", **(shown | more)), code
+    except (CompgenError, HTTPException, OSError):
+        raise
+    except Exception as error:
+        _report_fault(error)
+        raise InputError(
+            f"page {PAGES[name]} cannot show the files of this project ({type(error).__name__}). If a file of a step is not what "
+            "its command wrote, take that step back on page Project, or calculate again; otherwise this is a bug, and the "
+            "terminal shows where"
+        ) from error
 
 
 # Pages without a project, and what all of them need.
@@ -232,16 +261,35 @@ def _page(number: int, name: str, code: int = 200, **more: Any) -> tuple[str, in
 
 @pages.get("/start")
 def start() -> BaseResponse:
-    """Exchange the token of the first address for a session; it is valid once."""
+    """Exchange the token of the first address for a session; it is valid once.
+
+    A browser that comes from the private file (``from=file``) would not send its new cookie to where it is redirected,
+    because it comes from elsewhere: it gets a page that goes there by itself.
+    """
     workbench = the_workbench()
     with workbench.lock:
         given, known = request.args.get("token", ""), workbench.ticket
         if known is None or not same(given, known):
             abort(403, "This address is valid once. Close this page and start `volcomp app` again.")
         workbench.ticket = None
-    response = redirect("/projects/1/" if workbench.projects else "/", code=303)
+    if workbench.first_page is not None:
+        workbench.first_page.unlink(missing_ok=True)
+    target = "/projects/1/" if workbench.projects else "/"
+    response: BaseResponse = redirect(target, code=303)
+    if request.args.get("from") == "file":
+        response = Response(leading_to(target), mimetype="text/html")
     set_cookie(response, workbench.settings, "app", workbench.session)
     return response
+
+
+def leading_to(address: str) -> str:
+    """Return a page that leads the browser to another one at once, without telling it where it comes from."""
+    link = escape(address)
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>volcomp</title>'
+        f'<meta name="referrer" content="no-referrer"><meta http-equiv="refresh" content="0; url={link}"></head>'
+        f'<body><p><a href="{link}">The workbench</a></p></body></html>\n'
+    )
 
 
 @pages.get("/")
@@ -436,7 +484,7 @@ def describe_machine(runner: Runner, state: ProjectState) -> None:
         text = read_text(path)
         for key, value in values.items():
             text = contents.with_value(text, "", key, value)
-        write_file(path, text)
+        write_file(path, text, private=True)
         load_machine(str(path))
         by_hand = [f"# in {summary['file']}: {key} = {value}" for key, value in values.items()]
         data = {"machine": summary["file"], "meaning": summary["meaning"], "by_hand": by_hand}
@@ -476,7 +524,7 @@ def change_settings(runner: Runner, state: ProjectState) -> None:
     path, control = contents.machine_file(runner.project, state), _field("control")
     if path is None or control not in CONTROLLERS:
         raise InputError("choose a machine and a control first")
-    text, name = read_text(path), Path(_machine_of(state)).name
+    text, name = contents.machine_text(path), Path(_machine_of(state)).name
     if f"[controllers.{control}]" not in text:
         text = f"{text.rstrip()}\n\n[controllers.{control}]\n"
     changed = []
@@ -497,7 +545,7 @@ def _store_machine(runner: Runner, text: str, name: str, title: str, by_hand: st
     """Keep a machine file if ``volcomp check`` finds no problem; otherwise it is refused with all of them."""
     folder = runner.project.new_folder("machine")
     path = f"{folder}/{name}"
-    write_file(runner.project.path(path), text)
+    write_file(runner.project.path(path), text, private=True)
 
     words = ["check", path, "--kind", "machine", "--json"]
     step = Step(0, "machine", title, [words], folder, data={"machine": path, "by_hand": [f"# {path}: {by_hand}"]})
@@ -542,7 +590,7 @@ def add_measurements(runner: Runner, state: ProjectState) -> str | None:
     for file in files[:30]:
         folder = runner.project.new_folder("measurement")
         path = f"{folder}/{file_name(file.filename or '')}"
-        file.save(runner.project.path(path))
+        runner.project.keep(file.stream, path)
         if path.endswith(".toml") and not after:
             words = ["check", path, "--kind", "instrument", "--json"]
             step = Step(0, "instrument", f"Instrument {Path(path).name}", [words], folder, data={"file": path})
@@ -559,7 +607,7 @@ def _import_task(
     """Return the task that shows a file and converts it if nothing is open; a file in the native form is used as it is."""
     words = ["import", path, *answers, "--json"]
     try:
-        foreign = native_format(project.path(path)) is None
+        foreign = native_format(project.given(path)) is None
     except InputError:
         foreign = False  # the command says what is wrong
     if foreign:
@@ -591,13 +639,20 @@ def answer_questions(runner: Runner, state: ProjectState, item: int) -> str | No
         if name.startswith("typed-") and _field(name)
     ]
     answers = [*found.step.data["answers"], *(word for word in given if word), *typed]
-    if not all(contents.is_answer(word) for word in answers):
-        raise InputError("choose one of the answers")
+    for word in answers:
+        _checked_answer(word)
     folder = runner.project.new_folder("measurement")
     data = {"after": found.after, "answers_to": found.number}
     task = _import_task(runner.project, state, found.file, folder, list(dict.fromkeys(answers)), data)
     runner.start("reading the file again", "after" if found.after else "measurement", [task])
     return "after" if found.after else None
+
+
+def _checked_answer(word: str) -> None:
+    try:
+        answer(word)
+    except ValueError as error:
+        raise InputError("choose one of the answers") from error
 
 
 def _measurement(state: ProjectState, number: int) -> Any:
@@ -644,6 +699,7 @@ def state_numbers(runner: Runner, state: ProjectState) -> None:
     path = contents.machine_file(runner.project, state)
     if path is None:
         raise InputError("choose or describe the machine first")
+    contents.machine_text(path)
     stated.errors(load_machine(str(path)))
     runner.project.add(Step(0, "numbers", "Numbers known without a file", data={"numbers": numbers}), state.revision)
 
@@ -737,7 +793,7 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     words += [f"--{kind}={path}" for path in _uploaded(runner.project, folder, "sample")]
     again = next((step for step in state.steps if str(step.number) == _field("again") and step.kind == "run"), None)
     if again is not None:  # with the files and the bounds that were given then
-        bounds = tuple(f"--{name}" for name in contents.FIT_FIELDS)
+        bounds = tuple(f"--{name}" for name in FIT_FIELDS)
         words += [word for word in again.commands[0] if word.startswith(("--active=", f"--{kind}=", *bounds))]
         typed = dict(again.data.get("fit", {}))
     step = Step(0, "run", f"Tables for {control}", [words], folder, data={"control": control, "fit": typed})
@@ -746,7 +802,7 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
 
 def _fit_words() -> tuple[dict[str, str], list[str]]:
     """Return what was typed about smoothing and bounds, and as options of a command."""
-    typed = {name: _field(name) for name in contents.FIT_FIELDS if name in request.form}
+    typed = {name: _field(name) for name in FIT_FIELDS if name in request.form}
     words = [f"--{name}={part.strip()}" for name, text in typed.items() for part in text.split(";") if part.strip()]
     return typed, ["--robust" if word == "--robust=on" else word for word in words]
 
@@ -756,9 +812,7 @@ def _uploaded(project: Project, folder: str, name: str) -> list[str]:
     files = [item for item in request.files.getlist(name) if item.filename][:50]
     paths = [f"{folder}/{GIVEN}/{name}-{k}-{file_name(item.filename or '')}" for k, item in enumerate(files, start=1)]
     for item, path in zip(files, paths, strict=True):
-        project.path(path).parent.mkdir(exist_ok=True)
-        item.stream.seek(0)  # several steps may take the same file
-        item.save(project.path(path))
+        project.keep(item.stream, path)
     return paths
 
 
@@ -804,7 +858,7 @@ def use_program(runner: Runner, state: ProjectState) -> None:
     folder = project.new_folder("correct" if corrects else "part")
     commands = [["part", machine, setup["program"], f"--errors={errors}", *words, *_language(), "--out", folder]]
     if corrects:
-        words += [f"--{option}={typed[option]}" for option in contents.CORRECT_FIELDS if typed[option]]
+        words += [f"--{option}={typed[option]}" for option in CORRECT_FIELDS if typed[option]]
         fit = ["fit", machine, errors, *_fit_words()[1], "--out", f"{folder}/fit"]
         errors = f"{folder}/fit/fitted.errors.csv"
         commands = [
@@ -819,7 +873,7 @@ def use_program(runner: Runner, state: ProjectState) -> None:
 def _program_setup(project: Project, state: ProjectState) -> dict[str, Any]:
     """Return NC program, tool table and what was typed; a step keeps them if they are new."""
     known = {} if (last := state.last("program")) is None else dict(last.data)
-    typed = {name: _field(name) for name in contents.PROGRAM_FIELDS}
+    typed = {name: _field(name) for name in PROGRAM_FIELDS}
     if typed["dialect"] not in DIALECTS:
         raise InputError("choose the dialect of the program")
     if typed["tables"] and typed["tables"] not in [str(step.number) for step in state.steps if step.kind == "run"]:
@@ -834,8 +888,7 @@ def _program_setup(project: Project, state: ProjectState) -> dict[str, Any]:
     folder = project.new_folder("program") if given else ""
     for name, file in given.items():
         path = f"{folder}/{GIVEN}/{name}/{file_name(file.filename or '')}"
-        project.path(path).parent.mkdir(parents=True)
-        file.save(project.path(path))
+        project.keep(file.stream, path)
         setup[name] = path
     if setup != {key: value for key, value in known.items() if key != "by_hand"}:
         data = {**setup, "by_hand": [f"# {setup[name]}: uploaded" for name in given]}
@@ -902,8 +955,7 @@ def hand_over(runner: Runner, state: ProjectState) -> None:
         raise InputError("say whether the compensation is on while the machine is measured", field="measured")
     words = ["recal", "add", name, "--machine", _machine_of(state), "--inbox", "inbox", "--controller", control]
     words += ["--out", "recalibration", "--measured-with", measured, "--job", JOB]
-    path = runner.project.path(JOB)
-    before = read_text(path) if path.exists() else ""
+    path, before = runner.project.path(JOB), runner.project.job_text()
 
     def finish(step: Step, output: str) -> Step:
         """Keep what was appended to the job file, so that it can be taken back."""
@@ -955,13 +1007,14 @@ def download(number: int, step: int, position: int) -> Response:
 
 @pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/view/<path:name>")
 def view_page(number: int, step: int, name: str) -> Response:
-    """Send a page that a command wrote: a file in itself, with the script that its own policy names."""
+    """Send a page that a command wrote: a file in itself, with the script that its own policy names, away from ours."""
     project, found = _step(number, step)
     path = project.pages_of(found).get(name)
     if path is None:
         abort(404, "There is no such page.")
     text = path.read_text(encoding="utf-8")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
+    policy += "; sandbox allow-scripts"  # of no origin: a page in a project of somebody else reaches none of ours
     hashes = re.findall(r"'sha256-[A-Za-z0-9+/=]{44}'", Markup(text[:3000]).unescape().partition("</head>")[0])
     response = Response(text, mimetype="text/html")
     scripts = f"; script-src {' '.join(hashes)}" if hashes else ""
@@ -1006,11 +1059,21 @@ def archive(number: int, step: int) -> Response:
         abort(404, "This step has no files.")
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as packed:
         for name, path in files.items():
-            packed.write(path, f"{found.folder}/{name}")
+            packed.write(path, f"{found.folder}/{in_archive(name)}")
         if "preflight.md" in files:
             packed.writestr(f"{found.folder}/preflight.html", preflight_page(files["preflight.md"]))
     content.seek(0)
     return send_file(content, "application/zip", as_attachment=True, download_name=f"{found.folder}.zip")
+
+
+def in_archive(name: str) -> str:
+    r"""Return the path of a file in an archive, with no part that another system takes for a drive, a device or a way up.
+
+    >>> in_archive("check/..\\..\\x.bat"), in_archive("a/NUL.txt"), in_archive("b/report.html")
+    ('check/.._.._x.bat', 'a/_NUL.txt', 'b/report.html')
+    """
+    parts = [re.sub(r'[\\:*?"<>|\x00-\x1f\x7f]', "_", part) for part in name.split("/")]
+    return "/".join(f"_{part}" if re.fullmatch(DEVICES, part.partition(".")[0]) else part for part in parts)
 
 
 @pages.get(f"/projects/<{_NUMBER}:number>/commands.sh")
@@ -1109,10 +1172,14 @@ def _program_error(error: CompgenError) -> tuple[str, int]:
     return render_template("error.html", title="Not done", text=str(error), number=0), 409
 
 
-def _unexpected(error: Exception) -> tuple[str, int]:
+def _report_fault(error: Exception) -> None:
     place = traceback.extract_tb(error.__traceback__)[-1]
     where = f"{Path(place.filename).name}:{place.lineno}"
-    print(f"error: internal error: {type(error).__name__}: {error} ({where})", file=sys.stderr)
+    print(visible(f"error: internal error: {type(error).__name__}: {error} ({where})", flat=True), file=sys.stderr)
+
+
+def _unexpected(error: Exception) -> tuple[str, int]:
+    _report_fault(error)
     text = "This is a bug in the program; the terminal shows where. What was shown as saved is saved."
     return render_template("error.html", title="Internal error", text=text, number=0), 500
 
@@ -1153,6 +1220,22 @@ def make_server(workbench: Workbench) -> Any:
     return bounded(server)
 
 
+#: A browser that is a snap reads neither the folder for temporary files nor hidden ones in the user's own.
+SNAPS = Path("/snap/bin")
+
+
+@contextlib.contextmanager
+def start_file(workbench: Workbench, address: str) -> Iterator[str]:
+    """Yield the address of a private file that leads the browser to ``address``, whose token no other user may see.
+
+    Everybody on a computer may read the command line of a browser. The file is removed when the token has been used.
+    """
+    visible = Path.home() if SNAPS.is_dir() and os.access(Path.home(), os.W_OK) else None
+    with working_folder("start-", visible) as folder:
+        workbench.first_page = write_file(folder / "volcomp.html", leading_to(f"{address}&from=file"), private=True)
+        yield workbench.first_page.as_uri()
+
+
 def serve(
     folder: Path | None,
     port: int,
@@ -1160,8 +1243,12 @@ def serve(
     *,
     keep_open: bool = False,
     language: str = LANGUAGES[0],
+    browse: Callable[[str], object] | None = None,
 ) -> None:
-    """Serve on this computer until the last page is closed, or Ctrl-C; ``announce`` receives the first address.
+    """Serve on this computer until the last page is closed, or Ctrl-C.
+
+    ``announce`` receives the first address, which is a secret until it has been used; ``browse`` what a browser may be
+    called with.
 
     Raises
     ------
@@ -1186,9 +1273,13 @@ def serve(
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     if not keep_open:
         threading.Thread(target=watch, daemon=True).start()
-    announce(f"http://127.0.0.1:{server.effective_port}/start?token={workbench.ticket}")
+    address = f"http://127.0.0.1:{server.effective_port}/start?token={workbench.ticket}"
+    announce(address)
     try:
-        server.run()
+        with start_file(workbench, address) if browse else contextlib.nullcontext("") as page:
+            if browse:
+                browse(page)
+            server.run()
     except KeyboardInterrupt:
         pass
     finally:

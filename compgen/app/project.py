@@ -1,9 +1,13 @@
 """A project: a folder with the files of the contract, the list of its steps, and the command that runs.
 
-Every step is a command of ``volcomp``, run as a process of its own in the folder of the project, so what the pages show can
+Every step is a command of ``volcomp``, run as a process of its own on the files of the project, so what the pages show can
 be repeated from a shell. ``project.json`` lists the steps with a revision that grows with every change: who changes the
 project states the revision that was seen, and is refused if it is not the present one. A step has the folder
 ``NN-kind``; undoing the last one moves it to ``undone/``.
+
+A project may come from somebody else, so its folder is data: no command looks there for modules, settings or plug-ins, because
+it runs in a folder of its own with links to the steps that it names, and what is listed or linked there cannot name files
+elsewhere.
 """
 
 from __future__ import annotations
@@ -13,29 +17,36 @@ import json
 import os
 import re
 import shlex
+import shutil
 import signal
+import stat
 import subprocess
 import sys
 import threading
 import time
+import tomllib
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
-from typing import Any
+from pathlib import Path, PurePath
+from typing import IO, Any
 
-from compgen.data.files import json_text, read_bytes, read_text, write_file
-from compgen.errors import InputError
+from compgen.app.steps import FORM, Command, Step, command_line, read_steps
+from compgen.data.files import exclusive, json_text, read_bytes, read_text, working_folder, write_file
+from compgen.data.toml_files import WITHIN
+from compgen.errors import InputError, visible_line
 from compgen.resources import LANGUAGES
 
 PROJECT, UNDONE, LOCK = "project.json", "undone", ".project.lock"
 #: The job file of the hand-over to ``recal``, and what ``recal`` itself writes beside it.
 JOB, OF_RECAL = "recal.toml", ("inbox", "recalibration", "recal.sqlite")
-#: A project file of another program version with another form is refused.
-FORM = 1
-#: Longest list of steps, bytes.
-LARGEST_PROJECT = 20_000_000
+#: Longest list of steps, and longest file with the facts of a step, bytes.
+LARGEST_PROJECT, LARGEST_FACTS = 20_000_000, 100_000_000
+#: How long a change of the list of steps waits for that of another process, s.
+LOCK_S = 10.0
+#: Only the user who began a project may see what is in it.
+PRIVATE_FOLDER, PRIVATE_FILE, PRIVATE_MASK = 0o700, 0o600, 0o077
 #: A stopped command is ended by force after this time, s.
 STOP_S = 5.0
 #: Lines of a command's messages that are kept.
@@ -49,28 +60,14 @@ OF_ERRORS = ("part", "correct")
 MAIN_PAGES = ("report.html", "index.html", "sheet.html", "part.html", "plan.html")
 #: Messages of a command that refuse, and those that are kept with a step, in the languages of the program.
 REFUSED, TOLD = re.compile("(?:error|Fehler|Abweichung): (.*)"), re.compile("(?:warning|question|Warnung|offen): (.*)")
+#: Names that are devices in Windows, also with anything behind a dot.
+DEVICES = r"(?i)con|prn|aux|nul|conin\$|conout\$|clock\$|com[\d\u00b9\u00b2\u00b3]|lpt[\d\u00b9\u00b2\u00b3]"
 #: Exit codes of a command that has written its result: accepted or not.
 DONE = (0, 1)
 
 
 class StaleError(InputError):
     """The project was changed by another window after the page had been made."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step: its command lines (words after ``volcomp``), its folder, the exit code, and facts of its kind."""
-
-    number: int
-    kind: str
-    title: str
-    commands: Sequence[Sequence[str]] = ()
-    folder: str = ""
-    exit_code: int = 0
-    seconds: float = 0.0
-    time: str = ""
-    warnings: Sequence[str] = ()
-    data: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -126,7 +123,7 @@ class ProjectState:
         """Measurement files that were not removed, each as its latest step has it."""
         found: dict[int, Measurement] = {}
         for step in self.steps:
-            if step.kind == "measurement":
+            if step.kind == "measurement" and step.data:
                 number = int(step.data.get("answers_to", step.number))
                 known = found.get(number)
                 name = known.name if known else step.title
@@ -171,7 +168,7 @@ def file_name(given: str) -> str:
     last = re.split(r"[/\\]", unicodedata.normalize("NFC", given))[-1]
     name = re.sub(r"[^\w.-]", "_", last).lstrip(".-")
     stem, dot, suffix = name.partition(".")
-    if re.fullmatch(r"(?i)con|prn|aux|nul|com\d|lpt\d", stem):
+    if re.fullmatch(DEVICES, stem):
         stem = f"_{stem}"
     while len((stem + dot + suffix).encode()) > 120 and len(stem) + len(suffix) > 2:
         stem, suffix = (stem[:-1], suffix) if len(stem) >= len(suffix) else (stem, suffix[1:])
@@ -197,7 +194,7 @@ class Project:
         path = Path(folder).expanduser()
         try:
             path = path.resolve()
-            path.mkdir(parents=True, exist_ok=True)
+            path.mkdir(PRIVATE_FOLDER, parents=True, exist_ok=True)
             listed = [item.name for item in path.iterdir() if item.name != LOCK]
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
@@ -211,6 +208,8 @@ class Project:
                 file=path,
             )
         else:
+            with contextlib.suppress(OSError):  # an empty folder of a group, or of a system without such rights
+                path.chmod(PRIVATE_FOLDER)
             project._write(ProjectState(0, ()))
         return project
 
@@ -220,30 +219,23 @@ class Project:
         return self.folder.name
 
     def state(self) -> ProjectState:
-        """Read the steps; InputError for a file that is damaged or of another form."""
+        """Read the steps; InputError for a file that is damaged, of another form, or not what the pages write."""
         path = self.folder / PROJECT
-        try:
-            found = json.loads(read_bytes(path, LARGEST_PROJECT))
-            if found["form"] != FORM:
-                raise InputError(f"has the form {found['form']}; this program reads form {FORM}", file=path)
-            return ProjectState(int(found["revision"]), tuple(Step(**step) for step in found["steps"]))
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"is not the list of steps of a project: {error}", file=path) from error
+        if path.is_symlink() or not path.is_file():
+            raise InputError("is not a file with the steps of a project", file=path)
+        return ProjectState(*read_steps(read_bytes(path, LARGEST_PROJECT), path))
 
     def _write(self, state: ProjectState) -> None:
+        path = self.folder / PROJECT
         content = {"form": FORM, "revision": state.revision, "steps": [asdict(step) for step in state.steps]}
-        write_file(self.folder / PROJECT, json_text(content))
+        text = json_text(content)
+        read_steps(text.encode(), path)  # what could not be read again is not written
+        write_file(path, text, private=True)
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[ProjectState]:
         """Keep other threads and processes out while the list of steps changes."""
-        with self._lock, (self.folder / LOCK).open("a") as stream:
-            try:
-                import fcntl
-
-                fcntl.flock(stream, fcntl.LOCK_EX)
-            except ImportError:  # a system without such locks
-                pass
+        with self._lock, exclusive(self.folder / LOCK, LOCK_S, PRIVATE_FILE):
             yield self.state()
 
     def check(self, revision: int) -> ProjectState:
@@ -258,7 +250,7 @@ class Project:
         with self._alone() as state:
             number = self._next(state)
             name = f"{number:02d}-{kind}"
-            (self.folder / name).mkdir()
+            (self.folder / name).mkdir(PRIVATE_FOLDER)
             return name
 
     def _next(self, state: ProjectState) -> int:
@@ -296,7 +288,7 @@ class Project:
 
     def _take_back_job(self, step: Step) -> list[str]:
         """Remove the entry of a hand-over from the job file; return in words what stays."""
-        path, added, name = self.folder / JOB, str(step.data.get("added", "")), step.data.get("machine_there", "")
+        path, added, name = self.path(JOB), str(step.data.get("added", "")), step.data.get("machine_there", "")
         stays = []
         if path.is_file():
             text = read_text(path)
@@ -319,7 +311,10 @@ class Project:
         with contextlib.suppress(OSError):
             folder.rmdir()
             return
-        (self.folder / UNDONE).mkdir(exist_ok=True)
+        undone = self.folder / UNDONE
+        undone.mkdir(PRIVATE_FOLDER, exist_ok=True)
+        if undone.is_symlink():
+            raise InputError("is a link; nothing is moved through it, so remove it", file=undone)
         while (target := self.folder / UNDONE / (name if count == 1 else f"{name}-{count}")).exists():
             count += 1
         folder.rename(target)
@@ -330,6 +325,72 @@ class Project:
         if not path.is_relative_to(self.folder):
             raise InputError("is not in the folder of the project", file=name)
         return path
+
+    def job_text(self) -> str:
+        """Return the text of the job file, "" without one; InputError if it names commands, templates or other places.
+
+        Whoever runs ``volcomp recal`` with it trusts it; nothing is added to one that came with a project and does more.
+        """
+        if not os.path.lexists(self.folder / JOB):
+            return ""
+        path = self.given(JOB)
+        text = read_text(path)
+        try:
+            found = tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"is not valid TOML: {error}", file=path) from error
+        if strange := _beyond(found):
+            raise InputError(
+                f"has {strange}, which this workbench does not write: read the file, and if it is yours, add the machine with "
+                "`volcomp recal add`; otherwise move the file away",
+                file=path,
+            )
+        return text
+
+    def given(self, name: str) -> Path:
+        """Return the path of a file in the project that is to be read; InputError for a pipe, a device or no file."""
+        path = self.path(name)
+        if not path.is_file():
+            raise InputError("no such file in the folder of the project", file=name)
+        return path
+
+    def keep(self, stream: IO[bytes], name: str) -> None:
+        """Write what a user gave into a new file of the project; only this user may read it."""
+        path = self.path(name)
+        for folder in reversed(path.relative_to(self.folder).parents[:-1]):
+            (self.folder / folder).mkdir(PRIVATE_FOLDER, exist_ok=True)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), PRIVATE_FILE)
+        with os.fdopen(handle, "wb") as target:
+            stream.seek(0)  # several steps may take the same file
+            shutil.copyfileobj(stream, target)
+
+    def link(self, command: Command, place: Path) -> Path:
+        """Return the folder in which a command runs: ``place``, with links to the folders of the steps that it names.
+
+        Raises
+        ------
+        InputError
+            if anything in them leads out of the project, or is neither file nor folder.
+        """
+        for first in sorted({name.partition("/")[0] for name in command.paths}):
+            source = self.folder / first
+            if not os.path.lexists(source):
+                continue
+            self._check_contents(source)
+            try:
+                (place / first).symlink_to(source, target_is_directory=source.is_dir())
+            except OSError:  # a system where an ordinary user makes no links
+                return self.folder
+        return place
+
+    def _check_contents(self, source: Path) -> None:
+        inner = (Path(top) / name for top, folders, files in os.walk(source) for name in (*folders, *files))
+        for path in (source, *inner):
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode) and not path.resolve().is_relative_to(self.folder):
+                raise InputError("is a link that leads out of the folder of the project; remove it", file=path)
+            if not (stat.S_ISLNK(mode) or stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise InputError("is neither a file nor a folder; remove it", file=path)
 
     def files_of(self, step: Step) -> dict[str, Path]:
         """Return the files of a step by their path within its folder; links that lead out of it are left out."""
@@ -355,8 +416,8 @@ class Project:
         path = None if step is None else self.files_of(step).get(name)
         if path is None:
             return {}
-        with contextlib.suppress(ValueError):
-            found = json.loads(path.read_text(encoding="utf-8"))
+        with contextlib.suppress(ValueError, RecursionError):
+            found = json.loads(read_bytes(path, LARGEST_FACTS))
             return found if isinstance(found, dict) else {}
         return {}
 
@@ -365,16 +426,26 @@ class Project:
         lines = ["#!/bin/sh", "# What was done in this project, by the commands that did it.", "set -e"]
         lines += [f"cd {shlex.quote(str(self.folder))}"]
         for step in self.state().steps:
-            lines += ["", f"# {step.number}. {' '.join(step.title.split())}", *step.data.get("by_hand", ())]
+            lines += ["", f"# {step.number}. {visible_line(step.title)}"]
+            lines += [f"# {visible_line(text.lstrip('# '))}" for text in step.data.get("by_hand", ())]
             for words in step.commands:
                 ends = f" || [ $? -eq {step.exit_code} ]" if step.exit_code else ""
                 lines.append(command_line(words) + ends)
         return "\n".join(lines) + "\n"
 
 
-def command_line(words: Sequence[str]) -> str:
-    """Return a command as one would type it."""
-    return shlex.join(["volcomp", *words])
+def _beyond(found: Mapping[str, Any]) -> str:
+    """Return what of a job file runs a command, is a template, or leads out of its folder, "" without any."""
+    for key, value in found.items():
+        if key in ("notify", "templates"):
+            return f"the key {key}"
+        if isinstance(value, Mapping) and (inner := _beyond(value)):
+            return inner
+        if key in ("store", "machine", "inbox", "out", "instrument") and isinstance(value, str):
+            parts = PurePath(value.replace("\\", "/")).parts
+            if "://" in value or value.startswith(("/", "\\", "~")) or ".." in parts or re.match("[A-Za-z]:", value):
+                return f"{key} = {visible_line(value)[:60]!r}"
+    return ""
 
 
 # Commands that run.
@@ -410,15 +481,32 @@ class Progress:
         return (time.monotonic() if self.ended is None else self.ended) - self.began
 
 
-def arguments_for(words: Sequence[str]) -> list[str]:
-    """Return the words that start a command as a process of this Python; ``-v`` prints each of its steps."""
-    return [sys.executable, "-m", "compgen", "-v", *words]
+def arguments_for(command: Command, project: Path) -> list[str]:
+    """Return the words that start a command as a process of this Python; ``-v`` prints each of its steps.
+
+    Modules are not looked for in the working folder (``-P``), and a job file is written where it belongs.
+    """
+    words = [f"--job={project / JOB}" if word == f"--job={JOB}" else word for word in command.started]
+    return [sys.executable, "-P", "-m", "compgen", "-v", *words]
 
 
-def environment() -> dict[str, str]:
-    """Return the environment of a command: one thread, UTF-8, no plain-text colours, messages that are kept in English."""
-    english = {"COMPGEN_MESSAGES": LANGUAGES[0]}
-    return {**os.environ, **english, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "400"}
+def environment(project: Path) -> dict[str, str]:
+    """Return the environment of a command: one thread, UTF-8, no plain-text colours, messages that are kept in English.
+
+    What the environment of this program names relative to its working folder means the same in that of the command, and
+    no module comes from the folder of the project.
+    """
+    found = {key: value for key, value in os.environ.items() if key not in ("PYTHONSTARTUP", "PYTHONINSPECT")}
+    modules = [os.path.abspath(part) for part in found.pop("PYTHONPATH", "").split(os.pathsep) if part]
+    if outside := [part for part in modules if not Path(part).resolve().is_relative_to(project)]:
+        found["PYTHONPATH"] = os.pathsep.join(outside)
+    for key in ("COMPGEN_PLUGINS", "COMPGEN_CONFIG"):
+        if found.get(key):
+            found[key] = os.pathsep.join(os.path.abspath(part) for part in found[key].split(os.pathsep) if part)
+    return found | {
+        "COMPGEN_MESSAGES": LANGUAGES[0], WITHIN: str(project), "PYTHONSAFEPATH": "1", "PYTHONUTF8": "1",
+        "PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "COLUMNS": "400",
+    }  # fmt: skip
 
 
 class Runner:
@@ -507,13 +595,21 @@ class Runner:
     def _command(self, job: Progress, words: Sequence[str]) -> tuple[str, list[str], int]:
         """Run one command; return what it printed, its messages, and its exit code."""
         job.line = f"volcomp {words[0]}"
+        try:
+            command = Command.of(list(words))
+        except ValueError as error:
+            raise InputError(str(error)) from error
+        with working_folder("app-") as place:
+            return self._listened(job, arguments_for(command, self.project.folder), self.project.link(command, place))
+
+    def _listened(self, job: Progress, arguments: Sequence[str], place: Path) -> tuple[str, list[str], int]:
         with self._lock:
             if job.stopped:
                 return "", [], 130
             self._process = process = subprocess.Popen(
-                arguments_for(words), cwd=self.project.folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE, text=True, encoding="utf-8", errors="replace", env=environment(),
-                start_new_session=True,
+                arguments, cwd=place, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                encoding="utf-8", errors="replace", env=environment(self.project.folder), start_new_session=True,
+                umask=PRIVATE_MASK if os.name == "posix" else -1,
             )  # fmt: skip
         messages: list[str] = []
 

@@ -36,8 +36,7 @@ def app_command(folder: Path | None, port: int, no_browser: bool, keep_open: boo
 
     def announce(address: str) -> None:
         say(f"The workbench: {address}", "It ends when the last page is closed, or with Ctrl-C.")
-        if not no_browser:
-            webbrowser.open(address)
 
-    serve(folder, port, announce, keep_open=keep_open, language=language)
+    browse = None if no_browser else webbrowser.open
+    serve(folder, port, announce, keep_open=keep_open, language=language, browse=browse)
     return 0

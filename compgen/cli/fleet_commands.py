@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import getpass
+import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -91,9 +93,24 @@ def job_option(command: Command) -> Command:
         from compgen.fleet import logs
 
         logs.configure(log)  # type: ignore[arg-type]
-        return command(*args, job=read_job(job_file), **options)
+        job = read_job(job_file)
+        warn_of_password(job.store, job_file)
+        return command(*args, job=job, **options)
 
     return job_file_option(log_option(wrapper))  # type: ignore[return-value]
+
+
+def warn_of_password(url: str, file: Path | None) -> None:
+    """Log that other users of this computer can read the password of a store, from its job file or the command line."""
+    from compgen.fleet import logs
+
+    if re.match(r"[\w+]+://[^/@:]*:[^/@]+@", url) is None:
+        return
+    if file is None:
+        advice = "write the URL into a job file that only you can read, or the password into ~/.pgpass"
+        logs.warning("a password on the command line, which every user can read", advice=advice)
+    elif os.name == "posix" and file.stat().st_mode & 0o077:
+        logs.warning("a job file with a password that other users can read", file=str(file), advice=f"chmod 600 {file}")
 
 
 notify_option = click.option(
@@ -758,6 +775,8 @@ def serve_command(context: click.Context, store: str | None, given: dict[str, An
         raise _missing(error) from error
     url = _store_url(store, given["job"])
     logs.configure(log)  # type: ignore[arg-type]  # one of the choices
+    for file in (*([None] if store else []), *([given["job"]] if given["job"] else [])):
+        warn_of_password(url, file)
     run(DashboardSettings(url, **{**given, "users": given["users"] or default_users(url)}))
     return 0
 

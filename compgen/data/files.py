@@ -104,11 +104,12 @@ class OutputFolder:
     ``add`` keeps the contents in memory; ``commit`` writes each to a temporary name next to its target and only then
     renames them, so that an error leaves neither half a file nor half a set. ``commit`` renames a file passed to
     ``set_aside`` to ``PREVIOUS-...`` before the new ones get their names: a process killed in between leaves no old
-    file that looks like one of the new set.
+    file that looks like one of the new set. ``private``: only this user may read the files; otherwise the umask says
+    who may, but nobody who may not read the file that is replaced.
     """
 
-    def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+    def __init__(self, folder: str | Path, *, private: bool = False) -> None:
+        self.folder, self._mode = Path(folder), 0o600 if private else 0o666
         self._contents: dict[str, bytes] = {}
         self._copies: dict[str, Path] = {}
         self._aside: list[str] = []
@@ -169,7 +170,7 @@ class OutputFolder:
                 if path.is_dir():
                     raise IsADirectoryError(21, f"{path.name} is a folder")
             for name, content in contents.items():
-                temporary[name] = _write_temporary(paths[name], content)
+                temporary[name] = _write_temporary(paths[name], content, self._mode)
             _replace_all([*aside, *((temporary[name], paths[name]) for name in paths)])
         except OSError as error:
             _remove([*temporary.values()], made)
@@ -226,7 +227,7 @@ def _replace_all(moves: Sequence[tuple[Path, Path]]) -> None:
         raise
 
 
-def _write_temporary(target: Path, content: bytes | Path) -> Path:
+def _write_temporary(target: Path, content: bytes | Path, mode: int = 0o666) -> Path:
     handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=TEMPORARY, dir=target.parent)
     path = Path(name)
     try:
@@ -244,7 +245,9 @@ def _write_temporary(target: Path, content: bytes | Path) -> Path:
                 os.fsync(stream.fileno())
         mask = os.umask(0)
         os.umask(mask)
-        path.chmod(0o666 & ~mask)
+        with contextlib.suppress(OSError):  # a new file
+            mode &= 0o600 | target.lstat().st_mode
+        path.chmod(mode & ~mask)
     except BaseException:
         path.unlink(missing_ok=True)
         _unlock(path)
@@ -291,13 +294,14 @@ def _abandoned(path: Path, new_s: float = NEW_S) -> bool:
 
 
 @contextlib.contextmanager
-def working_folder(name: str = "") -> Iterator[Path]:
+def working_folder(name: str = "", parent: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder that is removed at the end, and by the next process if this one is killed.
 
-    Its files need not survive a power failure, so they are not forced to the disk.
+    Only this user may look into it. It is in the folder for temporary files unless ``parent`` names another. Its files
+    need not survive a power failure, so they are not forced to the disk.
     """
-    remove_abandoned_folders()
-    with _own_folder(Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}"))) as folder:
+    remove_abandoned_folders(parent)
+    with _own_folder(Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}", dir=parent))) as folder:
         yield folder
 
 
@@ -418,10 +422,10 @@ def _remove_folder(folder: Path) -> None:
         folder.rmdir()
 
 
-def remove_abandoned_folders() -> None:
-    """Remove this user's temporary folders whose processes were killed."""
+def remove_abandoned_folders(parent: Path | None = None) -> None:
+    """Remove this user's temporary folders whose processes were killed, from ``parent`` or the usual place."""
     with contextlib.suppress(OSError):
-        for entry in list(os.scandir(tempfile.gettempdir())):
+        for entry in list(os.scandir(parent or tempfile.gettempdir())):
             if not entry.name.startswith(FOLDERS):
                 continue
             with contextlib.suppress(OSError):
@@ -443,10 +447,10 @@ def _long_left(folder: str, found: os.stat_result) -> bool:
     return all(time.time() - os.lstat(path).st_mtime > OLD_S for path in paths)
 
 
-def write_file(path: str | Path, content: str | bytes) -> Path:
-    """Write one file atomically and return its path."""
+def write_file(path: str | Path, content: str | bytes, *, private: bool = False) -> Path:
+    """Write one file atomically and return its path; only this user may read one that is ``private``."""
     target = Path(path)
-    folder = OutputFolder(target.parent)
+    folder = OutputFolder(target.parent, private=private)
     folder.add(target.name, content)
     return folder.commit()[target.name]
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import math
+import os
 import re
 import tomllib
 import warnings
@@ -62,6 +63,8 @@ T = TypeVar("T")
 D = TypeVar("D")
 C = TypeVar("C", bound=Callable[..., Any])
 _REQUIRED = object()
+#: Variable of the environment with the only folder in which files may be that a TOML file names; without it any.
+WITHIN = "COMPGEN_FILES_WITHIN"
 #: A JSON schema (draft 2020-12), or a part of one.
 Schema = Mapping[str, Any]
 #: Where a key is in a file: keys of tables, and numbers in arrays of tables.
@@ -256,6 +259,9 @@ class Section:
 
     def _existing(self, key: str, name: str) -> Path:
         path = (self.path.parent if self.path else Path()) / name
+        folder = os.environ.get(WITHIN)
+        if folder and not path.resolve().is_relative_to(folder):
+            raise self.fail(key, f"{name} is not in the folder of the project; a project must not name files elsewhere")
         if not path.is_file():
             raise self.fail(key, f"no such file: {path}; give the path of a file")
         return path

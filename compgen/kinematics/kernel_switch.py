@@ -89,12 +89,16 @@ def load_kernels() -> bool:
 
 @contextmanager
 def _settings() -> Iterator[None]:
-    """Vectorise within a row, and keep the code in :func:`cache_folder` unless numba has another folder set."""
+    """Vectorise within a row, and keep the code in :func:`cache_folder` unless the environment names another folder.
+
+    Code that is loaded from there is run. So a folder counts only if ``NUMBA_CACHE_DIR`` names it: numba would also take
+    it from a file ``.numba_config.yaml`` in the working folder, where anybody's files may be.
+    """
     import numba
 
     before = numba.config.SLP_VECTORIZE, numba.config.CACHE_DIR
     numba.config.SLP_VECTORIZE = 1
-    numba.config.CACHE_DIR = before[1] or str(cache_folder("numba"))
+    numba.config.CACHE_DIR = os.environ.get("NUMBA_CACHE_DIR") or str(cache_folder("numba"))
     try:
         yield
     finally:

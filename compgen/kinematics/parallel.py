@@ -188,6 +188,25 @@ def _begin(stop: Any, told: Any) -> None:
 # --- processes of this machine -------------------------------------------------------------------------------------
 
 
+_starting = threading.Lock()
+
+
+@contextmanager
+def _modules_of_the_program() -> Iterator[None]:
+    """Let a Python process that starts now take no modules from the working folder, where anybody's files may be."""
+    name = "PYTHONSAFEPATH"
+    with _starting:
+        before = os.environ.get(name)
+        os.environ[name] = "1"
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = before
+
+
 class _Lane:
     """One process, replaced when it is killed."""
 
@@ -196,11 +215,13 @@ class _Lane:
         self._pool: ProcessPoolExecutor | None = None
 
     def perform(self, function: Packed, item: Packed) -> Future[Answer]:
-        if self._pool is None:
-            self._told[:] = (0.0, 0.0)
-            options: Any = {"initializer": _begin, "initargs": (self._stop, self._told)}
+        if self._pool is not None:
+            return self._pool.submit(perform, function, item)
+        self._told[:] = (0.0, 0.0)
+        options: Any = {"initializer": _begin, "initargs": (self._stop, self._told)}
+        with _modules_of_the_program():  # the process starts here
             self._pool = ProcessPoolExecutor(1, self._context, **options)
-        return self._pool.submit(perform, function, item)
+            return self._pool.submit(perform, function, item)
 
     @property
     def pid(self) -> int:

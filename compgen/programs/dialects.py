@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import unicodedata
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 from compgen.data.csv_files import csv_table
 from compgen.data.files import read_text
 from compgen.data.machine import Vector3
-from compgen.errors import InputError, visible_line
+from compgen.errors import InputError, program_text, visible_line
 
 #: What a G code does, in words that the reader knows; codes that only change how the control moves do "nothing".
 #: A "setting" takes all words of its block as its own; "setting P0" is one with P0 only.
@@ -235,9 +234,7 @@ class Dialect:
 
     def said(self, text: str) -> str:
         """Return ``text`` as a comment block."""
-        plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
-        clean = "".join(c if c.isalnum() or c in " .,:;=+-_/%" else " " for c in plain)
-        return self.comment.format(clean.replace(";", ",").upper())
+        return self.comment.format(program_text(text.replace(";", ",")).upper())
 
     def head(self) -> re.Pattern[bytes]:
         """Return the pattern of a line that has to stay before all others: %, the number or name of the program."""

@@ -17,7 +17,7 @@ from compgen.data import toml_files
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.toml_files import setting
-from compgen.errors import InputError
+from compgen.errors import InputError, program_text
 from compgen.identify.adjust.unknowns import check_travel
 from compgen.kinematics.exact_chain import rotate
 from compgen.simulate.gauges import TouchProbe
@@ -124,7 +124,7 @@ def probe_program(
         text = f"{error.message.partition(';')[0]}: the probe would go there; move the artefact or lower the clearance"
         raise InputError(text, field="--pose") from None
     context = {
-        "machine_name": machine.name,
+        "machine_name": program_text(machine.name),
         "poses": poses,
         "safe_z_mm": safe_mm,
         "probing": {**vars(probing)},

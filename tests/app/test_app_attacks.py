@@ -475,11 +475,11 @@ class Program:
 
 
 def commands_in(folder):
-    """Process ids of the commands that run in a folder."""
-    found = []
+    """Process ids of the commands that run on the files of a project."""
+    found, project = [], b"COMPGEN_FILES_WITHIN=%s\0" % os.fsencode(folder)
     for path in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
-            if (path / "cwd").resolve() == folder and b"compgen" in (path / "cmdline").read_bytes():
+            if project in (path / "environ").read_bytes() and b"compgen" in (path / "cmdline").read_bytes():
                 found.append(int(path.name))
     return found
 

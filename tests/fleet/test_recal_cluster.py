@@ -595,3 +595,16 @@ def test_workers_and_cluster_together_are_wrong_usage(factory, capsys):
     words = ["recal", "run", "--job", str(factory / "recal.toml"), "--cluster", "tcp://h:1", "--workers", "2"]
     assert run_command(cli, words) == 2
     assert "cannot be combined" in capsys.readouterr().err
+
+
+def test_a_process_takes_no_module_from_the_working_folder(tmp_path, monkeypatch):
+    """Python begins a process with the working folder as the first place of modules, also of those that it needs itself."""
+    marker = tmp_path / "PWNED"
+    for name in ("socket", "tempfile", "selectors", "struct", "random", "numpy", "compgen"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(marker)!r}, 'a').write(__name__)\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    with closing(Processes(1)) as processes:
+        assert processes.call(Packed(len), Packed([1, 2]), lambda: False) == 2
+    assert not marker.exists()
+    assert "PYTHONSAFEPATH" not in os.environ

@@ -25,6 +25,7 @@ from compgen.cli import cli
 from compgen.cli import fleet_commands as serve_commands
 from compgen.cli.common import run_command
 from compgen.errors import InputError
+from compgen.fleet import logs
 from compgen.fleet.dashboard.app import make_app
 from compgen.fleet.dashboard.metrics import WatchMetrics, start_metrics
 from compgen.fleet.dashboard.settings import DashboardSettings, read_token
@@ -230,3 +231,27 @@ def test_the_store_of_the_job_file_may_be_given_by_its_path(tmp_path, monkeypatc
     ) as found:
         serve_commands._store_url("postgresql://u:secret@h/n", Path("recal.toml"))
     assert "secret" not in str(found.value)
+
+
+@pytest.mark.parametrize(
+    ("url", "mode", "said"),
+    [
+        ("postgresql://meyer:s3cret@db/fleet", None, "on the command line"),
+        ("postgresql+psycopg://meyer:s3cret@db/fleet", 0o644, "chmod 600"),
+        ("postgresql://meyer:s3cret@db/fleet", 0o640, "chmod 600"),
+        ("postgresql://meyer:s3cret@db/fleet", 0o600, ""),
+        ("postgresql://meyer@db/fleet", 0o644, ""),
+        ("postgresql://meyer@db/fleet?host=/a:b@c", None, ""),
+        ("sqlite:///a:b@c.sqlite", None, ""),
+    ],
+)
+def test_a_password_that_others_can_read_is_warned_of_and_never_shown(tmp_path, capfd, url, mode, said):
+    logs.configure("json")
+    file = None if mode is None else tmp_path / "recal.toml"
+    if file is not None:
+        file.write_text(f'store = "{url}"')
+        file.chmod(mode)
+    serve_commands.warn_of_password(url, file)
+    shown = capfd.readouterr().err
+    assert said in shown if said else shown == ""
+    assert "s3cret" not in shown

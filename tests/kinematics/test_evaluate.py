@@ -17,11 +17,12 @@ from compgen.data.machine import CHAINS
 from compgen.data.names import ERRORS
 from compgen.errors import InputError
 from compgen.kinematics import exact_chain as exact_points
-from compgen.kinematics import exact_error, volumetric_error
+from compgen.kinematics import exact_error, kernel_switch, volumetric_error
 from compgen.kinematics import many_points as evaluate
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.kernel_switch import load_kernels
 from compgen.kinematics.many_points import NodeIndex, volumetric_error_on_grid
+from compgen.resources import cache_folder
 
 ROUNDING_MM = 1e-12
 RANGES_MM = ((-800.0, 0.0), (-300.0, 500.0), (0.0, 400.0))
@@ -389,3 +390,23 @@ def test_without_numba_there_are_no_kernels(monkeypatch):
     monkeypatch.setattr(exact_points, "_POINTS_FOR_KERNELS", 1)
     np.testing.assert_allclose(volumetric_error(machine_of(), errors_of(), points), due, rtol=0, atol=ROUNDING_MM)
     assert exact_error(machine_of(), errors_of(), points).shape == (5, 3)
+
+
+def test_machine_code_is_kept_where_the_environment_says_and_never_where_a_file_in_the_working_folder_does(monkeypatch):
+    """Code that is loaded from there is run; numba takes a folder from `.numba_config.yaml` of the working folder, too."""
+    numba = pytest.importorskip("numba")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "of-a-file")
+    with kernel_switch._settings():
+        assert str(cache_folder("numba")) == numba.config.CACHE_DIR
+    assert numba.config.CACHE_DIR == "of-a-file"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/named")
+    with kernel_switch._settings():
+        assert numba.config.CACHE_DIR == "/named"
+
+
+@pytest.mark.parametrize("name", ["cache", "./cache", ""])
+def test_the_cache_folder_is_never_below_the_working_folder(monkeypatch, name):
+    for variable in ("XDG_CACHE_HOME", "LOCALAPPDATA"):
+        monkeypatch.setenv(variable, name)
+    assert cache_folder("numba").is_absolute()

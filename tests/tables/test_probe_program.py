@@ -254,3 +254,12 @@ def test_the_command_writes_the_program_and_reads_its_log(tmp_path, small_machin
     assert code == 2
     assert "has no [probing] section" in err
     assert not (tmp_path / "q").exists()
+
+
+@pytest.mark.parametrize("name", DIALECTS)
+def test_the_name_of_a_machine_is_a_comment_whatever_it_contains(small_machine, name):
+    """A machine file may come from anybody; in LinuxCNC also (LOG, ...) and #<...> act."""
+    evil = replace(small_machine, name='a) G0 Z-99 (LOG, #1 % "<<x; M30 [1/0]')
+    program = probe_program(evil, PLATE, BORES, name)
+    plain = probe_program(replace(small_machine, name="a  G0 Z-99  LOG,  1     x  M30  1/0 "), PLATE, BORES, name)
+    assert program == plain

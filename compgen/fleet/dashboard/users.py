@@ -10,18 +10,16 @@ import json
 import os
 import re
 import secrets
-import tempfile
 import threading
 import unicodedata
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from argon2 import PasswordHasher
 from argon2.exceptions import Argon2Error, InvalidHashError
 
-from compgen.data.files import sha256_of
+from compgen.data.files import sha256_of, write_file
 from compgen.errors import InputError
 from compgen.fleet.records import AUTOMATIC
 
@@ -115,21 +113,7 @@ class Users:
     def _write(self, users: Mapping[str, str], readers: frozenset[str]) -> None:
         """Replace the file atomically; only its owner may read it."""
         text = json.dumps({"users": dict(sorted(users.items())), "readers": sorted(readers)}, indent=2) + "\n"
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(prefix=".users-", dir=self.path.parent)  # readable by the owner only
-        except OSError as error:
-            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
-        try:
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(text)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(name, self.path)
-        except OSError as error:
-            with suppress(OSError):
-                os.unlink(name)
-            raise InputError(f"cannot be written: {error.strerror or error}", file=self.path) from error
+        write_file(self.path, text, private=True)
 
 
 @cache
