@@ -17,7 +17,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, json_text, read_bytes, sha256_of_file, working_folder
 from compgen.data.machine import MM_PER_UNIT, Machine
-from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.programs.cycles import DrillingCycle
@@ -50,6 +50,8 @@ _HALF = 0.5 + 1e-6
 SAME_MM = 1e-6
 #: How many blocks that lead beyond the travel are listed.
 MOST_LISTED, MOST_IN_PREFLIGHT = 100, 20
+#: A program that has grown by more than this many times, and by more than so many blocks, is said to have.
+GROWTH, FEW_BLOCKS = 2, 200
 #: Characters of a comment in the first lines of a corrected program.
 LONGEST_COMMENT = 90
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
@@ -858,6 +860,8 @@ class _ReadBack:
     after: PathFigures = field(default_factory=PathFigures)
     travel: _Travel = field(init=False)
     lines: int = 0
+    #: Moves at feed of the corrected program.
+    cuts: int = 0
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
     broken: str = ""
     follow: Follow | None = None
@@ -882,6 +886,7 @@ class _ReadBack:
         zero, one = np.zeros(len(rows)), np.ones(len(rows))
         self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), directions)
         back = np.flatnonzero(read.cutting)
+        self.cuts += len(back)
         owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
         if owner is not None:
             meant = np.flatnonzero(wanted.cutting[pieces.move])
@@ -991,6 +996,30 @@ def _head_of(stream: BinaryIO, dialect: Dialect) -> int:
     return place
 
 
+def _growth_said(blocks: int, added: int, piece_mm: float, errors: ErrorTable, options: CorrectOptions) -> str:
+    """Say by how much a program has grown, why, and what makes it shorter; nothing for one that has not much."""
+    if added <= max(GROWTH * blocks, FEW_BLOCKS) or not piece_mm:
+        return ""
+    said = (
+        f"the corrected program has {blocks + added} blocks for {blocks}: a piece at feed is {piece_mm:.2f} mm long on average, "
+        f"{1000.0 / 60.0 / piece_mm:.0f} blocks a second at 1000 mm/min"
+    )
+    cure = (
+        f"a larger --tolerance-um ({options.tolerance_um:g}) or --shortest-mm ({options.shortest_mm:g}) make it shorter"
+    )
+    if not errors.curves:
+        return f"{said}; {cure}"
+    name, curve = min(errors.curves.items(), key=lambda item: float(np.diff(item[1].position_mm).min(initial=np.inf)))
+    apart_mm = float(np.diff(curve.position_mm).min(initial=np.inf))
+    # the second difference of independent values has six times their variance
+    scatter = float(np.sqrt(np.mean(np.diff(curve.value, 2) ** 2) / 6.0)) if len(curve.value) > 2 else 0.0
+    unit, per = ("um", MM_PER_UM) if error_named(name).kind == "linear" else ("urad", 1e-6)
+    return (
+        f"{said}. {name} has nodes {apart_mm:g} mm apart, whose values scatter by about {scatter / per:.2f} {unit}; smooth "
+        f"errors (volcomp fit), {cure}"
+    )
+
+
 def correct_program(  # noqa: PLR0913  (options by keyword)
     model: ExactModel,
     program: str | Path,
@@ -1040,6 +1069,8 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
         body = work / "body"
         with reader.opened() as stream, body.open("wb") as target:
             for batch in reader.batches(stream):
+                if reader.unknown:
+                    continue  # it is refused at its end, with all that is not known
                 by_radius, drilled = np.zeros((2, len(batch.moves)), dtype=bool)
                 for segment in batch.segments:
                     if isinstance(segment, Run):
@@ -1088,7 +1119,8 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
         check.travel.found = [replace(item, line=reader.in_file(item.line)) for item in check.travel.found]
         refused, note = check.travel.said()
         reasons += [refused] if refused else []
-        notes = [note] if note else []
+        grown = _growth_said(blocks, writer.added, after.length_mm / max(check.cuts, 1), model.errors, options)
+        notes = [text for text in (note, grown) if text]
         if in_cycle and after.normal_mm > enough_mm:
             notes.append(
                 f"line {after.normal_line}: a drilling cycle has one X and Y, here those that are right at its depth; the stroke "

@@ -332,6 +332,8 @@ def _on_machines(
     features, thinned, direction = PartFeatures(), [_Thinned() for _ in machines], np.zeros(3)
     with reader.opened() as stream:
         for batch in reader.batches(stream):
+            if reader.unknown:
+                continue  # it is refused at its end, with all that is not known
             moves = reader.numbered_as_in_file(batch.moves)
             ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
             directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended

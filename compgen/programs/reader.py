@@ -46,6 +46,8 @@ _VARIABLE = re.compile(
 )
 _VARIABLE_Q = re.compile(r"[A-Z]+\s*+[-+]?Q\d|Q\d++\s*+=|D\d++\s*+Q", re.IGNORECASE)
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
+#: How many lines of a code are said.
+MOST_LINES = 30
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
 #: A rest of a hole below which no further peck is made: the rounding of sums, mm.
@@ -162,6 +164,8 @@ class Reader:
         self.named = [False] * 3
         #: Least and largest machine positions of moves that are corrected, (2, 3); nan before there are any.
         self.reached_mm = np.full((2, 3), np.nan)
+        #: M codes that are not known, with their lines: all are said at the end.
+        self.unknown: dict[str, dict[int, None]] = {}
         self.ended = self.seen_percent = self.started = False
         self.closed_by_percent = False
         self._line, self._text = 0, ""
@@ -252,7 +256,10 @@ class Reader:
         return Batch(first_line, text, words, moves, segments)
 
     def finish(self, last_line: int) -> None:
-        """Refuse a program that ends in the middle."""
+        """Refuse a program that ends in the middle, or has M codes that are not known."""
+        if self.unknown:
+            first = min(map(self.in_file, next(iter(self.unknown.values()))))
+            raise InputError(self._said_unknown(), file=self.source, line=first)
         self._line, self._text = max(last_line, 1), ""
         if not self.started:
             self._fail("the program has no moves; expected an NC program")
@@ -282,6 +289,8 @@ class Reader:
     def _fail(self, message: str, field: str | None = None) -> NoReturn:
         text = visible_line(self._text)[:60]
         shown = f" (block: {text})" if text else ""
+        if self.unknown:
+            shown += f"; before that, {self._said_unknown()}"
         raise InputError(message + shown, file=self.source, line=self.in_file(self._line), field=field)
 
     # Many blocks at a time.
@@ -806,9 +815,20 @@ class Reader:
         if code in self.dialect.end:
             self.ended = True
         elif code not in self.dialect.m_codes and code not in self.setup.keep_unknown:
-            advice = f"is not known; if it moves nothing, add --keep-unknown {code}"
-            refused = self.dialect.refused
-            self._fail(f"{code}: {refused[code]}" if code in refused else f"{code} {advice}")
+            if code in self.dialect.refused:
+                self._fail(f"{code}: {self.dialect.refused[code]}")
+            self.unknown.setdefault(code, {})[self._line] = None
+
+    def _said_unknown(self) -> str:
+        """Say which M codes are not known, each with its lines."""
+        texts = []
+        for code, found in self.unknown.items():
+            lines = list(dict.fromkeys(map(self.in_file, found)))
+            shown = [str(line) for line in lines[:MOST_LINES]]
+            more = f" and {len(lines) - MOST_LINES} more" if len(lines) > MOST_LINES else ""
+            texts.append(f"{code} ({'line' if len(lines) == 1 else 'lines'} {', '.join(shown)}{more})")
+        is_not, they = ("is not", "it moves") if len(texts) == 1 else ("are not", "they move")
+        return f"{', '.join(texts)} {is_not} known; if {they} nothing, add --keep-unknown {','.join(self.unknown)}"
 
     def _modal(self, code: str, meaning: str, values: dict[str, float], actions: list[str]) -> None:
         """Take over a code that is no motion; what acts in this block only is added to ``actions``."""

@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -403,3 +404,67 @@ def test_blocks_of_a_subprogram_have_the_lines_of_the_file(tmp_path):
     text, setup = at_the_edge("fanuc", "M98 P7 L2\nM30\nO7\nG1 X5. F90\nX0.\nX9.\nM99")
     result, _ = run(tmp_path, text.replace("M99\nM30", "M99"), shift(x=10.0), "fanuc", setup)
     assert {item.line for item in result.beyond} == {7} and "line 7: X -600.010 mm" in result.reasons[0]
+
+
+# --- what is said about the program ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_m_codes_that_are_not_known_are_listed_all_at_once(tmp_path, dialect):
+    """With their lines; the first is the line of the message. M88 in a comment and M8 are none of them."""
+    comment = "; M88" if dialect in ("siemens", "heidenhain-iso") else "(M88)"
+    blocks = f"M177\nG1 X10. F100 M200\nM8\nM177\nX20.\n\nM300 {comment}\nY5. M177"
+    text, setup = at_the_edge(dialect, blocks, (0.0, 0.0, 0.0))
+    first = text.splitlines().index("M177") + 1
+    with pytest.raises(InputError) as caught:
+        run(tmp_path, text, shift(x=10.0), dialect, setup)
+    assert caught.value.message == (
+        f"M177 (lines {first}, {first + 3}, {first + 6}), M200 (line {first + 1}), M300 (line {first + 5}) are not known; if "
+        "they move nothing, add --keep-unknown M177,M200,M300"
+    )
+    assert (caught.value.line, (tmp_path / "out").exists()) == (first, False)
+    known = replace(setup, keep_unknown=frozenset({"M177", "M200", "M300"}))
+    assert run(tmp_path, text, shift(x=10.0), dialect, known)[0].accepted
+    known = replace(setup, keep_unknown=frozenset({"M177", "M200"}))
+    with pytest.raises(InputError, match=rf"M300 \(line {first + 5}\) is not known; .* --keep-unknown M300$"):
+        run(tmp_path, text, shift(), dialect, known)
+    # what stops the reading before its end says them, too
+    with pytest.raises(InputError, match=rf"G41: .*; before that, M177 \(line {first}\), M200 .* are not") as caught:
+        run(tmp_path, text.replace("M8\n", "G41\n"), shift(), dialect, setup)
+    assert caught.value.line == first + 2
+
+
+def test_the_lines_of_m_codes_are_those_of_the_file(tmp_path):
+    text, setup = at_the_edge("fanuc", "M98 P7 L40\nM30\nO7\nG1 X5. F90 M123\nX0.\nM99", (0.0, 0.0, 0.0))
+    text = text.replace("M99\nM30", "M99")
+    with pytest.raises(InputError) as caught:
+        run(tmp_path, text, shift(x=10.0), "fanuc", setup)
+    assert (caught.value.line, caught.value.message.startswith("M123 (line 6) is not known")) == (6, True)
+    many = "\n".join(["M123"] * 50)
+    with pytest.raises(InputError, match=r"31, 32 and 20 more\) is not known"):
+        run(tmp_path, at_the_edge("fanuc", many)[0], shift(x=10.0), "fanuc", setup)
+
+
+def test_a_program_that_grows_much_is_said_to(tmp_path):
+    """Nodes of 2 mm with a scatter of 2 um, as unfiltered measurements have: some hundred pieces for each cut of 500 mm."""
+    at = np.arange(-600.0, 602.0, 2.0)
+    value = np.random.default_rng(5).normal(0.0, 2e-3, len(at))
+    rough = ErrorTable({"EYX": Curve(at, value, np.zeros(len(at))), "EXX": Curve(at[::50], value[::50], np.zeros(13))})
+    blocks = "\n".join(f"G1 X{500 * (k % 2)}. Y{k}. F900" for k in range(3))
+    text, setup = at_the_edge("fanuc", blocks, (-250.0, 0.0, 0.0))
+    result, _ = run(tmp_path, text, rough, "fanuc", setup)
+    count, added = result.counts["blocks"], result.counts["added_blocks"]
+    assert added > 200 and len(result.notes) == 1
+    found = re.fullmatch(
+        r"the corrected program has (\d+) blocks for (\d+): a piece at feed is ([\d.]+) mm long on average, "
+        r"(\d+) blocks a second at 1000 mm/min\. EYX has nodes 2 mm apart, whose values scatter by about ([\d.]+) um; "
+        r"smooth errors \(volcomp fit\), a larger --tolerance-um \(1\) or --shortest-mm \(0\.1\) make it shorter",
+        result.notes[0],
+    )
+    assert (int(found[1]), int(found[2])) == (count + added, count)
+    piece_mm = result.after.length_mm / (added + 3)
+    assert float(found[3]) == pytest.approx(piece_mm, abs=0.006) and int(found[4]) == round(1000 / 60 / piece_mm)
+    assert float(found[5]) == pytest.approx(2.0, abs=0.25)
+    assert result.notes[0][1:] in (tmp_path / "out" / "preflight.md").read_text()
+    coarse, _ = run(tmp_path, text, rough, "fanuc", setup, tolerance_um=20.0)
+    assert coarse.notes == () and coarse.counts["added_blocks"] < 20
