@@ -38,7 +38,7 @@ from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.folder import read_volume
 from compgen.report.html.pictures import VolumeOnGrid, describe_error, draw_curve, draw_slices, draw_space, grid_of
-from compgen.report.html.write import judged
+from compgen.report.html.write import assumptions_of, judged
 from compgen.tables import load_format
 from compgen.tables.verification import MISFIT_CODES
 
@@ -720,6 +720,7 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     earlier = project.facts(before[-1], "identify.json") if before and applied else {}
     return {
         "step": step, "facts": project.facts(step, "identify.json"), "errors": errors, "earlier": earlier,
+        "assumed": assumptions_of(project.facts(step, "identify.json")) if step else [],
         "pictures": (drawn := error_pictures(errors) if errors else []),
         "volume": volume, "volume_tables": None if shown is step else shown,
         "values": {picture.key: picture.data for picture in (*drawn, *volume)},

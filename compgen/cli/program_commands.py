@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from compgen.cli.common import PATH, Command, json_option, language_option, options_of, out_option
 from compgen.cli.shared_options import (
@@ -29,7 +28,8 @@ from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.effects import effects_reversal
 from compgen.errors import InputError, number_text
 from compgen.foreign import open_errors
-from compgen.identify.covariance import covariance_or_independent
+from compgen.identify.covariance import covariance_or_independent, posterior_with
+from compgen.identify.posterior import assumed_text, worse_text
 from compgen.programs import CorrectOptions, Setup, correct_program, model_of, read_tools
 
 if TYPE_CHECKING:
@@ -114,10 +114,14 @@ def _model(machine: Machine, errors: Path | None, reversal: Path | None, only: s
 
 def _not_measured(model: ExactModel, errors: Path) -> list[str]:
     """Say what is assumed of errors that were not measured: a corrected program does not correct them."""
-    from compgen.programs import PartMachine
-
-    known = covariance_or_independent(model.errors, covariance_of(errors, model.errors, None, independent=False))
-    return PartMachine(model.machine.name, model, known).notes(np.zeros((0, 3)))
+    covariance = covariance_of(errors, model.errors, None, independent=False)
+    known = covariance_or_independent(model.errors, covariance)
+    if known is None:
+        return ["the errors have no uncertainties, so that of the part is not known"]
+    found = posterior_with(model.machine, model.errors, known)
+    if found is None:
+        return ["no prior: nothing is said of errors that were not measured"]
+    return [text for text in (assumed_text(found), worse_text(found)) if text]
 
 
 @click.command("correct")

@@ -244,7 +244,12 @@ class Identification(Drawable):
         """What was assumed of errors that no reading determines; of a result that has all of them, the sizes only."""
         prior = self.layout.machine.prior
         if "posterior_means" not in self.details or self.posterior is None:
-            return {"prior": prior.as_dict(), "not_measured": {}, "determined": list(self.errors.names)}
+            said = (
+                {}
+                if prior.is_none
+                else {"assumed": f"every error was measured; assumed between the readings: {prior.class_text}"}
+            )
+            return {"prior": prior.as_dict(), **said, "not_measured": {}, "determined": list(self.errors.names)}
         from compgen.identify.posterior import assumed_text, not_measured, worse_text
 
         found = self.posterior

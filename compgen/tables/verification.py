@@ -294,11 +294,7 @@ class ProbableGain:
     @property
     def open_text(self) -> str:
         """What is not known, the most expensive first; empty if every error is determined."""
-        if not self.open_um:
-            return ""
-        named = ", ".join(f"{name} {um_text(value)} um" for name, value in list(self.open_um.items())[:NAMED])
-        more = f" and {len(self.open_um) - NAMED} more" if len(self.open_um) > NAMED else ""
-        return f"not known: {named}{more} (u, rms over the volume)"
+        return open_text(self.open_um)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``probable`` of ``result.json``."""
@@ -317,6 +313,15 @@ class ProbableGain:
             "assumed": self.assumed,
             "machine_worse_than_class": self.machine_worse or None,
         }
+
+
+def open_text(open_um: Mapping[str, float]) -> str:
+    """Return what is not known of a machine, the most expensive first; empty if every error is determined."""
+    if not open_um:
+        return ""
+    named = ", ".join(f"{name} {um_text(value)} um" for name, value in list(open_um.items())[:NAMED])
+    more = f" and {len(open_um) - NAMED} more" if len(open_um) > NAMED else ""
+    return f"not known: {named}{more} (u, rms over the volume)"
 
 
 def rounded_limits(

@@ -43,7 +43,7 @@ from compgen.report.html.pictures import (
 from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
-from compgen.tables.verification import coverage_of
+from compgen.tables.verification import coverage_of, open_text, rounded_limits
 
 if TYPE_CHECKING:
     from markdown_it import MarkdownIt
@@ -178,6 +178,7 @@ def limitations(source: ResultFolder) -> list[str]:
         found.append(
             f"Not in the errors found, so no table corrects it: {'; '.join(map(str, identify['unobservable']))}."
         )
+    found += [text[0].upper() + text[1:] + "." for text in assumptions_of(identify)] if identify else []
     if identify and not identify.get("systematic"):
         found.append(
             "No systematic input (wavelength, temperature, target, drift) was stated; the uncertainties include none."
@@ -249,6 +250,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "verdict": _verdict(source, controls),
         "controls": controls,
         "errors": _errors(source.identified),
+        "assumed": assumptions_of(identify) if identify and identify.get("identified") is not False else [],
         "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
         "accuracy": accuracy_groups(source),
         "compare": comparison_groups(source),
@@ -277,12 +279,43 @@ def judged(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
         "volumetric": bool(result.get("volumetric", True)),
         "measured": str(_mapping(result.get("measured")).get("text", "")),
         "uncertainty": dict(_mapping(result.get("after_uncertainty"))),
+        "limits": _limits(_mapping(result.get("probable"))),
+        "assumed": assumptions_of(result),
+        "probability_better": result.get("probability_better"),
         "before": _mapping(result.get("before")),
         "after": _mapping(result.get("after")),
         "before_rigid": _mapping(result.get("before_rigid_motion_removed")),
         "after_rigid": _mapping(result.get("after_rigid_motion_removed")),
     }
     return {**found, "said": _headline(state, [found]), "text": _verdict_text([found])}
+
+
+#: What is said of a result that has no prior: made by an earlier version, or with class none.
+WITHOUT_PRIOR = (
+    "without prior: the uncertainties have nothing of errors that were not measured, and are not compared with those of "
+    "other results"
+)
+
+
+def assumptions_of(result: Mapping[str, Any]) -> list[str]:
+    """Return what ``result.json`` or ``identify.json`` says is assumed of errors that were not measured."""
+    if _mapping(result.get("prior")).get("class", "none") == "none":
+        return [WITHOUT_PRIOR]
+    probable = _mapping(result.get("probable")) or result
+    costs = {str(key): float(value) for key, value in _mapping(probable.get("not_determined_rms_um")).items()}
+    said = (probable.get("assumed"), open_text(costs), probable.get("machine_worse_than_class"))
+    return [str(text) for text in said if text]
+
+
+def _limits(probable: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Before with its limits, after and at most, um rms, rounded: as it stands, and with the rigid motion removed."""
+    found = {}
+    for key, name in (("as_it_stands", "rms_um"), ("rigid", "rms_rigid_motion_removed_um")):
+        parts = [_mapping(probable.get(f"{when}_{name}")) for when in ("before", "after")]
+        if all(isinstance(part.get(word), int | float) for part in parts for word in ("median", "low", "high")):
+            before, after = ((part["median"], part["low"], part["high"]) for part in parts)
+            found[key] = list(rounded_limits(before, after))
+    return found
 
 
 def _control(item: ControlFolder) -> dict[str, Any]:
@@ -300,7 +333,7 @@ def _control(item: ControlFolder) -> dict[str, Any]:
             for name, value in dict(result.get("uncorrected_um", {})).items()
         ],
         "reasons": list(result.get("reasons", [])),
-        "notes": list(result.get("notes", [])),
+        "notes": [text for text in result.get("notes", []) if text not in assumptions_of(result)],
         "warnings": list(item.manifest.get("warnings", [])),
         "sign_statement": item.manifest.get("sign_statement", ""),
         "parameters": list(item.manifest.get("parameters", [])),
@@ -342,13 +375,13 @@ def why_uncorrected(name: str) -> str:
 _KNOWN = {f"E{d}{a}" for d in "XYZABC" for a in "XYZ"} | {"EC0Y", "EB0Z", "EA0Z"}
 
 
-def um(value: Any) -> str:
-    """Return a figure in um with a sensible number of digits; a dash for None.
+def um(value: Any, u_um: Any = None) -> str:
+    """Return a figure in um with a sensible number of digits, no more than its expanded uncertainty leaves; a dash for None.
 
-    >>> um(2964.4), um(12.34), um(0.3959), um(None)
-    ('2964', '12.3', '0.40', '–')
+    >>> um(2964.4), um(12.34), um(0.3959), um(None), um(0.002, 6.1)
+    ('2964', '12.3', '0.40', '–', '<0.1')
     """
-    return um_text(value, whole_from=100.0)
+    return um_text(value, whole_from=100.0, u_um=u_um if isinstance(u_um, int | float) else None)
 
 
 #: Verdicts of a comparison in words.
@@ -415,6 +448,13 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     best = min(loadable, key=lambda item: item["after"].get("rms_um", math.inf))
     before, after = best["before"], best["after"]
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
+    if "as_it_stands" in best["limits"]:
+        one, low, high, left, most = best["limits"]["as_it_stands"]
+        known = "" if best["volumetric"] else f" ({best['measured']})"
+        return (
+            f"{name} error of the tool tip over the volume goes from {one} µm rms ({low} to {high}) to {left}, at most "
+            f"{most}, with the reference point fixed; 97.5 % limits, with what was not measured{known}."
+        )
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
     bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is unknown)"
     if not best["volumetric"]:
