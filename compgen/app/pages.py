@@ -79,7 +79,7 @@ from compgen.fleet.dashboard.guard import (
     same,
     set_cookie,
 )
-from compgen.fleet.dashboard.server import bounded
+from compgen.fleet.dashboard.server import LARGEST_BODY, bounded, small_for
 from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
 from compgen.identify.options import StatedNumbers
@@ -310,8 +310,8 @@ def open_project() -> BaseResponse | tuple[str, int]:
     """Open the folder of a project, or begin one."""
     folder = request.form.get("folder", "").strip()
     try:
-        if not folder or len(folder) > 1000:
-            raise InputError("give the folder of the project")
+        if not folder or len(folder) > 1000 or any(ord(char) < 32 for char in folder):
+            raise InputError("give the folder of the project: a path of at most 1000 characters on one line")
         number = the_workbench().open(folder)
         state = the_runner(number).project.state()
     except InputError as error:
@@ -1209,6 +1209,11 @@ def make_server(workbench: Workbench) -> Any:
     """Return a server on 127.0.0.1; connections that send their request slowly do not keep others out."""
     import waitress  # type: ignore[import-untyped]  # shipped without type information
 
+    def stranger(cookies: str) -> bool:
+        given = (part.strip() for part in cookies.split(";"))
+        own = f"{cookie_name(workbench.settings, 'app')}={workbench.session}"
+        return not any(same(part, own) for part in given)
+
     port = workbench.settings.port
     try:
         server = waitress.create_server(
@@ -1217,7 +1222,7 @@ def make_server(workbench: Workbench) -> Any:
         )  # fmt: skip
     except OSError as error:
         raise InputError(f"port {port} cannot be used: {error.strerror or error}", field="--port") from error
-    return bounded(server)
+    return bounded(server, small_for(stranger, LARGEST_BODY))
 
 
 #: A browser that is a snap reads neither the folder for temporary files nor hidden ones in the user's own.

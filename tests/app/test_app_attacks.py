@@ -413,6 +413,38 @@ def test_who_sends_byte_by_byte_does_not_keep_others_out(tmp_path, monkeypatch):
         served.close()
 
 
+@pytest.mark.parametrize("how", ["length", "chunks"])
+def test_what_a_stranger_sends_is_not_kept_on_the_disk(tmp_path, monkeypatch, how):
+    """A body is complete before the application sees the request: strangers are refused with its beginning."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    served = helper.Served(tmp_path / "project")
+    head = (
+        "POST /projects/1/measurement/add HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: text/plain\r\n{}\r\n{}\r\n\r\n"
+    )
+    cookie = f"Cookie: a=b; compgen-{served.address[1]}-app={{}}"
+    try:
+        for session, refused in (("wrong", True), (served.workbench.session, False)):
+            with socket.create_connection(served.address, timeout=helper.PATIENCE_S) as connection:
+                size = "Content-Length: 100000" if how == "length" else "Transfer-Encoding: chunked"
+                connection.sendall(head.format(cookie.format(session), size).encode())
+                body = b"x" * 100_000 if how == "length" else b"186a0\r\n" + b"x" * 100_000 + b"\r\n0\r\n\r\n"
+                with contextlib.suppress(OSError):
+                    connection.sendall(body)
+                code = connection.recv(12)
+                assert (b"413" in code) == refused, code
+    finally:
+        served.close()
+
+
+@pytest.mark.parametrize("folder", ["a\nb", "a\x00b", "\x1b[2J", "x" * 1001, ""])
+def test_the_name_of_a_project_is_one_line(site, tmp_path, folder):
+    named = f"{tmp_path}/{folder}" if folder else ""
+    data = {"csrf": site.workbench.csrf, "folder": named}
+    answer = site.client.post("/open", base_url=site.url, headers={"Origin": site.url}, data=data)
+    assert answer.status_code == 409
+    assert sorted(path.name for path in tmp_path.iterdir()) in (["project"], ["cache", "project"])
+
+
 def test_the_program_ends_after_the_last_page_was_closed(monkeypatch):
     now = [1000.0]
     monkeypatch.setattr(pages.time, "monotonic", lambda: now[0])

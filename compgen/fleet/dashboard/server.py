@@ -5,10 +5,13 @@ from __future__ import annotations
 import logging
 import signal
 import time
+from collections.abc import Callable
+from copy import copy
 from types import FrameType
 from typing import Any
 
 from waitress.channel import HTTPChannel  # type: ignore[import-untyped]  # shipped without type information
+from waitress.parser import HTTPRequestParser  # type: ignore[import-untyped]
 
 from compgen.errors import InputError
 from compgen.fleet import logs
@@ -41,12 +44,33 @@ class TimedChannel(HTTPChannel):  # type: ignore[misc]
         return bool(super().readable())
 
 
-def bounded(server: Any) -> Any:
+def bounded(server: Any, channel: type[TimedChannel] = TimedChannel) -> Any:
     """Return the server with connections that have a time limit."""
     for each in [*getattr(server, "map", {}).values(), server]:
         if hasattr(each, "channel_class"):
-            each.channel_class = TimedChannel
+            each.channel_class = channel
     return server
+
+
+def small_for(stranger: Callable[[str], bool], most_bytes: int) -> type[TimedChannel]:
+    """Return connections on which a request with cookies of a ``stranger`` has at most ``most_bytes``.
+
+    A body is kept on the disk before the application sees the request, so a limit of the application comes too late.
+    """
+
+    class Parser(HTTPRequestParser):  # type: ignore[misc]
+        adj: Any
+
+        def parse_header(self, header_plus: bytes) -> None:
+            super().parse_header(header_plus)
+            if stranger(str(self.headers.get("COOKIE", ""))):
+                self.adj = copy(self.adj)
+                self.adj.max_request_body_size = most_bytes
+
+    class Channel(TimedChannel):
+        parser_class = Parser
+
+    return Channel
 
 
 THREADS, LARGEST_BODY, LARGEST_HEADERS = 8, 65_536, 65_536
