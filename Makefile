@@ -3,6 +3,8 @@
 # make extras installs what recal, serve, --cluster, dcc.xml and the compiled kernels need in addition
 # make texts  writes the catalogues of texts again (CONTRIBUTING.md), and lists what has no translation
 # make pins   writes the pinned dependencies again (CONTRIBUTING.md)
+# make sbom   writes the bill of materials of the wheel again, from the pins and the version
+# make release builds wheel and source in dist/, checks both, and looks up known vulnerabilities of the pins
 # make bench  prints the ratios against named peers
 # make coverage    runs the tests and prints their branch coverage
 # make docs        builds the documentation site in docs-out/; make docs-links follows its links to other sites
@@ -11,11 +13,13 @@ BIN := .venv/bin
 CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
 DOCS := .venv-docs/bin
+RELEASE := .venv-release/bin
 
 # a module is compiled when it is first imported: to compile all of them takes longer than to install them
 PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
 PIP := $(BIN)/python $(PIP_INSTALL)
 PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
+PIP_RELEASE := $(RELEASE)/python $(PIP_INSTALL)
 COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
 
 # the tests of a file go to one process, which then prepares once what they share; three processes for two processors, because
@@ -25,7 +29,7 @@ SPREAD := -n 3 --dist loadfile --no-loadscope-reorder
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo extras test lint system bench coverage docs docs-links texts pins clean
+.PHONY: demo extras test lint system bench coverage docs docs-links texts pins sbom release clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready
@@ -107,6 +111,26 @@ pins:
 	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt pyproject.toml -o requirements-extras.txt
 	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt -c requirements-extras.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
 	$(COMPILE) $(UPGRADE) -c requirements.txt -c requirements-extras.txt requirements-docs.in -o requirements-docs.txt
+	$(COMPILE) $(UPGRADE) -c requirements.txt -c requirements-extras.txt -c requirements-dev.txt requirements-release.in -o requirements-release.txt
+	$(PYTHON) .ci/sbom.py
+
+sbom:
+	$(PYTHON) .ci/sbom.py
+
+# what makes a release has an environment of its own, as the site has
+.venv-release/ready: .venv/bin/python requirements-release.txt
+	@[ -x $(RELEASE)/python ] || $(BIN)/python -m venv .venv-release
+	$(PIP_RELEASE) --require-hashes -r requirements-release.txt
+	@touch $@
+
+# the wheel is built from the source archive, so that this is known to be whole
+release: .venv-release/ready sbom
+	@git diff --quiet -- compgen/sbom.cdx.json || echo "compgen/sbom.cdx.json has changed: commit it"
+	rm -rf dist
+	$(RELEASE)/python -m build --no-isolation --outdir dist .
+	$(RELEASE)/python -m twine check --strict dist/*
+	$(RELEASE)/python .ci/check-sbom.py dist/*.whl
+	.ci/audit $(RELEASE)/pip-audit requirements-extras.txt
 
 clean:
-	rm -rf .venv .venv-docs demo-out docs-out .coverage
+	rm -rf .venv .venv-docs .venv-release demo-out docs-out dist .coverage

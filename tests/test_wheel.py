@@ -1,5 +1,7 @@
 """What users install: the wheel holds the package, every file of the data folders and both licences; pins have hashes."""
 
+import json
+import os
 import re
 import shutil
 import subprocess
@@ -10,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from compgen.resources import data_folder
+from compgen.resources import VERSION, data_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA_FOLDERS = ("templates", "machines")
@@ -122,14 +124,17 @@ def named(texts):
 def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     optional = [text for extra in project["project"]["optional-dependencies"].values() for text in extra]
-    base, extras, dev, docs = (pins(f"requirements{kind}.txt") for kind in ("", "-extras", "-dev", "-docs"))
+    kinds = ("", "-extras", "-dev", "-docs", "-release")
+    base, extras, dev, docs, release = (pins(f"requirements{kind}.txt") for kind in kinds)
     assert named([*project["project"]["dependencies"], *project["build-system"]["requires"]]) <= set(base)
     assert named(optional) - {"compgen"} <= set(extras) - set(base)
     run = base | extras
     assert all(extras[name] == base[name] for name in base.keys() & extras.keys())
     assert {"pytest", "ruff", "mypy"} <= set(dev) - set(run)
     assert all(dev[name] == pin for name, pin in run.items())
-    assert all(count >= 1 for _, count in [*dev.values(), *docs.values()])
+    assert all(count >= 1 for _, count in [*dev.values(), *docs.values(), *release.values()])
+    assert {"build", "hatchling", "pip-audit", "twine"} <= set(release)
+    assert all(release[name] == dev[name] for name in release.keys() & dev.keys())
     assert {"sphinx", "myst-parser", "furo"} <= set(docs) - set(dev)
     assert all(docs[name] == run[name] for name in docs.keys() & run.keys())
     assert run["numpy"][1] > 20  # the wheels of all platforms, not of one
@@ -140,7 +145,60 @@ def test_make_installs_nothing_without_hashes():
     makefile = (ROOT / "Makefile").read_text()
     assert "pip install" not in makefile.replace("-m pip install --quiet --disable-pip-version-check", "", 1)
     assert "PIP_INSTALL" not in re.sub(r"^PIP\w* :=.*$", "", makefile, flags=re.MULTILINE)
-    lines = re.findall(r"^\t\$\(PIP(?:_DOCS)?\) (.*)$", makefile, re.MULTILINE)
-    assert len(lines) == 8
+    lines = re.findall(r"^\t\$\(PIP(?:_DOCS|_RELEASE)?\) (.*)$", makefile, re.MULTILINE)
+    assert len(lines) == 9
     for line in lines:
         assert line.startswith("--require-hashes -r ") or line == "--no-build-isolation --no-deps -e ."
+
+
+def test_the_bill_of_materials_comes_with_the_wheel_and_names_every_pin_that_compgen_runs_with(wheel, wheel_names):
+    """CycloneDX in .dist-info/sboms; compared with the pins and the installed packages. If it differs: make sbom."""
+    (name,) = (name for name in wheel_names if re.fullmatch(r"compgen-[^/]+\.dist-info/sboms/[^/]+\.cdx\.json", name))
+    with zipfile.ZipFile(wheel) as archive:
+        bill = json.loads(archive.read(name))
+        assert name in archive.read(name.split("/")[0] + "/RECORD").decode()
+    own = bill["metadata"]["component"]
+    assert (bill["bomFormat"], bill["specVersion"], own["version"]) == ("CycloneDX", "1.6", VERSION)
+    parts = {part["name"]: part for part in bill["components"] if part["type"] == "library"}
+    base, extras = pins("requirements.txt"), pins("requirements-extras.txt")
+    for package, part in parts.items():
+        assert part["version"] == extras[package][0] and part["purl"] == f"pkg:pypi/{package}@{part['version']}"
+    builds = named(re.findall(r"^[a-z-]+", (ROOT / "requirements.in").read_text(), re.MULTILINE))
+    assert not builds & parts.keys()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {name for name, part in parts.items() if part["scope"] == "required"}
+    assert named(project["dependencies"]) <= needed <= set(base)
+    optional = [text for extra in project["optional-dependencies"].values() for text in extra]
+    assert named(optional) - {"compgen"} <= set(parts) == set(extras)
+    edges = {item["ref"]: item["dependsOn"] for item in bill["dependencies"]}
+    assert parts["numpy"]["purl"] in edges[parts["scipy"]["purl"]] and parts["jinja2"]["purl"] in edges[own["purl"]]
+    refs = {part["bom-ref"] for part in bill["components"]} | {own["bom-ref"]}
+    assert edges.keys() | {ref for others in edges.values() for ref in others} <= refs
+
+
+@pytest.mark.parametrize(
+    ("answer", "status", "code", "said"),
+    [
+        ({"dependencies": [{"name": "numpy", "version": "2.0", "vulns": []}]}, 0, 0, "no known vulnerability"),
+        (
+            {
+                "dependencies": [
+                    {"name": "numpy", "version": "2.0", "vulns": [{"id": "CVE-1", "fix_versions": ["2.1"]}]}
+                ]
+            },
+            1,
+            1,
+            "numpy 2.0: CVE-1, mended in 2.1",
+        ),
+        (None, 1, 0, "the vulnerability source osv was not reached: no route to host\nNOT AUDITED"),
+    ],
+)
+def test_a_vulnerability_stops_a_release_and_a_source_that_is_not_reached_is_said(tmp_path, answer, status, code, said):
+    audit = tmp_path / "pip-audit"
+    text = "echo no route to host >&2" if answer is None else f"cat <<'END'\n{json.dumps(answer)}\nEND"
+    audit.write_text(f"#!/bin/sh\n{text}\nexit {status}\n")
+    audit.chmod(0o755)
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    command = [ROOT / ".ci" / "audit", audit, "requirements-extras.txt"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env={"PATH": path})
+    assert (done.returncode, said in done.stdout) == (code, True), done.stdout + done.stderr
