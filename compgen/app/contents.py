@@ -31,6 +31,7 @@ from compgen.data.files import read_text
 from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
+from compgen.data.prior import CLASS_WORDS
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.kinematics import exact_error
@@ -628,7 +629,7 @@ def machine_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "machine": machine, "text": text, "parsed": parsed,
         "chain": Chain(chain) if chain in CHAINS else None, "in_words": in_words, "picture": chain_picture,
         "shipped": sorted(machine_files(())), "example": Chain("WXYFZT"), "chains": [Chain(name) for name in CHAINS],
-        "cards": [load_format(name) for name in sorted(CONTROLLERS)],
+        "cards": [load_format(name) for name in sorted(CONTROLLERS)], "classes": CLASS_WORDS,
         "controls": [(load_format(name), settings_of(text, name), open_points(name))
                      for name in controls],
         "checked": state.last("machine"),

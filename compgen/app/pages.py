@@ -68,6 +68,7 @@ from compgen.data.language import texts_of
 from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
+from compgen.data.prior import class_named
 from compgen.errors import CompgenError, InputError, number_text, visible
 from compgen.fleet.dashboard.guard import (
     HEADERS,
@@ -469,6 +470,7 @@ def describe_machine(runner: Runner, state: ProjectState) -> None:
         low, high = _number(f"{letter}-low"), _number(f"{letter}-high")
         words.append(f"--travel={letter}={low:g}..{high:g}")
     words += [f"--control={control}" for control in request.form.getlist("control") if control in CONTROLLERS]
+    words += [f"--class={class_named(_field('class'))}"] if _field("class") else []
     values = {}
     for key in ("reference_point_mm", "tool_offset_mm"):
         given = [_field(f"{key}-{letter}") for letter in AXES]

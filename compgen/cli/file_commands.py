@@ -32,6 +32,7 @@ from compgen.data.machine import (
 )
 from compgen.data.names import AXES
 from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.data.prior import CLASS_WORDS, USUAL_CLASS, class_named
 from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.job import job_of, job_schema
@@ -127,6 +128,13 @@ def schema_command(kind: str) -> int:
     return 0
 
 
+#: What a machine file without a prior is told.
+NO_CLASS = (
+    f"[prior] class is not stated, so errors of a {CLASS_WORDS[USUAL_CLASS]} are assumed where nothing is measured; known are "
+    + ", ".join(f"{key} ({words})" for key, words in CLASS_WORDS.items())
+)
+
+
 @click.command("check")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("--kind", type=click.Choice(list(KINDS)), help="Kind of the files; default: recognised by their keys.")
@@ -151,7 +159,9 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         likeliest = max(KINDS, key=lambda name: len(KINDS[name].keys & present))
         known = kind or (likeliest if KINDS[likeliest].keys & present else None)
         if known is None and present and not named:
-            listing.append({"file": str(path), "kind": None, "problems": [], "warnings": [], "unsure": False})
+            listing.append(
+                {"file": str(path), "kind": None, "problems": [], "warnings": [], "hints": [], "unsure": False}
+            )
             continue
         if known is None and present:
             none = InputError(f"is none of {', '.join(KINDS)}: its keys do not show its kind; give --kind", file=path)
@@ -174,6 +184,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
                 "kind": known,
                 "problems": problems,
                 "warnings": list(found.warnings),
+                "hints": [NO_CLASS] if known == "machine" and "prior" not in present else [],
                 "unsure": found.unsure,
             }
         )
@@ -192,6 +203,7 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         if item["unsure"]:
             say("  settings that depend on these keys are checked once these are correct")
         say(*(f"  {'question' if '?' in text else 'warning'}: {text}" for text in item["warnings"]), style="yellow")
+        say(*(f"  hint: {text}" for text in item.get("hints", [])))
     return 2 if count else 0
 
 
@@ -246,6 +258,13 @@ def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:
     default=".",
     help="Folder of NAME.toml; default: this one.",
 )
+@click.option(
+    "--class",
+    "class_name",
+    metavar="CLASS",
+    help="Class of the machine, which says how large errors are assumed to be that are not measured: precision (jig borer), "
+    "general (machining centre), large (portal), router (hobby), printer, or none.",
+)
 @click.option("--force", is_flag=True, help="Overwrite a file that exists.")
 @json_option
 def init_command(
@@ -255,6 +274,7 @@ def init_command(
     nodes: tuple[str, ...],
     controls: tuple[str, ...],
     out: Path,
+    class_name: str | None,
     force: bool,
     as_json: bool,
 ) -> int:
@@ -286,11 +306,15 @@ def init_command(
             f"Controls ({', '.join(sorted(CONTROLLERS))}; several with commas)", default="none", err=True
         )
         controls = () if text == "none" else tuple(controller_named(item.strip()).name for item in text.split(","))
+    if asks and class_name is None:
+        listed = ", ".join(CLASS_WORDS.values())
+        class_name = click.prompt(f"What kind of machine is it ({listed})", default=CLASS_WORDS[USUAL_CLASS], err=True)
+    class_name = None if class_name is None else class_named(class_name)
     # a control with mandatory settings is read only once they are stated
     plain = machine_text(name, understood, ranges, counts)
     machine = parse_machine(plain, target)
     sections = [_control_section(machine, control) for control in dict.fromkeys(controls)]
-    written = machine_text(name, understood, ranges, counts, sections)
+    written = machine_text(name, understood, ranges, counts, sections, class_name)
     found = parse_machine(written, target)
     output = OutputFolder(out)
     output.add(target.name, written)

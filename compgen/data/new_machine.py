@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from compgen.data import toml_files
 from compgen.data.machine import CHAINS, Axis, Chain, Emphasis, Interval, Machine
 from compgen.data.names import AXES
+from compgen.data.prior import CLASS_WORDS, USUAL_CLASS
 from compgen.errors import InputError
 
 #: What carries an axis: words (beginnings, umlauts spelt out), whether it is on the side of the tool (None: either), and how
@@ -156,9 +157,17 @@ def usual_nodes(travel: Interval) -> int:
 
 
 def machine_text(
-    name: str, chain: Chain, travel_mm: Mapping[str, Interval], nodes: Mapping[str, int], sections: Sequence[str] = ()
+    name: str,
+    chain: Chain,
+    travel_mm: Mapping[str, Interval],
+    nodes: Mapping[str, int],
+    sections: Sequence[str] = (),
+    class_name: str | None = None,
 ) -> str:
-    """Return the text of a machine file with a comment on every key, followed by ``sections`` for the controls."""
+    """Return the text of a machine file with a comment on every key, followed by ``sections`` for the controls.
+
+    ``class_name`` is the class of the machine, which says what is assumed of errors that are not measured.
+    """
     said = toml_files.section_schema(Machine, Emphasis)["properties"]
     of_axis = toml_files.section_schema(Axis)["properties"]
     at_zero = [min(max(0.0, travel_mm[letter][0]), travel_mm[letter][1]) for letter in AXES]
@@ -191,4 +200,12 @@ def machine_text(
             line("expansion_um_per_m_k", 11.5, of_axis, "# "),
             line("screw_pitch_mm", 10.0, of_axis, "# "),
         ]
+    classes = ", ".join(f"{key}: {words}" for key, words in CLASS_WORDS.items())
+    of_class = f'class = "{class_name or USUAL_CLASS}"'
+    lines += [
+        "",
+        "[prior]",
+        f"{of_class if class_name else f'# {of_class}':<41} # class of the machine: how large errors are assumed that are not",
+        f"{'':41} # measured; {classes}",
+    ]
     return "\n".join([*lines, *(part for section in sections for part in ("", section))]) + "\n"

@@ -20,6 +20,24 @@ CLASS_WORDS = {
     "router": "hobby router",
     "printer": "printer",
 }
+
+
+def class_named(words: str) -> str:
+    """Return the class that a shop names: one of the keys, or its words; InputError for others.
+
+    >>> class_named("router"), class_named("Machining centre"), class_named("none")
+    ('router', 'general', 'none')
+    """
+    given = " ".join(words.lower().replace("center", "centre").split())
+    for name, said in CLASS_WORDS.items():
+        if given in (name, said):
+            return name
+    if given == NONE:
+        return NONE
+    listed = ", ".join(f"{name} ({said})" for name, said in CLASS_WORDS.items())
+    raise InputError(f"{words[:60]!r} is not a class of machines; known are {listed}, and {NONE}", field="--class")
+
+
 #: The class of a machine whose file states none.
 USUAL_CLASS = "general"
 #: No prior: what is not measured stays without a statement.

@@ -436,7 +436,16 @@ def test_on_a_terminal_what_no_option_says_is_asked(tmp_path):
     ours, theirs = pty.openpty()
     command = [sys.executable, "-c", "from compgen.cli import main; main()", "init"]
     process = subprocess.Popen(command, stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path)
-    answers = ["mill", "table moves in X and Y, head in Z", "2", "0..600", "0..400", "-0.3..0.2", "isg-csv"]
+    answers = [
+        "mill",
+        "table moves in X and Y, head in Z",
+        "2",
+        "0..600",
+        "0..400",
+        "-0.3..0.2",
+        "isg-csv",
+        "hobby router",
+    ]
     os.write(ours, ("\n".join(answers) + "\n").encode())
     _, stderr = process.communicate(timeout=60)
     os.close(ours)

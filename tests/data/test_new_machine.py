@@ -4,6 +4,7 @@ import pytest
 
 from compgen.data.machine import CHAINS, parse_machine
 from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.data.prior import class_named
 from compgen.errors import InputError
 
 
@@ -100,3 +101,47 @@ def test_every_default_that_the_file_shows_can_be_taken_as_it_is(tmp_path):
 )
 def test_usual_nodes_are_a_hundred_mm_apart(travel, nodes):
     assert usual_nodes(travel) == nodes
+
+
+def test_the_file_states_the_class_of_the_machine(tmp_path):
+    travel = {axis: (0.0, 500.0) for axis in "XYZ"}
+    written = {
+        name: parse_machine(
+            machine_text("m", chains_of("WFYXZT")[0], travel, dict.fromkeys("XYZ", 6), (), name), tmp_path / "m.toml"
+        )
+        for name in (None, "precision", "router", "none")
+    }
+    assert {name: machine.prior.class_name for name, machine in written.items()} == {name: name for name in written}
+    # angles of a machining centre 12 urad, of a router 20 times as large
+    assert written[None].prior.size_um("EAX") == 12.0
+    assert written["router"].prior.size_um("EAX") == 240.0
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [("Machining center", "general"), ("precision jig borer", "precision"), (" large  portal", "large"),
+     ("HOBBY ROUTER", "router"), ("printer", "printer"), ("none", "none")],
+)  # fmt: skip
+def test_a_class_is_named_as_a_shop_says_it(words, name):
+    assert class_named(words) == name
+
+
+@pytest.mark.parametrize("words", ["", "mill", "generall", "0", "router printer"])
+def test_other_words_are_no_class(words):
+    with pytest.raises(InputError, match=r"is not a class of machines; known are precision \(precision jig borer\)"):
+        class_named(words)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [("angle_urad = 0", "angle_urad"), ("angle_urad = -3", "angle_urad"), ("angle_urad = 1e9", "is the unit that of the key"),
+     ('class = "huge"', "class"), ("angles_urad = 3", "angle_urad"), ('angle_urad = "12 urad"', "angle_urad"),
+     ("EXX_urad = 3", "EXX_um"), ('learn = "down"', "learn"), ("squareness_urad = nan", "squareness_urad"),
+     ('class = "none"\nangle_urad = 3', "none")],
+)  # fmt: skip
+def test_a_prior_that_cannot_be_is_refused_with_its_key(line, said, tmp_path):
+    travel = {axis: (0.0, 500.0) for axis in "XYZ"}
+    text = machine_text("m", chains_of("WFYXZT")[0], travel, dict.fromkeys("XYZ", 6))
+    with pytest.raises(InputError) as caught:
+        parse_machine(f"{text}{line}\n", tmp_path / "m.toml")  # [prior] is the last section
+    assert said in str(caught.value)
