@@ -1220,7 +1220,7 @@ def _checks_said(result: ProgramCorrection) -> list[str]:
         within = dialect.check_within[result.machine_units == "inch"]
         texts.append(
             f"The first blocks of the program stop it where X, Y or Z of {', '.join(checked)} differ by more than {within} "
-            f"{result.machine_units}, the unit in which the control keeps them (machine_units of the machine file)."
+            f"{result.machine_units}; the control keeps them in {result.machine_units} (machine_units of the machine file)."
         )
     if result.unchecked:
         texts.append(f"Compare by hand, since the program does not check it: {', '.join(result.unchecked)}.")
