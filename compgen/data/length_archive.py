@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import tokenize
 import warnings
 import weakref
 import zipfile
@@ -155,16 +154,7 @@ def open_archive(path: str | Path) -> LengthArchive:
             members = {item.filename.removesuffix(".npy"): _member(source, stream, item) for item in archive.infolist()}
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error
-    except (
-        zipfile.BadZipFile,
-        ValueError,
-        EOFError,
-        struct.error,
-        OSError,
-        SyntaxError,
-        tokenize.TokenError,
-        MemoryError,
-    ) as error:
+    except (zipfile.BadZipFile, ValueError, EOFError, struct.error, OSError) as error:
         raise InputError(
             f"is not an archive of numpy (.npz), or is truncated or damaged ({error})", file=source
         ) from error

@@ -427,7 +427,7 @@ class Machine(Displayed):
             if sections of controls state both.
         """
         tables = {name: section.data.get("machine_units") for name, section in self.controllers.items()}
-        stated = {str(unit): name for name, unit in tables.items() if str(unit) in MM_PER_UNIT}
+        stated = {unit: name for name, unit in tables.items() if unit in MM_PER_UNIT}
         if self.machine_units is None and len(stated) > 1:
             raise InputError(
                 f"[controllers.{stated['mm']}] is in mm, [controllers.{stated['inch']}] in inch; state it for the machine",

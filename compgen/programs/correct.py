@@ -22,6 +22,7 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
+from compgen.programs.follower import Follower, difference, read_twice
 from compgen.programs.path import (
     PLANE_AXES,
     RAPID,
@@ -514,7 +515,8 @@ class ProgramWriter:
         if lines and cycle.lines[0] == block.text:
             self.changed += 1
             return lines
-        if lines and self.dialect.pole and not re.search(r"M0*(89|99)(?!\d)|G79", block.text.upper()):
+        codes = {f"{letter}{float(value):g}" for letter, value, *_ in block.words if value and letter in "GM"}
+        if lines and self.dialect.pole and not codes & {"M89", "M99", "G79"}:
             body = text.partition(";")[0].rstrip("* \t\r\n")
             text = f"{body} M89{text[len(body) :]}"  # a definition ends the calls by all positions
         self.changed += text != block.text
@@ -583,7 +585,7 @@ class _RunPieces:
         if self.arc.any():
             self._arcs()
         writer = self.writer
-        writer.target_mm, writer.written_mm = self.command_mm[-1], np.array(self.reached_mm[-1])
+        writer.target_mm, writer.written_mm = np.array(self.command_mm[-1]), np.array(self.reached_mm[-1])
         added += np.bincount(self.line[~self.begins], minlength=len(added))
         writer.added += int(np.sum(~self.begins))
         self._edit(edits)
@@ -851,11 +853,17 @@ class _Travel:
 
 @dataclass
 class _ReadBack:
-    """Adds up the deviations of the program and of the corrected one, batch by batch."""
+    """Adds up the deviations of the program and of the corrected one, batch by batch.
+
+    The corrected text is read twice: by ``follower``, whose moves are judged, and by ``reader``, which has to agree.
+    ``least_mm`` is what rounding and tolerance may change.
+    """
 
     model: ExactModel
     reader: Reader
+    follower: Follower
     step_mm: float
+    least_mm: float
     before: PathFigures = field(default_factory=PathFigures)
     after: PathFigures = field(default_factory=PathFigures)
     travel: _Travel = field(init=False)
@@ -863,20 +871,28 @@ class _ReadBack:
     #: Moves at feed of the corrected program.
     cuts: int = 0
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
+    largest_mm: FloatArray = field(default_factory=lambda: np.zeros(3))
     broken: str = ""
     follow: Follow | None = None
+    #: For each axis that moves at feed left uncorrected, the first line and how many moves.
+    unplaced: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.travel = _Travel(self.model.machine)
 
-    def add(self, wanted: Moves, text: bytes, origins: IntArray, pieces: Pieces) -> None:
+    def add(self, wanted: Moves, text: bytes, origins: IntArray, pieces: Pieces, drilled: NDArray[np.bool_]) -> None:
         """Read corrected blocks and compare them with the moves that are wanted.
 
-        ``origins`` are the numbers of the blocks that they come from, ``pieces`` how the moves were meant to be divided.
+        ``origins`` are the numbers of the blocks that they come from, ``pieces`` how the moves were meant to be divided,
+        ``drilled`` which are those of a cycle.
         """
-        read = self.reader.batch(text, self.lines + 1).moves
+        expected = self.reader.batch(text, self.lines + 1).moves
+        read = self.follower.follow(text.decode("latin-1"), range(self.lines + 1, self.lines + 1 + len(origins)))
+        if found := difference(expected, read):
+            line, how = found
+            self._break(int(origins[line - self.lines - 1]), f"what was written can be read in two ways: {how}")
         origin = origins[read.line - self.lines - 1]
-        self.travel.add(wanted, read, origin, text, self.lines + 1)
+        self.travel.add(wanted, expected, origins[expected.line - self.lines - 1], text, self.lines + 1)
         self.lines += len(origins)
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
         directions = np.vstack([self.direction, ended[:-1]])[: len(wanted)], ended
@@ -885,6 +901,8 @@ class _ReadBack:
         rows = np.flatnonzero(wanted.cutting)
         zero, one = np.zeros(len(rows)), np.ones(len(rows))
         self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), directions)
+        self._note_unplaced(wanted)
+        self._hold_places(wanted, read, origin, pieces)
         back = np.flatnonzero(read.cutting)
         self.cuts += len(back)
         owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
@@ -892,9 +910,69 @@ class _ReadBack:
             meant = np.flatnonzero(wanted.cutting[pieces.move])
             if np.array_equal(pieces.move[meant], owner):  # else shares by length, which slack makes longer
                 low, high = pieces.begins()[meant], pieces.share[meant]
+                self._hold_ends(wanted, read.part(back), owner, pieces.command_mm[meant], drilled)
             self._add(self.after, wanted, owner, read.part(back), (low, high), directions)
             if self.follow is not None:
                 self.follow(wanted, owner, read.part(back), low, high)
+
+    def _note_unplaced(self, wanted: Moves) -> None:
+        ends = wanted.cutting & (wanted.at_mm == wanted.end_mm).all(axis=1)
+        for k, axis in enumerate(AXES):
+            lines = wanted.line[ends & ~wanted.corrected[:, k]]
+            if len(lines):
+                first, count = self.unplaced.get(axis, (int(lines[0]), 0))
+                self.unplaced[axis] = first, count + len(lines)
+
+    def notes(self) -> list[str]:
+        """Say where an axis stays as the program has it, because its place depends on numbers that were not used yet."""
+        why = "because no block has named it since its work offset or tool length changed; name all axes after such a change"
+        return [
+            f"line {self.reader.in_file(first)}: {axis} is not corrected in {count} move{'s' * (count > 1)} at feed, {why}"
+            for axis, (first, count) in self.unplaced.items()
+        ]
+
+    def _break(self, line: int, message: str) -> None:
+        self.broken = self.broken or f"line {self.reader.in_file(line)}: {message}"
+
+    def _hold_places(self, wanted: Moves, read: Moves, origin: IntArray, pieces: Pieces) -> None:
+        """Hold where each block leads against the program: no place is farther off than twice the largest correction."""
+        change = np.abs(pieces.command_mm[pieces.share == 1.0] - wanted.end_mm)
+        self.largest_mm = np.fmax(self.largest_mm, np.fmax.reduce(change, axis=0, initial=0.0))
+        most_mm = 2.0 * self.largest_mm + self.least_mm
+        last = [
+            np.append(np.flatnonzero(np.diff(line)), len(line) - 1) if len(line) else line
+            for line in (wanted.line, origin)
+        ]
+        known = np.intersect1d(wanted.line[last[0]], origin[last[1]], assume_unique=True)
+        places = [
+            moves.end_mm[index[np.searchsorted(line[index], known)]]
+            for moves, line, index in ((wanted, wanted.line, last[0]), (read, origin, last[1]))
+        ]
+        off = np.where(np.isnan(places[0]), 0.0, np.nan_to_num(np.abs(places[1] - places[0]), nan=np.inf))
+        new = np.flatnonzero(~np.isin(origin, wanted.line))
+        way = np.abs(read.end_mm - read.start_mm)[new]
+        for numbers, far in ((known, off), (origin[new], way)):
+            worst = np.flatnonzero((far > most_mm).any(axis=1))
+            if len(worst):
+                far_mm = float(far[worst[0]].max())
+                self._break(
+                    int(numbers[worst[0]]), f"the corrected program leads {far_mm:.3f} mm away from the program"
+                )
+
+    def _hold_ends(
+        self, wanted: Moves, read: Moves, owner: IntArray, command_mm: FloatArray, drilled: NDArray[np.bool_]
+    ) -> None:
+        """Hold the ends of moves at feed against the commands that were meant; of a cycle the depth of each hole."""
+        deep = (wanted.end_mm[:, 2] < wanted.start_mm[:, 2]) & (wanted.at_mm == wanted.end_mm).all(axis=1)
+        meant = wanted.corrected & (~drilled | (deep & wanted.corrected[:, 2]))[:, None]
+        off = np.where(meant[owner], np.nan_to_num(np.abs(read.end_mm - command_mm), nan=np.inf), 0.0)
+        worst = np.flatnonzero((off > self.least_mm).any(axis=1))
+        if len(worst):
+            far_mm = float(off[worst[0]].max())
+            self._break(
+                int(wanted.line[owner[worst[0]]]),
+                f"the corrected program leads {far_mm:.4f} mm away from what is right",
+            )
 
     def _add(
         self,
@@ -917,7 +995,9 @@ class _ReadBack:
             or not (lines == found_lines).all()
             or ((count > 1) & (count != found_count)).any()
         ):
-            self.broken = "the corrected program has other moves than the program"
+            self._break(
+                int(wanted.line[0]) if len(wanted) else 1, "the corrected program has other moves than the program"
+            )
             return None, np.zeros(0), np.zeros(0)
         index = np.searchsorted(found_lines, origin)
         rank = np.arange(len(origin)) - found_first[index]
@@ -1062,13 +1142,17 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
     corrector = Corrector(model, options.tolerance_um * MM_PER_UM, options.shortest_mm, resolution_mm)
     writer = ProgramWriter(dialect, decimals)
     again = Reader(model.machine, dialect, setup, f"{source.name} as corrected")
-    check = _ReadBack(model, again, 2.0 * corrector.step_mm, follow=follow)
+    follower = Follower(dialect.name, reader.setup, model.machine)
+    rounding_mm = 3.0 * max(10.0 ** -decimals[0], MM_PER_INCH * 10.0 ** -decimals[1])
+    check = _ReadBack(
+        model, again, follower, 2.0 * corrector.step_mm, rounding_mm + corrector.tolerance_mm, follow=follow
+    )
     again.travel_slack_mm = 10.0
     blocks, in_cycle = 0, False
     with working_folder("correct-") as work:
         body = work / "body"
-        with reader.opened() as stream, body.open("wb") as target:
-            for batch in reader.batches(stream):
+        with body.open("wb") as target:
+            for batch in read_twice(reader):
                 if reader.unknown:
                     continue  # it is refused at its end, with all that is not known
                 by_radius, drilled = np.zeros((2, len(batch.moves)), dtype=bool)
@@ -1087,7 +1171,7 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
                     raise InputError(error.message, file=source, line=reader.in_file(error.line or 0)) from error
                 corrected = text.encode("latin-1")
                 target.write(corrected)
-                check.add(batch.moves, corrected, origins, pieces)
+                check.add(batch.moves, corrected, origins, pieces, drilled)
                 if check.after.normal_line > blocks:  # the farthest so far is in this batch
                     in_cycle = bool(drilled[batch.moves.line == check.after.normal_line].any())
                 blocks += len(batch.words.start) - 1
@@ -1120,7 +1204,7 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
         refused, note = check.travel.said()
         reasons += [refused] if refused else []
         grown = _growth_said(blocks, writer.added, after.length_mm / max(check.cuts, 1), model.errors, options)
-        notes = [text for text in (note, grown) if text]
+        notes = [*([] if unchanged else check.notes()), *(text for text in (note, grown) if text)]
         if in_cycle and after.normal_mm > enough_mm:
             notes.append(
                 f"line {after.normal_line}: a drilling cycle has one X and Y, here those that are right at its depth; the stroke "

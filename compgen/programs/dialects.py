@@ -256,7 +256,7 @@ _CALLS = "MSG|GROUP_BEGIN|GROUP_END|GROUP_ADDEND|WORKPIECE|CYCLE832|SETMS|FGROUP
 _ASSIGNED = r"(?:SPOSA?|LIMS|OVR|OVRRAP|CTOL|OTOL|ATOL|ADIS|ADISPOS|ACC|VELOLIM|JERKLIM|FA|SCC|SVC|S\d|M\d+)"
 #: Calls, axis functions and labels of SINUMERIK that move nothing of X, Y and Z.
 _SIEMENS_SETTINGS = (
-    r"\bMSG\s*+\([^\n]*\)"
+    r"\bMSG\s*+\((?:\"[^\"\n]*+\"|[^()\"\n]|\([^()\n]*+\))*+\)"
     rf"|\b(?:{_CALLS})\s*+\((?:\"[^\"\n]*\"|[^()\"\n])*+\)|\bCYCLE800\s*+\(\s*+\)|\bCYCLE832\b(?!\s*+\()"
     rf"|\b{_ASSIGNED}\s*+(?:\[\s*+\w++\s*+\]\s*+)?=\s*+(?:(?:AC|IC|DC|ACP|ACN)\s*+\(\s*+{VALUE}\s*+\)|{VALUE})"
 )

@@ -22,6 +22,7 @@ from compgen.kinematics.many_points import full_grid
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
 from compgen.programs.features import PartFeatures, Quantity, Samples
+from compgen.programs.follower import read_twice
 from compgen.programs.path import (
     ExactModel,
     IntArray,
@@ -330,31 +331,30 @@ def _on_machines(
     reader = Reader(machines[0].model.machine, known, setup, source)
     figures = [(PathFigures(), None if one.tables is None else PathFigures()) for one in machines]
     features, thinned, direction = PartFeatures(), [_Thinned() for _ in machines], np.zeros(3)
-    with reader.opened() as stream:
-        for batch in reader.batches(stream):
-            if reader.unknown:
-                continue  # it is refused at its end, with all that is not known
-            moves = reader.numbered_as_in_file(batch.moves)
-            ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
-            directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended
-            direction = ended[-1] if len(moves) else direction
-            rows = np.flatnonzero(moves.cutting)
-            driven, shares = moves.part(rows), (np.zeros(len(rows)), np.ones(len(rows)))
-            for machine, (before, after), points in zip(machines, figures, thinned, strict=True):
-                kept: list[list[PathDeviations]] = [[], []]
-                models = [(before, machine.model), *([] if after is None else [(after, machine.with_tables)])]
-                for (own, model), parts in zip(models, kept, strict=False):
-                    for found in path_deviations(model, STEP_MM, moves, rows, driven, shares, directions):
-                        own.add(found)
-                        parts.append(found)
-                points.add(*kept)
-            drilled = {
-                reader.in_file(item.number)
-                for item in batch.segments
-                if isinstance(item, SingleBlock) and item.kind in ("cycle", "hole")
-            }
-            features.add(moves, drilled, ended)
-            show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
+    for batch in read_twice(reader):
+        if reader.unknown:
+            continue  # it is refused at its end, with all that is not known
+        moves = reader.numbered_as_in_file(batch.moves)
+        ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
+        directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended
+        direction = ended[-1] if len(moves) else direction
+        rows = np.flatnonzero(moves.cutting)
+        driven, shares = moves.part(rows), (np.zeros(len(rows)), np.ones(len(rows)))
+        for machine, (before, after), points in zip(machines, figures, thinned, strict=True):
+            kept: list[list[PathDeviations]] = [[], []]
+            models = [(before, machine.model), *([] if after is None else [(after, machine.with_tables)])]
+            for (own, model), parts in zip(models, kept, strict=False):
+                for found in path_deviations(model, STEP_MM, moves, rows, driven, shares, directions):
+                    own.add(found)
+                    parts.append(found)
+            points.add(*kept)
+        drilled = {
+            reader.in_file(item.number)
+            for item in batch.segments
+            if isinstance(item, SingleBlock) and item.kind in ("cycle", "hole")
+        }
+        features.add(moves, drilled, ended)
+        show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
     for machine in machines:
         machine.model.errors.warn_outside(reader.reached_mm)
     quantities = list(features.quantities())

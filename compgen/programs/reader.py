@@ -153,7 +153,8 @@ class Reader:
         self.last_arc: int | None = None
         #: The drilling cycle that a block has defined, and whether all positions call it (MCALL, M89).
         self.drilling: DrillingCycle | None = None
-        self.calling = self._defining = False
+        self.calling = self._defining = self._ends_calls = False
+        self._drilling_scale = 1.0
         self._modes: dict[str, str] = {}
         self.selected = self.loaded = ""
         self.length_on = self.tool_on = False
@@ -651,6 +652,7 @@ class Reader:
                 reason = self.dialect.refused.get(code, "is no cycle that is followed; post its moves")
                 self._fail(f"{code}: {reason}")
             self.drilling, self.calling, self._defining = DrillingCycle(code, (), {}), False, True
+            self._drilling_scale = self.scale
         elif not self._defining or not re.match(r"\s*(?:N\d+\s*)?Q\d+\s*=", body, re.IGNORECASE):
             self._defining = self._defining and body.lstrip().startswith(";")
             return False
@@ -671,6 +673,7 @@ class Reader:
                 return name.end()
             if dialect.name == "siemens" and name[2] and defines_hole(code):
                 self.drilling = DrillingCycle.called(code, self._text, name.start(2), name[2])
+                self._drilling_scale = self.scale
                 words.append((code, "", at, at))
                 return name.end()
             if code in dialect.codes and not name[2]:
@@ -712,6 +715,7 @@ class Reader:
                 name = text.strip('"').upper()
             elif letter in "GM":
                 codes.append(f"{letter}{number_of(text):g}")
+        self._ends_calls = "M99" in codes
         setting = [code for code in codes if self._is_setting(code)]
         cycles = self.cycle is not None or any(dialect.codes.get(code, "").startswith("cycle") for code in codes)
         lengths = "XYZIJRQ" if cycles else "XYZIJKR"
@@ -876,7 +880,7 @@ class Reader:
             self.used_tools[f"{code} in line {self._line}"] = self.length
             actions.append("done")
         elif meaning == "no preset":
-            self.preset = (0.0,) * 3
+            self._end_preset(code, values)
             actions.append(meaning)
         elif what in ("shift", "preset") and argument:
             self._shift(code, argument, values)
@@ -889,6 +893,7 @@ class Reader:
             actions.append("done")
         elif meaning == "definition":
             self.drilling, self.calling = DrillingCycle(code, (), {}).defined_further(self._text), False
+            self._drilling_scale = self.scale
             actions.append("done")
         elif meaning == "calls":
             self.calling = True
@@ -907,6 +912,16 @@ class Reader:
             actions.append(f"home {code}")
         elif meaning != "nothing":
             actions.append(meaning)
+
+    def _end_preset(self, code: str, values: dict[str, float]) -> None:
+        """End G92: FANUC names the axes, which end G52 as well; in other dialects axis words beside it are a move."""
+        named, fanuc = {"XYZ".index(letter) for letter in values.keys() & set("XYZ")}, self.dialect.name == "fanuc"
+        if named and not fanuc:
+            self._fail(f"{code} and a move are in one block; divide the block")
+        if named and any((self.preset[k] or self.shift[k]) and k not in named for k in range(3)):
+            self._fail(f"{code} ends the offsets of some axes only; name X, Y and Z")
+        self.preset = (0.0,) * 3
+        self.shift = (0.0,) * 3 if fanuc else self.shift
 
     def _shift(self, code: str, how: str, values: dict[str, float]) -> None:
         """Shift the coordinates: the axes that are named, all (``all``), further (``more``), or not at all (``off``)."""
@@ -1311,8 +1326,10 @@ class Reader:
         own = cycle.lines[0] == self._text
         if own and self.calling:
             self._fail(f"{cycle.name} while MCALL calls a cycle at all positions; end it by MCALL alone before")
-        if "drill here" in single and re.search("M0*99", self._text.upper()):
+        if "drill here" in single and self._ends_calls:
             self.calling = False
+        if self.scale != self._drilling_scale:
+            self._fail(f"the unit has changed since {cycle.name} was defined; define it again")
         elsewhere = "machine coordinates" in single or (own and moving)
         if elsewhere or self.plane != 2 or (moving and self.motion not in (RAPID, FEED)):
             self._fail("a hole is drilled where G0 or G1 led, in the plane G17, not in machine coordinates; post moves")

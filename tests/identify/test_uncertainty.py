@@ -2,16 +2,14 @@
 
 import io
 import json
-import zipfile
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 import machines
-from compgen.data.error_table import Curve, ErrorTable, format_errors, read_errors
+from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.files import sha256_of
 from compgen.data.lengths import Lengths, Points, format_lengths, read_lengths
 from compgen.data.names import SQUARENESS_NAMES, error_named
@@ -20,14 +18,13 @@ from compgen.identify import (
     IdentifyOptions,
     KnownStations,
     SystematicInputs,
-    covariance,
     identify,
     joint_covariance,
     predict_uncertainty,
     read_covariance,
 )
 from compgen.identify.adjust.problem import length_problem
-from compgen.identify.covariance import FILE_NAME, error_values, format_covariance, parse_covariance, posterior_with
+from compgen.identify.covariance import FILE_NAME, error_values, format_covariance, posterior_with
 from compgen.kinematics import exact_error, modelled_errors, volumetric_error
 from compgen.pipeline import identification_files, provenance_of
 
@@ -518,43 +515,3 @@ def test_lengths_with_times_and_tools_survive_writing(tmp_path):
     options = IdentifyOptions(systematic=inputs)
     first, second = identify(machine, lengths, options), identify(machine, again, options)
     assert np.allclose(vector_u(first.errors), vector_u(second.errors), rtol=1e-6, atol=1e-12)
-
-
-def archive_with(header=b"", flag=0):
-    """An archive whose array states any shape, or that says it is encrypted."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as packed:
-        packed.writestr("factor.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
-    content = bytearray(stream.getvalue())
-    for mark, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
-        content[content.index(mark) + at] |= flag
-    return bytes(content)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        archive_with(b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000, 9), }\n"),
-        archive_with(b"{'descr': '<f8', 'fortran_order': False, 'shape': (1,), }\n", flag=1),
-        archive_with(b"{" * 200 + b"\n"),
-    ],
-)
-def test_a_covariance_file_that_states_what_it_does_not_have_is_refused(content):
-    with pytest.raises(InputError, match="truncated or damaged"):
-        parse_covariance(content, Path("x.covariance.npz"))
-
-
-def test_a_covariance_file_that_unpacks_to_much_is_refused(monkeypatch):
-    monkeypatch.setattr(covariance, "MOST_UNPACKED", 1000)
-    stream = io.BytesIO()
-    np.savez_compressed(stream, factor=np.zeros(100_000))
-    with pytest.raises(InputError, match="unpacks to 1 MB"):
-        parse_covariance(stream.getvalue(), Path("x.covariance.npz"))
-
-
-@pytest.mark.parametrize("name", ["../x.npz", "/etc/x.npz", "a/x.npz", "..\\x.npz"])
-def test_an_errors_file_names_a_covariance_beside_it_only(tmp_path, small_errors, name):
-    path = tmp_path / "e.errors.csv"
-    path.write_text(format_errors(small_errors, {"covariance": name}))
-    with pytest.raises(InputError, match="a file beside this one"):
-        covariance.covariance_named_by(path, read_errors(path))

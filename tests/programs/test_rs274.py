@@ -10,6 +10,7 @@ from programs.make import OFFSETS_MM, TOOLS_MM, mill, random_holes, random_progr
 
 from compgen.programs import CorrectOptions, Reader, Setup, correct_program, model_of
 from compgen.programs.dialects import DIALECTS
+from compgen.programs.follower import Follower
 from compgen.programs.path import CCW, PLANE_AXES, RAPID
 
 pytestmark = pytest.mark.skipif(
@@ -223,8 +224,8 @@ def test_drilling_in_increments_and_with_repeats(tmp_path, make_errors):
 
 
 def machine_moves(program, folder):
-    """Straight moves of the interpreter: whether at feed, and where the machine goes (mm): all offsets are added."""
-    unit, zero, moves, last = 1.0, {}, [], np.full(3, np.nan)
+    """Moves of the interpreter: whether at feed, and where the machine goes (mm): all offsets are added."""
+    unit, zero, moves, last, plane = 1.0, {}, [], np.full(3, np.nan), 2
     for line in interpreted(program, folder).splitlines():
         found = re.search(r"([A-Z_0-9]+)\((.*)\)", line)
         name, text = (found[1], found[2]) if found else ("", "")
@@ -233,23 +234,30 @@ def machine_moves(program, folder):
         elif name in ("SET_G5X_OFFSET", "SET_G92_OFFSET", "USE_TOOL_LENGTH_OFFSET"):
             numbers = [float(part) for part in re.split("[, ]+", text)]
             zero[name] = np.array(numbers[1:4] if name == "SET_G5X_OFFSET" else numbers[:3]) * unit
-        elif name.startswith("STRAIGHT_"):
-            end = np.array([float(part) for part in text.split(",")[:3]]) * unit + sum(zero.values())
-            if not np.abs(end - last).max() < MICRON:
-                moves.append((name == "STRAIGHT_FEED", end))
+        elif name == "SELECT_PLANE":
+            plane = {"XY": 2, "XZ": 1, "YZ": 0}[text.removeprefix("CANON_PLANE_")]
+        elif name.startswith("STRAIGHT_") or name == "ARC_FEED":
+            numbers = [float(part) for part in text.split(",")[:6]]
+            if name == "ARC_FEED":
+                a, b = PLANE_AXES[plane]
+                found = {a: numbers[0], b: numbers[1], plane: numbers[5]}
+                numbers = [found[k] for k in range(3)]
+            end = np.array(numbers[:3]) * unit + sum(zero.values())
+            if name == "ARC_FEED" or not np.abs(end - last).max() < MICRON:
+                moves.append((name != "STRAIGHT_TRAVERSE", end))
             last = end
     return moves
 
 
-def our_machine_moves(text):
-    """The same of our reader, and the moves themselves."""
-    every, found, last = (
-        Reader(mill(), DIALECTS["linuxcnc"], SETUP, "p").batch(text.encode(), 1).moves,
-        [],
-        np.full(3, np.nan),
-    )
-    for end, feed in zip(every.end_mm, every.cutting, strict=True):
-        if not np.abs(end - last).max() < MICRON:
+def our_machine_moves(text, *, follower=False):
+    """The same of our reader, or of the follower that it is held against, and the moves themselves."""
+    if follower:
+        every = Follower("linuxcnc", SETUP, mill()).follow(text, range(1, text.count("\n") + 2))
+    else:
+        every = Reader(mill(), DIALECTS["linuxcnc"], SETUP, "p").batch(text.encode(), 1).moves
+    found, last = [], np.full(3, np.nan)
+    for end, feed, sweep in zip(every.end_mm, every.cutting, every.sweep_rad, strict=True):
+        if sweep or not np.abs(end - last).max() < MICRON:
             found.append((bool(feed), end))
         last = end
     return found, every
@@ -264,7 +272,7 @@ def without_header(text):
     return "\n".join(line for line in text.splitlines() if not re.match(r"o<|\(abort|\(CORRECTED", line)) + "\n"
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", range(16))
 def test_holes_are_where_the_interpreter_drills_them_whatever_changes_between_them(
     tmp_path, seed, make_errors, monkeypatch
 ):
@@ -296,6 +304,21 @@ def test_holes_are_where_the_interpreter_drills_them_whatever_changes_between_th
     assert before > 5 * PRINTED_MM
     # rapid moves lead where the program led, but for the correction
     assert np.abs(driven[-1][1] - truth[-1][1]).max() < 3 * before
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("program_of", [random_program, random_holes])
+def test_the_follower_goes_where_the_interpreter_goes(tmp_path, seed, program_of, monkeypatch):
+    """It shares nothing with the reader; alone, it finds every move of the interpreter."""
+    if seed % 2:
+        monkeypatch.setattr("compgen.programs.follower._LEAST_RUN", 1)
+    program = tmp_path / "p.ngc"
+    program.write_text(program_of(seed + 100))
+    found, _ = our_machine_moves(program.read_text(), follower=True)
+    truth = machine_moves(program, tmp_path)
+    assert [feed for feed, _ in found] == [feed for feed, _ in truth]
+    for k, ((_, end), (_, there)) in enumerate(zip(found, truth, strict=True)):
+        assert np.abs(end - there).max(where=~np.isnan(end), initial=0.0) < PRINTED_MM, (k, end, there)
 
 
 def test_a_cycle_keeps_its_numbers_from_increments_to_absolute(tmp_path):

@@ -1,0 +1,996 @@
+"""A second reading of NC programs: where a control goes by a text, from that text and what is set at the control alone.
+
+It shares no state, no table of codes and no splitting into words with :mod:`compgen.programs.reader`, by which programs are
+corrected: what that takes a program for, and what was written from it, is held against the moves that are found here. It
+explains nothing: what cannot be followed has been refused by the reader before. Numbers of drilling cycles are kept as the
+program gives them, and become heights when a hole is drilled.
+"""
+
+from __future__ import annotations
+
+import cmath
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.csv_files import FloatArray
+from compgen.data.machine import Machine, Vector3
+from compgen.errors import InputError
+from compgen.programs.path import CCW, CW, FEED, RAPID, IntArray, Moves
+from compgen.programs.reader import Batch, Reader, Setup
+
+Place = list[float]
+_NOWHERE = (math.nan,) * 3
+#: Heights that differ by less are one, mm: sums of the same numbers in another order.
+_ROUNDED_MM = 1e-7
+#: Dialects that begin a program in mm, whatever the unit of the machine is.
+_STARTS_IN_MM = ("heidenhain-iso", "grbl")
+_NUMBER = r"(?:[-+]\s*+)?(?:\d++\.?\d*+|\.\d++)"
+
+# Words: name and value. What is no word (comments, texts) is left out. Blanks and digits are taken once and for all (possessive).
+
+_PLAIN = re.compile(rf"\([^()\n]*+\)|;[^\n]*+|(?P<name>[A-Z])\s*+(?P<number>{_NUMBER})")
+_HEIDENHAIN = re.compile(
+    rf";[^\n]*+|(?P<name>Q\d++(?=\s*+=)|P\d\d(?=[\s+-])|D[LR](?=\s*+[-+])|[A-Z])\s*+=?\s*+"
+    rf"(?:(?P<number>{_NUMBER})|\"(?P<text>[^\"\n]*+)\")"
+    r"|(?P<word>[A-Z_]\w*+)",
+    re.IGNORECASE,
+)
+_SIEMENS = re.compile(
+    r";[^\n]*+"
+    r"|(?P<name>[XYZ]1(?=\s*+=)|[SM]\d++(?=\s*+=)|[A-Z_]{2}\w*+\s*+(?:\[[^\]\n]*+\]\s*+)?(?==)|[A-Z](?=\s*+[-+=.\d]))\s*+=?\s*+"
+    rf"(?:(?P<mode>AC|IC|DC|ACP|ACN)\s*+\(\s*+(?P<inner>{_NUMBER})\s*+\)|\"(?P<text>[^\"\n]*+)\"|(?P<number>{_NUMBER}))"
+    r"|(?P<call>[A-Z_]\w*+)\s*+\((?P<inside>(?:\"[^\"\n]*+\"|[^()\"\n]|\([^()\n]*+\))*+)\)"
+    r"|(?P<word>[A-Z_]\w*+)",
+    re.IGNORECASE,
+)
+#: Numbers of codes that are written as they are named.
+_SHORT = frozenset(str(k) for k in range(1000))
+_LEXERS = {"siemens": _SIEMENS, "heidenhain-iso": _HEIDENHAIN}
+
+
+@dataclass
+class _Words:
+    """The words of a block: codes in order, numbers by address, addresses with a mode of their own, calls with their text."""
+
+    codes: list[str] = field(default_factory=list)
+    number: dict[str, float] = field(default_factory=dict)
+    mode: dict[str, str] = field(default_factory=dict)
+    name: str = ""
+    call: tuple[str, str] | None = None
+
+    @staticmethod
+    def of(text: str, dialect: str) -> _Words:
+        """Split a block."""
+        found = _Words()
+        if dialect not in _LEXERS:
+            for name, value in _PLAIN.findall(text.upper()):
+                if name:
+                    found._put(name, value)
+            return found
+        for word in _LEXERS[dialect].finditer(text):
+            part = word.groupdict()
+            if part.get("call"):
+                found.call = part["call"].upper(), part["inside"]
+                found.codes.append(found.call[0])
+            elif part.get("word"):
+                found.codes.append(part["word"].upper())
+            elif part["name"]:
+                found._take(part["name"].upper(), part)
+        return found
+
+    def _take(self, name: str, part: dict[str, str | None]) -> None:
+        if part.get("text") is not None:
+            self.name = str(part["text"]).upper() if name == "T" else self.name
+            return
+        if part.get("mode") and name not in self.number:
+            self.mode[name] = str(part["mode"]).upper()
+        self._put(name, part["number"] or part.get("inner") or "nan")
+
+    def _put(self, name: str, text: str) -> None:
+        try:
+            value = float(text)
+        except ValueError:  # a blank between the sign and the digits
+            value = float("".join(text.split()))
+        if name in ("G", "M"):
+            self.codes.append(name + (text if text in _SHORT else f"{value:g}"))
+        elif name not in self.number:
+            self.number[name] = value
+
+    def axes(self) -> list[float | None]:
+        """Numbers of X, Y and Z."""
+        get = self.number.get
+        return [get("X", get("X1")), get("Y", get("Y1")), get("Z", get("Z1"))]
+
+
+# Blocks in a row of nothing but places, and the fewest that are followed together.
+
+_LEAST_RUN = 8
+
+_COMMENTS = {"fanuc": r"\([^()\n]*+\)", "siemens": r";[^\n]*+", "heidenhain-iso": r";[^\n]*+"}
+_OTHER_COMMENTS = r"\([^()\n]*+\)|;[^\n]*+"
+
+
+def _runs(dialect: str) -> re.Pattern[str]:
+    """The pattern of such blocks; of HEIDENHAIN without arcs, whose centre is a pole."""
+    straight = dialect == "heidenhain-iso"
+    place = rf"(?:[XYZ{'' if straight else 'IJKR'}FS][+-]?(?:\d++\.?\d*+|\.\d++)|M0?[345789](?![\d.]))[ ]*+"
+    head = rf"(?:N\d++[ ]*+)?(?:G0?[0-{1 if straight else 3}](?![\d.])[ ]*+)?"
+    tail = rf"(?:[*;][ ]*+)?(?:(?:{_COMMENTS.get(dialect, _OTHER_COMMENTS)})[ ]*+)*+"
+    return re.compile(rf"(?:^{head}(?:{place})*+{tail}\r?\n)+", re.MULTILINE | re.IGNORECASE)
+
+
+_BLANK_LETTERS = bytes(32 if chr(k).isalpha() or chr(k) in "*;" else k for k in range(256))
+_COLUMN_OF = np.array([b"XYZIJKR".find(bytes([k])) for k in range(256)])
+
+
+def _places(given_mm: FloatArray, at: FloatArray, zero: FloatArray, *, relative: bool) -> FloatArray:
+    """Places (n + 1, 3) before the first block and after each, from the numbers (n, 3) of the blocks."""
+    if relative:
+        return np.cumsum(np.vstack([at, np.nan_to_num(given_mm)]), axis=0)
+    every = np.vstack([at, given_mm + zero])
+    last = np.maximum.accumulate(np.where(np.isnan(every), 0, np.arange(len(every))[:, None]))
+    return np.take_along_axis(every, last, axis=0)
+
+
+# What the codes of each dialect do to a position, with a number. A code that is not here does nothing to it.
+
+_Does = dict[str, tuple[str, float]]
+
+
+def _each(what: str, *codes: object, number: float = 0.0) -> _Does:
+    """Codes that do the same; a number is that of a G code."""
+    return {code if isinstance(code, str) else f"G{code}": (what, number) for code in codes}
+
+
+_EVERYWHERE: _Does = {
+    **{f"G{k}": ("go", float(k)) for k in range(4)},
+    **{"G17": ("plane", 2.0), "G18": ("plane", 1.0), "G19": ("plane", 0.0)},
+    **{"G90": ("relative", 0.0), "G91": ("relative", 1.0), "G4": ("quiet", 0.0)},
+}
+_COMMON: _Does = {
+    **_EVERYWHERE,
+    **{"G20": ("unit", 25.4), "G21": ("unit", 1.0)},
+    **_each("fixture", *range(54, 60)),
+    **_each("machine", 53),
+    **_each("home", 28, 30),
+    **_each("no length", 49),
+    **_each("end", 80),
+    **_each("preset", 92),
+    **_each("no preset", 92.1),
+}
+_GRBL: _Does = {**_COMMON, **_each("store", 28.1, 30.1), **_each("typed length", 43.1)}
+_CYCLES: _Does = {
+    **{f"G{k}": ("cycle", float(k)) for k in (73, 81, 82, 83, 85, 86, 89)},
+    **{"G98": ("to R", 0.0), "G99": ("to R", 1.0), "G43": ("length", 0.0)},
+}
+#: How a shift counts: in place of that of the named axes, of all axes, further, or not at all.
+_NAMED, _ANEW, _MORE, _OFF = range(4)
+_TABLES: dict[str, _Does] = {
+    "grbl": _GRBL,
+    "linuxcnc": {
+        **_GRBL,
+        **_CYCLES,
+        **_each("no preset", 92.2),
+        **_each("offset", 52),
+        **{"G90.1": ("centre", 1.0), "G91.1": ("centre", 0.0)},
+        **_each("fixture", 59.1, 59.2, 59.3),
+    },
+    "fanuc": {
+        **_COMMON,
+        **_CYCLES,
+        **{"G74": ("cycle", 84.0), "G84": ("cycle", 84.0), "G76": ("cycle", 86.0), "G88": ("cycle", 86.0)},
+        **_each("fixture", *range(110, 130), 154, 54.1),
+        **_each("frame", 52),
+        **_each("quiet", 5, 5.1, 8, 103, 187, 22, 23, 25, 26, 54.2, 54.4),
+    },
+    "siemens": {
+        **_EVERYWHERE,
+        **{"G70": ("unit", 25.4), "G700": ("unit", 25.4), "G71": ("unit", 1.0), "G710": ("unit", 1.0)},
+        **_each("fixture", *range(54, 60), *range(505, 600)),
+        **_each("no fixture", 500),
+        **_each("machine", 53, 153, "SUPA"),
+        **_each("lost", 74, 75),
+        **_each("quiet", 25, 26),
+        **_each("modally", "MCALL"),
+        **_each("turn", "CYCLE800"),
+        **_each("frame", "TRANS", number=_ANEW),
+        **_each("frame", "ATRANS", number=_MORE),
+        **_each("frame", "ROT", "SCALE", "MIRROR", number=_OFF),
+        **_each("define", *(f"CYCLE{k}" for k in (*range(81, 90), 840))),
+    },
+    "heidenhain-iso": {
+        **_EVERYWHERE,
+        **{"G70": ("unit", 25.4), "G71": ("unit", 1.0)},
+        **_each("pole", 29),
+        **_each("again", 5),
+        **_each("once", "FMAX"),
+        **_each("quiet", 30, 31, 62, 36, 51, 98),
+        **_each("frame", 54),
+        **_each("tool", 99),
+        **_each("hole", 79, "M99"),
+        **_each("modally", "M89"),
+        **_each("machine", "M91"),
+        **_each("define", 83, 84, 85, *range(200, 300)),
+    },
+}
+#: What takes the words of its block for itself, so that they are no move.
+_TAKES_WORDS = {"quiet", "frame", "offset", "typed length", "store", "turn", "tool"}
+_ENDS = {"siemens": ("M2", "M17", "M30")}
+#: Cycles that leave the depth at feed, and where the arguments of a cycle of SINUMERIK say what its depth counts from.
+_BACK_AT_FEED = {"CYCLE84", "CYCLE840", "CYCLE85", "CYCLE89", "G84", "G85", "G201", "G202", "G206", "G207", "G209"}
+_DEPTH_MODE = {"CYCLE81": 8, "CYCLE82": 8, "CYCLE83": 19, "CYCLE84": 23, "CYCLE840": 19, "CYCLE85": 10, "CYCLE86": 13}
+
+
+@dataclass
+class _Hole:
+    """A cycle that one block defines: its name and numbers."""
+
+    name: str
+    number: dict[str, float]
+
+    @staticmethod
+    def of_call(name: str, inside: str) -> _Hole:
+        """Return a cycle of SINUMERIK from the text between its parentheses."""
+        parts = [part.strip() for part in inside.split(",")]
+        given = {k: float(re.sub(r"\s", "", part)) for k, part in enumerate(parts) if re.fullmatch(_NUMBER, part)}
+        names = {0: "RTP", 1: "RFP", 2: "SDIS", 3: "DP", 4: "DPR", _DEPTH_MODE.get(name, -1): "AMODE"}
+        return _Hole(name, {names[k]: value for k, value in given.items() if k in names})
+
+    def heights(self, start: float) -> tuple[float, float, float]:
+        """Where feed begins and ends, and where the tool is left; ``start`` is where it is before."""
+        n = self.number
+        if self.name.startswith("CYCLE"):
+            from_plane = "DPR" in n if n.get("AMODE", 0.0) % 10 == 0 else n["AMODE"] % 10 == 1
+            reference = n.get("RFP", 0.0)
+            depth = reference - abs(n.get("DPR", 0.0)) if from_plane else n.get("DP", 0.0)
+            return reference + abs(n.get("SDIS", 0.0)), depth, n.get("RTP", 0.0)
+        if "P02" in n:
+            return start, start + n.get("P01", 0.0) + n["P02"], start
+        top = n.get("Q203", 0.0)
+        return top + n.get("Q200", 0.0), top + n.get("Q201", 0.0), top + max(n.get("Q200", 0.0), n.get("Q204", 0.0))
+
+
+@dataclass
+class _Series:
+    """Numbers of a drilling cycle of G codes, as the program gives them, from its first block to its end."""
+
+    kind: int
+    #: Z of the program at the first hole, and the machine position of its zero there (mm).
+    level: float
+    zero: float
+    z: float = math.nan
+    r: float = math.nan
+    q: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What the codes of a block do, whether it then moves, ends the program, and leaves zero and tool as they are."""
+
+    does: list[tuple[str, str, float]]
+    kinds: frozenset[str]
+    executes: bool
+    ends: bool
+    only_goes: bool
+
+
+class Follower:
+    """Follows the blocks of a program in order: ``at`` is where the axes of the machine are (mm), nan if that is not known.
+
+    Of the machine it takes where G28 leads, and the tool while no tool length is active.
+    """
+
+    def __init__(self, dialect: str, setup: Setup, machine: Machine) -> None:
+        self.dialect, self.setup, self.bare_tool_mm = dialect, setup, machine.tool_offset_mm
+        self.table = _TABLES[dialect]
+        self.linuxcnc, self.heidenhain = dialect == "linuxcnc", dialect == "heidenhain-iso"
+        self.at: Place = [math.nan] * 3
+        self.homes = {"G28": list(machine.reference_place_mm), "G30": [math.nan] * 3}
+        self.fixture: Sequence[float] = setup.work_offsets_mm.get("PRESET" if self.heidenhain else "G54", _NOWHERE)
+        self.preset, self.frame, self.length = [0.0] * 3, [0.0] * 3, [0.0] * 3
+        self.lengthened = False
+        self.lengths = dict(setup.tools_mm)
+        self.spindle = self.chosen = ""
+        self.unit = 25.4 if dialect not in _STARTS_IN_MM and machine.units == "inch" else 1.0
+        self.relative, self.plane, self.centre_from_zero = False, 2, False
+        self.motion: int | None = 0 if dialect == "grbl" else None
+        self.turned: int | None = None
+        self.pole: Place = [math.nan] * 3
+        self.series: _Series | None = None
+        self.to_r = self.linuxcnc
+        self.hole: _Hole | None = None
+        self.modally = False
+        self.done = self.moved = self.percent = False
+        self.number = 0
+        self.runs, self.comments = _runs(dialect), re.compile(_COMMENTS.get(dialect, _OTHER_COMMENTS))
+        #: Moves, and the zeros and tools in force, of which each move has the number.
+        self.rows: list[tuple[float, ...]] = []
+        self.zeros: list[tuple[float, ...]] = []
+        self.zero_changed = True
+        self.plans: dict[tuple[str, ...], _Plan] = {}
+
+    def follow(self, text: str, numbers: Sequence[int]) -> Moves:
+        """Follow blocks, each with its number; returns their moves."""
+        parts: list[Moves] = []
+        at = line = 0
+        for run in self.runs.finditer(text):
+            if run[0].count("\n") < _LEAST_RUN:
+                continue
+            line = self._singles(text[at : run.start()], numbers, line)
+            at, rest = run.end(), run[0]
+            for _ in range(min(3, rest.count("\n"))):  # the first blocks may place the axes
+                found = self._run(rest, np.asarray(numbers[line : line + rest.count("\n")]))
+                if found is not None:
+                    parts += [self._taken(), found]
+                    line, rest = line + rest.count("\n"), ""
+                    break
+                first, newline, rest = rest.partition("\n")
+                line = self._singles(first + newline, numbers, line)
+            line = self._singles(rest, numbers, line)
+        self._singles(text[at:], numbers, line)
+        return Moves.joined([*parts, self._taken()])
+
+    def _singles(self, text: str, numbers: Sequence[int], line: int) -> int:
+        """Follow blocks one by one, of which ``line`` is the index of the first; returns that of the next."""
+        every = text.split("\n")
+        if not every[-1]:
+            every.pop()
+        for k, block in enumerate(every, line):
+            if not self.done and block.strip():
+                self.number = numbers[k]
+                self._block(block)
+        return line + len(every)
+
+    def _taken(self) -> Moves:
+        """Moves of the rows since the last call."""
+        data = np.array(self.rows).reshape(len(self.rows), 14)
+        known = np.array(self.zeros).reshape(len(self.zeros), 6)
+        self.rows, self.zeros = [], []
+        zero, tool = np.split(known[data[:, 13].astype(np.int64)], 2, axis=1)
+        start, end, centre = (data[:, k : k + 3] for k in (4, 7, 10))
+        number, kind, plane = data[:, :3].astype(np.int64).T
+        every = np.ones((len(data), 3), dtype=bool)
+        return Moves(number, kind, start, end, centre, plane, data[:, 3], zero, tool, end, every)
+
+    # Where the zero of the program is, and moves from where the machine is.
+
+    def _zero(self, k: int) -> float:
+        return self.fixture[k] + self.frame[k] + self.preset[k] + self.length[k]
+
+    def _tool(self) -> Vector3:
+        if not self.lengthened:
+            return self.bare_tool_mm
+        x, y, z = (gauge - length for gauge, length in zip(self.setup.gauge_mm, self.length, strict=True))
+        return x, y, z
+
+    def _to(self, kind: int, end: Sequence[float], centre: Sequence[float] = _NOWHERE, sweep: float = 0.0) -> None:
+        if self.zero_changed or not self.zeros:
+            self.zeros.append((self._zero(0), self._zero(1), self._zero(2), *self._tool()))
+            self.zero_changed = False
+        place = len(self.zeros) - 1
+        self.rows.append((self.number, kind, self.plane, sweep, *self.at, *end, *centre, place))
+        self.at, self.moved = list(end), True
+
+    def _reached(self, words: _Words, axes: Sequence[float | None]) -> Place:
+        """Where axis words lead."""
+        end = list(self.at)
+        for k, value in enumerate(axes):
+            if value is not None:
+                mode = words.mode.get("XYZ"[k])
+                from_here = self.relative if mode is None else mode == "IC"
+                end[k] = (self.at[k] if from_here else self._zero(k)) + value * self.unit
+        return end
+
+    # Blocks.
+
+    def _block(self, text: str) -> None:
+        body = text.strip()
+        if body[0] == "/":
+            if self.setup.skip_deleted:
+                return
+            body = re.sub(r"^/\d?\s*", "", body)
+        if body[0] in "<N:%*n" if body else False:
+            bare = re.sub(r"^(?:N\s*\d+|<[^<>\n]*>)\s*", "", body, flags=re.IGNORECASE)
+            if bare.startswith("%"):
+                return self._percent(bare)
+            if self.heidenhain and bare.startswith("*"):
+                return None
+            body = bare
+        words = _Words.of(body, self.dialect)
+        if self.heidenhain and any(name[0] == "Q" and name[1:].isdigit() for name in words.number):
+            return self._definition(words)
+        if words.codes or "T" in words.number or "D" in words.number or "H" in words.number or words.name:
+            return self._act(words)
+        return self._execute(words, frozenset())
+
+    def _percent(self, body: str) -> None:
+        if self.heidenhain:
+            unit = re.search(r"\bG7([01])\b", body)
+            self.unit = self.unit if unit is None else (25.4 if unit[1] == "0" else 1.0)
+            self.done = self.moved
+        elif self.dialect != "siemens":
+            self.done = self.percent or self.moved
+        self.percent = True
+
+    def _definition(self, words: _Words) -> None:
+        """A cycle from G200, or more of its numbers."""
+        code = next((code for code in words.codes if re.fullmatch(r"G2\d\d", code)), None)
+        if code:
+            self.hole, self.modally = _Hole(code, {}), False
+        if self.hole is not None:
+            self.hole = _Hole(self.hole.name, {**self.hole.number, **words.number})
+
+    def _act(self, words: _Words) -> None:
+        plan = self.plans.get(tuple(words.codes)) or self._plan(tuple(words.codes))
+        for _, kind, number in plan.does:
+            if kind == "unit":
+                self.unit = number
+            elif kind == "relative":
+                self.relative = number > 0
+        if not plan.only_goes or "T" in words.number or "D" in words.number or "H" in words.number or words.name:
+            self.zero_changed = True
+            self._change_tool(words)
+        for code, kind, number in plan.does:
+            self._state(code, kind, number, words)
+        if self.zero_changed and not (self.heidenhain and plan.kinds & {"quiet", "tool"}):
+            self._call_length(words)
+        if plan.executes:
+            self._execute(words, plan.kinds)
+        self.done = self.done or plan.ends
+
+    def _plan(self, codes: tuple[str, ...]) -> _Plan:
+        """What the codes of a block do."""
+        does = [(code, *self.table[code]) for code in codes if code in self.table]
+        kinds = frozenset(kind for _, kind, _ in does)
+        takes = _TAKES_WORDS | ({"no preset"} if self.dialect == "fanuc" else set())
+        executes = not kinds & takes and (self.heidenhain or "modally" not in kinds)
+        ends = bool(set(codes) & set(_ENDS.get(self.dialect, ("M2", "M30"))))
+        self.plans[codes] = _Plan(
+            does, kinds, executes, ends, kinds <= {"go", "plane", "relative", "quiet"} and "M6" not in codes
+        )
+        return self.plans[codes]
+
+    def _change_tool(self, words: _Words) -> None:
+        if self.heidenhain:
+            return
+        self.chosen = f"{words.number['T']:g}" if "T" in words.number else words.name or self.chosen
+        if "M6" in words.codes:
+            self.spindle = self.chosen
+
+    def _state(self, code: str, kind: str, number: float, words: _Words) -> None:
+        """Take over what a code changes without a move."""
+        if kind == "plane":
+            self.plane = int(number)
+        elif kind == "centre":
+            self.centre_from_zero = number > 0
+        elif kind == "to R":
+            self.to_r = number > 0
+        elif kind in ("fixture", "no fixture"):
+            self.fixture = (0.0, 0.0, 0.0) if kind == "no fixture" else self._fixture(code, words.number.get("P"))
+        elif kind.endswith("length"):
+            self._set_length(kind, words)
+        elif kind in ("frame", "offset", "no preset", "store"):
+            self._set_zero(code, kind, number, words)
+        elif kind == "turn" and words.call and words.call[1].strip():
+            self.at = [math.nan] * 3
+        elif kind in ("define", "modally", "tool"):
+            self._set_hole(code, kind, words)
+        elif kind == "end":
+            self.series, self.motion = None, self.motion if self.dialect == "fanuc" else None
+        elif kind == "again":
+            self.motion = self.turned
+        elif kind == "go":
+            self.motion, self.series = int(number), None
+            self.turned = self.motion if self.motion in (CW, CCW) else self.turned
+
+    def _fixture(self, code: str, given: float | None) -> Sequence[float]:
+        if self.dialect == "fanuc" and given is not None and code in ("G54", "G54.1", "G154"):
+            code = f"{'G154' if code == 'G154' else 'G54.1'}P{given:g}"
+        return self.setup.work_offsets_mm.get(code, _NOWHERE)
+
+    def _set_length(self, kind: str, words: _Words) -> None:
+        if kind == "no length":
+            self._lengthen("0")
+        elif kind == "length":
+            self._lengthen(f"{words.number['H']:g}" if "H" in words.number else self.spindle)
+        else:
+            typed = zip(words.axes(), self.length, strict=True)
+            self.length, self.lengthened = [old if v is None else v * self.unit for v, old in typed], True
+
+    def _set_zero(self, code: str, kind: str, number: float, words: _Words) -> None:
+        if kind == "no preset":
+            self.preset = [0.0] * 3
+            self.frame = [0.0] * 3 if self.dialect == "fanuc" else self.frame
+        elif kind == "store":
+            self.homes[code[:3]] = list(self.at)
+        elif kind == "offset":
+            self.preset = [
+                old if v is None else v * self.unit for v, old in zip(words.axes(), self.preset, strict=True)
+            ]
+        else:
+            self._shift(_MORE if self.heidenhain and self.relative else int(number), words.axes())
+
+    def _set_hole(self, code: str, kind: str, words: _Words) -> None:
+        if kind == "tool":
+            self.lengths[f"{words.number.get('T', 0.0):g}"] = (0.0, 0.0, words.number.get("L", 0.0) * self.unit)
+        elif kind == "modally":
+            self.modally = self.heidenhain or words.call is not None
+        else:
+            self.hole = _Hole.of_call(*words.call) if words.call else _Hole(code, dict(words.number))
+            self.modally = self.modally and not self.heidenhain
+
+    def _shift(self, how: int, axes: Sequence[float | None]) -> None:
+        kept = [0.0] * 3 if how in (_ANEW, _OFF) else self.frame
+        added = kept if how == _MORE else [0.0] * 3
+        self.frame = [
+            old if v is None else v * self.unit + more for v, old, more in zip(axes, kept, added, strict=True)
+        ]
+
+    def _call_length(self, words: _Words) -> None:
+        """Lengths that come with a tool, and with H alone."""
+        numbers = words.number
+        if self.heidenhain:
+            tool = f"{numbers['T']:g}" if "T" in numbers else words.name
+            if tool:
+                self._lengthen(tool, numbers.get("DL", 0.0) * self.unit)
+        elif self.dialect == "siemens":
+            tool, edge = self.spindle or self.chosen, numbers.get("D")
+            if edge is not None:
+                self._lengthen(tool if edge == 1.0 else "0" if edge == 0.0 else f"{tool}D{edge:g}")
+            elif "M6" in words.codes and self.spindle:
+                self._lengthen(self.spindle)
+        elif "H" in numbers and "G43" not in words.codes and self.lengthened:
+            self._lengthen(f"{numbers['H']:g}")
+
+    def _lengthen(self, tool: str, longer_mm: float = 0.0) -> None:
+        if tool == "0":
+            self.length, self.lengthened = [0.0] * 3, False
+        else:
+            x, y, z = self.lengths.get(tool, _NOWHERE)
+            self.length, self.lengthened = [x, y, z + longer_mm], True
+
+    # Moves.
+
+    def _run(self, text: str, numbers: IntArray) -> Moves | None:
+        """Follow many blocks that have nothing but numbers of places and G0 to G3; None if that cannot be done now."""
+        at, zero, before = np.array(self.at), np.array([self._zero(k) for k in range(3)]), self.motion
+        blocked = self.series is not None or self.modally or self.done or before is None
+        if blocked or before is None or np.isnan([at, zero]).any() or (self.heidenhain and before > FEED):
+            return None
+        if "(" in text or ";" in text:
+            text = self.comments.sub(lambda comment: " " * len(comment[0]), text)
+        raw = text.upper().encode("latin-1")
+        code = np.frombuffer(raw, dtype=np.uint8)
+        where = np.flatnonzero((code >= ord("A")) & (code <= ord("Z")))
+        value, name, line = (
+            np.array(raw.translate(_BLANK_LETTERS).split(), dtype=np.float64),
+            code[where],
+            np.cumsum(code == 10)[where],
+        )
+        given = np.full((len(numbers), 7), np.nan)
+        column = _COLUMN_OF[name]
+        given[line[column >= 0], column[column >= 0]] = value[column >= 0]
+        own = np.full(len(numbers), -1)
+        own[line[name == ord("G")]] = value[name == ord("G")]
+        motion = np.append(before, own)[np.maximum.accumulate(np.where(own >= 0, np.arange(1, len(own) + 1), 0))]
+        place = _places(given[:, :3] * self.unit, at, zero, relative=self.relative)
+        moving, centred = ~np.isnan(given[:, :3]).all(axis=1), ~np.isnan(given[:, 3:6]).all(axis=1)
+        rows = np.flatnonzero(moving | (centred & (motion >= CW)))
+        start, end = place[:-1][rows], place[1:][rows]
+        centre, sweep = np.full((len(rows), 3), np.nan), np.zeros(len(rows))
+        arcs = np.flatnonzero(motion[rows] >= CW)
+        if len(arcs):
+            centre[arcs], sweep[arcs] = self._turns(
+                motion[rows][arcs], start[arcs], end[arcs], given[rows[arcs], 3:], zero
+            )
+        self.at, self.motion, self.moved = place[-1].tolist(), int(motion[-1]), self.moved or len(rows) > 0
+        turned = motion[own >= CW]
+        self.turned = int(turned[-1]) if len(turned) else self.turned
+        same = [np.broadcast_to(np.array(one), end.shape) for one in (zero, self._tool(), np.ones(3, dtype=bool))]
+        return Moves(
+            numbers[rows],
+            motion[rows],
+            start,
+            end,
+            centre,
+            np.full(len(rows), self.plane),
+            sweep,
+            same[0],
+            same[1],
+            end,
+            same[2],
+        )
+
+    def _turns(
+        self, motion: IntArray, start: FloatArray, end: FloatArray, given: FloatArray, zero: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Centres (n, 3) and signed angles (n,) of arcs; ``given`` are I, J, K and R. As :meth:`_turn` does one."""
+        first, second = (self.plane + 1) % 3, (self.plane + 2) % 3
+        a, b = start[:, first] + 1j * start[:, second], end[:, first] + 1j * end[:, second]
+        sense, radius = np.where(motion == CCW, 1.0, -1.0), given[:, 3]
+        base = np.broadcast_to(zero, start.shape) if self.centre_from_zero else start
+        middle = base[:, [first, second]] + np.nan_to_num(given[:, [first, second]]) * self.unit
+        centre = middle[:, 0] + 1j * middle[:, 1]
+        by_radius = np.flatnonzero(~np.isnan(radius))
+        chord, r = (b - a)[by_radius], radius[by_radius]
+        height = np.sqrt(np.maximum((r * self.unit) ** 2 - 0.25 * np.abs(chord) ** 2, 0.0))
+        side = np.where(r > 0.0, sense[by_radius], -sense[by_radius])
+        centre[by_radius] = 0.5 * (a + b)[by_radius] + 1j * side * height * chord / np.abs(chord)
+        angle = np.angle((b - centre) / (a - centre)) * sense % (2.0 * np.pi)
+        angle[(np.abs(b - a) < 1e-9) | (angle == 0.0)] = 2.0 * np.pi
+        found = np.full(start.shape, np.nan)
+        found[:, first], found[:, second] = centre.real, centre.imag
+        return found, sense * angle
+
+    def _execute(self, words: _Words, kinds: frozenset[str]) -> None:
+        axes = words.axes()
+        moving = any(axis is not None for axis in axes)
+        if "home" in kinds or "lost" in kinds:
+            self._go_home(words, axes)
+        elif "preset" in kinds:
+            self._take_as(axes)
+        elif "hole" in kinds or ("define" in kinds and words.call is not None) or (self.modally and moving):
+            self._drill_there(words, axes, moving)
+            self.modally = self.modally and "M99" not in words.codes
+        elif "machine" in kinds:
+            if moving:
+                self._to(RAPID, [here if v is None else v * self.unit for v, here in zip(axes, self.at, strict=True)])
+        elif "cycle" in kinds or (self.series is not None and (moving or "R" in words.number)):
+            self._drill(words, axes, moving)
+        else:
+            self._go(words, axes, moving, kinds)
+
+    def _go(self, words: _Words, axes: Sequence[float | None], moving: bool, kinds: frozenset[str]) -> None:
+        centred = [words.number.get(letter) for letter in "IJK"]
+        if self.heidenhain:
+            for k, value in enumerate(centred):
+                if value is not None:
+                    self.pole[k] = (self.at[k] if self.relative else self._zero(k)) + value * self.unit
+                elif "pole" in kinds:
+                    self.pole[k] = self.at[k]
+            centred = [None] * 3
+        turning = self.motion in (CW, CCW) and "once" not in kinds
+        if turning and (moving or any(value is not None for value in centred)):
+            self._turn(words, self._reached(words, axes), centred)
+        elif moving and self.motion is not None:
+            self._to(RAPID if "once" in kinds else self.motion, self._reached(words, axes))
+
+    def _turn(self, words: _Words, end: Place, centred: Sequence[float | None]) -> None:
+        """An arc, as complex numbers in its plane."""
+        first, second = (self.plane + 1) % 3, (self.plane + 2) % 3
+        start, stop = complex(self.at[first], self.at[second]), complex(end[first], end[second])
+        sense = 1.0 if self.motion == CCW else -1.0
+        radius = words.number.get("CR", words.number.get("R"))
+        if radius is not None:
+            chord = stop - start
+            height = math.sqrt(max((radius * self.unit) ** 2 - 0.25 * abs(chord) ** 2, 0.0))
+            side = sense if radius > 0.0 else -sense
+            middle = 0.5 * (start + stop) + 1j * side * height * chord / abs(chord)
+        else:
+            middle = complex(*(self._centre(words, centred[k], k) for k in (first, second)))
+        angle = cmath.phase((stop - middle) / (start - middle)) * sense % (2.0 * math.pi)
+        if abs(stop - start) < 1e-9 or angle == 0.0:
+            angle = 2.0 * math.pi
+        turns = words.number.get("TURN", words.number.get("P", 1.0) - 1.0 if self.linuxcnc else 0.0)
+        centre = list(_NOWHERE)
+        centre[first], centre[second] = middle.real, middle.imag
+        self._to(CCW if sense > 0 else CW, end, centre, sense * (angle + 2.0 * math.pi * turns))
+
+    def _centre(self, words: _Words, value: float | None, k: int) -> float:
+        if self.heidenhain:
+            return self.pole[k]
+        mode = words.mode.get("IJK"[k])
+        from_zero = self.centre_from_zero if mode is None else mode == "AC"
+        return (self._zero(k) if from_zero else self.at[k]) + (value or 0.0) * self.unit
+
+    def _go_home(self, words: _Words, axes: Sequence[float | None]) -> None:
+        code = next((code for code in ("G28", "G30") if code in words.codes), "")
+        named = [axis is not None for axis in axes]
+        if not any(named):
+            if self.dialect == "fanuc" or not code:
+                return
+            named = [True] * 3
+        if code:
+            known = [
+                axis if not (self.relative and math.isnan(here)) else None
+                for axis, here in zip(axes, self.at, strict=True)
+            ]
+            self._to(RAPID, self._reached(words, known))
+        home = self.homes.get(code, [math.nan] * 3)
+        self._to(RAPID, [there if name else here for name, there, here in zip(named, home, self.at, strict=True)])
+
+    def _take_as(self, axes: Sequence[float | None]) -> None:
+        """G92: the position is given its number; a shift of the axis ends."""
+        for k, value in enumerate(axes):
+            if value is not None:
+                self.frame[k] = 0.0
+                self.preset[k] = self.at[k] - self.fixture[k] - self.length[k] - value * self.unit
+
+    # Holes.
+
+    def _drill_there(self, words: _Words, axes: Sequence[float | None], moving: bool) -> None:
+        """Move as the block says, then execute the cycle that is defined."""
+        if self.hole is None:
+            return
+        if moving:
+            self._to(RAPID if "FMAX" in words.codes or self.motion is None else self.motion, self._reached(words, axes))
+        zero = self._zero(2)
+        level, depth, left = (
+            zero + height * self.unit for height in self.hole.heights((self.at[2] - zero) / self.unit)
+        )
+        back = FEED if self.hole.name in _BACK_AT_FEED else RAPID
+        for kind, height in ((RAPID, level), (FEED, depth), (back, level), (RAPID, left)):
+            self._to(kind, [self.at[0], self.at[1], height])
+
+    def _drill(self, words: _Words, axes: Sequence[float | None], moving: bool) -> None:
+        """A drilling cycle of G codes: take its numbers, then drill where the block says, as often as it says."""
+        zero, numbers = self._zero(2), words.number
+        kind = next((int(self.table[c][1]) for c in words.codes if self.table.get(c, ("", 0.0))[0] == "cycle"), None)
+        if self.series is None:
+            self.series = _Series(kind or 0, (self.at[2] - zero) / self.unit, zero)
+        series = self.series
+        series.kind = series.kind if kind is None else kind
+        series.q = numbers.get("Q", series.q)
+        times = numbers.get("L", math.nan)
+        if math.isnan(times):
+            times = numbers.get("K", 1.0) if self.dialect == "fanuc" and not numbers.keys() & {"I", "J"} else 1.0
+        self._give(series, numbers, zero)
+        if times == 0 or not moving:
+            return
+        step = [0.0 if v is None or not self.relative else v * self.unit for v in axes[:2]]
+        place = [
+            self.at[k] if v is None or self.relative else self._zero(k) + v * self.unit for k, v in enumerate(axes[:2])
+        ]
+        if self.linuxcnc:
+            base = series.level if self.relative else 0.0
+            level = base + series.r
+            depth = (level if self.relative else 0.0) + series.z
+            self._as_linuxcnc(series, place, step, int(times), (level, depth, series.level))
+        else:
+            level, depth = zero + series.r * self.unit, zero + series.z * self.unit
+            initial = zero + series.level * self.unit if zero == series.zero else math.nan
+            self._as_fanuc(series.kind, place, step, int(times), (level, depth, initial))
+
+    def _give(self, series: _Series, numbers: dict[str, float], zero: float) -> None:
+        """Z and R of a block: LinuxCNC keeps the numbers, FANUC the heights that they mean in G91."""
+        z, r = numbers.get("Z"), numbers.get("R")
+        if self.relative and not self.linuxcnc and z is not None and r is not None:
+            series.r = r + (series.level if zero == series.zero else math.nan)
+            series.z = series.r + z
+        else:
+            series.z, series.r = series.z if z is None else z, series.r if r is None else r
+
+    def _as_linuxcnc(
+        self, series: _Series, place: Place, step: Place, times: int, heights: tuple[float, float, float]
+    ) -> None:
+        """The moves of LinuxCNC: it compares R with the level before the series, and pecks by Q."""
+        zero, unit = self._zero(2), self.unit
+        level, depth, initial = heights
+        here = (self.at[2] - zero) / unit
+        here = level if abs(here - level) < _ROUNDED_MM / unit else here
+        if initial < level:
+            self._to(RAPID, [*self.at[:2], zero + level * unit])
+            initial = here = level
+        clear = level if self.to_r else initial
+        for number in range(times):
+            place = [a + b for a, b in zip(place, step, strict=True)]
+
+            def go(kind: int, height: float, x: float = place[0], y: float = place[1]) -> None:
+                self._to(kind, [x, y, zero + height * unit])
+
+            go(RAPID, here if math.isnan(here) or (number == 0 and here > level) else clear)
+            go(RAPID, level)
+            self._peck(go, series, level, depth)
+            go(FEED, depth)
+            if series.kind == 85:
+                go(FEED, level)
+            go(FEED if series.kind == 89 else RAPID, clear)
+
+    def _peck(self, go: Callable[[int, float], None], series: _Series, level: float, depth: float) -> None:
+        """Strokes of G73 and G83 before the last one: back by 0.01 inch, or out and again to 0.01 inch above."""
+        gap, at = 0.254 / self.unit, level - series.q
+        while series.kind in (73, 83) and series.q > 0.0 and at > depth + 1e-9 / self.unit:
+            go(FEED, at)
+            if series.kind == 83:
+                go(RAPID, level)
+            go(RAPID, at + gap)
+            at -= series.q
+
+    def _as_fanuc(self, kind: int, place: Place, step: Place, times: int, heights: tuple[float, float, float]) -> None:
+        """The moves of FANUC: over the hole at the height where the tool is, and back to R or to the initial level."""
+        level, depth, initial = heights
+        if self.at[2] < level:
+            self._to(RAPID, [*self.at[:2], level])
+        clear, unknown = level if self.to_r or initial < level else initial, math.isnan(self.at[2])
+        for _ in range(times):
+            place = [a + b for a, b in zip(place, step, strict=True)]
+            over = math.nan if unknown else level if self.at[2] < level else self.at[2]
+            for how, height in (
+                (RAPID, over),
+                (RAPID, level),
+                (FEED, depth),
+                (FEED if kind in (84, 85, 89) else RAPID, level),
+            ):
+                self._to(how, [*place, height])
+            self._to(RAPID, [*place, clear])
+
+
+# Programs: blocks in the order in which the control executes them.
+
+
+#: Characters of a program, and blocks of one with calls, that are followed at a time.
+_AT_A_TIME, _BLOCKS_AT_A_TIME = 1 << 18, 8192
+
+
+def executed(source: Path, dialect: str, *, skip_deleted: bool = False) -> Iterator[tuple[str, Sequence[int]]]:
+    """Yield the text of a file, a part at a time, with the line of each block, as the control executes it: calls are followed."""
+    with source.open(encoding="latin-1", newline="\n") as stream:
+        if dialect in ("fanuc", "linuxcnc") and _may_call(source):
+            blocks = _with_calls(stream.readlines(), dialect, skip_deleted)
+            while some := list(itertools.islice(blocks, _BLOCKS_AT_A_TIME)):
+                yield "".join(text for _, text in some), [number for number, _ in some]
+            return
+        number = 1
+        while text := stream.read(_AT_A_TIME):
+            text += stream.readline()
+            count = text.count("\n") + (text[-1] != "\n")
+            yield text, range(number, number + count)
+            number += count
+
+
+def _may_call(source: Path) -> bool:
+    with source.open("rb") as stream:
+        return any(b"9" in line and re.search(rb"M[\s+]*0*9[78]", line, re.IGNORECASE) for line in stream)
+
+
+def _with_calls(lines: Sequence[str], dialect: str, skip_deleted: bool) -> Iterator[tuple[int, str]]:
+    """Execute blocks, with a stack of calls: (block to return to, calls left, first block of the subprogram)."""
+    every = [_Words() if skip_deleted and line.lstrip().startswith("/") else _Words.of(line, dialect) for line in lines]
+    heads = [_head(line) for line in lines]
+    stack: list[tuple[int, int, int]] = []
+    k = 0
+    while k < len(lines):
+        words = every[k]
+        number, codes = words.number.get("P"), set(words.codes)
+        first, times = None, 1
+        if number is not None and codes & {"M97", "M98"}:
+            first, times = _called(int(number), words, heads, every, k, "M97" in codes)
+        back = "M99" in codes and stack
+        yield k + 1, lines[k] if first is None else re.sub(r"[PL]\s*\d+", "", lines[k], flags=re.IGNORECASE)
+        if codes & {"M2", "M30"}:
+            return
+        k += 1
+        if first is not None and times:
+            stack.append((k, times - 1, first))
+            k = first
+        elif back:
+            then, left, begin = stack.pop()
+            if left:
+                stack.append((then, left - 1, begin))
+            k = begin if left else then
+        if len(stack) > 10:
+            return
+
+
+def _head(line: str) -> int | None:
+    found = re.match(r"\s*(?:N\s*\d+\s*)?[O:]\s*(\d+)", line, re.IGNORECASE)
+    return int(found[1]) if found else None
+
+
+def _called(
+    number: int, words: _Words, heads: Sequence[int | None], every: Sequence[_Words], k: int, local: bool
+) -> tuple[int | None, int]:
+    """Where what a block calls begins, and how often; None if it is not in the file."""
+    times = int(words.number.get("L", 1.0))
+    if local:
+        return next((j for j, other in enumerate(every) if other.number.get("N") == number and j != k), None), times
+    if number in heads:
+        return heads.index(number) + 1, times
+    if "L" not in words.number and number % 10000 in heads:
+        return heads.index(number % 10000) + 1, number // 10000
+    return None, times
+
+
+# Two readings held against each other.
+
+#: Places that differ by less are the same, mm: holes in increments are rewritten with two more decimals than the dialect has.
+_SAME_MM = 1e-4
+
+
+def difference(read: Moves, followed: Moves) -> tuple[int, str] | None:
+    """Return the first line at which two readings of a program differ, and how; None if they agree.
+
+    Where the reader does not know a position there is nothing to differ. Moves that lead nowhere do not count.
+    """
+    first, second = (moves.part(np.flatnonzero(_moving(moves))) for moves in (read, followed))
+    count = min(len(first), len(second))
+    a, b = first.part(slice(0, count)), second.part(slice(0, count))
+    places = np.abs(np.hstack([a.end_mm - b.end_mm, a.centre_mm - b.centre_mm]))
+    off = np.where(np.isnan(np.hstack([a.end_mm, a.centre_mm])), 0.0, np.nan_to_num(places, nan=np.inf)).max(
+        axis=1, initial=0.0
+    )
+    wrong = (
+        (off > _SAME_MM)
+        | (a.kind != b.kind)
+        | (a.line != b.line)
+        | (np.abs(a.tool_mm - b.tool_mm).max(axis=1, initial=0.0) > _SAME_MM)
+    )
+    arcs = a.sweep_rad != b.sweep_rad
+    radius_mm = np.nanmax(np.abs(a.start_mm - a.centre_mm), axis=1, initial=0.0)
+    wrong |= arcs & (np.abs(a.sweep_rad - b.sweep_rad) * radius_mm > _SAME_MM)
+    if wrong.any():
+        k = int(np.argmax(wrong))
+        return int(a.line[k]), f"{_told(a, k)}, or {_told(b, k)}"
+    if len(first) != len(second):
+        longer = first if len(first) > count else second
+        return int(longer.line[count]), f"{_told(longer, count)}, or no move"
+    return None
+
+
+def _moving(moves: Moves) -> NDArray[np.bool_]:
+    known = ~(np.isnan(moves.start_mm) & np.isnan(moves.end_mm))
+    apart = ~(np.abs(moves.end_mm - moves.start_mm) < 1e-6)
+    return np.asarray((known & apart).any(axis=1) | (moves.sweep_rad != 0))
+
+
+def _told(moves: Moves, k: int) -> str:
+    kind = ("rapid", "at feed", "clockwise", "counterclockwise")[int(moves.kind[k])]
+    place = " ".join(f"{letter}{value:.4f}" for letter, value in zip("XYZ", moves.end_mm[k], strict=True))
+    return f"{kind} to {place} of the machine in line {int(moves.line[k])}"
+
+
+class Agreement:
+    """Follows a file beside its reader and refuses the first move on which the two differ."""
+
+    def __init__(self, reader: Reader) -> None:
+        source, dialect = Path(reader.source), reader.dialect.name
+        self.reader = reader
+        self._follower = Follower(dialect, reader.setup, reader.machine)
+        self._blocks = executed(source, dialect, skip_deleted=reader.setup.skip_deleted)
+        self._ahead = Moves.of_rows([])
+
+    def hold(self, moves: Moves) -> None:
+        """Take the next moves of the reader, with the lines of the file."""
+        moves = moves.part(np.flatnonzero(_moving(moves)))
+        parts = [self._ahead]
+        while sum(map(len, parts)) < len(moves):
+            some = next(self._blocks, None)
+            if some is None:
+                break
+            found = self._follower.follow(*some)
+            parts.append(found.part(np.flatnonzero(_moving(found))))
+        every = Moves.joined(parts)
+        self._compare(moves, every.part(slice(0, len(moves))))
+        self._ahead = every.part(slice(len(moves), None))
+
+    def finish(self) -> None:
+        """Take the end of the program."""
+        rest = [self._ahead, *(self._follower.follow(*some) for some in self._blocks)]
+        self._compare(Moves.of_rows([]), Moves.joined(rest))
+
+    def _compare(self, read: Moves, followed: Moves) -> None:
+        if found := difference(read, followed):
+            line, how = found
+            raise InputError(
+                f"can be read in two ways: {how}; post moves that leave no doubt, and please report this program",
+                file=self.reader.source,
+                line=line,
+            )
+
+
+def read_twice(reader: Reader) -> Iterator[Batch]:
+    """Yield the batches of a reader's program, each held against the moves of a follower of the same file."""
+    second = Agreement(reader)
+    with reader.opened() as stream:
+        for batch in reader.batches(stream):
+            if not reader.unknown:  # codes that are not known are refused at the end
+                second.hold(reader.numbered_as_in_file(batch.moves))
+            yield batch
+    second.finish()
