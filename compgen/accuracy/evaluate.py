@@ -529,8 +529,8 @@ def _over_draws(
     values: dict[tuple[str, str], list[float]] = {(group, key): [] for group, part in groups.items() for key in part}
     for one in source.drawn():
         ((full, pairs),) = volume_fields(source.machine, (one,), alignment, DRAWN_POINTS)
-        found = {"volume": volume_figures(full, pairs), **groups_of_errors(one, line)}
-        for group, part in found.items():
+        groups_found: dict[str, Any] = {"volume": volume_figures(full, pairs), **groups_of_errors(one, line)}
+        for group, part in groups_found.items():
             for key, item in part.items():
                 values[group, key].append(item.value)
     result: dict[str, dict[str, Figure]] = {}
