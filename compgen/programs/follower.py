@@ -44,7 +44,7 @@ _HEIDENHAIN = re.compile(
 )
 _SIEMENS = re.compile(
     r";[^\n]*+"
-    r"|(?P<name>[XYZ]1(?=\s*+=)|[SM]\d++(?=\s*+=)|[A-Z_]{2}\w*+\s*+(?:\[[^\]\n]*+\]\s*+)?(?==)|[A-Z](?=\s*+[-+=.\d]))\s*+=?\s*+"
+    r"|(?P<name>[XYZ]1(?=\s*+=)|[SM]\d++(?=\s*+=)|[A-Z_]{2}\w*+\s*+(?:\[[^\]\n]*+\]\s*+)?(?==)|[A-Z](?=\s*+[-+=.\d\"]))\s*+=?\s*+"
     rf"(?:(?P<mode>AC|IC|DC|ACP|ACN)\s*+\(\s*+(?P<inner>{_NUMBER})\s*+\)|\"(?P<text>[^\"\n]*+)\"|(?P<number>{_NUMBER}))"
     r"|(?P<call>[A-Z_]\w*+)\s*+\((?P<inside>(?:\"[^\"\n]*+\"|[^()\"\n]|\([^()\n]*+\))*+)\)"
     r"|(?P<word>[A-Z_]\w*+)",
@@ -152,7 +152,7 @@ def _each(what: str, *codes: object, number: float = 0.0) -> _Does:
 _EVERYWHERE: _Does = {
     **{f"G{k}": ("go", float(k)) for k in range(4)},
     **{"G17": ("plane", 2.0), "G18": ("plane", 1.0), "G19": ("plane", 0.0)},
-    **{"G90": ("relative", 0.0), "G91": ("relative", 1.0), "G4": ("quiet", 0.0)},
+    **{"G90": ("relative", 0.0), "G91": ("relative", 1.0), "G4": ("dwell", 0.0)},
 }
 _COMMON: _Does = {
     **_EVERYWHERE,
@@ -221,7 +221,7 @@ _TABLES: dict[str, _Does] = {
     },
 }
 #: What takes the words of its block for itself, so that they are no move.
-_TAKES_WORDS = {"quiet", "frame", "offset", "typed length", "store", "turn", "tool"}
+_TAKES_WORDS = {"quiet", "dwell", "frame", "offset", "typed length", "store", "turn", "tool"}
 _ENDS = {"siemens": ("M2", "M17", "M30")}
 #: Cycles that leave the depth at feed, and where the arguments of a cycle of SINUMERIK say what its depth counts from.
 _BACK_AT_FEED = {"CYCLE84", "CYCLE840", "CYCLE85", "CYCLE89", "G84", "G85", "G201", "G202", "G206", "G207", "G209"}
@@ -415,7 +415,7 @@ class Follower:
             unit = re.search(r"\bG7([01])\b", body)
             self.unit = self.unit if unit is None else (25.4 if unit[1] == "0" else 1.0)
             self.done = self.moved
-        elif self.dialect != "siemens":
+        elif self.dialect in ("fanuc", "linuxcnc"):
             self.done = self.percent or self.moved
         self.percent = True
 
@@ -448,12 +448,13 @@ class Follower:
     def _plan(self, codes: tuple[str, ...]) -> _Plan:
         """What the codes of a block do."""
         does = [(code, *self.table[code]) for code in codes if code in self.table]
+        does.sort(key=lambda what: what[1] != "end")  # a move in the block of G80 comes after it
         kinds = frozenset(kind for _, kind, _ in does)
         takes = _TAKES_WORDS | ({"no preset"} if self.dialect == "fanuc" else set())
         executes = not kinds & takes and (self.heidenhain or "modally" not in kinds)
         ends = bool(set(codes) & set(_ENDS.get(self.dialect, ("M2", "M30"))))
         self.plans[codes] = _Plan(
-            does, kinds, executes, ends, kinds <= {"go", "plane", "relative", "quiet"} and "M6" not in codes
+            does, kinds, executes, ends, kinds <= {"go", "plane", "relative", "quiet", "dwell"} and "M6" not in codes
         )
         return self.plans[codes]
 

@@ -508,14 +508,21 @@ class Reader:
             meaning.startswith(("motion", "no motion", "home")) for meaning in meanings
         )
         incremental = "G91" in codes or (not self.absolute and "G90" not in codes)
-        own = {"shift", "preset", "store", "machine", "setting", "dwell", "tool"}  # take the words of their block
+        own = {"shift", "preset", "store", "machine", "setting", "dwell"}  # take the words of their block
+        # and these move the zero from which the holes before were counted
+        own |= {"work", "tool", "inch", "mm", *(("no",) if begins or on else ())}
         if (
             not incremental
             or not (begins or on)
             or not numbers.keys() & set("XYZR")
             or own & {m.split()[0] for m in meanings if m}
+            or "H" in numbers
         ):
             return ()
+        letters = [letter for letter, value, *_ in words if value and letter not in "GM"]
+        for letter in numbers.keys() & set(letters):
+            if letters.count(letter) > 1:
+                self._fail(f"{letter} is given twice in a block")
         offset, scale, given = self._offset(), self.scale, list(self.cycle_given)
         x, y, z = ((place - zero) / scale for place, zero in zip(self.position, offset, strict=True))
         if self.cycle is not None:

@@ -146,6 +146,10 @@ def test_the_program_of_the_report(tmp_path):
         ("linuxcnc", "M61 Q3\nG43", "tool in the spindle is not known"),
         ("linuxcnc", "G43 H0", "another length"),
         ("linuxcnc", "X5. H2", "without G43"),
+        ("linuxcnc", "G91 X5. R-10. Z-2. R-3.", "R is given twice"),
+        ("linuxcnc", "G91\nG55 X5. R-10. Z-2.", "divide the block"),
+        ("fanuc", "G91\nG43 H2 X5. R-10. Z-2.", "divide the block"),
+        ("fanuc", "G91 X5. R-10. Z-2. H2", "divide the block"),
     ],
 )
 def test_changes_that_are_refused_within_a_cycle(dialect, block, words):
