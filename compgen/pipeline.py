@@ -42,6 +42,7 @@ from compgen.resources import LANGUAGES
 if TYPE_CHECKING:
     from compgen.fit import FitOptions, FitResult
     from compgen.identify.monte_carlo import SelfCheck
+    from compgen.plan.next_best import NextBest
     from compgen.tables import Export, ReadTables, SafetyLimits, Verification
     from compgen.tables.active import ActiveTables
 
@@ -65,7 +66,8 @@ class ControllerResult:
 class RunResult(Drawable):
     """Outcome of :func:`run`; ``accepted`` is True if every control's tables are.
 
-    ``earlier_report`` is the path to which the report of the earlier tables in the folder was moved.
+    ``earlier_report`` is the path to which the report of the earlier tables in the folder was moved, ``next_best`` what to
+    measure next; None where the readings determine every error.
 
     Examples
     --------
@@ -84,6 +86,7 @@ class RunResult(Drawable):
     fitted: FitResult
     results: tuple[ControllerResult, ...]
     earlier_report: tuple[Path, ...] = ()
+    next_best: NextBest | None = None
 
     @property
     def accepted(self) -> bool:
@@ -95,7 +98,7 @@ class RunResult(Drawable):
         summaries = [item.verification.summary() for item in self.results]
         common = {
             "accepted": self.accepted,
-            "identify": self.identification.summary(),
+            "identify": {**self.identification.summary(), **proposed_keys(self.next_best)},
             "paths": [str(path) for item in self.results for path in item.paths],
         }
         if len(summaries) == 1:
@@ -127,13 +130,30 @@ def provenance_of(*paths: str | Path | None) -> Provenance:
     return Provenance(tuple((path.name, sha256_of_file(path)) for path in files))
 
 
+def next_measurements(result: Identification) -> NextBest | None:
+    """Return what to measure next; None where the readings determine every error, and without a prior."""
+    if "posterior_means" not in result.details or result.posterior is None:
+        return None
+    from compgen.plan.next_best import next_best
+
+    return next_best(result.posterior)
+
+
+def proposed_keys(found: NextBest | None) -> dict[str, Any]:
+    """Return the keys ``next_measurements`` and ``next_text`` of ``identify.json`` and ``result.json``."""
+    return {"next_measurements": [], "next_text": ""} if found is None else found.summary()
+
+
 def identification_files(
-    result: Identification, provenance: Provenance, checked: SelfCheck | None = None
+    result: Identification,
+    provenance: Provenance,
+    checked: SelfCheck | None = None,
+    proposed: NextBest | None = None,
 ) -> dict[str, str | bytes]:
     """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
 
-    Where a reversal was found, ``identified.reversal.csv`` is added. The two-step method adds
-    ``measured.deviations.csv``; deviations as input give no stations.
+    ``proposed`` is what to measure next. Where a reversal was found, ``identified.reversal.csv`` is added. The two-step
+    method adds ``measured.deviations.csv``; deviations as input give no stations.
     """
     stations = result.stations
     columns: dict[str, Sequence[str] | FloatArray] = {
@@ -149,7 +169,11 @@ def identification_files(
         "readings": [str(item.readings) for item in stations],
         "residual_rms_um": np.array([item.rms_um for item in stations]),
     }
-    summary = {**result.summary(), "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs]}
+    summary = {
+        **result.summary(),
+        **proposed_keys(proposed),
+        "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs],
+    }
     text = format_errors(result.errors, {"covariance": covariance.FILE_NAME} if result.has_covariance else {})
     files: dict[str, str | bytes] = {"identified.errors.csv": text}
     if result.has_covariance:
@@ -467,6 +491,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         smoothing = replace(smoothing, smoothness=0.0)
     fitted = fit(machine, identification.errors, smoothing, covariance=known)
     reversal = identified_reversal(identification)
+    proposed = next_measurements(identification)
     source = str(machine.source or machine.name)  # for the command that searches for the missing effect
     words = ["diagnose", source, *map(str, measurements), "--out", str(Path(folder) / "diagnosis")]
     diagnosis = shlex.join(["volcomp", *words])
@@ -491,13 +516,20 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         )  # else they are wrong
         found = tables.measurement_objections(identification, taken, allow_misfit=allow_misfit)
         reasons = dict.fromkeys([*verification.reasons, *tables.blocking_reasons(found)])
-        verification = replace(verification, objections=(*verification.objections, *found), reasons=tuple(reasons))
+        verification = replace(
+            verification,
+            objections=(*verification.objections, *found),
+            reasons=tuple(reasons),
+            remarks=identification.notes,
+            proposed=proposed_keys(proposed),
+        )
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
         extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language, read)
         checked[sub_folder] = exported, read, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
-    add_identification(output, {**identification_files(identification, provenance), **fit_files(fitted), **evidence})
+    identified = identification_files(identification, provenance, proposed=proposed)
+    add_identification(output, {**identified, **fit_files(fitted), **evidence})
     results, earlier_report = _write_results(output, checked)
-    return RunResult(identification, fitted, tuple(results), earlier_report)
+    return RunResult(identification, fitted, tuple(results), earlier_report, proposed)

@@ -34,10 +34,12 @@ from compgen.pipeline import (
     failure_reported,
     identification_files,
     identify_bare,
+    next_measurements,
+    proposed_keys,
     provenance_of,
     with_reversal,
 )
-from compgen.report.terminal import identification_table
+from compgen.report.terminal import advice_text, identification_table
 
 if TYPE_CHECKING:
     from compgen.tables.active import ActiveTables
@@ -131,14 +133,17 @@ def identify_command(
                     progress=lambda k: show(f"self-check: {k} of {replicates} replicates"),
                     mapper=spread,
                 )
-    files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked)
+    proposed = next_measurements(result)
+    files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked, proposed)
     output = OutputFolder(out)
     add_identification(output, {**files, **evidence_files(machine, measurement, result)})
     output.commit()
     if as_json:
-        print_json({**result.summary(), **({"monte_carlo": checked.summary()} if checked else {})})
+        more = {"monte_carlo": checked.summary()} if checked else {}
+        print_json({**result.summary(), **proposed_keys(proposed), **more})
     else:
         stdout.print(identification_table(result))
+        stdout.print(advice_text(result, proposed))
         if checked:
             text = f"self-check, {checked.replicates} replicates: standard deviation over stated uncertainty "
             text += f"{checked.ratio_median:.2f} ({checked.ratio_min:.2f} ... {checked.ratio_max:.2f}): "

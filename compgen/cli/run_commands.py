@@ -35,7 +35,7 @@ from compgen.fit import FitOptions
 from compgen.identify import IdentifyOptions
 from compgen.identify.options import StatedNumbers
 from compgen.pipeline import run
-from compgen.report.terminal import identification_table, verification_table
+from compgen.report.terminal import advice_text, identification_table, verification_table
 from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
@@ -214,6 +214,7 @@ def run_command(
     else:
         stdout.print(identification_table(result.identification, assumed=False))
         stdout.print(verification_table([item.verification for item in result.results]))
+        stdout.print(advice_text(result.identification, result.next_best))
         for item in result.results:
             say_paths(item.paths)
         if report is not None:

@@ -6,7 +6,7 @@ The code for a kind is imported when a file of that kind is read.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -166,6 +166,8 @@ def known_alone(
     machine: Machine, measurement: OneKind | None, alone: Identification, options: IdentifyOptions
 ) -> Identification:
     """Return the result of one measurement with what the prior of the machine file says of the rest."""
+    if measurement is not None:
+        alone = replace(alone, notes=unseen(machine, [measurement]))
     learn = machine.prior.learn in ("up", "both")
     on_nodes = not isinstance(measurement, Lengths) or at_nodes(machine, measurement.position_mm)
     if not machine.prior.is_none and on_nodes and determines_all(machine, alone):
@@ -309,7 +311,84 @@ def identify_mixed(
     if len(parts) == 2 and posed and posed[0] is not None and others and others[0] is not None:
         merged = merge(machine, others[0], posed[0])
         return with_prior(machine, [Source("", None, merged)], merged, options)
-    return with_prior(machine, parts, identify_together(machine, parts, options), options)
+    together = identify_together(machine, parts, options)
+    together = replace(together, notes=unseen(machine, [part for _, part in measurement.parts]))
+    return with_prior(machine, parts, together, options)
+
+
+# What readings cannot show although it makes the errors wrong, and the check that would show it.
+
+
+#: Set-ups of a plate count as turned in its plane if the sine of the angle between its axes is at least this, and the
+#: cosine of that between its normals.
+TURNED, STILL_FLAT = 0.5, 0.9
+
+
+def unseen(machine: Machine, parts: Sequence[OneKind | ErrorTable]) -> tuple[str, ...]:
+    """Return what no residual of these readings shows: a plate that is not square, runs at another temperature."""
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.deviations import Artefact
+
+    found: list[str] = []
+    for k, part in enumerate(parts):
+        others = [*parts[:k], *parts[k + 1 :]]
+        if isinstance(part, Artefact) and part.calibrated.all():
+            found += _unseen_in_plate(part, others)
+        elif isinstance(part, AxisRuns) and not any(name.startswith("temp_") for name in part.covariates):
+            found.append(_unseen_in_runs(machine, part))
+    return tuple(dict.fromkeys(found))
+
+
+def _unseen_in_runs(machine: Machine, runs: AxisRuns) -> str:
+    """A run at another temperature than stated."""
+    from compgen.identify.axis_tests import U_NOT_READ_K, USUAL_EXPANSION
+
+    stated = [machine.axes[axis].expansion_um_per_m_k or 1e6 * USUAL_EXPANSION for axis in runs.axes]
+    letters = ", ".join(AXES[axis] for axis in runs.axes)
+    return (
+        f"runs of {letters} at another temperature than 20 degC, or than the instrument assumed, would have the same residuals "
+        f"and a wrong scale ({max(stated):.3g} um/m for each K); their file has no temperatures, so u allows for "
+        f"{U_NOT_READ_K:g} K. Read the temperatures of axis and instrument (columns temp_x_c ...), or measure a length standard "
+        "at the other end of the travel"
+    )
+
+
+def _unseen_in_plate(plate: Artefact, others: Sequence[OneKind | ErrorTable]) -> Iterator[str]:
+    """A calibrated plate that is itself out of square, or at another temperature than when it was calibrated."""
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.data.circles import Circles
+    from compgen.data.deviations import Artefact, Deviations
+    from compgen.identify.six_dof import SixDofMeasurement
+
+    whole = (Lengths, Deviations, SixDofMeasurement)
+    squares = [part for part in others if isinstance(part, ErrorTable) and part.squareness]
+    if not (squares or any(isinstance(part, (*whole, Circles, Artefact)) for part in others) or _turned(plate)):
+        yield (
+            "a plate whose own axes are not square to each other (wrong calibration, bent by its clamps) would have the same "
+            "residuals, and its angle would count as squareness of the machine: measure it once more, turned by 90 degrees"
+        )
+    if not any(isinstance(part, (*whole, AxisRuns)) for part in others):
+        yield (
+            "a plate at another temperature than that of its calibration would have the same residuals and a wrong scale of the "
+            "axes: read its temperature, or measure a length standard as well"
+        )
+
+
+def _turned(plate: Artefact) -> bool:
+    """Whether a plate lay in two directions that differ, in its own plane: only then its angle is not the machine's."""
+    turns = []
+    for setup in np.unique(plate.setup).tolist():
+        own = plate.setup == setup
+        nominal, measured = plate.nominal_mm[own], np.nan_to_num(plate.measured_mm[own])
+        left, _, right = np.linalg.svd((measured - measured.mean(axis=0)).T @ (nominal - nominal.mean(axis=0)))
+        turns.append(left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right)  # fits best (Kabsch 1976)
+    axes = np.linalg.svd(plate.nominal_mm - plate.nominal_mm.mean(axis=0))[2]  # the last one is across the plate
+    for k, one in enumerate(turns):
+        for other in turns[:k]:
+            relative = axes @ other.T @ one @ axes.T
+            if abs(relative[2, 2]) > STILL_FLAT and abs(relative[0, 1]) > TURNED:
+                return True
+    return False
 
 
 # What a later report needs in addition to the results of an identification: the machine file, and the residuals.

@@ -347,12 +347,19 @@ def circle_observations(
 def circle_readings(machine: Machine, layout: ErrorParameters, circles: Circles, found: Identification) -> Observations:
     """Return every reading of circles as one of the errors of a layout: squareness, scales, straightness and angles.
 
-    Centre, zero of the gauge, servo mismatch and reversals are further unknowns. The noise is that which ``found`` has
-    from their residuals, enlarged by the correlation along the path.
+    The noise is that which ``found`` has from their residuals, enlarged by the correlation along the path.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)  # said when the circles were identified
-        position_mm = circle_positions(machine, circles)
+        return circle_design(machine, layout, circles, max(found.u_length_um, FINEST) * MM_PER_UM)
+
+
+def circle_design(machine: Machine, layout: ErrorParameters, circles: Circles, sigma_mm: float) -> Observations:
+    """Return readings of circles with a noise as readings of the errors of a layout.
+
+    Centre, zero of the gauge, servo mismatch and reversals are further unknowns.
+    """
+    position_mm = circle_positions(machine, circles)
     own = ("squareness", "scales", "straightness")
     others = [column.values for column in _columns(machine, circles, position_mm) if column.kind not in own]
     errors = layout.design(c_matrix(machine, position_mm), layout.bases(position_mm))
@@ -363,7 +370,7 @@ def circle_readings(machine: Machine, layout: ErrorParameters, circles: Circles,
         design=np.einsum("nd,ndp->np", circles.radial(), errors),
         others=np.column_stack(others),
         value=circles.deviation_mm,
-        sigma=np.full(len(circles), max(found.u_length_um, FINEST) * MM_PER_UM),
+        sigma=np.full(len(circles), sigma_mm),
         at_mm=np.where(in_plane, position_mm, np.nan),
         shows=in_plane[:, axes],
     )

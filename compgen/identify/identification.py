@@ -91,6 +91,7 @@ class Identification(Drawable):
     details : additional figures of the method.
     objections : why no result from these errors may be accepted; empty if there is no such reason.
     doubts : why a result from these errors is accepted with reservations only.
+    notes : what these readings cannot show although it would make the errors wrong, and which check would show it.
     posterior_source : computes ``posterior``.
     misfit : whether the residuals exceed their uncertainty, and what explains them; None if the method does not use an
         uncertainty of the readings.
@@ -143,6 +144,7 @@ class Identification(Drawable):
     misfit: Misfit | None = None
     counted: tuple[int, int] | None = None
     doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     posterior_source: Callable[[], Posterior] | None = field(default=None, repr=False)
 
     @cached_property
@@ -238,6 +240,7 @@ class Identification(Drawable):
             **({"steps": dict(self.steps)} if self.steps else {}),
             **({self.method: dict(self.details)} if self.details else {}),
             **({"objections": list(self.objections)} if self.objections else {}),
+            "notes": list(self.notes),
         }
 
     def _assumptions(self) -> dict[str, Any]:

@@ -1,35 +1,49 @@
-"""Planning a measurement: what it will determine, how well, and better places for the stations."""
+"""Planning a measurement: what it will determine, how well, better places for the stations, and what to measure next."""
 
-from compgen.plan.prediction import (
-    Plan,
-    Planned,
-    PlanVisibility,
-    VolumeUncertainty,
-    plan,
-    plan_of,
-    plan_visibility,
-    planned,
-    planned_noise,
-)
-from compgen.plan.stations import (
-    Box,
-    PlannedStations,
-    Shell,
-    box_from_text,
-    format_stations,
-    planned_stations,
-    read_boxes,
-    read_stations,
-    regions_of,
-    shell_around,
-)
-from compgen.plan.suggest import Suggestion, TrajectoryCandidate, candidate_trajectories, judge_trajectories, suggest
+from typing import TYPE_CHECKING
+
+from compgen.resources import load_on_first_use
+
+if TYPE_CHECKING:
+    from compgen.plan.next_best import NextBest, NextMeasurement, next_best
+    from compgen.plan.prediction import (
+        Plan,
+        Planned,
+        PlanVisibility,
+        VolumeUncertainty,
+        plan,
+        plan_of,
+        plan_visibility,
+        planned,
+        planned_noise,
+    )
+    from compgen.plan.stations import (
+        Box,
+        PlannedStations,
+        Shell,
+        box_from_text,
+        format_stations,
+        planned_stations,
+        read_boxes,
+        read_stations,
+        regions_of,
+        shell_around,
+    )
+    from compgen.plan.suggest import (
+        Suggestion,
+        TrajectoryCandidate,
+        candidate_trajectories,
+        judge_trajectories,
+        suggest,
+    )
 
 __all__ = [
     "Box",
+    "NextBest",
+    "NextMeasurement",
     "Plan",
-    "Planned",
     "PlanVisibility",
+    "Planned",
     "PlannedStations",
     "Shell",
     "Suggestion",
@@ -39,6 +53,7 @@ __all__ = [
     "candidate_trajectories",
     "format_stations",
     "judge_trajectories",
+    "next_best",
     "plan",
     "plan_of",
     "plan_visibility",
@@ -51,3 +66,5 @@ __all__ = [
     "shell_around",
     "suggest",
 ]
+
+load_on_first_use(__name__, __all__)

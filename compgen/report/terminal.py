@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from compgen.identify import Identification
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
     from compgen.plan.gauges import GaugePlan
+    from compgen.plan.next_best import NextBest
     from compgen.tables import Residuals, Verification
     from compgen.tables.active import MergeReport, TableDifference
     from compgen.tables.signs import CrashTest
@@ -118,6 +119,14 @@ def _assumed(result: Identification) -> list[str]:
     from compgen.identify.posterior import assumed_text, worse_text
 
     return [text for text in (assumed_text(result.posterior), worse_text(result.posterior)) if text]
+
+
+def advice_text(result: Identification, proposed: NextBest | None) -> Group:
+    """Return what the readings cannot show, with the check that would show it, and what to measure next."""
+    lines = [f"note: {text}" for text in result.notes]
+    if proposed is not None and proposed.text:
+        lines.append(f"next measurement: {proposed.text}")
+    return Group(*(Text(line) for line in lines))
 
 
 def _errors_table(result: Identification) -> Table:

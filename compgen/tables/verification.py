@@ -783,7 +783,8 @@ class Verification(Drawable):
     ``reasons`` says why the tables are not accepted (empty: accepted). ``unrepresentable_um`` is the largest residual
     that the best table of this control leaves (without a constant offset if the control cannot apply one), and
     ``uncorrected_um`` gives the errors behind it with the largest displacement that remains. ``reservations`` are
-    remarks of the control on tables that exceed no limit: what is inferred, has no room, or is unknown.
+    remarks of the control on tables that exceed no limit: what is inferred, has no room, or is unknown. ``remarks`` are those
+    on the measurement, and ``proposed`` the keys of ``result.json`` on what to measure next.
 
     Examples
     --------
@@ -823,6 +824,8 @@ class Verification(Drawable):
     next_command: str = ""
     tools: str = ""
     gain: ProbableGain | None = None
+    remarks: tuple[str, ...] = ()
+    proposed: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
@@ -926,7 +929,7 @@ class Verification(Drawable):
                 f"with the present set-up the largest error grows from {self.before.max_um:.1f} to {self.after.max_um:.1f} um, "
                 "by a rigid motion of the workpiece"
             )
-        return tuple(notes)
+        return (*notes, *self.remarks)
 
     @property
     def assumptions(self) -> list[str]:
@@ -962,6 +965,7 @@ class Verification(Drawable):
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
             "next_command": self.next_command or None,
+            **self.proposed,
             "judged_with_tools": self.tools,
             "safety": self.safety.summary(),
             "files": [{"name": name, "sha256": digest} for name, digest in self.files],
