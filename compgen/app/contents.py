@@ -38,8 +38,16 @@ from compgen.kinematics import exact_error
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.folder import read_volume
-from compgen.report.html.pictures import VolumeOnGrid, describe_error, draw_curve, draw_slices, draw_space, grid_of
-from compgen.report.html.write import assumptions_of, judged
+from compgen.report.html.pictures import (
+    VolumeOnGrid,
+    describe_error,
+    draw_curve,
+    draw_proposed,
+    draw_slices,
+    draw_space,
+    grid_of,
+)
+from compgen.report.html.write import assumptions_of, judged, proposed_rows
 from compgen.tables import load_format
 from compgen.tables.verification import MISFIT_CODES
 
@@ -611,6 +619,13 @@ def gap_picture(diagnosis: Mapping[str, Any]) -> Markup:
     return shrink_picture(rows) if rows else Markup("")
 
 
+def proposed_measurements(facts: Mapping[str, Any]) -> list[tuple[dict[str, Any], Picture]]:
+    """What to measure next, with how each instrument stands."""
+    rows = list(proposed_rows(facts.get("next_measurements")))
+    pictures = {picture.key: picture for picture in draw_proposed(rows)}
+    return [(row, pictures[f"next-{k}"]) for k, row in enumerate(rows) if f"next-{k}" in pictures]
+
+
 # What each page of a project shows.
 
 
@@ -655,7 +670,11 @@ def plan_page(project: Project, state: ProjectState) -> dict[str, Any]:
             for name, item in predicted.items()
         ]
         views = list(project.pages_of(step))
-        found.append({"step": step, "facts": facts, "rows": rows, "views": views, "current": state.is_current(step)})
+        proposed = proposed_measurements(facts)
+        current = state.is_current(step)
+        found.append(
+            {"step": step, "facts": facts, "rows": rows, "views": views, "current": current, "proposed": proposed}
+        )
     last = state.last("plan")
     return {"results": found, "typed": {"circles": "", "poses": ""} if last is None else last.data["typed"]}
 
@@ -723,6 +742,7 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "step": step, "facts": project.facts(step, "identify.json"), "errors": errors, "earlier": earlier,
         "assumed": assumptions_of(project.facts(step, "identify.json")) if step else [],
         "pictures": (drawn := error_pictures(errors) if errors else []),
+        "proposed": proposed_measurements(project.facts(step, "identify.json")),
         "volume": volume, "volume_tables": None if shown is step else shown,
         "values": {picture.key: picture.data for picture in (*drawn, *volume)},
         "squareness": squareness_rows(errors) if errors else [],

@@ -21,10 +21,10 @@ from compgen.cli.common import (
     out_option,
     print_json,
 )
-from compgen.cli.shared_options import machine_argument, prior_option
+from compgen.cli.shared_options import covariance_of, machine_argument, prior_option
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import format_errors
+from compgen.data.error_table import ErrorTable, format_errors
 from compgen.data.files import OutputFolder, write_file
 from compgen.data.lengths import Points, format_points, read_points
 from compgen.data.machine import Machine
@@ -55,7 +55,14 @@ from compgen.plan import (
 )
 from compgen.plan.gauges import plan_gauges, plan_page
 from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
-from compgen.report.terminal import gauge_plan_table, plan_table, suggestion_table, trajectory_table, visibility_table
+from compgen.report.terminal import (
+    gauge_plan_table,
+    next_table,
+    plan_table,
+    suggestion_table,
+    trajectory_table,
+    visibility_table,
+)
 from compgen.simulate import (
     AxisLaser,
     Ballbar,
@@ -85,6 +92,7 @@ Progress = Callable[[str], None]
 
 @click.command("plan")
 @machine_argument
+@prior_option
 @click.option("--stations", type=PATH, help="Laser tracer: CSV with station, x_mm, y_mm, z_mm.")
 @click.option("--points", type=PATH, help="*.points.csv (mm); a point listed twice is measured twice.")
 @click.option("--grid", is_flag=True, help="Use all nodes of the machine as points, instead of --points.")
@@ -109,7 +117,9 @@ Progress = Callable[[str], None]
 )
 @click.option("--program", metavar="CONTROLLER", help="Write the program that probes the artefact, probe-program.nc.")
 @click.option(
-    "--errors", type=PATH, help="Known errors (um, urad), whose effect on artefact and circles plan.html shows."
+    "--errors",
+    type=PATH,
+    help="Known errors (um, urad). With --artefact or --circle plan.html shows their effect; alone: what to measure next.",
 )
 @options_of(IdentifyOptions, "readings", only=("u_length_um", "u_length_um_per_m"))
 @click.option("--suggest", "search", is_flag=True, help="Search for better station positions.")
@@ -160,7 +170,8 @@ def plan_command(
 
     With --stations: a laser tracer. With --artefact, --circle or both: gauges of the workshop, alone or with a tracer in
     one adjustment; plan.html then shows deviation arrows and the polar diagram for --errors, with a slider for each error.
-    With --program also the NC program that probes the artefact (mm); volcomp import reads its log.
+    With --program also the NC program that probes the artefact (mm); volcomp import reads its log. With none of these: what to
+    measure next, of what a workshop has, where --errors are known (*.errors.csv of volcomp identify or run), or nothing is.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
     suggested.stations.csv, with --target-um proposed.points.csv (mm). Lists the effects other than the geometric errors
@@ -169,6 +180,7 @@ def plan_command(
     error at all is determined.
 
     For gauges: volcomp plan zha-gantry --artefact plate.toml --pose -400,-500,-200 --circle XY:150 --out plan/
+    What to measure next: volcomp plan zha-gantry --errors identified/identified.errors.csv --out plan/
 
     \b
     Example:
@@ -195,11 +207,13 @@ def plan_command(
             grid=grid,
             as_json=as_json,
         )
-    if pose or errors or program:
+    if pose or program or (errors and stations):
         option = "--pose" if pose else "--program" if program else "--errors"
         raise InputError(f"{option} belongs to --artefact or --circle, and neither is given")
     if stations is None:
-        raise InputError("give --stations FILE (laser tracer), --artefact FILE or --circle PLANE:RADIUS")
+        if points or grid or search or box or boxes or target_um is not None:
+            raise InputError("give --stations FILE (laser tracer), --artefact FILE or --circle PLANE:RADIUS")
+        return _plan_next(machine, errors, out, language, as_json=as_json)
     noise = planned_noise(readings)
     given, where = read_stations(stations), _points(machine, points, grid=grid)
     if (box or boxes) and not search:
@@ -277,6 +291,41 @@ def _plan_gauges(
     folder.commit()
     answer(as_json, found.summary(), gauge_plan_table(found))
     return 0 if found.errors.names else 1
+
+
+def _plan_next(machine: Machine, errors: Path | None, out: Path, language: str, *, as_json: bool) -> int:
+    """Say what to measure next, from the errors that are known, or from nothing but the prior."""
+    from compgen.identify.posterior import not_measured
+    from compgen.plan.next_best import next_best, next_page, unmeasured
+
+    if machine.prior.is_none:
+        raise InputError(
+            "what to measure next follows from how large errors are assumed that were not measured, and class 'none' assumes "
+            "nothing; give another class",
+            field="--prior",
+        )
+    table = ErrorTable({}, {}) if errors is None else open_errors(errors)
+    known = None if errors is None else covariance_of(errors, table, None, independent=False)
+    posterior = posterior_with(machine, table, known) if table.names else unmeasured(machine)
+    if posterior is None:
+        raise InputError("states no uncertainty (u_value) for some values, so what is known is unknown", file=errors)
+    found = next_best(posterior)
+    summary = {
+        "machine": machine.name,
+        "prior": posterior.prior.as_dict(),
+        "assumed": assumed_text(posterior),
+        "determined": [name for name in posterior.determined if name in table.names],
+        "not_measured": not_measured(posterior, table.names),
+        "u_rms_um": found.u_um,
+        **found.summary(),
+    }
+    folder = OutputFolder(out)
+    page = next_page(found, str(summary["assumed"]))
+    folder.add("plan.html", for_readers({"plan.html": page}, language)["plan.html"])
+    folder.add("plan.json", json.dumps(summary, indent=2) + "\n")
+    folder.commit()
+    answer(as_json, summary, next_table(found, str(summary["assumed"])))
+    return 0
 
 
 Judged = tuple[list[TrajectoryCandidate], TrajectoryCandidate | None]

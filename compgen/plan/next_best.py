@@ -14,14 +14,15 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from html import escape
 from typing import Any
 
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.charts import Picture, Plot, svg
+from compgen.data.charts import Picture, Plot, page_assets, picture_grid, svg
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact
@@ -34,7 +35,7 @@ from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.axis_tests import axis_observations, circle_design
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import artefact_observations
-from compgen.identify.posterior import Posterior
+from compgen.identify.posterior import Posterior, posterior_of_values
 from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import full_grid
@@ -43,6 +44,8 @@ from compgen.kinematics.many_points import full_grid
 LEVELS = 5
 #: A measurement is proposed if it takes this share of u, rms over the volume, and at most so many are.
 USEFUL, MOST = 0.03, 8
+#: What is said where nothing is proposed.
+NOTHING_NEXT = "Nothing of what a workshop has would reduce the uncertainty over the volume by much."
 #: An error counts as reduced if its standard uncertainty falls by this share.
 REDUCED = 0.1
 #: Where lines and set-ups away from the middle are, as shares of the travel.
@@ -133,12 +136,14 @@ class NextBest:
     Parameters
     ----------
     machine : its travel.
+    u_um : u of the field over the volume as it is known, rms, um.
     measurements : those that help; empty where everything is determined.
     largest : the error that is not determined and makes most of the uncertainty; empty where there is none.
     sentence : what is assumed of it.
     """
 
     machine: Machine
+    u_um: float
     measurements: tuple[NextMeasurement, ...] = ()
     largest: str = ""
     sentence: str = ""
@@ -148,16 +153,13 @@ class NextBest:
         """What makes most of the uncertainty, and what would reduce it; empty where nothing is proposed."""
         if not self.measurements:
             return ""
-        before = self.measurements[0].u_before_um
         chosen: list[NextMeasurement] = []
         for least in (1, 2, 3):  # the best with one set-up, with two, with more; more work has to bring more
             found = [item for item in self.measurements if min(item.candidate.set_ups, 3) == least]
             if found and (not chosen or found[0].u_after_um < chosen[-1].u_after_um):
                 chosen.append(found[0])
         first, *others = chosen
-        said = (
-            f"{_capital(first.candidate.what)} would reduce u from {um_text(before)} to {um_text(first.u_after_um)} um"
-        )
+        said = f"{_capital(first.candidate.what)} would reduce u from {um_text(self.u_um)} to {um_text(first.u_after_um)} um"
         said += "".join(f", {item.candidate.what} to {um_text(item.u_after_um)}" for item in others)
         return f"{self.sentence} {said} (rms over the volume)."
 
@@ -173,30 +175,30 @@ def _capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
+def unmeasured(machine: Machine) -> Posterior:
+    """Return what is known of a machine before anything is measured: its prior."""
+    return posterior_of_values(machine, (), np.zeros(0), np.zeros(0), np.zeros((0, 0)))
+
+
 def next_best(found: Posterior) -> NextBest:
     """Return what to measure next, from what is known of the errors of a machine.
 
     Examples
     --------
-    >>> import numpy as np
     >>> import compgen
-    >>> from compgen.identify.posterior import posterior_of_values
-    >>> from compgen.plan.next_best import next_best
-    >>> machine = compgen.load_machine("zha-gantry")
-    >>> nothing = np.zeros(0)
-    >>> unmeasured = posterior_of_values(machine, [], nothing, nothing, np.zeros((0, 0)))
-    >>> next_best(unmeasured).measurements[0].candidate.code
+    >>> from compgen.plan.next_best import next_best, unmeasured
+    >>> next_best(unmeasured(compgen.load_machine("zha-gantry"))).measurements[0].candidate.code
     'laser_tracer'
     """
-    if set(found.determined) >= set(found.names):
-        return NextBest(found.machine)
     with one_thread():
-        return _searched(found)
+        volume = _Volume(found)
+        if set(found.determined) >= set(found.names):
+            return NextBest(found.machine, volume.rms_um())
+        return _searched(found, volume)
 
 
-def _searched(found: Posterior) -> NextBest:
-    machine, volume = found.machine, _Volume(found)
-    before = volume.rms_um()
+def _searched(found: Posterior, volume: _Volume) -> NextBest:
+    machine, before = found.machine, volume.rms_um()
     best: dict[str, tuple[float, Candidate]] = {}
     for candidate in candidates(found):
         after = volume.rms_um(candidate.readings)
@@ -207,10 +209,10 @@ def _searched(found: Posterior) -> NextBest:
     chosen = [NextMeasurement(item, before, after, volume.reduced(item.readings)) for after, item in useful[:MOST]]
     open_errors = {name: share for name, share in volume.parts().items() if name not in found.determined}
     if not chosen or not open_errors:
-        return NextBest(machine)
+        return NextBest(machine, before)
     largest = max(open_errors, key=lambda name: open_errors[name])
     share = open_errors[largest] / sum(volume.parts().values())
-    return NextBest(machine, tuple(chosen), largest, _assumed(found, largest, share))
+    return NextBest(machine, before, tuple(chosen), largest, _assumed(found, largest, share))
 
 
 def _assumed(found: Posterior, name: str, share: float) -> str:
@@ -706,3 +708,31 @@ def _seen(place_mm: FloatArray) -> FloatArray:
     """Places (n, 3) as seen from the front, from above: X to the right, Z up, Y away, (n, 2)."""
     x, y, z = place_mm.T
     return np.column_stack([x + 0.45 * y, z + 0.3 * y])
+
+
+def next_page(found: NextBest, assumed: str) -> str:
+    """Return the text of ``plan.html``: what to measure next, and how each instrument stands. It loads nothing."""
+    pictures = [
+        replace(set_up_picture(item.summary(found.machine), f"next-{k}"), note=f"u {um_text(item.u_after_um)} µm")
+        for k, item in enumerate(found.measurements)
+    ]
+    rows = "".join(
+        f'<tr><th scope="row">{escape(item.candidate.what)}</th><td class="n">{um_text(item.u_after_um)}</td>'
+        f"<td>{', '.join(item.reduces)}</td><td>{escape(item.candidate.how)}</td></tr>"
+        for item in found.measurements
+    )
+    head = '<tr><th scope="col">measurement</th><th scope="col" class="n">u after, µm</th><th scope="col">reduces</th>'
+    table = f'<div class="scroll"><table>{head}<th scope="col">how</th></tr>{rows}</table></div>'
+    style, _, policy = page_assets()
+    name = escape(found.machine.name)
+    body = (
+        f"<h1>What to measure next on {name}</h1><p>{escape(found.text or NOTHING_NEXT)}</p>"
+        f'<p class="note">u of the tool tip over the volume now: {um_text(found.u_um)} µm rms (k = 1); {escape(assumed)}.</p>'
+        + (table + picture_grid(pictures) if pictures else "")
+    )
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{name}: next measurement</title><style>{style}</style></head><body>\n{body}</body></html>\n"
+    )

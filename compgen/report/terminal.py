@@ -558,6 +558,19 @@ def gauge_plan_table(plan: GaugePlan) -> Group:
     return Group(Text("\n".join(lines)), *([table] if plan.errors.names else []), *notes)
 
 
+def next_table(found: NextBest, assumed: str) -> Group:
+    """Return what to measure next, with what each measurement would bring and how it is done."""
+    from compgen.plan.next_best import NOTHING_NEXT
+
+    table = Table("measurement", "u after (um)", "reduces", box=box.SIMPLE)
+    for item in found.measurements:
+        most = ", ".join(item.reduces[:6]) + (" ..." if len(item.reduces) > 6 else "")
+        table.add_row(item.candidate.what, um_text(item.u_after_um), most)
+    lines = [f"u of the tool tip over the volume, rms: {um_text(found.u_um)} um (k = 1)", assumed]
+    how = [Text(f"{item.candidate.what}: {item.candidate.how}") for item in found.measurements]
+    return Group(Text("\n".join([*lines, found.text or NOTHING_NEXT])), *([table, *how] if found.measurements else []))
+
+
 def volume_line(title: str, plan: Plan) -> str:
     """Return a line or two with the uncertainty of E over the volume."""
     report = plan.volume.summary()

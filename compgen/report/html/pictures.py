@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,6 +61,19 @@ def describe_error(name: str) -> str:
     if error.kind == "squareness":
         return {"EC0Y": "Squareness of Y to X", "EB0Z": "Squareness of Z to X", "EA0Z": "Squareness of Z to Y"}[name]
     return f"Roll of {axis}" if error.direction == error.axis else f"Rotation of {axis} about {AXES[error.direction]}"
+
+
+def draw_proposed(entries: Sequence[Mapping[str, Any]]) -> list[Picture]:
+    """How the instruments of proposed measurements stand; entries that are damaged are left out."""
+    if not entries:
+        return []
+    from compgen.plan.next_best import set_up_picture  # few folders propose something
+
+    found = []
+    for k, entry in enumerate(entries):
+        with suppress(KeyError, TypeError, ValueError, IndexError):
+            found.append(set_up_picture(entry, f"next-{k}"))
+    return found
 
 
 def draw_curve(

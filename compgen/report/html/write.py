@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -31,6 +31,7 @@ from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder,
 from compgen.report.html.pictures import (
     describe_error,
     draw_curve,
+    draw_proposed,
     draw_residuals,
     draw_slices,
     draw_space,
@@ -223,7 +224,7 @@ VERDICTS = {
 MEASUREMENT = (
     "method", "readings", "readings_used", "residual_rms_um", "residual_max_um", "reduced_chi_square", "degrees_of_freedom",
     "rank", "unknowns", "u_length", "u_deviation", "unobservable", "rejected", "segments", "stations", "corrections",
-    "worst_standard_uncertainty", "systematic", "objections",
+    "worst_standard_uncertainty", "systematic", "objections", "notes",
 )  # fmt: skip
 
 
@@ -252,6 +253,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "errors": _errors(source.identified),
         "assumed": assumptions_of(identify) if identify and identify.get("identified") is not False else [],
         "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
+        "next": _proposed(source),
         "accuracy": accuracy_groups(source),
         "compare": comparison_groups(source),
         "machine": _machine(source),
@@ -266,6 +268,22 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "limitations": limitations(source),
         "notes": list(source.notes),
     }
+
+
+def _proposed(source: ResultFolder) -> dict[str, Any]:
+    """What to measure next, as ``identify.json`` or ``result.json`` has it; empty where nothing is proposed."""
+    found = (source.identify, *(item.result for item in source.controls))
+    data = next((item for item in found if item.get("next_measurements")), {})
+    return {"text": str(data.get("next_text", "")), "measurements": list(proposed_rows(data.get("next_measurements")))}
+
+
+def proposed_rows(listed: Any) -> Iterator[dict[str, Any]]:
+    """Yield what a page shows of ``next_measurements``; entries without their keys are left out."""
+    for item in listed if isinstance(listed, list) else ():
+        known = _mapping(item)
+        if isinstance(known.get("reduces"), list) and isinstance(known.get("u_after_um"), int | float):
+            texts = {key: str(known.get(key, "")) for key in ("what", "how")}
+            yield {**texts, **{key: known.get(key) for key in ("u_after_um", "reduces", "picture")}}
 
 
 def judged(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
@@ -931,6 +949,7 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
     if source.residuals is not None:
         found["measurement"] = draw_residuals(source.residuals)
     found["stations"] = draw_stations(source.identify.get("stations", []), source.residuals)
+    found["next"] = draw_proposed(data["next"]["measurements"])
     known: dict[bytes, str] = {}
     for k, item in enumerate(source.controls):
         grid = grid_of(item.volume)
