@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from html import escape
 from typing import Any
 
@@ -21,44 +21,63 @@ from compgen.data.files import json_text
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError, number_text, um_text
 from compgen.identify.adjust.determined import Determined
 from compgen.identify.adjust.unknowns import error_parameters
 from compgen.identify.axis_tests import identify_circles
 from compgen.identify.covariance import values_with_factor
+from compgen.identify.identification import Identification, without_adjustment
 from compgen.identify.options import IdentifyOptions
-from compgen.identify.together import Source, solve_together
+from compgen.identify.posterior import Information, Posterior, assumed_text, not_measured, with_information
+from compgen.identify.together import Source, solve_together, with_prior
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import volumetric_error
+from compgen.plan.next_best import REDUCED, unmeasured
+from compgen.plan.prediction import FEW_POINTS, VolumeUncertainty, volume_of
 from compgen.simulate.gauges import CIRCLE_NOISE_UM, Ballbar, PlatePose, TouchProbe
 from compgen.simulate.trajectory import Stops
 
 Gauge = TouchProbe | Ballbar
 
-# Readings of a perfect machine, and the adjustment that a measurement would get.
+# Readings of a perfect machine, and the posterior that a measurement would get.
 
 
 @dataclass(frozen=True)
 class Addition:
-    """A pose or circle to add: in words, as an option, errors that it adds, and the mean ratio of uncertainties."""
+    """A pose or circle to add: in words, as an option, what it adds and reduces, and u of the field over the volume with it.
+
+    ``adds`` are errors that are determined with it and not without, ``reduces`` those whose uncertainty it reduces, by what
+    that takes from u of the field. ``u_ratio`` is the mean ratio of the uncertainties of the errors that were determined before.
+    """
 
     text: str
     option: str
     adds: tuple[str, ...]
+    reduces: tuple[str, ...]
     u_ratio: float
+    u_after_um: float | None = None
 
     @property
     def effect(self) -> str:
         """What it brings, in words."""
         adds = f"determines {', '.join(self.adds)}" if self.adds else ""
-        ratio = f"the others {self.u_ratio:.2f} times as uncertain" if self.u_ratio < 0.995 else ""
-        return "; ".join(part for part in (adds, ratio) if part)
+        others = [name for name in self.reduces if name not in self.adds][:MOST_NAMES]
+        less = f"reduces {', '.join(others)}" if others else ""
+        after = "" if self.u_after_um is None else f"u over the volume then {um_text(self.u_after_um)} um"
+        return "; ".join(part for part in (adds, less, after) if part)
 
     def summary(self) -> dict[str, Any]:
         """Return the entry of ``additions`` in ``plan.json``."""
-        return {"what": self.text, "option": self.option, "adds": list(self.adds), "u_ratio": self.u_ratio}
+        return {
+            "what": self.text,
+            "option": self.option,
+            "adds": list(self.adds),
+            "reduces": list(self.reduces),
+            "u_ratio": self.u_ratio,
+            "u_after_um": self.u_after_um,
+        }
 
 
 @dataclass(frozen=True, repr=False)
@@ -70,8 +89,10 @@ class GaugePlan(Displayed):
     machine, gauges : the machine, its gauges, and planned tracer lengths, if any.
     lengths : planned tracer lengths, or None.
     readings, freedom : number of readings, without calibration data, and degrees of freedom.
-    solution : the adjustment; None if it determines no error.
-    errors : errors that are determined, with values of zero and the predicted standard uncertainties.
+    solution : the adjustment of the readings alone; None if they determine no error.
+    errors : errors that an identification would list, with values of zero and the predicted standard uncertainties.
+    posterior : what will be known of every error; None without a prior.
+    volume : u of E over the volume; None without a prior.
     additions : what to measure in addition, the most useful first.
     """
 
@@ -82,46 +103,60 @@ class GaugePlan(Displayed):
     freedom: int
     solution: Determined | None
     errors: ErrorTable
+    posterior: Posterior | None = None
+    volume: VolumeUncertainty | None = None
     additions: tuple[Addition, ...] = ()
 
     @property
     def whole(self) -> tuple[str, ...]:
-        """Errors that the measurement determines."""
+        """Errors that the measurement determines: at most a third of what is assumed of them remains unknown."""
         return tuple(name for name in self.errors.names if name not in self.partly)
 
     @property
     def partly(self) -> tuple[str, ...]:
-        """Errors of which a part cannot be separated from poses, the artefact or other errors."""
-        return self.solution.partly if self.solution else ()
+        """Errors of which the measurement shows something, but not enough."""
+        if self.posterior is None:
+            return self.solution.partly if self.solution else ()
+        return tuple(name for name in self.errors.names if name not in self.posterior.determined)
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Errors of the machine's model that the readings do not show, or not separately from others."""
-        return tuple(name for name in modelled_errors(self.machine) if name not in self.errors.names)
+        """Errors that the measurement shows little of or nothing: what is assumed of them remains unknown."""
+        names = modelled_errors(self.machine) if self.posterior is None else self.posterior.names
+        return tuple(name for name in names if name not in self.errors.names)
 
-    @property
-    def within_circles(self) -> str:
-        """A note on squareness by circles, empty without circles."""
-        circles = any(isinstance(gauge, Ballbar) for gauge in self.gauges)
-        return "squareness by circles is that within the circle, unless straightness is determined" if circles else ""
+    def uncertainties(self) -> dict[str, dict[str, Any]]:
+        """Largest standard uncertainty of each error over the travel and where it was read; with a prior of every error."""
+        empty, largest = self.solution.unreached if self.solution else {}, {}
+        for name in self.errors.names if self.posterior is None else self.posterior.names:
+            error, listed = error_named(name), name in self.errors.names
+            at_mm, u = self._u_of(name)
+            worst, read = int(np.argmax(np.nan_to_num(u, nan=np.inf))), ~np.isin(at_mm, empty.get(name, []))
+            known = bool(np.isfinite(u[worst]))
+            largest[name] = {
+                "unit": error.unit,
+                "u_max": float(u[worst]) / error.si_per_unit if known else None,
+                "at_mm": None if np.isnan(at_mm[worst]) else float(at_mm[worst]),
+                "u_max_where_read": float(u[read].max()) / error.si_per_unit
+                if listed and known and read.any()
+                else None,
+                "state": "assumed" if not listed else "partly" if name in self.partly else "determined",
+            }
+        return largest
+
+    def _u_of(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Positions (m,) and standard uncertainties (m,) of an error, mm and rad; nan for the position of a squareness."""
+        if name in self.errors.squareness:
+            return np.full(1, np.nan), np.array([self.errors.squareness[name][1]])
+        if name in self.errors.curves:
+            return self.errors.curves[name].position_mm, self.errors.curves[name].u
+        assert self.posterior is not None
+        error = error_named(name)
+        at_mm = np.full(1, np.nan) if error.kind == "squareness" else self.machine.axes[error.axis].nodes_mm
+        return at_mm, self.posterior.curve(name, at_mm).u
 
     def summary(self) -> dict[str, Any]:
         """Return the contents of ``plan.json``."""
-        largest, empty = {}, self.solution.unreached if self.solution else {}
-        for name in self.errors.names:
-            error = error_named(name)
-            if name in self.errors.squareness:
-                at_mm, u = np.full(1, np.nan), np.array([self.errors.squareness[name][1]])
-            else:
-                at_mm, u = self.errors.curves[name].position_mm, self.errors.curves[name].u
-            read = ~np.isin(at_mm, empty.get(name, []))
-            worst = int(np.argmax(u))
-            largest[name] = {
-                "unit": error.unit,
-                "u_max": float(u[worst]) / error.si_per_unit,
-                "at_mm": None if np.isnan(at_mm[worst]) else float(at_mm[worst]),
-                "u_max_where_read": float(u[read].max()) / error.si_per_unit if read.any() else None,
-            }
         found = self.solution
         return {
             "determined": list(self.whole),
@@ -133,20 +168,44 @@ class GaugePlan(Displayed):
             "rank": found.rank if found else 0,
             "degrees_of_freedom": self.freedom,
             "condition": found.condition if found else None,
-            "u": largest,
+            "u": self.uncertainties(),
+            **self._assumed(),
             "nodes_without_data": {name: at.tolist() for name, at in found.unreached.items()} if found else {},
             "additions": [item.summary() for item in self.additions],
+        }
+
+    def _assumed(self) -> dict[str, Any]:
+        """What is assumed of errors that the measurement does not show, what it costs, and u of the field."""
+        if self.posterior is None or self.volume is None:
+            return {"prior": self.machine.prior.as_dict(), "not_measured": {}}
+        return {
+            "volume": self.volume.summary(),
+            "prior": self.posterior.prior.as_dict(),
+            "assumed": assumed_text(self.posterior),
+            "not_measured": not_measured(self.posterior, self.errors.names),
         }
 
     def overview(self) -> Overview:
         """Largest uncertainty of each error."""
         rows = tuple(
-            (name, f"{item['u_max']:.3g}", str(item["unit"]), "partly" if name in self.partly else "")
-            for name, item in self.summary()["u"].items()
+            (name, number_text(item["u_max"], missing="not determined"), str(item["unit"]), str(item["state"]))
+            for name, item in self.uncertainties().items()
         )
         return Overview(
             f"plan: {len(self.whole)} errors from {self.readings} readings", ("error", "u", "unit", ""), rows
         )
+
+
+def volume_text(plan: GaugePlan) -> str:
+    """Say how well the field over the volume will be known, and what is assumed for it; empty without a prior."""
+    if plan.volume is None or plan.posterior is None:
+        return ""
+    largest, mean = um_text(plan.volume.worst_um), um_text(plan.volume.rms_um)
+    return f"u of E over the volume, max / rms: {largest} / {mean} um; {assumed_text(plan.posterior)}"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _described(gauge: Gauge) -> str:
@@ -209,80 +268,153 @@ def plan_gauges(
         for a feature or a circle outside the travel.
     """
     with one_thread():
-        found = _predicted(machine, tuple(gauges), lengths, options or IdentifyOptions())
-        return replace(found, additions=_additions(found, options or IdentifyOptions())) if additions else found
+        setting = _Setting(machine, lengths, replace(options or IdentifyOptions(), reject=False))
+        found = _predicted(setting, tuple(gauges))
+        return replace(found, additions=_additions(setting, found)) if additions else found
 
 
-def _predicted(
-    machine: Machine, gauges: tuple[Gauge, ...], lengths: Lengths | None, options: IdentifyOptions
-) -> GaugePlan:
-    parts, count = [], 0
-    for k, gauge in enumerate(gauges):
-        readings = perfect_readings(machine, gauge)
-        if isinstance(readings, Artefact):
-            parts.append(Source(f"artefact {k}", readings, None))
-            count += int(np.isfinite(readings.measured_mm).sum())
-        else:
-            # readings with any scatter give the weights; the covariance is that of the stated noise
-            u_mm = gauge.noise_um * MM_PER_UM or CIRCLE_NOISE_UM * MM_PER_UM
-            scatter = u_mm * np.random.default_rng(k).standard_normal(len(readings))
-            alone = identify_circles(machine, replace(readings, deviation_mm=scatter))
-            assert alone.values_factor is not None
-            factor = alone.values_factor * (u_mm / (alone.u_length_um * MM_PER_UM))
-            alone = replace(alone, values_factor=factor, u_length_um=u_mm / MM_PER_UM)
-            parts.append(Source(f"circles {k}", readings, alone))
-            count += len(readings)
-    if lengths is not None:
-        parts.append(Source("lengths", lengths, None))
-        count += len(lengths)
+@dataclass(frozen=True)
+class _Setting:
+    """What all plans of a machine share: planned lengths, options, and what each gauge reads, once it was asked for."""
+
+    machine: Machine
+    lengths: Lengths | None
+    options: IdentifyOptions
+    known: dict[Gauge, Source] = field(default_factory=dict)
+
+    def sources(self, gauges: Sequence[Gauge]) -> list[Source]:
+        """What gauges and the tracer read, with the uncertainty that identification would find."""
+        for gauge in gauges:
+            if gauge not in self.known:
+                self.known[gauge] = _source(self.machine, gauge)
+        parts = [replace(self.known[gauge], name=f"gauge {k}") for k, gauge in enumerate(gauges)]
+        return [*parts, Source("lengths", self.lengths, None)] if self.lengths is not None else parts
+
+
+def _predicted(setting: _Setting, gauges: tuple[Gauge, ...]) -> GaugePlan:
+    """The plan of gauges: what least squares determines, and the posterior that identification would have of the readings."""
+    machine, lengths, plain = setting.machine, setting.lengths, setting.options
+    parts = setting.sources(gauges)
+    count = sum(_count(part) for part in parts)
     layout = error_parameters(machine, modelled_errors(machine))
     metadata = {"machine": machine.name, "source": "compgen plan", "values": "zero, only u_value is predicted"}
+    freedom, solution, errors = 0, None, ErrorTable({}, {}, metadata)
     try:
-        _, solution, _ = solve_together(machine, layout, parts, replace(options, reject=False))
+        _, solution, _ = solve_together(machine, layout, parts, plain)
     except UndeterminedError:
-        return GaugePlan(machine, gauges, lengths, count, 0, None, ErrorTable({}, {}, metadata))
-    errors, _ = values_with_factor(solution.layout, np.zeros(solution.layout.size), solution.factor)
-    freedom = solution.freedom + sum(part.alone.degrees_of_freedom for part in parts if part.alone is not None)
-    return GaugePlan(machine, gauges, lengths, count, freedom, solution, errors.replace(metadata=metadata))
+        pass
+    else:
+        errors, _ = values_with_factor(solution.layout, np.zeros(solution.layout.size), solution.factor)
+        freedom = solution.freedom + sum(part.alone.degrees_of_freedom for part in parts if part.alone is not None)
+    alone = without_adjustment(machine, errors.replace(metadata=metadata), np.zeros(0), "stated", "no reading shows it")
+    known, posterior = _with_prior(machine, parts, alone, plain)
+    volume = None if posterior is None else volume_of(machine, posterior)
+    return GaugePlan(machine, gauges, lengths, count, freedom, solution, known, posterior, volume)
+
+
+def _with_prior(
+    machine: Machine, parts: Sequence[Source], alone: Identification, options: IdentifyOptions
+) -> tuple[ErrorTable, Posterior | None]:
+    """The errors that identification would list, with their uncertainties, and the posterior; values are zero."""
+    nothing = alone.errors.only()
+    if not alone.errors.names:  # identification refuses such readings
+        return nothing, None if machine.prior.is_none else unmeasured(machine)
+    try:
+        found = with_prior(machine, parts, replace(alone, method="together"), options)
+    except UndeterminedError:
+        return nothing, unmeasured(machine)
+    return found.errors.with_values(np.zeros(len(found.errors.values()))), found.posterior
+
+
+def _count(part: Source) -> int:
+    """Number of readings of a part, without calibration data."""
+    measured = part.measurement
+    if isinstance(measured, Artefact):
+        return int(np.isfinite(measured.measured_mm).sum())
+    assert isinstance(measured, Circles | Lengths)
+    return len(measured)
+
+
+def _source(machine: Machine, gauge: Gauge) -> Source:
+    """What a gauge reads, with the uncertainty that identification would find."""
+    readings = perfect_readings(machine, gauge)
+    if isinstance(readings, Artefact):
+        return Source("", readings, None)
+    u_mm = gauge.noise_um * MM_PER_UM or CIRCLE_NOISE_UM * MM_PER_UM
+    # readings with any scatter give the weights; the covariance is that of the expected scatter
+    scatter = u_mm * np.random.default_rng(0).standard_normal(len(readings))
+    alone = identify_circles(machine, replace(readings, deviation_mm=scatter))
+    assert alone.values_factor is not None
+    expected_um = _scatter_um(machine, readings, u_mm)
+    factor = alone.values_factor * (expected_um / alone.u_length_um)
+    return Source("", readings, replace(alone, values_factor=factor, u_length_um=expected_um))
+
+
+def _scatter_um(machine: Machine, circles: Circles, u_mm: float) -> float:
+    """Standard uncertainty of a reading that identification will find in the residuals of circles, um.
+
+    Noise, and what guides as bent as the prior has them leave: from machines drawn from it. Without a prior the noise.
+    """
+    if machine.prior.is_none:
+        return u_mm / MM_PER_UM
+    position_mm = circles.centre_mm + circles.radius_mm[:, None] * circles.radial()
+    moved = np.einsum("knd,nd->kn", unmeasured(machine).field(position_mm).draws(DRAWN, 1), circles.radial())
+    noise = u_mm * np.random.default_rng(1).standard_normal(moved.shape)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        found = [identify_circles(machine, replace(circles, deviation_mm=row)).u_length_um for row in moved + noise]
+    return float(np.sqrt(np.mean(np.square(found))))
 
 
 # What to add: each candidate is planned as well.
 
 
-#: Number of additions that are listed.
-MOST_ADDITIONS = 3
+#: Number of additions that are listed, and of errors that each is said to reduce.
+MOST_ADDITIONS, MOST_NAMES = 3, 5
+#: Machines that are drawn from the prior for the scatter of circles.
+DRAWN = 8
 #: Radii of circles to add, mm, the largest that fits first.
 RADII_MM = (300.0, 200.0, 150.0, 100.0, 50.0)
-#: An addition is useful if it lowers the uncertainties to this share on average.
-USEFUL = 0.95
+#: An addition is useful if it lowers u of the field (without a prior: of the errors, on average) to this share.
+USEFUL = 0.97
 
 
-def _additions(found: GaugePlan, options: IdentifyOptions) -> tuple[Addition, ...]:
-    """The most useful poses and circles in addition, best first: by the errors that they add, then the uncertainties."""
+@dataclass(frozen=True)
+class _More:
+    """A pose or circle that could be added: in words, as an option, and all gauges with it."""
+
+    text: str
+    option: str
+    gauges: tuple[Gauge, ...]
+
+
+def _additions(setting: _Setting, found: GaugePlan) -> tuple[Addition, ...]:
+    """The most useful poses and circles in addition, best first: by u of the field, without a prior by what they determine."""
+    candidates = [*_more_poses(found), *_more_circles(found)]
+    if found.posterior is not None:
+        rated = [(_u_with(setting, found.posterior, item), item) for item in candidates]
+        least = USEFUL * (found.volume.rms_um if found.volume else np.inf)
+        rated.sort(key=lambda pair: pair[0])
+        candidates = [item for u_um, item in rated if u_um < least][:MOST_ADDITIONS]
+    judged = [addition for item in candidates if (addition := _judged(setting, found, item)) is not None]
+    if found.posterior is not None:
+        return tuple(sorted(judged, key=lambda item: item.u_after_um or 0.0))
+    judged.sort(key=lambda item: (-len(item.adds), item.u_ratio))
+    # the last one is what lowers the uncertainties most
+    chosen = [*judged[: MOST_ADDITIONS - 1], *sorted(judged[MOST_ADDITIONS - 1 :], key=lambda item: item.u_ratio)[:1]]
+    return tuple(chosen)
+
+
+def _more_poses(found: GaugePlan) -> Iterator[_More]:
+    """Every artefact turned, shifted, at the ends of the travel, upright."""
     from scipy.spatial.transform import Rotation  # imported here: slow to load
 
-    machine, before = found.machine, {name: item["u_max"] for name, item in found.summary()["u"].items()}
-    candidates: list[tuple[str, str, tuple[Gauge, ...]]] = []
     for k, gauge in enumerate(found.gauges):
         if isinstance(gauge, Ballbar):
             continue
-        base, others = gauge.poses[0], (found.gauges[:k], found.gauges[k + 1 :])
+        base = gauge.poses[0]
         lies = Rotation.from_rotvec(base.rotation_deg, degrees=True)
-        steps = [(f"turned by {angle} degrees", (0.0, 0.0, float(angle)), np.zeros(3)) for angle in (90, 180, 270)]
-        for axis in range(3):
-            half_mm = 0.5 * (np.array([gauge.columns, gauge.rows, gauge.layers]) - 1) * np.array(gauge.pitch_mm)
-            reach_mm = float(np.abs(lies.as_matrix())[axis] @ half_mm)
-            low_mm, high_mm = machine.axes[axis].range_mm
-            ends = (low_mm + reach_mm + 1.0, high_mm - reach_mm - 1.0)
-            shifts = [(f"shifted by one pitch in {AXES[axis]}", gauge.pitch_mm[axis])] if axis < 2 else []
-            shifts += [(f"at {AXES[axis]} {end:.0f}", float(np.round(end)) - base.origin_mm[axis]) for end in ends]
-            steps += [(text, (0.0, 0.0, 0.0), np.eye(3)[axis] * by_mm) for text, by_mm in shifts]
-        if len(gauge.components) == 3:
-            steps += [
-                ("upright in ZX", (90.0, 0.0, 0.0), np.zeros(3)),
-                ("upright in YZ", (0.0, 90.0, 0.0), np.zeros(3)),
-            ]
-        for text, turn_deg, shift_mm in steps:
+        for text, turn_deg, shift_mm in _moves(found.machine, gauge, lies.as_matrix()):
             turned = (Rotation.from_rotvec(turn_deg, degrees=True) * lies).as_rotvec(degrees=True)
             x, y, z = (np.array(base.origin_mm) + shift_mm).tolist()
             a, b, c = np.round(turned, 6).tolist()
@@ -291,34 +423,77 @@ def _additions(found: GaugePlan, options: IdentifyOptions) -> tuple[Addition, ..
                 continue
             numbers = [x, y, z, *((c,) if not a and not b else (a, b, c))]
             option = f"--pose {','.join(f'{value:g}' for value in (numbers if a or b or c else numbers[:3]))}"
-            candidates.append((text, option, (*others[0], replace(gauge, poses=(*gauge.poses, pose)), *others[1])))
+            more = replace(gauge, poses=(*gauge.poses, pose))
+            yield _More(text, option, (*found.gauges[:k], more, *found.gauges[k + 1 :]))
+
+
+def _moves(
+    machine: Machine, gauge: TouchProbe, lies: FloatArray
+) -> Iterator[tuple[str, tuple[float, float, float], FloatArray]]:
+    """Turns (degrees) and shifts (mm) of an artefact from its first pose, in words."""
+    for angle in (90, 180, 270):
+        yield f"turned by {angle} degrees", (0.0, 0.0, float(angle)), np.zeros(3)
+    base = gauge.poses[0]
+    half_mm = 0.5 * (np.array([gauge.columns, gauge.rows, gauge.layers]) - 1) * np.array(gauge.pitch_mm)
+    for axis in range(3):
+        reach_mm = float(np.abs(lies)[axis] @ half_mm)
+        low_mm, high_mm = machine.axes[axis].range_mm
+        ends = (low_mm + reach_mm + 1.0, high_mm - reach_mm - 1.0)
+        shifts = [(f"shifted by one pitch in {AXES[axis]}", gauge.pitch_mm[axis])] if axis < 2 else []
+        shifts += [(f"at {AXES[axis]} {end:.0f}", float(np.round(end)) - base.origin_mm[axis]) for end in ends]
+        for text, by_mm in shifts:
+            yield text, (0.0, 0.0, 0.0), np.eye(3)[axis] * by_mm
+    if len(gauge.components) == 3:
+        yield "upright in ZX", (90.0, 0.0, 0.0), np.zeros(3)
+        yield "upright in YZ", (0.0, 90.0, 0.0), np.zeros(3)
+
+
+def _more_circles(found: GaugePlan) -> Iterator[_More]:
+    """A circle in every plane that has none."""
     drawn = {plane for gauge in found.gauges if isinstance(gauge, Ballbar) for plane in gauge.planes}
     for plane in sorted({0, 1, 2} - drawn):
-        room_mm = 0.5 * min(np.ptp(machine.axes[k].range_mm) for k in list(PLANES.values())[plane])
-        fitting = [radius for radius in RADII_MM if radius < room_mm]
-        if fitting:
-            name = list(PLANES)[plane]
-            ballbar = Ballbar((plane,), fitting[0], noise_um=CIRCLE_NOISE_UM)
-            text = f"a circle in {name}, radius {fitting[0]:g} mm"
-            candidates.append((text, f"--circle {name}:{fitting[0]:g}", (*found.gauges, ballbar)))
-    judged = []
-    for text, option, gauges in candidates:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CompgenWarning)
-            try:
-                more = _predicted(machine, gauges, found.lengths, options)
-            except InputError:  # it leaves the travel
-                continue
-        adds = tuple(name for name in more.whole if name not in found.whole)
-        after = {name: item["u_max"] for name, item in more.summary()["u"].items()}
-        ratios = [after[name] / before[name] for name in found.whole if name in after and before[name] > 0]
-        ratio = float(np.exp(np.mean(np.log(ratios)))) if ratios else 1.0
-        if adds or ratio < USEFUL:
-            judged.append(Addition(text, option, adds, ratio))
-    judged.sort(key=lambda item: (-len(item.adds), item.u_ratio))
-    # the last one is what lowers the uncertainties most
-    chosen = [*judged[: MOST_ADDITIONS - 1], *sorted(judged[MOST_ADDITIONS - 1 :], key=lambda item: item.u_ratio)[:1]]
-    return tuple(chosen)
+        name, axes = list(PLANES)[plane], list(PLANES.values())[plane]
+        room_mm = 0.5 * min(np.ptp(found.machine.axes[k].range_mm) for k in axes)
+        radius_mm = next((radius for radius in RADII_MM if radius < room_mm), None)
+        if radius_mm is not None:
+            ballbar = Ballbar((plane,), radius_mm, noise_um=CIRCLE_NOISE_UM)
+            text = f"a circle in {name}, radius {radius_mm:g} mm"
+            yield _More(text, f"--circle {name}:{radius_mm:g}", (*found.gauges, ballbar))
+
+
+def _u_with(setting: _Setting, posterior: Posterior, more: _More) -> float:
+    """Return u of the field, rms, um, with a pose or circle in addition; infinite if it leaves the travel."""
+    layout = posterior.layout
+    try:
+        parts, start = setting.sources(more.gauges), np.zeros(layout.size)
+        readings = [part.readings(setting.machine, layout, setting.options, start) for part in parts]
+    except (InputError, UndeterminedError):
+        return np.inf
+    whole = with_information(posterior, [Information.of(item) for item in readings])
+    return volume_of(setting.machine, whole, FEW_POINTS).rms_um
+
+
+def _judged(setting: _Setting, found: GaugePlan, item: _More) -> Addition | None:
+    """What a pose or circle brings; None if it is not useful."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        try:
+            more = _predicted(setting, item.gauges)
+        except InputError:  # it leaves the travel
+            return None
+    adds = tuple(name for name in more.whole if name not in found.whole)
+    before, after = (
+        {name: row["u_max"] for name, row in plan.uncertainties().items() if row["u_max"]} for plan in (found, more)
+    )
+    ratios = {name: after[name] / before[name] for name in before if name in after}
+    determined = [ratios[name] for name in found.whole if name in ratios]
+    ratio = float(np.exp(np.mean(np.log(determined)))) if determined else 1.0
+    if found.posterior is None and not adds and ratio >= USEFUL:
+        return None
+    less = sorted((name for name, value in ratios.items() if value < 1.0 - REDUCED), key=lambda name: ratios[name])
+    return Addition(
+        item.text, item.option, adds, tuple(less), ratio, None if more.volume is None else more.volume.rms_um
+    )
 
 
 # What the gauges would show on a machine with known errors: arrows on the artefact, the polar diagram of the circle.
@@ -508,17 +683,15 @@ def plan_page(found: GaugePlan, errors: ErrorTable | None = None) -> str:
         only = replace(view, responses_um={name: view.responses_um[name] for name in visible})
         picture, data[f"view-{k}"] = _drawing(only, f"view-{k}", np.asarray(total, dtype=np.float64))
         pictures.append(picture)
-    planned, rows = found.summary()["u"], []
+    planned, rows = found.uncertainties(), []
     for name in visible:
         error = error_named(name)
         values = (table.squareness[name][0],) if name in table.squareness else table.curves[name].value
         size = float(np.abs(values).max()) / error.si_per_unit
         unit = error.unit.replace("u", "µ", 1)
-        u = (
-            f"± {planned[name]['u_max']:.2g} {unit}{' (partly separable)' if name in found.partly else ''}"
-            if name in planned
-            else "–"
-        )
+        state = {"determined": "", "partly": " (shown in part)", "assumed": " (assumed, not shown)"}
+        u_max = planned.get(name, {}).get("u_max")
+        u = "–" if u_max is None else f"± {u_max:.2g} {unit}{state[planned[name]['state']]}"
         rows.append(
             f'<tr><th scope="row"><label for="slider-{name}">{name}</label></th><td>{size:.4g} {unit}</td>'
             f'<td class="needs-script"><input type="range" id="slider-{name}" data-error="{name}" min="-200" max="200" '
@@ -539,10 +712,8 @@ def plan_page(found: GaugePlan, errors: ErrorTable | None = None) -> str:
         '<div class="scroll"><table><tr><th>error</th><th>largest</th><th class="needs-script">share</th>'
         '<th class="needs-script"></th><th>u of this plan</th></tr>' + "".join(rows) + "</table></div>",
         f"<p>Not visible here: {', '.join(hidden)}.</p>" if hidden else "",
-        f"<p>Not determined by this plan: {', '.join(found.left_out)}.</p>" if found.left_out else "",
-        "<p>Squareness by circles is that within the circle, unless straightness is determined.</p>"
-        if found.within_circles
-        else "",
+        f"<p>Not shown by this plan: {', '.join(found.left_out)}.</p>" if found.left_out else "",
+        f"<p>{escape(_capital(volume_text(found)))}.</p>" if found.volume else "",
         "<h2>What to add</h2><ul>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else "",
     ]
     style, script, policy = page_assets("gauges.js")

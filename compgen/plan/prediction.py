@@ -26,11 +26,20 @@ from compgen.identify.adjust.problem import LengthProblem, length_problem
 from compgen.identify.adjust.solver import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
 from compgen.identify.adjust.unknowns import ErrorParameters, State, check_travel, dead_lengths_of, error_parameters
 from compgen.identify.covariance import error_values
-from compgen.identify.identification import table_of_values
+from compgen.identify.identification import at_nodes, state_names, table_of_values
 from compgen.identify.options import IdentifyOptions, ReadingNoise, reading_noise
+from compgen.identify.posterior import (
+    Information,
+    Posterior,
+    assumed_text,
+    posterior_of_values,
+    reading_levels,
+    solve_posterior,
+    state_layout,
+)
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.many_points import volume_grid
+from compgen.kinematics.many_points import MOST_POINTS, volume_grid
 from compgen.plan.stations import PlannedStations
 
 # The least-squares problem of a measurement that has not been made: its normal matrix, and its consequences.
@@ -188,18 +197,20 @@ def planned_rank(found: Planned, matrix: FloatArray) -> Rank:
 # What a measurement will determine, and how well, before it is made.
 
 
-#: Points of the volume whose rows of C B are computed together.
-CHUNK_POINTS = 1024
+#: Points of the volume whose rows of C B are computed together; enough points to rank candidates.
+CHUNK_POINTS, FEW_POINTS = 1024, 200
 
 
 @dataclass(frozen=True)
 class VolumeUncertainty:
     """Standard uncertainty of E = C P over the grid of nodes and the middles between them, reference point fixed.
 
+    With a prior it includes what nobody measures, and what the curves do between the readings.
+
     Parameters
     ----------
     position_mm : the points, shape (n, 3).
-    u_mm : standard uncertainty of each component, shape (n, 3), nan if undetermined.
+    u_mm : standard uncertainty of each component, shape (n, 3), nan if undetermined (without a prior only).
     """
 
     position_mm: FloatArray
@@ -243,8 +254,11 @@ class Plan(Drawable):
     planned : the measurement.
     rank : numerical rank, condition and the combinations without data in words.
     nodes_without_data : nodes in mm by axis that no reading affects.
-    errors : zero values with the predicted standard uncertainties, nan if undetermined.
+    errors : zero values with the predicted standard uncertainties; of values that the readings do not determine that of the
+        posterior, without a prior nan.
     volume : uncertainty of E over the working volume.
+    open_errors : errors that the readings alone do not determine at every node.
+    posterior : what will be known of every error; None without a prior.
 
     Examples
     --------
@@ -264,6 +278,8 @@ class Plan(Drawable):
     nodes_without_data: dict[str, list[float]]
     errors: ErrorTable
     volume: VolumeUncertainty
+    open_errors: tuple[str, ...] = ()
+    posterior: Posterior | None = None
 
     @property
     def readings(self) -> int:
@@ -287,12 +303,12 @@ class Plan(Drawable):
         """Return the contents of ``plan.json``."""
         stations, noise, curves = self.planned.stations, self.planned.noise, {}
         for name, curve in self.errors.curves.items():
-            error, whole = error_named(name), bool(np.isfinite(curve.u).all())
+            error, known = error_named(name), bool(np.isfinite(curve.u).all())
             curves[name] = {
                 "unit": error.unit,
-                "determined": whole,
-                "u_max": float(curve.u.max()) / error.si_per_unit if whole else None,
-                "at_mm": float(curve.position_mm[int(np.argmax(curve.u))]) if whole else None,
+                "determined": name not in self.open_errors,
+                "u_max": float(curve.u.max()) / error.si_per_unit if known else None,
+                "at_mm": float(curve.position_mm[int(np.argmax(curve.u))]) if known else None,
             }
         return {
             "determined": self.determined,
@@ -320,6 +336,8 @@ class Plan(Drawable):
                 name: {"unit": "urad", "u": _known(u * 1e6)} for name, (_, u) in self.errors.squareness.items()
             },
             "volume": self.volume.summary(),
+            "prior": (self.planned.machine if self.posterior is None else self.posterior).prior.as_dict(),
+            **({} if self.posterior is None else {"assumed": assumed_text(self.posterior)}),
         }
 
     def overview(self) -> Overview:
@@ -373,29 +391,102 @@ def planned_noise(options: IdentifyOptions | None = None) -> ReadingNoise:
 def plan_of(found: Planned) -> Plan:
     """Return the plan of a measurement that has been set up."""
     matrix = found.normal_matrix(found.stations.position_mm)
-    rank = planned_rank(found, matrix)
-    prediction = predict_unknowns(matrix)
-    nodes = [axis.nodes_mm for axis in found.machine.axes]
-    grid = volume_grid(found.machine, (nodes[0], nodes[1], nodes[2])).position_mm
+    rank, prediction = planned_rank(found, matrix), predict_unknowns(matrix)
     of_errors = prediction.of(slice(0, found.problem.parameters.size))
     table = table_of_values(
         (name, position_mm, np.zeros(len(position_mm)), prediction.of(columns).u(matrix))
         for name, position_mm, columns, matrix in error_values(found.problem.parameters)
     )
+    machine, lost = found.machine, np.isnan(table.uncertainties())
+    names, at_mm = table.labels()
+    posterior = _planned_posterior(found, of_errors, full=not lost.any() and rank.rank == rank.size)
+    if posterior is None:
+        volume = _volume_of_nodes(found, of_errors)
+    else:
+        volume = volume_of(machine, posterior)
+        if lost.any():
+            table = table.with_values(u=np.where(lost, _assumed_u(posterior, names, at_mm), table.uncertainties()))
     metadata = {
-        "machine": found.machine.name,
+        "machine": machine.name,
         "source": "compgen plan",
         "values": "zero, only u_value is predicted",
-        "reference_point_mm": " ".join(f"{value:g}" for value in found.machine.reference_point_mm),
+        "reference_point_mm": " ".join(f"{value:g}" for value in machine.reference_point_mm),
     }
+    open_errors = tuple(dict.fromkeys(name for name, missing in zip(names, lost.tolist(), strict=True) if missing))
+    errors = table.replace(metadata=metadata)
+    return Plan(found, rank, found.nodes_without_data(), errors, volume, open_errors, posterior)
+
+
+def _volume_of_nodes(found: Planned, of_errors: Prediction) -> VolumeUncertainty:
+    """What the noise of the readings makes of u(E), the curves taken as straight between their nodes."""
+    grid = _grid_mm(found.machine)
     chunks = [grid[k : k + CHUNK_POINTS] for k in range(0, len(grid), CHUNK_POINTS)]
-    return Plan(
-        planned=found,
-        rank=rank,
-        nodes_without_data=found.nodes_without_data(),
-        errors=table.replace(metadata=metadata),
-        volume=VolumeUncertainty(grid, np.concatenate([of_errors.u(found.error_rows(chunk)) for chunk in chunks])),
-    )
+    return VolumeUncertainty(grid, np.concatenate([of_errors.u(found.error_rows(chunk)) for chunk in chunks]))
+
+
+def _grid_mm(machine: Machine, most: int = MOST_POINTS) -> FloatArray:
+    nodes = [axis.nodes_mm for axis in machine.axes]
+    return volume_grid(machine, (nodes[0], nodes[1], nodes[2]), most).position_mm
+
+
+def volume_of(machine: Machine, posterior: Posterior, most: int = MOST_POINTS) -> VolumeUncertainty:
+    """Return u(E) over the volume of a machine, at ``most`` points, from what is known of every error."""
+    grid = _grid_mm(machine, most)
+    chunks = [grid[k : k + CHUNK_POINTS] for k in range(0, len(grid), CHUNK_POINTS)]
+    return VolumeUncertainty(grid, np.concatenate([np.sqrt(posterior.field(chunk).variance) for chunk in chunks]))
+
+
+def _assumed_u(posterior: Posterior, names: Sequence[str], at_mm: FloatArray) -> FloatArray:
+    """Standard uncertainty of error values (k,) in the posterior; nan for errors that it does not contain."""
+    label, found = np.array(names), np.full(len(names), np.nan)
+    for name in posterior.names:
+        own = label == name
+        if own.any():
+            found[own] = posterior.curve(name, at_mm[own]).u
+    return found
+
+
+def _planned_posterior(found: Planned, of_errors: Prediction, *, full: bool) -> Posterior | None:
+    """What identification of the lengths would know of every error; None without a prior.
+
+    As there, lengths at the nodes that determine everything enter as the errors that they determine, others one by one.
+    """
+    machine = found.machine
+    if machine.prior.is_none:
+        return None
+    position_mm = found.lengths.position_mm
+    if full and at_nodes(machine, position_mm):
+        values = [
+            (name, at, of_errors.of(columns), rows)
+            for name, at, columns, rows in error_values(found.problem.parameters)
+        ]
+        names = [name for name, at, _, _ in values for _ in at]
+        factor = np.vstack([rows @ part.factor for _, _, part, rows in values])
+        return posterior_of_values(
+            machine, names, np.concatenate([at for _, at, _, _ in values]), np.zeros(len(names)), factor
+        )
+    levels = [reading_levels(axis, position_mm[:, k]) for k, axis in enumerate(machine.axes)]
+    layout = state_layout(machine, levels, state_names(machine))
+    spans = np.column_stack([position_mm.min(axis=0), position_mm.max(axis=0)])
+    learn = not full or machine.prior.learn in ("up", "both")
+    return solve_posterior(machine, layout, [_information(found, layout)], spans, learn=learn)
+
+
+def _information(found: Planned, layout: ErrorParameters) -> Information:
+    """What the lengths say about the unknowns of a layout, stations and dead lengths eliminated; they say zero."""
+    lengths, groups = found.lengths, dead_lengths_of(found.lengths)
+    finer = layout.machine
+    problem = grid_problem(layout, lengths.position_mm, found.tool_mm, lengths.station, groups, found.distances_mm())
+    state = State(np.zeros(layout.size), found.stations.position_mm, np.zeros(found.problem.groups))
+    weight = 1.0 / found.noise.sigma_mm(found.distances_mm()) ** 2
+    matrix = (problem or length_problem(finer, lengths, layout)).weighted(weight).normal_matrix(state)
+    errors, others = slice(0, layout.size), slice(layout.size, None)
+    values, directions = np.linalg.eigh(matrix[others, others])
+    used = values > ZERO_EIGENVALUE * values[-1]
+    shared = (directions[:, used] / np.sqrt(values[used])).T @ matrix[others, errors]
+    reduced = matrix[errors, errors] - shared.T @ shared
+    freedom = len(lengths) - int(np.count_nonzero(used))
+    return Information(0.5 * (reduced + reduced.T), np.zeros(layout.size), 0.0, freedom)
 
 
 # Effects of the catalogue that a planned measurement cannot show, and what to measure in addition.

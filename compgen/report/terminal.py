@@ -505,6 +505,7 @@ def plan_table(plan: Plan) -> Group:
         f"uncertainty of a reading ({plan.planned.noise.source}): {plan.planned.noise.constant_um:g} um + "
         f"{plan.planned.noise.proportional_um_per_m:g} um/m",
         volume_line("volume", plan),
+        *([] if plan.posterior is None else [plan.summary()["assumed"]]),
     ]
     notes = [Text(f"not determined: {reason}", "red") for reason in plan.reasons[:MOST_PLAN_REASONS]]
     if len(plan.reasons) > MOST_PLAN_REASONS:
@@ -529,23 +530,26 @@ def plan_table(plan: Plan) -> Group:
 
 def gauge_plan_table(plan: GaugePlan) -> Group:
     """Return what a plan with artefacts and circles determines, what it leaves out, and what to add."""
+    from compgen.plan.gauges import volume_text
+
     summary = plan.summary()
     lines = [*summary["gauges"], f"{plan.readings} readings, {summary['degrees_of_freedom']} degrees of freedom"]
+    lines += [text for text in (volume_text(plan),) if text]
     table = Table("error", "u (k = 1) where read", "over the travel", "at (mm)", "unit", "", box=box.SIMPLE)
     for name, item in summary["u"].items():
         where = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
-        numbers = (number_text(item["u_max_where_read"], missing="-"), number_text(item["u_max"]))
-        table.add_row(name, *numbers, where, item["unit"], "partly" if name in plan.partly else "")
+        numbers = (number_text(item["u_max_where_read"], missing="-"), number_text(item["u_max"], missing="not known"))
+        table.add_row(name, *numbers, where, item["unit"], "" if item["state"] == "determined" else item["state"])
     notes = [Text("no error is determined", "red")] if not plan.errors.names else []
     if plan.left_out:
-        notes.append(Text(f"not determined, taken as zero: {', '.join(plan.left_out)}", "yellow"))
-    if plan.partly:
+        notes.append(Text(f"not shown: {', '.join(plan.left_out)}", "yellow"))
+    if plan.partly and plan.posterior is None:
         text = (
             "partly: not separable from poses, the artefact or other errors in every direction; u is that of the rest"
         )
         notes.append(Text(text, "yellow"))
-    if plan.within_circles:
-        notes.append(Text(plan.within_circles))
+    elif plan.partly:
+        notes.append(Text("partly: more than a third of what is assumed of them remains unknown", "yellow"))
     empty = {axis: nodes for name, nodes in summary["nodes_without_data"].items() if (axis := name[2])}
     notes += [
         Text(
@@ -568,7 +572,8 @@ def next_table(found: NextBest, assumed: str) -> Group:
         table.add_row(item.candidate.what, um_text(item.u_after_um), most)
     lines = [f"u of the tool tip over the volume, rms: {um_text(found.u_um)} um (k = 1)", assumed]
     how = [Text(f"{item.candidate.what}: {item.candidate.how}") for item in found.measurements]
-    return Group(Text("\n".join([*lines, found.text or NOTHING_NEXT])), *([table, *how] if found.measurements else []))
+    said = Text("\n".join([*lines, found.text or NOTHING_NEXT]))
+    return Group(said, table, *how) if found.measurements else Group(said)
 
 
 def volume_line(title: str, plan: Plan) -> str:
