@@ -306,7 +306,7 @@ def _predicted(setting: _Setting, gauges: tuple[Gauge, ...]) -> GaugePlan:
     else:
         errors, _ = values_with_factor(solution.layout, np.zeros(solution.layout.size), solution.factor)
         freedom = solution.freedom + sum(part.alone.degrees_of_freedom for part in parts if part.alone is not None)
-    alone = without_adjustment(machine, errors.replace(metadata=metadata), np.zeros(0), "stated", "no reading shows it")
+    alone = without_adjustment(machine, errors.replace(metadata=metadata), np.zeros(1), "stated", "no reading shows it")
     known, posterior = _with_prior(machine, parts, alone, plain)
     volume = None if posterior is None else volume_of(machine, posterior)
     return GaugePlan(machine, gauges, lengths, count, freedom, solution, known, posterior, volume)
@@ -392,7 +392,8 @@ def _additions(setting: _Setting, found: GaugePlan) -> tuple[Addition, ...]:
     """The most useful poses and circles in addition, best first: by u of the field, without a prior by what they determine."""
     candidates = [*_more_poses(found), *_more_circles(found)]
     if found.posterior is not None:
-        rated = [(_u_with(setting, found.posterior, item), item) for item in candidates]
+        said: dict[Gauge, Information] = {}
+        rated = [(_u_with(setting, found.posterior, item, said), item) for item in candidates]
         least = USEFUL * (found.volume.rms_um if found.volume else np.inf)
         rated.sort(key=lambda pair: pair[0])
         candidates = [item for u_um, item in rated if u_um < least][:MOST_ADDITIONS]
@@ -461,15 +462,20 @@ def _more_circles(found: GaugePlan) -> Iterator[_More]:
             yield _More(text, f"--circle {name}:{radius_mm:g}", (*found.gauges, ballbar))
 
 
-def _u_with(setting: _Setting, posterior: Posterior, more: _More) -> float:
-    """Return u of the field, rms, um, with a pose or circle in addition; infinite if it leaves the travel."""
-    layout = posterior.layout
+def _u_with(setting: _Setting, posterior: Posterior, more: _More, said: dict[Gauge, Information]) -> float:
+    """Return u of the field, rms, um, with a pose or circle in addition; infinite if it leaves the travel.
+
+    ``said`` keeps what each gauge says about the state of the posterior.
+    """
+    layout, new = posterior.layout, [gauge for gauge in more.gauges if gauge not in said]
     try:
-        parts, start = setting.sources(more.gauges), np.zeros(layout.size)
+        parts, start = setting.sources(new), np.zeros(layout.size)
         readings = [part.readings(setting.machine, layout, setting.options, start) for part in parts]
     except (InputError, UndeterminedError):
         return np.inf
-    whole = with_information(posterior, [Information.of(item) for item in readings])
+    found = [Information.of(item) for item in readings]
+    said |= dict(zip(new, found, strict=False))  # behind the gauges: the tracer
+    whole = with_information(posterior, [*(said[gauge] for gauge in more.gauges), *found[len(new) :]])
     return volume_of(setting.machine, whole, FEW_POINTS).rms_um
 
 

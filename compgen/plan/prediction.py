@@ -257,6 +257,8 @@ class Plan(Drawable):
     errors : zero values with the predicted standard uncertainties; of values that the readings do not determine that of the
         posterior, without a prior nan.
     volume : uncertainty of E over the working volume.
+    from_readings : the part of it that the noise of the readings makes, which depends on stations and points; the curves
+        are taken as straight between their nodes. Without a prior it is the same as ``volume``.
     open_errors : errors that the readings alone do not determine at every node.
     posterior : what will be known of every error; None without a prior.
 
@@ -278,6 +280,7 @@ class Plan(Drawable):
     nodes_without_data: dict[str, list[float]]
     errors: ErrorTable
     volume: VolumeUncertainty
+    from_readings: VolumeUncertainty
     open_errors: tuple[str, ...] = ()
     posterior: Posterior | None = None
 
@@ -336,6 +339,7 @@ class Plan(Drawable):
                 name: {"unit": "urad", "u": _known(u * 1e6)} for name, (_, u) in self.errors.squareness.items()
             },
             "volume": self.volume.summary(),
+            "volume_from_readings": self.from_readings.summary(),
             "prior": (self.planned.machine if self.posterior is None else self.posterior).prior.as_dict(),
             **({} if self.posterior is None else {"assumed": assumed_text(self.posterior)}),
         }
@@ -400,12 +404,10 @@ def plan_of(found: Planned) -> Plan:
     machine, lost = found.machine, np.isnan(table.uncertainties())
     names, at_mm = table.labels()
     posterior = _planned_posterior(found, of_errors, full=not lost.any() and rank.rank == rank.size)
-    if posterior is None:
-        volume = _volume_of_nodes(found, of_errors)
-    else:
-        volume = volume_of(machine, posterior)
-        if lost.any():
-            table = table.with_values(u=np.where(lost, _assumed_u(posterior, names, at_mm), table.uncertainties()))
+    from_readings = _from_readings(found, of_errors)
+    volume = from_readings if posterior is None else volume_of(machine, posterior)
+    if posterior is not None and lost.any():
+        table = table.with_values(u=np.where(lost, _assumed_u(posterior, names, at_mm), table.uncertainties()))
     metadata = {
         "machine": machine.name,
         "source": "compgen plan",
@@ -414,10 +416,10 @@ def plan_of(found: Planned) -> Plan:
     }
     open_errors = tuple(dict.fromkeys(name for name, missing in zip(names, lost.tolist(), strict=True) if missing))
     errors = table.replace(metadata=metadata)
-    return Plan(found, rank, found.nodes_without_data(), errors, volume, open_errors, posterior)
+    return Plan(found, rank, found.nodes_without_data(), errors, volume, from_readings, open_errors, posterior)
 
 
-def _volume_of_nodes(found: Planned, of_errors: Prediction) -> VolumeUncertainty:
+def _from_readings(found: Planned, of_errors: Prediction) -> VolumeUncertainty:
     """What the noise of the readings makes of u(E), the curves taken as straight between their nodes."""
     grid = _grid_mm(found.machine)
     chunks = [grid[k : k + CHUNK_POINTS] for k in range(0, len(grid), CHUNK_POINTS)]

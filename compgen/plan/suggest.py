@@ -182,13 +182,18 @@ def points_of(found: Planned) -> Points:
 
 @dataclass(frozen=True)
 class TrajectoryCandidate:
-    """A trajectory with its number of points and what it would reach; ``worst_um`` is infinite if undetermined."""
+    """A trajectory with its number of points and what it would reach; ``worst_um`` is infinite if undetermined.
+
+    ``worst_um`` and ``rms_um`` are what the noise of the readings makes of u(E), ``volume_um`` is the largest u(E) with what
+    the curves do between their nodes, which no trajectory changes; None without a prior.
+    """
 
     name: str
     position_mm: FloatArray
     determined: bool
     worst_um: float
     rms_um: float
+    volume_um: float | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return one entry of ``trajectories`` of ``plan.json``."""
@@ -198,6 +203,7 @@ class TrajectoryCandidate:
             "determined": self.determined,
             "u_max_um": self.worst_um if np.isfinite(self.worst_um) else None,
             "u_rms_um": self.rms_um if np.isfinite(self.rms_um) else None,
+            "u_max_over_volume_um": self.volume_um,
         }
 
 
@@ -264,8 +270,9 @@ def judge_trajectories(
         for name, position_mm in candidate_trajectories(machine).items():
             progress(f"judging trajectory: {name}")
             result = plan_of(planned(machine, stations, Points(position_mm), noise))
-            worst, rms = result.volume.worst_um, result.volume.rms_um
-            judged.append(TrajectoryCandidate(name, position_mm, result.determined, worst, rms))
+            worst, rms = result.from_readings.worst_um, result.from_readings.rms_um
+            over_volume = None if result.posterior is None else result.volume.worst_um
+            judged.append(TrajectoryCandidate(name, position_mm, result.determined, worst, rms, over_volume))
             if result.determined and worst <= target_um:
                 return judged, judged[-1]
     return judged, None

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from compgen.accuracy.field import ComparedFigure, Figure
     from compgen.fit import FitResult
     from compgen.identify import Identification
-    from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate
+    from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate, VolumeUncertainty
     from compgen.plan.gauges import GaugePlan
     from compgen.plan.next_best import NextBest
     from compgen.tables import Residuals, Verification
@@ -505,6 +505,7 @@ def plan_table(plan: Plan) -> Group:
         f"uncertainty of a reading ({plan.planned.noise.source}): {plan.planned.noise.constant_um:g} um + "
         f"{plan.planned.noise.proportional_um_per_m:g} um/m",
         volume_line("volume", plan),
+        f"  of this from the noise of the readings: {_worst_and_rms(plan.from_readings)}",
         *([] if plan.posterior is None else [plan.summary()["assumed"]]),
     ]
     notes = [Text(f"not determined: {reason}", "red") for reason in plan.reasons[:MOST_PLAN_REASONS]]
@@ -576,6 +577,13 @@ def next_table(found: NextBest, assumed: str) -> Group:
     return Group(said, table, *how) if found.measurements else Group(said)
 
 
+def _worst_and_rms(volume: VolumeUncertainty) -> str:
+    """Largest and rms u of E over the volume; in words where it is undetermined."""
+    if not np.isfinite(volume.rms_um):
+        return "undetermined"
+    return f"{volume.worst_um:.3f} / {volume.rms_um:.3f} um"
+
+
 def volume_line(title: str, plan: Plan) -> str:
     """Return a line or two with the uncertainty of E over the volume."""
     report = plan.volume.summary()
@@ -600,20 +608,30 @@ def trajectory_table(
     judged: Sequence[TrajectoryCandidate], chosen: TrajectoryCandidate | None, target_um: float
 ) -> Group:
     """Return the trajectories that were judged, and the one that reaches the target."""
-    table = Table("trajectory", "points", "u max (um)", "u rms (um)", box=box.SIMPLE)
+    table = Table("trajectory", "points", "u max (um)", "u rms (um)", "with all between the nodes, max", box=box.SIMPLE)
     for item in judged:
         table.add_row(
             item.name,
             str(len(item.position_mm)),
             number_text(item.worst_um, missing="not determined"),
             number_text(item.rms_um, missing="not determined"),
+            "" if item.volume_um is None else number_text(item.volume_um),
         )
     verdict = (
         f"the smallest trajectory within {target_um:g} um: {chosen.name}"
         if chosen
         else f"no trajectory reaches {target_um:g} um with these stations"
     )
-    return Group(table, Text(verdict, "" if chosen else "red"))
+    notes = []
+    if chosen is not None and chosen.volume_um is not None and chosen.volume_um > target_um:
+        notes.append(
+            Text(
+                "this is what the noise of the readings makes; with what is assumed of the curves between their nodes u is up "
+                f"to {number_text(chosen.volume_um)} um (more nodes in the machine file reduce that)",
+                "yellow",
+            )
+        )
+    return Group(table, Text(verdict, "" if chosen else "red"), *notes)
 
 
 def visibility_table(visible: PlanVisibility) -> Group:

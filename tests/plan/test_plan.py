@@ -9,6 +9,7 @@ import pytest
 from compgen.data.error_table import read_errors
 from compgen.data.lengths import Lengths, Points, read_points
 from compgen.data.machine import Axis, load_machine
+from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError
 from compgen.identify import IdentifyOptions, identify
 from compgen.kinematics.first_order import c_matrix
@@ -39,6 +40,7 @@ PLACES = {
     "D": [-100.0, 1300.0, 600.0],
 }
 NOISE = IdentifyOptions(u_length_um=0.2, u_length_um_per_m=0.0)
+NO_PRIOR = PriorSettings(class_name="none")
 UNEVEN_NOISE = IdentifyOptions(u_length_um=0.2, u_length_um_per_m=0.3)
 
 
@@ -119,11 +121,14 @@ def test_the_prediction_is_the_inverse_of_the_dense_normal_matrix(kind):
     for k, name in enumerate(layout.squareness):
         place = size - len(layout.squareness) + k
         assert result.errors.squareness[name][1] == pytest.approx(np.sqrt(covariance[place, place]), rel=1e-6)
-    chosen = result.volume.position_mm[::7]
+    chosen = result.from_readings.position_mm[::7]
     bases = [layout.basis(axis, chosen[:, axis]) for axis in range(3)]
     design = layout.design(c_matrix(machine, chosen), bases)
     expected = np.sqrt(np.maximum(np.einsum("nij,jk,nik->ni", design, covariance[:size, :size], design), 0.0))
-    assert np.allclose(result.volume.u_mm[::7], expected, rtol=1e-5, atol=1e-9)
+    assert np.allclose(result.from_readings.u_mm[::7], expected, rtol=1e-5, atol=1e-9)
+    assert result.volume.rms_um > result.from_readings.rms_um  # with what the curves do between their nodes
+    without = plan(replace(machine, prior=NO_PRIOR), stations_of(), points, UNEVEN_NOISE)
+    assert np.array_equal(without.volume.u_mm, result.from_readings.u_mm)
 
 
 def test_identification_has_the_uncertainty_that_was_planned():
@@ -151,7 +156,10 @@ def test_points_that_stand_twice_are_read_twice():
     points = points_of(machine)
     once = plan(machine, stations_of(), points, NOISE)
     twice = plan(machine, stations_of(), Points(np.tile(points.position_mm, (2, 1))), NOISE)
-    assert twice.volume.worst_um == pytest.approx(once.volume.worst_um / np.sqrt(2), rel=1e-6)
+    assert twice.from_readings.worst_um == pytest.approx(once.from_readings.worst_um / np.sqrt(2), rel=1e-6)
+    assert (
+        once.volume.worst_um > twice.volume.worst_um > once.volume.worst_um / np.sqrt(2)
+    )  # what is between the nodes stays
     assert twice.readings == 2 * once.readings
 
 
@@ -184,7 +192,7 @@ def test_a_fourth_station_cuts_the_worst_uncertainty_by_more_than_two():
     three, four = (plan(machine, stations_of(count), points_of(machine), NOISE) for count in (3, 4))
     worst = [max(np.max(curve.u) for name, curve in p.errors.curves.items() if name[1] in "XYZ") for p in (three, four)]
     assert 2.0 < worst[0] / worst[1] < 5.0
-    assert three.volume.worst_um > 2.0 * four.volume.worst_um
+    assert three.from_readings.worst_um > 2.0 * four.from_readings.worst_um
 
 
 @pytest.mark.parametrize("kind", ["frame", "faces"])
@@ -196,7 +204,7 @@ def test_twelve_edges_or_six_faces_determine_everything(kind):
 
 
 def test_three_lines_through_a_corner_leave_twenty_node_values_untouched():
-    machine = gantry(5)
+    machine = gantry(5, prior=NO_PRIOR)
     result = plan(machine, stations_of(), corner_lines(machine), NOISE)
     assert result.rank.size - result.rank.rank == 20
     open_nodes = {name: np.count_nonzero(np.isnan(curve.u)) for name, curve in result.errors.curves.items()}
@@ -240,7 +248,7 @@ def test_all_21_errors_need_three_tools():
 
 
 def test_nodes_without_data_are_named_and_the_rest_is_predicted():
-    machine = gantry(5)
+    machine = gantry(5, prior=NO_PRIOR)
     grid = points_of(machine).position_mm
     points = Points(grid[np.abs(grid[:, 0] + 400.0) > 1.0])
     result = plan(machine, stations_of(), points, NOISE)
@@ -255,6 +263,26 @@ def test_nodes_without_data_are_named_and_the_rest_is_predicted():
     assert report["curves"]["EYY"]["u_max"] > 0
     assert report["volume"]["undetermined_points"] == 3 * 9 * 9
     assert report["volume"]["u_max_um"] is None
+
+
+def test_with_a_prior_what_the_readings_do_not_determine_has_what_is_assumed_of_it():
+    """No u is missing or zero: along three lines through a corner, angles have no lever, and keep the size of their class."""
+    machine = gantry(5, prior=PriorSettings(class_name="large", learn="no"))
+    result = plan(machine, stations_of(), corner_lines(machine), NOISE)
+    assert not result.determined
+    assert set(result.open_errors) == {"EAX", "EBX", "EAY", "EBY", "ECY"}
+    report = result.summary()
+    assert report["prior"]["class"] == "large"
+    assert "angles up to 72 urad" in report["assumed"]
+    far = machine.axes[0].range_mm[
+        0
+    ]  # two correlation lengths and more from the reference point, where the curve is zero
+    assert report["curves"]["EAX"]["determined"] is False
+    assert report["curves"]["EAX"]["at_mm"] == far
+    assert report["curves"]["EAX"]["u_max"] == pytest.approx(36.0 * np.sqrt(2.0), rel=0.02)
+    assert report["curves"]["EXX"]["determined"] is True
+    assert report["volume"]["undetermined_points"] == 0
+    assert report["volume"]["u_rms_um"] > 20.0
 
 
 def test_as_many_readings_as_unknowns_leave_nothing_to_check():
@@ -323,8 +351,8 @@ def test_the_criterion_of_the_search_is_that_of_the_plan():
     result = plan(machine, stations, points_of(machine), NOISE)
     on_grid = len(search.rows)
     assert on_grid <= 200
-    assert value <= result.volume.worst_um * (1 + 1e-9)
-    assert value == pytest.approx(result.volume.worst_um, rel=0.1)
+    assert value <= result.from_readings.worst_um * (1 + 1e-9)
+    assert value == pytest.approx(result.from_readings.worst_um, rel=0.1)
 
 
 @pytest.mark.parametrize("criterion", ["worst", "rms"])

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,21 @@ import pytest
 from compgen.data.comparison import without_rigid_motion
 from compgen.data.error_table import Curve, ErrorTable, format_errors
 from compgen.data.lengths import Points
+from compgen.data.names import SQUARENESS_NAMES, error_named
+from compgen.data.prior import PriorSettings
+from compgen.identify.any_measurement import MixedMeasurement, identify_measurement
 from compgen.identify.axis_tests import identify_circles
+from compgen.identify.identification import state_names
 from compgen.identify.options import IdentifyOptions
 from compgen.identify.positions import identify_artefact
+from compgen.identify.posterior import processes_of, root_of
 from compgen.identify.together import Source, identify_together
-from compgen.kinematics.many_points import full_grid
+from compgen.kinematics.exact_chain import tip_position
+from compgen.kinematics.first_order import c_matrix
+from compgen.kinematics.many_points import full_grid, volumetric_error
 from compgen.plan import planned, planned_noise, planned_stations
 from compgen.plan.gauges import perfect_readings, plan_gauges, plan_page, shown_by
+from compgen.report.terminal import gauge_plan_table
 from compgen.simulate.gauges import Ballbar, PlatePose, TouchProbe, circle_from_text, pose_from_text
 from tests.browser import Browser, program
 
@@ -44,7 +53,14 @@ def noisy(machine, probe, seed):
     return found
 
 
-def test_the_planned_uncertainty_is_the_scatter_of_measurements(small_machine):
+@pytest.fixture(scope="module")
+def bare_machine(small_machine):
+    """Without a prior a plan is that of least squares: what the readings alone determine."""
+    return replace(small_machine, prior=PriorSettings(class_name="none"))
+
+
+def test_the_planned_uncertainty_is_the_scatter_of_measurements(bare_machine):
+    small_machine = bare_machine
     plan = plan_gauges(small_machine, [FLAT], additions=False)
     assert {"EXX", "EYX", "EXY", "EYY", "EC0Y"} <= set(plan.whole)
     values = []
@@ -59,33 +75,44 @@ def test_the_planned_uncertainty_is_the_scatter_of_measurements(small_machine):
     assert ratio.max() < 1.5
 
 
-def test_a_pose_turned_is_what_an_uncalibrated_plate_lacks(small_machine):
+def test_a_pose_turned_is_what_an_uncalibrated_plate_lacks(bare_machine):
     """Self-calibration: one pose determines nothing, every addition is another pose; with turns and a shift it is enough."""
     alone = TouchProbe(**{**vars(FLAT), "calibrated": False, "columns": 5, "rows": 5})
-    plan = plan_gauges(small_machine, [alone])
+    plan = plan_gauges(bare_machine, [alone])
     assert plan.errors.names == ()
     assert plan.additions
     assert plan.additions[0].adds
     places = [PlatePose((-50.0, 100.0, -100.0), (0.0, 0.0, angle)) for angle in (0.0, 90.0, 180.0)]
     turned = TouchProbe(**{**vars(alone), "poses": (*places, PlatePose((10.0, 100.0, -100.0)))})
-    more = plan_gauges(small_machine, [turned], additions=False)
+    more = plan_gauges(bare_machine, [turned], additions=False)
     assert {"EYX", "EXY", "EC0Y"} <= set(more.whole)
     assert {"EXX", "EYY"} <= set(more.partly)  # no length: the common scale stays open
 
 
 def test_the_best_addition_keeps_what_it_promises(small_machine):
     plan = plan_gauges(small_machine, [FLAT])
-    best = plan.additions[0]
-    pose = pose_from_text(best.option.removeprefix("--pose "))
-    more = plan_gauges(small_machine, [TouchProbe(**{**vars(FLAT), "poses": (*FLAT.poses, pose)})], additions=False)
-    assert set(best.adds) == set(more.whole) - set(plan.whole)
+    assert [item.u_after_um for item in plan.additions] == sorted(item.u_after_um for item in plan.additions)
+    for best in plan.additions[:2]:
+        option, _, text = best.option.partition(" ")
+        if option == "--circle":
+            gauges = [FLAT, circle_from_text(text)]
+        else:
+            gauges = [TouchProbe(**{**vars(FLAT), "poses": (*FLAT.poses, pose_from_text(text))})]
+        more = plan_gauges(small_machine, gauges, additions=False)
+        assert set(best.adds) == set(more.whole) - set(plan.whole)
+        assert best.u_after_um == pytest.approx(more.volume.rms_um, rel=1e-9)
+        assert best.u_after_um < plan.volume.rms_um
 
 
-def test_circles_in_three_planes_and_a_tracer_are_planned_in_one_adjustment(small_machine):
+def test_circles_in_three_planes_and_a_tracer_are_planned_in_one_adjustment(bare_machine):
+    small_machine = bare_machine
     circles = [circle_from_text(f"{plane}:90") for plane in ("XY", "YZ", "ZX")]
     plan = plan_gauges(small_machine, circles, additions=False)
     assert plan.whole == ("EC0Y", "EB0Z", "EA0Z")
-    u = plan.errors.squareness["EC0Y"][1]  # R/2 sin 2t: u = s / (R/2 sqrt(n/2)), the other terms are orthogonal to it
+    assert np.isnan(plan.errors.squareness["EC0Y"][1])  # over the travel: nothing is known of the guides, nor assumed
+    u = plan.solution.curve("EC0Y", np.zeros(1))[1][
+        0
+    ]  # within the circle: R/2 sin 2t: u = s / (R/2 sqrt(n/2)), the other terms are orthogonal to it
     assert u == pytest.approx(0.5e-3 / (45.0 * np.sqrt(720 / 2)), rel=0.05)
     stations = planned_stations({"A": (-500, -300, -400), "B": (400, -300, -400)})
     points = Points(full_grid([axis.nodes_mm for axis in small_machine.axes]).reshape(-1, 3))
@@ -94,8 +121,9 @@ def test_circles_in_three_planes_and_a_tracer_are_planned_in_one_adjustment(smal
     assert set(both.whole) > set(plan_gauges(small_machine, [FLAT], additions=False).whole)
 
 
-def test_a_plan_with_a_circle_is_that_of_the_identification(small_machine):
+def test_a_plan_with_a_circle_is_that_of_the_identification(bare_machine):
     """The planned uncertainty of a mixture is what its adjustment states."""
+    small_machine = bare_machine
     ballbar = Ballbar((0,), 90.0, noise_um=0.5)
     plan = plan_gauges(small_machine, [FLAT, ballbar], additions=False)
     circles = perfect_readings(small_machine, ballbar)
@@ -106,7 +134,77 @@ def test_a_plan_with_a_circle_is_that_of_the_identification(small_machine):
     ]
     found = identify_together(small_machine, parts, IdentifyOptions())
     u = found.errors.uncertainties() / found.u_scale
-    assert plan.errors.uncertainties() == pytest.approx(u, rel=0.1, abs=1e-9)
+    places = zip(*plan.errors.labels(), strict=True)
+    planned_u = [plan.solution.curve(name, np.array([at]))[1][0] for name, at in places]
+    assert planned_u == pytest.approx(u, rel=0.1, abs=1e-9)
+
+
+def drawn(machine, seed):
+    """Errors of a machine drawn from its prior."""
+    rng, names, curves = np.random.default_rng(seed), state_names(machine), {}
+    for name, process in processes_of(machine, machine.prior, names).items():
+        at = np.linspace(*machine.axes[error_named(name).axis].range_mm, 61)
+        root = root_of(process.covariance(at, at))
+        curves[name] = Curve(at, root @ rng.standard_normal(root.shape[1]), np.zeros(61))
+    squareness = {name: (machine.prior.size(name) * rng.standard_normal(), 0.0) for name in SQUARENESS_NAMES}
+    return ErrorTable(curves, squareness)
+
+
+def measured(machine, gauge, errors, seed):
+    def tips(stops):
+        tool = np.array(machine.tool_offset_mm)
+        return tip_position(machine, errors.at(stops.position_mm), stops.position_mm, tool)
+
+    return gauge.measure(machine, tips, [], {}, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize(
+    "gauges",
+    [
+        (Ballbar((0,), 90.0, noise_um=0.5), Ballbar((1,), 90.0, noise_um=0.5)),
+        (replace(FLAT, columns=5, rows=5), Ballbar((0,), 90.0, noise_um=0.5)),
+    ],
+    ids=["circles", "plate-and-circle"],
+)
+def test_what_is_planned_is_what_identification_says_of_machines_drawn_from_the_prior(small_machine, gauges):
+    """u of the field and of every error; and the field of those machines is known as well as was planned."""
+    plan = plan_gauges(small_machine, gauges, additions=False)
+    at_mm = plan.volume.position_mm[:: len(plan.volume.position_mm) // 100]
+    fields, singles, errors_over_u = [], [], []
+    for seed in range(4):
+        truth = drawn(small_machine, seed)
+        parts = [(f"{k}", measured(small_machine, gauge, truth, 50 + seed)) for k, gauge in enumerate(gauges)]
+        found = identify_measurement(small_machine, MixedMeasurement(tuple(parts)), IdentifyOptions()).posterior
+        fields.append(np.sqrt(found.field(at_mm).variance.mean() / plan.posterior.field(at_mm).variance.mean()))
+        singles += [found.shares[name] / plan.posterior.shares[name] for name in found.names]
+        mean = np.einsum("nij,nj->ni", c_matrix(small_machine, at_mm), found.mean_table(found.names).at(at_mm))
+        off = volumetric_error(small_machine, truth, at_mm) - mean
+        errors_over_u.append(np.mean(off**2) / plan.posterior.field(at_mm).variance.mean())
+    assert np.median(fields) == pytest.approx(1.0, abs=0.1)
+    assert 0.85 < min(fields) < max(fields) < 1.3
+    assert np.median(singles) == pytest.approx(1.0, abs=0.15)
+    assert 0.5 < np.sqrt(np.mean(errors_over_u)) < 1.2
+
+
+def test_what_circles_do_not_show_has_the_uncertainty_of_its_class_and_is_what_to_add(small_machine):
+    """Circles in XY and YZ say nothing of EB0Z: it makes most of u, so a circle in ZX comes first, and for it."""
+    plan = plan_gauges(small_machine, [circle_from_text("XY:90"), circle_from_text("YZ:90")])
+    report = plan.summary()
+    assert set(report["u"]) == set(state_names(small_machine))
+    assert all(item["u_max"] > 0 for item in report["u"].values())
+    assert report["u"]["EB0Z"]["state"] == "assumed"
+    assert report["u"]["EB0Z"]["u_max"] >= small_machine.prior.size_um("EB0Z")
+    assert report["u"]["EC0Y"]["u_max"] < report["u"]["EB0Z"]["u_max"]
+    assert "EB0Z" in report["left_out"]
+    assert report["not_measured"]["EB0Z"]["unit"] == "urad"
+    assert report["additions"][0]["option"] == "--circle ZX:100"
+    assert report["additions"][0]["reduces"][0] == "EB0Z"
+    assert "EC0Y" not in (*report["additions"][0]["reduces"], *report["additions"][0]["adds"])
+    larger = replace(small_machine, prior=PriorSettings(class_name="large"))
+    ratio = plan_gauges(larger, plan.gauges, additions=False).volume.rms_um / plan.volume.rms_um
+    assert ratio == pytest.approx(3.0, rel=0.03)  # nearly all of it is what was not measured
+    text = " ".join(str(item) for item in gauge_plan_table(plan).renderables)
+    assert "taken as zero" not in text + plan_page(plan)
 
 
 def test_pictures_show_what_exact_readings_show(small_machine, errors):
@@ -157,7 +255,7 @@ def test_the_command_writes_a_page_that_needs_nothing_else(tmp_path, small_machi
     assert code == 0
     assert "EC0Y" in out
     report = json.loads((tmp_path / "o" / "plan.json").read_text())
-    assert "EC0Y" in report["determined"]
+    assert report["u"]["EC0Y"]["state"] == "partly"  # within the plate and the circle; the guides may bend beyond them
     assert "EZZ" in report["left_out"]
     assert report["readings"] == 2 * 2 * 25 + 720
     page = (tmp_path / "o" / "plan.html").read_text()
@@ -174,7 +272,11 @@ def test_the_command_writes_a_page_that_needs_nothing_else(tmp_path, small_machi
     ("words", "message"),
     [
         (["--pose", "0,0,0"], "--pose belongs to --artefact"),
-        ([], "give --stations FILE (laser tracer), --artefact FILE or --circle"),
+        (["--grid"], "give --stations FILE (laser tracer), --artefact FILE or --circle"),
+        (["--target-um", "1"], "give --stations FILE (laser tracer), --artefact FILE or --circle"),
+        (["--prior", "none"], "class 'none' assumes nothing"),
+        (["--prior", "lathe"], "'lathe' is not a class of machines"),
+        (["--circle", "XY:90", "--prior", "lathe"], "'lathe' is not a class of machines"),
         (["--circle", "XZ:90"], "'XZ:90' is not PLANE:RADIUS"),
         (["--circle", "XY:5000"], "the circle leaves it"),
         (["--circle", "XY:90", "--grid"], "--points and --grid are where a laser tracer reads"),
