@@ -220,7 +220,9 @@ def _assumed(found: Posterior, name: str, share: float) -> str:
     error = error_named(name)
     part = f"It makes {100.0 * share:.0f} % of the remaining uncertainty."
     if name not in found.shown:
-        size = COVERAGE * found.prior.size_um(name)
+        # positioning errors grow with the travel, too
+        scale = found.prior.scale(name) * found.machine.axes[error.axis].length_mm / error.si_per_unit
+        size = COVERAGE * float(np.hypot(found.prior.size_um(name), scale))
         return f"Assumed, not measured: {error_words(name)} ({name}) up to {size:.3g} {error.unit} (k = 2). {part}"
     low, high = found.machine.axes[error.axis].range_mm
     u = float(found.curve(name, np.linspace(low, high, ALONG)).u.max()) / error.si_per_unit
