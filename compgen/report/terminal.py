@@ -506,7 +506,7 @@ def plan_table(plan: Plan) -> Group:
         f"{plan.planned.noise.proportional_um_per_m:g} um/m",
         volume_line("volume", plan),
         f"  of this from the noise of the readings: {_worst_and_rms(plan.from_readings)}",
-        *([] if plan.posterior is None else [plan.summary()["assumed"]]),
+        *([] if plan.posterior is None or plan.determined else [plan.summary()["assumed"]]),
     ]
     notes = [Text(f"not determined: {reason}", "red") for reason in plan.reasons[:MOST_PLAN_REASONS]]
     if len(plan.reasons) > MOST_PLAN_REASONS:
