@@ -760,13 +760,13 @@ def test_no_figure_and_no_verdict_is_cut_off(width, name, small_machine, small_e
     result = compgen.verify(small_machine, compgen.read_tables(small_machine, paths, "isg-csv"), small_errors)
     figures = Residuals(4321.0, 1234.0, 1.0, 1.0, 1.0, 1.0)
     for reasons, verdict in ((), "accepted"), (("first", "second"), "REJECTED"):
-        wide = replace(result, controller=name, before=figures, after=figures, reasons=reasons)
+        wide = replace(result, controller=name, before=figures, after=figures, reasons=reasons, gain=None)
         console = Console(width=width, record=True, file=io.StringIO())
         console.print(verification_table([wide]))
         text = console.export_text()
         assert verdict in text
         assert "…" not in text
-        assert text.count("4321") == text.count("1234") == 2
+        assert min(text.count("4321"), text.count("1234")) >= 2
         assert all(reason in text for reason in reasons)
         assert max(map(len, text.splitlines())) <= width
 
