@@ -19,6 +19,7 @@ from compgen.cli.shared_options import check_settings
 from compgen.cli.terminal import answer, complain, say
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data import toml_files
+from compgen.data.csv_files import whole_number
 from compgen.data.files import OutputFolder, name_problem
 from compgen.data.machine import (
     Chain,
@@ -391,9 +392,10 @@ def _nodes(given: Sequence[str], ranges: Mapping[str, Interval]) -> dict[str, in
     for part in given:
         letters, equals, number = part.rpartition("=")
         chosen = letters.strip().upper() if equals else AXES
-        if not number.strip().isdecimal() or not 2 <= int(number) <= 10001 or any(item not in AXES for item in chosen):
+        count = whole_number(number.strip())
+        if count is None or not 2 <= count <= 10001 or any(item not in AXES for item in chosen):
             raise InputError(f"{part!r} is not of the form [AXIS=]N with N from 2 to 10001, e.g. X=11", field="--nodes")
-        found |= dict.fromkeys(chosen, int(number))
+        found |= dict.fromkeys(chosen, count)
     return found
 
 

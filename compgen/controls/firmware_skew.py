@@ -37,6 +37,8 @@ DECIMALS = 9
 HEIGHT_MM = 1000.0
 #: Marlin refuses larger factors.
 MARLIN_LARGEST = 1.0
+#: A larger factor, axes at less than 45 degrees, is no skew of a machine but a wrong number.
+LARGEST_SKEW = 1.0
 #: Marlin corrects nothing within this distance of the lower end of X and Y.
 MARLIN_MARGIN_MM = 1.0
 SHEAR_WARNING = (
@@ -164,7 +166,14 @@ class SkewControl(Controller[Settings, SkewFactors]):
         if missing:
             message = f"no factor {', '.join(missing)} was found; is it the right file, or is it truncated?"
             raise files[0].fail(message, 1) if files else InputError(message)
-        return self.factors_from(values), remarks
+        factors = self.factors_from(values)
+        largest = max(abs(factors.xy), abs(factors.xz), abs(factors.yz))
+        if not largest <= LARGEST_SKEW:
+            message = (
+                f"gives a skew factor of {largest:g}; no machine has one above {LARGEST_SKEW:g}: check number and unit"
+            )
+            raise files[0].fail(message, 1)
+        return factors, remarks
 
     def emulate(self, tables: SkewFactors, points: Points) -> FloatArray:
         """Return what the shears add to the commanded positions."""

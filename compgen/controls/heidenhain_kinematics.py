@@ -235,6 +235,9 @@ class HeidenhainKinematics(Controller[DraftSettings, DraftTables]):
                 f"{len(chains)} files with rows for the kinematics table were given; expected one", file=first
             )
         coms = {file_stem(table.file.path.name): table for table in read if table.kind == "COM"}
+        for item in coms.values():  # also in columns to which no row refers
+            for given in item.columns:
+                _entries(item, given.name)
         tables: dict[int, DraftTable] = {}
         constants: dict[str, Decimal] = {}
         for row in chains[0].rows:

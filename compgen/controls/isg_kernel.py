@@ -17,7 +17,7 @@ from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, co
 from compgen.controls.shared.grids import Cell, ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
 from compgen.controls.shared.scanner import MOST_LINES, check_complete, content_lines, floating, uses_exponent
 from compgen.controls.shared.terms import error_terms
-from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.csv_files import FloatArray, fixed, whole_number
 from compgen.data.error_table import Curve, ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.lengths import Points
@@ -204,7 +204,7 @@ def is_list_file(source: SourceFile) -> bool:
         if words and not words[0].startswith("//"):
             key = words[0].lower()
             if key in (*_ACTING, *_INERT) or _INDEXED.fullmatch(key):
-                return len(words) == 2 and (len(key) > 1 or words[1].isdigit())
+                return len(words) == 2 and (len(key) > 1 or whole_number(words[1]) is not None)
             return False
     return False
 

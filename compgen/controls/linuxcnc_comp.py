@@ -21,13 +21,14 @@ from compgen.controls.shared.base import (
     travel_of,
 )
 from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
+from compgen.controls.shared.scanner import number_pattern
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import MM_PER_UNIT, Machine
-from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.names import AXES, LARGEST, MM_PER_UM
 from compgen.data.toml_files import (
     accepted,
     accepts,
@@ -44,7 +45,7 @@ T = TypeVar("T")
 
 
 #: A number as read by C with %lf, except hexadecimal digits, ``inf`` and ``nan``.
-_NUMBER = re.compile(r"[+-]?(?:\d{1,40}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][+-]?\d{1,4})?")
+_NUMBER = number_pattern(exponent=4)
 _BLANK = re.compile(r"[ \t\r\n]*+")
 #: Number of characters quoted from a wrong word.
 SHOWN = 40
@@ -90,7 +91,7 @@ def lines_of(source: SourceFile) -> Iterator[tuple[int, str, bool]]:
 
 def number_in(source: SourceFile, line: int, word: str, what: str) -> float:
     """Return a finite number; InputError with the line for a decimal comma, nan, inf or anything else."""
-    if _NUMBER.fullmatch(word) and math.isfinite(value := float(word)):
+    if _NUMBER.fullmatch(word) and math.isfinite(value := float(word)) and abs(value) <= LARGEST:
         return value
     hint = "; the decimal mark of LinuxCNC is '.'" if "," in word else ""
     raise source.fail(f"{word[:SHOWN]!r} is not a number; expected {what}{hint}", line)
@@ -98,7 +99,7 @@ def number_in(source: SourceFile, line: int, word: str, what: str) -> float:
 
 def whole_in(source: SourceFile, line: int, word: str, what: str, limits: tuple[int, int]) -> int:
     """Return a whole number within ``limits`` (both included); else InputError with the line."""
-    if not re.fullmatch(r"\d{1,9}", word) or not limits[0] <= int(word) <= limits[1]:
+    if not re.fullmatch(r"[0-9]{1,9}", word) or not limits[0] <= int(word) <= limits[1]:
         raise source.fail(f"{word[:SHOWN]!r} is not {what}; expected {limits[0]} ... {limits[1]}", line)
     return int(word)
 

@@ -26,7 +26,7 @@ from compgen.controls.shared.grids import equidistant_grid, loss_setting, uneven
 from compgen.controls.shared.scanner import check_complete, check_size, content_lines, fixed_point, floating
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
-from compgen.data.csv_files import FloatArray, fixed
+from compgen.data.csv_files import FloatArray, fixed, whole_number
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
@@ -611,7 +611,7 @@ class Aerotech(ScrewMapControl[AerotechSettings]):
                 for word in words[1:]:
                     key, _, number = word.upper().partition("=")
                     if not number and axis is None and key.isdigit():
-                        if len(key) > 2 or int(key) not in self.settings.axis_numbers:
+                        if whole_number(key, 2) not in self.settings.axis_numbers:
                             raise source.fail(f"axis {key[:9]} is none of {self.settings.axis_numbers}", line)
                         axis = self.settings.axis_numbers.index(int(key))
                     elif (key, number) in (("POSUNIT", "PRIMARY"), ("CORUNIT", "PRIMARY")):

@@ -64,7 +64,7 @@ from compgen.controls.siemens_text import (
     noted_table,
     read_assignments,
 )
-from compgen.data.csv_files import FloatArray
+from compgen.data.csv_files import FloatArray, whole_number
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
@@ -417,8 +417,8 @@ def _switched(
     result = dict(found)
     among_tables = {(item.variable, item.index): item for item in given.items if item.variable in SWITCHES}
     for (variable, index), item in {**given.machine_data, **among_tables}.items():
-        number = int(index[0]) if len(index) == 1 and index[0].isdigit() else -1
-        if number not in result:
+        number = whole_number(index[0]) if len(index) == 1 else None
+        if number is None or number not in result:
             continue
         if variable == "SN_CEC_TABLE_ENABLE":
             result[number] = replace(result[number], enabled=item.whole(0, 1) == 1)

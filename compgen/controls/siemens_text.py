@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from compgen.controls.shared.base import SourceFile, coverage_violations
 from compgen.controls.shared.scanner import Findings, fixed_point, number_pattern, plain_lines
-from compgen.data.csv_files import FloatArray
+from compgen.data.csv_files import FloatArray, whole_number
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError, nearest, one_line
 
@@ -89,9 +89,10 @@ class Assignment:
     def index_number(self, place: int, maximum: int) -> int:
         """Return one of the indices as a whole number from 0 to ``maximum``."""
         text = self.index[place]
-        if not text.isdigit() or len(text) > 9 or int(text) > maximum:
+        number = whole_number(text)
+        if number is None or number > maximum:
             raise self.fail(f"index {one_line(text)[:20]!r} is not a whole number from 0 to {maximum}")
-        return int(text)
+        return number
 
 
 def read_assignments(files: Sequence[SourceFile], index_counts: Mapping[str, int]) -> list[Assignment]:
@@ -171,7 +172,7 @@ def _assignments(source: SourceFile, index_counts: Mapping[str, int]) -> Iterato
 def _plain_indices(text: str) -> tuple[str, ...]:
     """The indices of a variable without blanks and leading zeros: [0,01] and [0,1] are the same."""
     words = [word.strip() for word in re.split(r"[,.]", text)]
-    return tuple(str(int(word)) if word.isdigit() and len(word) < 10 else word for word in words)
+    return tuple(word if (number := whole_number(word)) is None else str(number) for word in words)
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.files import decoded, read_text
+from compgen.data.files import LONGEST_LINE, decoded, read_text
 from compgen.data.names import LARGEST, SMALLEST
 from compgen.errors import CompgenWarning, InputError, doubled, nearest, visible_line
 
-#: How much of a large file is in memory at a time, bytes; also the longest line of such a file.
+#: How much of a large file is in memory at a time, bytes.
 PART_BYTES = 1 << 22
 _LINE_END = re.compile(r"\r\n|\r|\n")
 #: Quotes, comments and all ASCII white space except the line feed.
@@ -131,8 +131,9 @@ _LARGEST_BY_DIGITS, _MOST_BY_DIGITS, _TIE = 9999.5, 8, 1e-3
 #: A spreadsheet interprets a cell with such a beginning as a formula, in a comment also after a comma.
 _FORMULA = re.compile(r"'*[=+\-@]")
 _IN_COMMENT = re.compile(r"(?<=[,;])(?=[=+\-@])")
-#: Limits: columns of a header; characters of it in a message; ignored columns that are listed.
-MOST_COLUMNS, _SHOWN, _NAMED = 10_000, 200, 20
+#: Limits: columns of a header; fields of a file, each of which takes some sixty bytes; characters of the header in a message;
+#: ignored columns that are listed.
+MOST_COLUMNS, MOST_FIELDS, _SHOWN, _NAMED = 10_000, 60_000_000, 200, 20
 
 
 @dataclass(frozen=True)
@@ -236,6 +237,15 @@ def _is_number(cell: str) -> bool:
     return cell.isascii() and "_" not in cell
 
 
+def whole_number(text: str, digits: int = 9) -> int | None:
+    """Return a whole number of at most so many plain digits, without a sign; None for anything else.
+
+    >>> whole_number("007"), whole_number("\u00b2"), whole_number("9" * 5000)
+    (7, None, None)
+    """
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= digits else None
+
+
 def names_in_header(text: str) -> set[str]:
     """Return the names in the first line of a text that is not a comment; empty without one."""
     lines = (line.strip() for line in text.splitlines())
@@ -266,6 +276,9 @@ def csv_table(
     source: Path, content: str, required: Iterable[str], optional: Iterable[str] = (), prefixes: Iterable[str] = ()
 ) -> CsvTable:
     """Read the text ``content`` of the file ``source`` as :func:`read_csv` does."""
+    fields = content.count(",")
+    if fields > MOST_FIELDS:
+        raise InputError(f"has {fields} fields; at most {MOST_FIELDS} are read: leave out columns or rows", file=source)
     file = parse_plain(content) or parse_any(source, content)
     required = list(required)
     _check_header(source, file.header_line, file.header, required)
@@ -323,7 +336,7 @@ def _parts(source: Path) -> Iterator[str]:
         with source.open("rb") as stream:
             while block := stream.read(PART_BYTES):
                 whole, end, rest = (rest + block).rpartition(b"\n")
-                if len(rest) > PART_BYTES:
+                if len(rest) > min(LONGEST_LINE, PART_BYTES):
                     line = lines + held.count(b"\n") + 1
                     raise InputError("is too long for a line; is it a text file?", file=source, line=line)
                 if not end:

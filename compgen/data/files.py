@@ -39,6 +39,9 @@ EMPTY_S = 3600.0
 #: One with contents but no lock (of a version that had none, or whose lock someone deleted) in which nothing has changed for
 #: this long is removed, too, s. Its name and mode must be those that this program gives.
 OLD_S, OLD_NAME, OWN_MODE = 7 * 86400.0, re.compile(rf"{FOLDERS}(recal|restore|lengths)-[a-z0-9_]{{8}}"), 0o700
+#: Limits of a text that is read whole: its size in bytes, and the characters of one line (a table of 10 000 columns has fewer).
+#: They are checked before anything is split: a line of megabytes would become millions of fields.
+MOST_TEXT, LONGEST_LINE, _PIECE = 256_000_000, 200_000, 1 << 20
 #: Temporary files and folders of this process, each with the open file that keeps its lock.
 _locks: dict[Path, int] = {}
 
@@ -462,16 +465,45 @@ def read_bytes(path: str | Path, most: int = -1) -> bytes:
         if source.is_dir():
             raise InputError("is a folder; expected a file", file=source)
         with source.open("rb") as stream:
-            return stream.read(most)
+            if most < 0:
+                return stream.read()
+            parts, left = [], most  # in pieces: Python reserves all of what is asked for at once
+            while left > 0 and (part := stream.read(min(left, _PIECE))):
+                parts.append(part)
+                left -= len(part)
+            return b"".join(parts)
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=source) from error
 
 
-def read_text(path: str | Path) -> str:
-    """Return the UTF-8 text of ``path`` (a byte-order mark is dropped) or raise an InputError that says why not."""
-    return decoded(read_bytes(path), path)
+def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
+    """Return the UTF-8 text of ``path`` (a byte-order mark is dropped) or raise an InputError that says why not.
+
+    A file of more than ``most`` bytes, or with a line longer than :data:`LONGEST_LINE`, is refused.
+    """
+    too_large = Path(path).is_file() and os.stat(path).st_size > most
+    content = b"" if too_large else read_bytes(path, most + 1)
+    if too_large or len(content) > most:
+        size = f"has {os.stat(path).st_size / 1e6:.0f} MB" if too_large else "is too large"
+        raise InputError(f"{size}; at most {most / 1e6:g} MB are read of such a file: is it the right one?", file=path)
+    text = decoded(content, path)
+    check_lines(text, path)
+    return text
+
+
+def check_lines(text: str, path: str | Path) -> None:
+    """Raise InputError for a line longer than :data:`LONGEST_LINE`; the cost is that of a search, not of a split."""
+    start = 0
+    while len(text) - start > LONGEST_LINE:
+        window = start + LONGEST_LINE + 1
+        end = max(text.rfind("\n", start, window), text.rfind("\r", start, window))
+        if end < 0:
+            line = 1 + text.count("\n", 0, start)
+            message = f"has a line of more than {LONGEST_LINE} characters; is it a text file, with line ends?"
+            raise InputError(message, file=path, line=line)
+        start = end + 1
 
 
 def decoded(content: bytes, path: str | Path, encoding: str = "utf-8-sig", before: int = 0) -> str:

@@ -112,6 +112,8 @@ def _plain(cell: str) -> str:
 
 #: Rows of the largest possible sheet.
 MOST_ROWS, MOST_COLUMNS, MOST_CELL = 1_048_576, 500, 2_000
+#: Cells of a row, as in the widest possible sheet; targets may be columns.
+MOST_WIDE = 16_384
 #: Cells of a table; each takes some sixty bytes of memory.
 MOST_CELLS = 10_000_000
 #: Number of lines examined for the separator, and for the header.
@@ -196,7 +198,9 @@ def grid_of_text(source: Text) -> CellGrid:
     numbers = [k for k, line in enumerate(lines, start=1) if line and not line.isspace()]
     content = [lines[k - 1] for k in numbers] if len(numbers) < len(lines) else lines
     separator = _separator(content[:_SAMPLE_LINES])
-    cells = len(content) * (1 + max((line.count(separator or " ") for line in content[:_SAMPLE_LINES]), default=0))
+    marks = source.text.count(separator) if separator else source.text.count(" ") + source.text.count("\t")
+    widest = max((line.count(separator or " ") for line in content[:_SAMPLE_LINES]), default=0)
+    cells = max(len(content) * (1 + widest), len(content) + marks)
     if cells > MOST_CELLS:
         raise source.fail(f"has about {cells} cells; at most {MOST_CELLS} are read: leave out columns or rows")
     if separator is None:
@@ -208,6 +212,10 @@ def grid_of_text(source: Text) -> CellGrid:
             raise source.fail(f"is not readable as a table: {error}") from error
         if len(rows) != len(content):
             raise source.fail("a quoted cell contains a line end; write each row on one line")
+    widest = max(map(len, rows), default=0)
+    if widest > MOST_WIDE:
+        line = numbers[next(k for k, row in enumerate(rows) if len(row) == widest)]
+        raise source.fail(f"has {widest} cells; at most {MOST_WIDE} are read: is this a table?", line)
     names = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", None: "blanks"}
     notes = [f"columns are separated by {names[separator]}"]
     if source.encoding not in ("utf-8", "utf-8-sig"):

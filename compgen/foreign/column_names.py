@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from compgen.data.csv_files import whole_number
 from compgen.data.names import ERROR_NAMES
 from compgen.errors import InputError, nearest
 
@@ -152,9 +153,9 @@ def _read(text: str, letters: str = "") -> _Words:
         if token[0].isdigit():
             if following in ("s", "sigma", "\u03c3"):
                 continue  # 2 s is not a second run
-            whole = token.isdigit() and len(token) <= 3
-            numbers += [int(token)] if whole else []
-            unknown += [] if whole else [token]
+            whole = whole_number(token, 3)
+            numbers += [] if whole is None else [whole]
+            unknown += [token] if whole is None else []
         elif token in letters:
             ways.add(1 if token == letters[0] else -1)
         elif token in _UP:

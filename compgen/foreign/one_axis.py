@@ -19,6 +19,8 @@ IntArray = NDArray[np.int64]
 #: A reading is reported if it is this far from the median, mm or rad, and this many times further than nine in ten
 #: others.
 _NOTABLE, _FAR = 0.1, 20.0
+#: Runs are compared if readings are missing at fewer than this many times as many places as there are readings.
+_SPARSE = 100
 _AXIS = re.compile(r"(?<![A-Z])([XYZ])[0-9]?(?![A-Z])")
 
 
@@ -116,16 +118,18 @@ def motion(position_mm: FloatArray, run: IntArray) -> IntArray:
 
     A run of a single target has direction 0, and a repeated target keeps the direction of the row before it.
     """
+    order = np.argsort(run, kind="stable")  # all runs at once: a file may have as many as rows
+    own, place = run[order], np.arange(len(order))
+    begins = np.diff(own, prepend=own[:1] - 1) != 0
+    step = np.sign(np.round(np.diff(position_mm[order], prepend=0.0) / SAME_TARGET_MM)).astype(np.int64)
+    step[begins] = 0
+    start = np.maximum.accumulate(np.where(begins, place, 0))
+    last = np.maximum.accumulate(np.where(step != 0, place, -1))
+    after = np.minimum.accumulate(np.where(step != 0, place, len(place))[::-1])[::-1]
+    ends = np.append(np.flatnonzero(begins)[1:], len(place))[np.cumsum(begins) - 1]
+    source = np.where(last > start, last, np.where(after < ends, after, -1))
     direction = np.zeros(len(position_mm), dtype=np.int64)
-    for number in np.unique(run):
-        rows = np.flatnonzero(run == number)
-        step = np.sign(np.round(np.diff(position_mm[rows]) / SAME_TARGET_MM)).astype(np.int64)
-        moving = np.flatnonzero(step)
-        if not moving.size:
-            continue
-        last = np.maximum.accumulate(np.where(step != 0, np.arange(len(step)), -1))
-        filled = np.where(last >= 0, step[np.maximum(last, 0)], step[moving[0]])
-        direction[rows] = np.concatenate([filled[:1], filled])
+    direction[order] = np.where(source >= 0, step[source], 0)
     return direction
 
 
@@ -189,9 +193,13 @@ def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
     found, name = [], f"axis {axis}" if axis else "the axis"
     keys = np.round(runs.position_mm / SAME_TARGET_MM).astype(np.int64)
     _, target = np.unique(keys, return_inverse=True)
-    _, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_inverse=True)
-    table = np.full((one_way.max() + 1, target.max() + 1), np.nan)
-    table[one_way, target] = runs.value
+    _, rows, one_way = np.unique(2 * runs.run + (runs.direction < 0), return_index=True, return_inverse=True)
+    shape = (int(one_way.max()) + 1, int(target.max()) + 1)
+    if shape[0] * shape[1] > _SPARSE * len(runs.value):
+        shape = (0, shape[1])  # hardly two readings of any run: there are no runs to compare
+    table = np.full(shape, np.nan)
+    if len(table):
+        table[one_way, target] = runs.value
     empty = int(np.isnan(table).sum())
     if empty and len(runs.value) > table.size // 2:
         row, column = np.argwhere(np.isnan(table))[0]
@@ -206,12 +214,10 @@ def remarks(runs: OneAxis, axis: str, *, angular: bool) -> list[str]:
         size = f"{value / RAD_PER_URAD:.5g} urad" if angular else f"{value / MM_PER_UM:.5g} um"
         found.append(f"{name}: {size} at {at:g} mm, line {runs.line[worst]}, is far from all others; a mistake?")
     first: dict[bytes, int] = {}
-    for k, values in enumerate(
-        table
-    ):  # copies: equal at three targets or more in the same direction, but not all alike
-        if np.isnan(values).any() or len(values) < 3 or np.ptp(values) == 0:
-            continue
-        row = int(np.flatnonzero(one_way == k)[0])
+    # copies: equal at three targets or more in the same direction, but not all alike
+    whole = ~np.isnan(table).any(axis=1) & (np.ptp(table, axis=1) > 0) if len(table) and table.shape[1] > 2 else []
+    for k in np.flatnonzero(whole).tolist():
+        values, row = table[k], int(rows[k])
         earlier = first.setdefault(values.tobytes() + bytes([int(runs.direction[row]) + 1]), row)
         if earlier != row:
             pair = f"{int(runs.run[earlier])} and {int(runs.run[row])}"

@@ -13,7 +13,7 @@ from typing import Literal
 
 from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, about_own_lines, is_apart, read_errors
-from compgen.data.files import read_bytes
+from compgen.data.files import check_lines, read_bytes
 from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
 from compgen.errors import InputError
 from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
@@ -121,6 +121,7 @@ def read_source(path: Path, encodings: Sequence[str] = ENCODINGS, most: int = MO
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
         raise InputError("contains NUL bytes: it is not text, or was not written completely", file=path, line=line)
+    check_lines(text, path)
     return Text(path, text, encoding)
 
 

@@ -496,12 +496,12 @@ def _sweeps(target: FloatArray, run: IntArray | None = None) -> IntArray:
 
 def _contradicted(target: FloatArray, run: IntArray, label: IntArray) -> bool:
     """Whether the rows of each label run in the opposite direction, in every run; a table sorted by targets shows nothing."""
-    ways: dict[int, set[int]] = {1: set(), -1: set()}
-    for number in np.unique(run):
-        for sign in (1, -1):
-            steps = np.diff(target[(run == number) & (label == sign)])
-            if len(steps):
-                ways[sign].add(int(np.sign(steps[0])) if np.all(np.sign(steps) == np.sign(steps[0])) else 0)
+    ways: dict[int, set[int]] = {}
+    for sign in (1, -1):
+        rows = np.flatnonzero(label == sign)
+        rows = rows[np.argsort(run[rows], kind="stable")]
+        steps = np.sign(np.diff(target[rows]))[np.diff(run[rows]) == 0]
+        ways[sign] = set(steps.astype(np.int64).tolist())
     return ways[1] == {-1} and ways[-1] == {1}
 
 

@@ -21,7 +21,7 @@ from compgen.data.comparison import Difference, Residuals, residuals_twice, rms,
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
-from compgen.data.files import read_bytes, sha256_of
+from compgen.data.files import check_lines, read_bytes, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
@@ -695,6 +695,9 @@ def parse_tables(machine: Machine, contents: Mapping[str, bytes], controller: st
 
 def _parsed(control: AnyController, contents: Sequence[tuple[Path, bytes]], *, foreign: bool) -> ReadTables:
     hashes = tuple((path.name, sha256_of(content)) for path, content in contents)
+    for path, content in contents:
+        if content.lstrip()[:1] != b"{":  # JSON may be on one line
+            check_lines(content.decode("latin-1"), path)
     try:
         sources = [SourceFile(path, _decode(path, content)) for path, content in contents]
         tables = control.parse(sources)

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 
 from compgen.controls.shared.base import SourceFile
+from compgen.data.names import LARGEST
 from compgen.errors import one_line
 
 MOST_LINES = 200_000
@@ -113,9 +114,11 @@ def content_lines(source: SourceFile, comment: str = "//", longest: int = 4000) 
 def floating(source: SourceFile, line: int, word: str, what: str, pattern: re.Pattern[str] = FLOATING) -> float:
     """Return a word as a finite number, with or without an exponent; InputError says why it is not one.
 
-    ``what`` names the number in the message.
+    ``what`` names the number in the message. No table has numbers beyond ``LARGEST``, and sums and products of others are finite.
     """
     if pattern.fullmatch(word) and math.isfinite(value := float(word)):
+        if abs(value) > LARGEST:
+            raise source.fail(f"{what}: {word[:SHOWN]} is larger than {LARGEST:g}, the largest number allowed", line)
         return value
     hint = "; the decimal mark is '.', columns are separated by blanks" if "," in word or ";" in word else ""
     raise source.fail(f"{what}: {one_line(word)[:SHOWN]!r} is not a finite number{hint}", line)
