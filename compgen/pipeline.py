@@ -15,6 +15,7 @@ import numpy as np
 
 from compgen import effects, tables
 from compgen.controls import controller_named
+from compgen.data.arguments import names_of, of_kind, path_of, paths_of
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
@@ -464,6 +465,9 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     """
     from compgen.fit import FitOptions, fit
 
+    of_kind("machine", machine, Machine)
+    measurements, controllers = paths_of("measurements", measurements), names_of("controllers", controllers)
+    path_of("folder", folder)
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
         raise InputError("no controller was given; give at least one")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from compgen.controls import CONTROLLERS, Controller
+from compgen.data.arguments import paths_of
 from compgen.data.registry import PATH_ORIGIN, Kind, call_problem, load_entry_points, load_file
 from compgen.effects import FAMILIES
 from compgen.effects.catalogue import check_family
@@ -120,9 +121,10 @@ def load_plugins(paths: Sequence[str | Path] = (), *, installed: bool = True) ->
     ...     print(Path(error.file).name)
     my_control.py
     """
+    given = paths_of("paths", paths)
     if installed:
         load_entry_points(KINDS)
-    for path in paths:
+    for path in given:
         load_file(path, KINDS)
 
 

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import numbers
 from compgen.data.csv_files import FloatArray
 from compgen.data.names import MM_PER_UM
 
@@ -51,6 +52,10 @@ def without_rigid_motion(position_mm: FloatArray, error_mm: FloatArray) -> Float
     >>> float(np.abs(compgen.without_rigid_motion(position_mm, shifted)).max()) < 1e-12
     True
     """
+    position_mm = numbers("position_mm", position_mm, None, 3)
+    error_mm = numbers("error_mm", error_mm, len(position_mm), 3)
+    if not len(position_mm):
+        return error_mm
     actual = position_mm + error_mm
     nominal, moved = position_mm - position_mm.mean(axis=0), actual - actual.mean(axis=0)
     return np.asarray(moved @ best_rotation(moved.T @ nominal) - nominal)

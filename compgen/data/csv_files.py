@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import path_of
 from compgen.data.files import LONGEST_LINE, decoded, read_text
 from compgen.data.names import LARGEST, SMALLEST
 from compgen.errors import CompgenWarning, InputError, doubled, nearest, visible_line
@@ -269,7 +270,8 @@ def read_csv(
     InputError
         for an empty file, a missing or doubled column, a row with too few or too many fields, a truncated last line.
     """
-    return csv_table(Path(path), read_text(path), required, optional, prefixes)
+    source = path_of("path", path)
+    return csv_table(source, read_text(source), required, optional, prefixes)
 
 
 def csv_table(

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import numbers
 from compgen.data.comparison import best_rotation
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.display import Displayed, Overview, ranges_of
@@ -25,6 +26,7 @@ from compgen.data.records import (
     TOOL,
     Field,
     Schema,
+    check_rows,
     deviations_um,
     uncertainties,
 )
@@ -94,6 +96,13 @@ class Deviations(Displayed):
     metadata: Mapping[str, str] = field(default_factory=dict)
     origin: Sequence[tuple[str, int]] = ()
     poses: Mapping[int, RoughPose] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        numbers("deviation_mm", self.deviation_mm, None, 3, unknown=True)
+        check_rows(self, unknown=("deviation_mm", "u_mm"))
+        if self.u_mm is not None and (self.u_mm <= 0.0).any():
+            text = f"contains {np.nanmin(self.u_mm):g}; expected standard uncertainties above zero (nan: not measured)"
+            raise InputError(text, field="u_mm")
 
     def __len__(self) -> int:
         """Return the number of positions."""

@@ -17,6 +17,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
 from compgen.data.files import read_text
@@ -53,11 +54,17 @@ class Curve(Displayed):
     u: FloatArray
 
     def __post_init__(self) -> None:
+        for name, unknown in (("position_mm", True), ("value", False), ("u", True)):
+            least = 0.0 if name == "u" else -np.inf
+            object.__setattr__(self, name, numbers(name, getattr(self, name), None, unknown=unknown, least=least))
         if not len(self.position_mm) == len(self.value) == len(self.u) > 0:
-            raise ValueError(f"lengths differ: {len(self.position_mm)}, {len(self.value)}, {len(self.u)}")
+            sizes = f"{len(self.position_mm)}, {len(self.value)}, {len(self.u)}"
+            raise InputError(
+                f"lengths differ: {sizes}; expected one value and one u for each position", field="value, u"
+            )
         ascending = self.position_mm[1:] > self.position_mm[:-1]
         if not (ascending.all() and np.isfinite(self.position_mm).all()):
-            raise ValueError("positions of a curve must be finite and ascending")
+            raise InputError("positions of a curve must be finite and ascending", field="position_mm")
 
     def at(self, position_mm: FloatArray) -> FloatArray:
         """Value at the given positions, same shape."""
@@ -99,13 +106,22 @@ class ErrorTable(Drawable):
     metadata: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for names, allowed, what in (
-            (self.curves, CURVE_NAMES, "18 errors that are functions"),
-            (self.squareness, SQUARENESS_NAMES, "3 squareness errors"),
+        for field_name, given, allowed, what in (
+            ("curves", self.curves, CURVE_NAMES, "18 errors that are functions"),
+            ("squareness", self.squareness, SQUARENESS_NAMES, "3 squareness errors"),
         ):
-            for name in names:
+            of_kind(field_name, given, Mapping)
+            for name in given:
                 if name not in allowed:
-                    raise ValueError(f"{name!r} is not one of the {what}")
+                    raise InputError(f"{name!r} is not one of the {what}", field=field_name)
+        of_kind("metadata", self.metadata, Mapping)
+        for name, curve in self.curves.items():
+            of_kind(f"curves[{name}]", curve, Curve)
+        for name, pair in self.squareness.items():
+            value, u = numbers(f"squareness[{name}]", pair, 2, unknown=True).tolist()
+            if not np.isfinite(value) or u < 0.0:
+                expected = "value and standard uncertainty of zero or more (nan: unknown), rad"
+                raise InputError(f"is ({value:g}, {u:g}); expected {expected}", field=f"squareness[{name}]")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -364,6 +380,7 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
     >>> print(text.splitlines()[-1])
     EC0Y,,30.000000000,1.000000000
     """
+    of_kind("errors", errors, ErrorTable)
     names: list[str] = []
     positions: list[float] = []
     values: list[float] = []
@@ -402,6 +419,7 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
 LARGEST_UM = 1000.0
 #: A smaller reversal is not worth a table, mm.
 WORTH_MM = 0.1 * MM_PER_UM
+_PAIRS_OF_AXES = frozenset((axis, component) for axis in range(3) for component in range(3))
 
 
 @dataclass(frozen=True, repr=False)
@@ -422,6 +440,15 @@ class ReversalCurves(Displayed):
 
     curves: Mapping[tuple[int, int], Curve]
     metadata: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        of_kind("curves", self.curves, Mapping)
+        of_kind("metadata", self.metadata, Mapping)
+        for key, curve in self.curves.items():
+            if key not in _PAIRS_OF_AXES:
+                expected = "(axis that travels, component), both 0, 1 or 2 for X, Y, Z"
+                raise InputError(f"the key {key!r} is not {expected}", field="curves")
+            of_kind(f"curves[{key}]", curve, Curve)
 
     def displacement(
         self, position_mm: FloatArray, approach: FloatArray, taken_up: FloatArray | float = 1.0

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from compgen.data.arguments import path_of
 from compgen.errors import InputError
 
 TEMPORARY = ".tmp"
@@ -112,7 +113,7 @@ class OutputFolder:
     """
 
     def __init__(self, folder: str | Path, *, private: bool = False) -> None:
-        self.folder, self._mode = Path(folder), 0o600 if private else 0o666
+        self.folder, self._mode = path_of("folder", folder), 0o600 if private else 0o666
         self._contents: dict[str, bytes] = {}
         self._copies: dict[str, Path] = {}
         self._aside: list[str] = []
@@ -460,7 +461,7 @@ def write_file(path: str | Path, content: str | bytes, *, private: bool = False)
 
 def read_bytes(path: str | Path, most: int = -1) -> bytes:
     """Return the contents of ``path``, at most ``most`` bytes of it, or raise an InputError that says why not."""
-    source = Path(path)
+    source = path_of("path", path)
     try:
         if source.is_dir():
             raise InputError("is a folder; expected a file", file=source)
@@ -483,10 +484,11 @@ def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
 
     A file of more than ``most`` bytes, or with a line longer than :data:`LONGEST_LINE`, is refused.
     """
-    too_large = Path(path).is_file() and os.stat(path).st_size > most
+    path = path_of("path", path)
+    too_large = os.path.isfile(path) and os.path.getsize(path) > most
     content = b"" if too_large else read_bytes(path, most + 1)
     if too_large or len(content) > most:
-        size = f"has {os.stat(path).st_size / 1e6:.0f} MB" if too_large else "is too large"
+        size = f"has {os.path.getsize(path) / 1e6:.0f} MB" if too_large else "is too large"
         raise InputError(f"{size}; at most {most / 1e6:g} MB are read of such a file: is it the right one?", file=path)
     text = decoded(content, path)
     check_lines(text, path)

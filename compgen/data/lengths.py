@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import labels_of, paths_of, whole_numbers
 from compgen.data.csv_files import CsvTable, FloatArray
 from compgen.data.display import Displayed, Overview, ranges_of, shortened
 from compgen.data.records import (
@@ -23,8 +24,10 @@ from compgen.data.records import (
     TOOL,
     Field,
     Schema,
+    check_rows,
     within,
 )
+from compgen.errors import InputError
 
 #: Archives of at most this many readings are read whole, like text files.
 MOST_WHOLE = 200_000
@@ -84,6 +87,16 @@ class Lengths(Displayed):
     metadata: Mapping[str, str] = field(default_factory=dict)
     origin: Sequence[tuple[str, int]] = ()
 
+    def __post_init__(self) -> None:
+        check_rows(self, names=("length_mm",))
+        count, stations = len(self.length_mm), len(labels_of("stations", self.stations))
+        object.__setattr__(self, "station", whole_numbers("station", self.station, count))
+        if count and (self.station.min() < 0 or self.station.max() >= stations):
+            text = f"goes from {self.station.min()} to {self.station.max()}; expected indices of {stations} stations"
+            raise InputError(text, field="station")
+        if len(labels_of("point", self.point)) != count:
+            raise InputError(f"has {len(self.point)} labels for {count} readings", field="point")
+
     def __len__(self) -> int:
         """Return the number of readings."""
         return len(self.length_mm)
@@ -138,7 +151,7 @@ def read_lengths(files: str | Path | Sequence[str | Path]) -> Lengths:
     >>> compgen.read_lengths("examples/zha-gantry.lengths.csv").metadata["instrument"]
     'laser-tracer'
     """
-    sources = [files] if isinstance(files, str | Path) else list(files)
+    sources = paths_of("files", files)
     binary = [source for source in sources if str(source).lower().endswith((ARCHIVE, PARQUET))]
     parts = []
     text = [source for source in sources if source not in binary]
@@ -200,6 +213,9 @@ class Points(Displayed):
     tool_mm: FloatArray | None = None
     approach: FloatArray | None = None
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_rows(self)
 
     def __len__(self) -> int:
         """Return the number of points."""

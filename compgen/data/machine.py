@@ -16,6 +16,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from compgen.data import toml_files
+from compgen.data.arguments import numbers, of_kind, path_of, text_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
 from compgen.data.names import AXES, ERROR_NAMES
@@ -268,9 +269,10 @@ class Chain:
     tool_side: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.name not in CHAINS:
-            raise ValueError(
-                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. 'WFYXZT'"
+        if not isinstance(self.name, str) or self.name not in CHAINS:
+            raise InputError(
+                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. 'WFYXZT'",
+                field="name",
             )
         left, _, right = self.name[1:-1].partition("F")
         object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
@@ -312,6 +314,15 @@ class Axis(Displayed):
     screw_pitch_mm: float | None = toml_files.setting(
         toml_files.positive, None, meaning="pitch of the screw, mm: used to search for periodic errors"
     )
+
+    def __post_init__(self) -> None:
+        low, high = numbers("range_mm", self.range_mm, 2).tolist()
+        nodes = numbers("nodes_mm", self.nodes_mm, None)
+        if not low < high:
+            raise InputError(f"goes from {low:g} to {high:g} mm; expected the lower end first", field="range_mm")
+        if len(nodes) < 2 or (np.diff(nodes) <= 0.0).any():
+            raise InputError("expected at least two positions in ascending order, mm", field="nodes_mm")
+        object.__setattr__(self, "nodes_mm", nodes)
 
     @property
     def length_mm(self) -> float:
@@ -403,6 +414,20 @@ class Machine(Displayed):
         0.0,
         meaning="how far beyond the travel NC programs may go, mm: the software limits are as far from range_mm, or farther",
     )
+
+    def __post_init__(self) -> None:
+        text_of("name", self.name)
+        of_kind("chain", self.chain, Chain)
+        of_kind("axes", self.axes, tuple, list)
+        if len(self.axes) != len(AXES):
+            raise InputError(f"has {len(self.axes)} axes; expected those of X, Y and Z", field="axes")
+        for letter, axis in zip(AXES, self.axes, strict=True):
+            of_kind(f"axes[{letter}]", axis, Axis)
+        for name in ("tool_offset_mm", "reference_point_mm"):
+            numbers(name, getattr(self, name), 3)
+        for name, allowed in (("squareness_reference", ("X", "Y")), ("curves", ("linear", "cubic"))):
+            if text_of(name, getattr(self, name)) not in allowed:
+                raise InputError(f"is {getattr(self, name)!r}; expected {' or '.join(allowed)}", field=name)
 
     @property
     def file(self) -> Path | None:
@@ -634,7 +659,7 @@ def load_machine(machine: str | Path, folders: tuple[Path, ...] = ()) -> Machine
     >>> machine.axes
     (<Axis: -800 to 0 mm, 11 nodes>, <Axis: -1000 to 0 mm, 11 nodes>, <Axis: -350 to 0 mm, 11 nodes>)
     """
-    path = Path(machine)
+    path = path_of("machine", machine)
     if path.suffix == ".toml" or len(path.parts) > 1:
         return read_machine(path)
     local = Path("machines")

@@ -14,6 +14,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from compgen.data.arguments import numbers, of_kind, paths_of, whole_numbers
 from compgen.data.csv_files import CsvTable, FloatArray, format_csv, names_in_header, read_csv
 from compgen.data.files import read_bytes, read_text
 from compgen.data.names import AXES, MM_PER_UM
@@ -121,6 +122,38 @@ def one_of(allowed: Iterable[str], what: str) -> Callable[[CsvTable, str], np.nd
     return read
 
 
+def check_rows(record: Any, *, names: Sequence[str] = (), unknown: Sequence[str] = ()) -> None:
+    """Check the arrays of a record with a row for each position (n, 3), and make float64 arrays of lists and whole numbers.
+
+    ``names`` are its further arrays (n,), ``unknown`` the fields in which nan means: not measured, not known. InputError with
+    the name of the field.
+    """
+
+    def put(name: str, value: Any) -> None:
+        object.__setattr__(record, name, value)
+
+    put("position_mm", numbers("position_mm", record.position_mm, None, 3))
+    count = len(record.position_mm)
+    for name in ("deviation_mm", "u_mm", "tool_mm", "approach"):
+        value = getattr(record, name, None)
+        if value is not None:
+            put(
+                name,
+                numbers(name, value, count, 3, unknown=name in unknown, least=-1.0 if name == "approach" else -np.inf),
+            )
+    for name in names:
+        put(name, numbers(name, getattr(record, name), count, unknown=name in unknown))
+    for name, read in (("labels", whole_numbers), ("covariates", _covariate)):
+        given = getattr(record, name, {})
+        of_kind(name, given, Mapping)
+        put(name, {key: read(f"{name}[{key}]", values, count) for key, values in given.items()})
+    of_kind("metadata", getattr(record, "metadata", {}), Mapping)
+
+
+def _covariate(name: str, value: Any, count: int) -> FloatArray:
+    return numbers(name, value, count, unknown=True)
+
+
 #: Reads a column of axis letters as 0, 1, 2 for X, Y, Z.
 axes_of = one_of(AXES, "an axis")
 
@@ -222,7 +255,7 @@ class Schema:
 
     def read_tables(self, files: str | Path | Sequence[str | Path]) -> list[CsvTable]:
         """Read the columns of one or more files; the same rows must not occur twice."""
-        sources = list(files) if isinstance(files, Sequence) and not isinstance(files, str) else [files]
+        sources = paths_of("files", files)
         if not sources:
             raise InputError("no measurement file was given")
         tables = [self.read_table(source) for source in sources]

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Drawable, Overview, Panel, shortened
 from compgen.data.error_table import ErrorTable
@@ -345,12 +346,16 @@ class FitOptions:
     robust: bool = option(False, "Huber loss instead of least squares: single outlying nodes do not bend the curve.")
 
     def __post_init__(self) -> None:
+        for name in ("max_abs", "max_slope", "max_curvature", "monotone"):
+            of_kind(name, getattr(self, name), Mapping)
+        of_kind("smoothness", self.smoothness, float, int, type(None))
         if self.smoothness is not None and not (math.isfinite(self.smoothness) and self.smoothness >= 0):
             message = f"{self.smoothness!r} is not allowed; give a number >= 0, or omit it to choose it from the data"
             raise InputError(message, field="smoothness")
         for bound in ("max_abs", "max_slope", "max_curvature"):
             for key, limit in getattr(self, bound).items():
                 _check_key(bound, key)
+                of_kind(f"{bound}[{key}]", limit, float, int, np.floating)
                 if not limit > 0:
                     message = f"{limit!r} for {key} is not a possible bound; give a positive number, or omit it"
                     raise InputError(message, field=bound)

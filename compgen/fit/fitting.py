@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
@@ -606,6 +607,12 @@ def fit(
     >>> bool(abs(curve.value[[0, -1]]).max() < 1e-12)
     True
     """
+    for name, value, kind in (
+        ("machine", machine, Machine),
+        ("errors", errors, ErrorTable),
+        ("options", options, FitOptions),
+    ):
+        of_kind(name, value, kind)
     with one_thread():
         return _fit(machine, errors, options, covariance, constraints)
 

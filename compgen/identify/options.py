@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from compgen.data.arguments import of_kind, text_of
 from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
@@ -241,6 +242,23 @@ class IdentifyOptions:
         "nothing was measured, or the values are in mm.",
         in_job=flag,
     )
+
+    def __post_init__(self) -> None:
+        for name in ("u_length_um", "u_length_um_per_m", "u_deviation_um"):
+            value = getattr(self, name)
+            of_kind(name, value, float, int, np.floating, type(None))
+            if value is not None and not 0.0 <= value < np.inf:
+                text = f"{value:g} is not a standard uncertainty; give a finite number of zero or more, or leave it out"
+                raise InputError(text, field=name)
+        of_kind("systematic", self.systematic, SystematicInputs)
+        for name, allowed in (
+            ("method", METHODS), ("part_scale", ("known", "free")), ("travel", ("machine", "from-data")),
+            ("nodes", ("machine", "from-data")),
+        ):  # fmt: skip
+            if text_of(name, getattr(self, name)) not in allowed:
+                raise InputError(f"{getattr(self, name)!r} is not known; give {' or '.join(allowed)}", field=name)
+        if not (isinstance(self.stations, str) and self.stations == "nominal"):
+            of_kind("stations", self.stations, KnownStations, type(None))
 
 
 @dataclass(frozen=True)

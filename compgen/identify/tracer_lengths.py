@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
@@ -163,7 +164,7 @@ def start_values(task: Task) -> tuple[State, list[int]]:
         own = np.flatnonzero(station_of == k)
         if readings[k] < 4 + len(own):
             origin = task.lengths.origin
-            file = origin[int(np.flatnonzero(task.station == k)[0])][0] if origin else None
+            file = origin[int(np.flatnonzero(task.station == k)[0])][0] if origin and readings[k] else None
             message = f"station {task.lengths.stations[k]!r} has only {readings[k]} reading(s); it cannot be located"
             raise InputError(message, file=file)
         found = at_once[k]
@@ -426,6 +427,11 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     >>> print(f"{1e6 * value:.1f} +- {1e6 * u:.1f} urad")
     2903.6 +- 0.2 urad
     """
+    of_kind("machine", machine, Machine)
+    of_kind("lengths", lengths, Lengths)
+    of_kind("options", options, IdentifyOptions, type(None))
+    if not len(lengths):
+        raise InputError("contains no reading", field="lengths")
     chosen = options or IdentifyOptions()
     with one_thread():
         if chosen.nodes == "from-data":  # tried without warnings; those of the nodes that are taken come below

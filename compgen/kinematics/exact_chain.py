@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
@@ -254,9 +255,9 @@ def exact_error(
     >>> compgen.exact_error(machine, leaning, position_mm).round(4).tolist()
     [[2.903, 0.0042, 0.0]]
     """
-    position = checked_points(position_mm)
+    position = checked_points(machine, errors, position_mm)
     result = checked_out(out, position.shape)
-    tool = np.atleast_2d(tool_of(machine, tool_mm))
+    tool = np.atleast_2d(tool_of(machine, tool_mm, len(position)))
     tables, order = motion_tables(errors), passing_order(machine)
     squareness = np.array([errors.squareness.get(name, (0.0, 0.0))[0] for name in _SQUARENESS])
     tilt = travel_directions(machine, squareness)[0] - np.eye(3)
@@ -332,6 +333,8 @@ def predict(machine: Machine, errors: ErrorTable, points: Points, *, exact: bool
     >>> compgen.predict(machine, leaning, points, exact=True).round(4).tolist()
     [[2.903, 0.0042, 0.0]]
     """
+    of_kind("errors", errors, ErrorTable)
+    of_kind("points", points, Points)
     errors.warn_outside(points.position_mm)
     model = exact_error if exact else volumetric_error
     return model(machine, errors, points.position_mm, points.tool_mm)

@@ -7,6 +7,7 @@ from functools import cache
 
 import numpy as np
 
+from compgen.data.arguments import numbers, of_kind, vectors
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Chain, Machine, Reference
 from compgen.data.names import ERROR_INDEX, ERROR_NAMES, ERRORS
@@ -68,9 +69,17 @@ def factor(lever: int | None, position_mm: FloatArray, tool_mm: FloatArray) -> F
     return np.broadcast_to(tool_mm, position_mm.shape)[:, lever - 3]
 
 
-def tool_of(machine: Machine, tool_mm: FloatArray | None) -> FloatArray:
-    """Return the tool offset to use: the given one, else the machine's, shape (3,) or (n, 3)."""
-    return np.asarray(machine.tool_offset_mm if tool_mm is None else tool_mm, dtype=np.float64)
+def tool_of(
+    machine: Machine, tool_mm: FloatArray | None, count: int | None = None, name: str = "tool_mm"
+) -> FloatArray:
+    """Return the tool offset to use: the given one, else the machine's, shape (3,) or (n, 3).
+
+    With ``count`` points there is one offset, or one for each of them.
+    """
+    if tool_mm is None:
+        return np.asarray(machine.tool_offset_mm, dtype=np.float64)
+    found = vectors(name, tool_mm)
+    return found if count is None or len(found) == 1 or found.ndim == 1 else numbers(name, found, count, 3)
 
 
 def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> FloatArray:
@@ -96,8 +105,9 @@ def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | No
     >>> C[0, :, ERROR_INDEX["EC0Y"]].tolist()  # dX = -Y EC0Y
     [200.0, 0.0, 0.0]
     """
-    position_mm = np.asarray(position_mm, dtype=np.float64)
-    tool = tool_of(machine, tool_mm)
+    of_kind("machine", machine, Machine)
+    position_mm = numbers("position_mm", position_mm, None, 3)
+    tool = tool_of(machine, tool_mm, len(position_mm))
     matrix = np.zeros((len(position_mm), 3, len(ERRORS)))
     for term in coefficients(machine.chain, machine.squareness_reference):
         matrix[:, term.output, ERROR_INDEX[term.error]] += term.sign * factor(term.lever, position_mm, tool)
@@ -132,7 +142,8 @@ def observable_errors(machine: Machine, tools_mm: FloatArray | None = None) -> t
     >>> len(names), "ECX" in names  # ECX has no lever arm on this chain
     (17, False)
     """
-    tools = np.zeros((1, 3)) if tools_mm is None else np.atleast_2d(tools_mm)
+    of_kind("machine", machine, Machine)
+    tools = np.zeros((1, 3)) if tools_mm is None else np.atleast_2d(tool_of(machine, tools_mm, name="tools_mm"))
     spread = tools - tools.mean(axis=0)
     longest = np.linalg.norm(spread, axis=1).max()
     idle: list[set[int]] = [

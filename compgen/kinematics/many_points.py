@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Emphasis, Machine
@@ -385,7 +386,7 @@ def motion_tables(errors: ErrorTable) -> AxisTables:
 def _motion_tables(*curves: tuple[str, bytes, bytes]) -> AxisTables:
     """The tables of curves: names, nodes in mm, values. Many small calculations ask for those of the same errors."""
     numbers = ((name, np.frombuffer(nodes), np.frombuffer(values)) for name, nodes, values in curves)
-    errors = ErrorTable({name: Curve(nodes_mm, value, value) for name, nodes_mm, value in numbers})
+    errors = ErrorTable({name: Curve(nodes_mm, value, np.zeros(len(value))) for name, nodes_mm, value in numbers})
     tables = [AxisTable(index, np.zeros((len(index.nodes_mm), 2, 3))) for index in _indices(errors)]
     for error in ERRORS:
         if error.name in errors.curves:
@@ -489,12 +490,11 @@ _GRID_BLOCK = 32_768
 _POINTS_FOR_KERNELS, _GRID_FOR_KERNELS = 20_000_000, 500_000_000
 
 
-def checked_points(position_mm: FloatArray) -> FloatArray:
-    """Return positions as numbers, or raise if they are not of shape (n, 3)."""
-    position = np.asarray(position_mm, dtype=np.float64)
-    if position.ndim != 2 or position.shape[1] != 3:
-        raise InputError(f"positions have the shape {position.shape}; expected (n, 3): x, y, z in mm for each point")
-    return position
+def checked_points(machine: Machine, errors: ErrorTable, position_mm: FloatArray) -> FloatArray:
+    """Return positions as numbers, or raise if they are not of shape (n, 3), or the others are not what they should be."""
+    of_kind("machine", machine, Machine)
+    of_kind("errors", errors, ErrorTable)
+    return numbers("position_mm", position_mm, None, 3)
 
 
 def checked_out(out: FloatArray | None, shape: tuple[int, ...]) -> FloatArray:
@@ -543,9 +543,9 @@ def volumetric_error(
     >>> compgen.volumetric_error(machine, leaning, position_mm).round(4).tolist()
     [[2.903, 0.0, 0.0]]
     """
-    position = checked_points(position_mm)
+    position = checked_points(machine, errors, position_mm)
     result = checked_out(out, position.shape)
-    tool = tool_of(machine, tool_mm)
+    tool = tool_of(machine, tool_mm, len(position))
     each = None if tool.ndim == 1 else np.broadcast_to(tool, position.shape)
     tables = field_tables(machine, errors, tool if each is None else None)
     if use_compiled(len(position), _POINTS_FOR_KERNELS):

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Drawable, Overview, Panel
 from compgen.data.error_table import ErrorTable
@@ -381,6 +382,9 @@ def plan(machine: Machine, stations: PlannedStations, points: Points, options: I
     >>> compgen.plan(machine, stations, points).determined
     True
     """
+    of_kind("machine", machine, Machine)
+    of_kind("stations", stations, PlannedStations)
+    of_kind("points", points, Points)
     with one_thread():
         return plan_of(planned(machine, stations, points, planned_noise(options)))
 

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import FloatArray, format_csv, read_csv
 from compgen.data.lengths import POSITION_COLUMNS
 from compgen.data.machine import Machine
@@ -66,8 +67,9 @@ def planned_stations(positions: Mapping[str, Sequence[float]]) -> PlannedStation
     >>> stations.names
     ('LT1', 'LT2')
     """
+    of_kind("positions", positions, Mapping)
     index = np.arange(len(positions))
-    where = np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3)
+    where = np.array([numbers(f"positions[{name}]", place, 3) for name, place in positions.items()]).reshape(-1, 3)
     return PlannedStations(tuple(positions), where, np.column_stack([index, 0 * index]))
 
 

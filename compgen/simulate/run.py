@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from compgen.data import toml_files
+from compgen.data.arguments import of_kind, path_of
 from compgen.data.axis_runs import AxisRuns, Diagonals, format_axis_runs, format_diagonals
 from compgen.data.circles import Circles, format_circles
 from compgen.data.csv_files import FloatArray
@@ -349,6 +350,8 @@ def simulate(
     >>> [bool((item.lengths.length_mm == measured.lengths.length_mm).all()) for item in (again, other)]
     [True, False]
     """
+    of_kind("machine", machine, Machine)
+    of_kind("scenario", scenario, Scenario)
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
     instrument = scenario.instrument
@@ -554,6 +557,8 @@ def write_simulation(
     >>> sorted(paths)
     ['truth.errors.csv', 'zha-gantry.lengths.csv']
     """
+    of_kind("simulation", simulation, Simulation, SimulatedReadings, MovingSimulation)
+    path_of("folder", folder)
     output = OutputFolder(folder)
     if isinstance(simulation, MovingSimulation):
         output.add("truth.errors.csv", format_errors(simulation.truth))

@@ -11,6 +11,7 @@ from typing import Any
 
 from compgen import effects
 from compgen.controls import CONTROLLERS, AnyController, SourceFile, controller_named
+from compgen.data.arguments import of_kind, text_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview, shortened
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, format_errors, format_reversal, reversal_name
@@ -248,6 +249,9 @@ def export(
     >>> sorted(exported.files)
     ['volcomp0.csv', 'volcomp0.lis']
     """
+    of_kind("machine", machine, Machine)
+    of_kind("errors", errors, ErrorTable)
+    text_of("controller", controller)
     control = controller_named(controller)(machine)
     card = usable_format(controller, templates, allow_unverified=allow_unverified)
     basis = control.basis(errors)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from compgen.controls import AnyController, SourceFile, controller_named
 from compgen.controls.shared.base import Monomial, Term
+from compgen.data.arguments import of_kind, paths_of, text_of
 from compgen.data.comparison import Difference, Residuals, residuals_twice, rms, small_motion
 from compgen.data.csv_files import FloatArray, format_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
@@ -669,8 +670,10 @@ def read_tables(
     >>> tables
     <ReadTables: isg-csv: volcomp0.csv, volcomp0.lis>
     """
+    of_kind("machine", machine, Machine)
+    text_of("controller", controller)
     control = controller_named(controller)(machine)
-    files = table_files([paths] if isinstance(paths, str | Path) else paths, controller)
+    files = table_files(paths_of("paths", paths), controller)
     if not files:
         raise InputError("no table file was given")
     contents = []
@@ -1034,6 +1037,12 @@ def verify(
     >>> result.accepted, result.after.max_um < 0.5
     (True, True)
     """
+    for name, value, kind in (
+        ("machine", machine, Machine),
+        ("tables", tables, ReadTables),
+        ("errors", errors, ErrorTable),
+    ):
+        of_kind(name, value, kind)
     control = tables.controller
     judge = judge_of(machine, control, errors, tables.tables)
     grid_mm, solver = judge.grid.position_mm, judge.solver
