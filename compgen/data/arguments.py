@@ -88,7 +88,7 @@ def labels_of(name: str, value: Any) -> Sequence[str]:
 
 
 def numbers(
-    name: str, value: Any, *shape: int | None, unknown: bool = False, least: float = -np.inf
+    name: str, value: Any, *shape: int | None, unknown: bool = False, least: float = -np.inf, finite: bool = True
 ) -> NDArray[np.float64]:
     """Return an argument that must be an array of real, finite numbers.
 
@@ -99,13 +99,14 @@ def numbers(
     shape : size of each dimension, None for any.
     unknown : nan is allowed, for what is not known.
     least : smallest number.
+    finite : False: any real numbers; what depends on an infinite or unknown one is that, too.
     """
     found = _real(name, value)
     if found.ndim != len(shape) or any(size not in (None, own) for size, own in zip(shape, found.shape, strict=True)):
         expected = ", ".join("n" if size is None else str(size) for size in shape)
         comma = "," if len(shape) == 1 else ""
         raise InputError(f"has the shape {found.shape}; expected ({expected}{comma})", field=name)
-    if not np.isfinite(found.sum()):  # a sum over millions of numbers is much faster than a look at each
+    if finite and not np.isfinite(found.sum()):  # a sum over millions of numbers is much faster than a look at each
         good = np.isfinite(found) | (np.isnan(found) if unknown else False)
         if not good.all():
             hint = " (nan: unknown)" if unknown else ""
@@ -118,9 +119,9 @@ def numbers(
 
 
 def vectors(name: str, value: Any) -> NDArray[np.float64]:
-    """Return an argument that must be one vector (3,), or several (n, 3)."""
+    """Return an argument that must be one vector (3,), or several (n, 3), of any real numbers."""
     found = _real(name, value)
-    return numbers(name, found, *((3,) if found.ndim == 1 else (None, 3)))
+    return numbers(name, found, *((3,) if found.ndim == 1 else (None, 3)), finite=False)
 
 
 def whole_numbers(name: str, value: Any, size: int) -> NDArray[np.int64]:

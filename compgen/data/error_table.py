@@ -54,9 +54,8 @@ class Curve(Displayed):
     u: FloatArray
 
     def __post_init__(self) -> None:
-        for name, unknown in (("position_mm", True), ("value", False), ("u", True)):
-            least = 0.0 if name == "u" else -np.inf
-            object.__setattr__(self, name, numbers(name, getattr(self, name), None, unknown=unknown, least=least))
+        for name, how in (("position_mm", {"finite": False}), ("value", {}), ("u", {"unknown": True, "least": 0.0})):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), None, **how))
         if not len(self.position_mm) == len(self.value) == len(self.u) > 0:
             sizes = f"{len(self.position_mm)}, {len(self.value)}, {len(self.u)}"
             raise InputError(

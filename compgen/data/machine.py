@@ -271,8 +271,7 @@ class Chain:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or self.name not in CHAINS:
             raise InputError(
-                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. 'WFYXZT'",
-                field="name",
+                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. the name 'WFYXZT'"
             )
         left, _, right = self.name[1:-1].partition("F")
         object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))

@@ -79,7 +79,9 @@ def tool_of(
     if tool_mm is None:
         return np.asarray(machine.tool_offset_mm, dtype=np.float64)
     found = vectors(name, tool_mm)
-    return found if count is None or len(found) == 1 or found.ndim == 1 else numbers(name, found, count, 3)
+    return (
+        found if count is None or len(found) == 1 or found.ndim == 1 else numbers(name, found, count, 3, finite=False)
+    )
 
 
 def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | None = None) -> FloatArray:
@@ -106,7 +108,7 @@ def c_matrix(machine: Machine, position_mm: FloatArray, tool_mm: FloatArray | No
     [200.0, 0.0, 0.0]
     """
     of_kind("machine", machine, Machine)
-    position_mm = numbers("position_mm", position_mm, None, 3)
+    position_mm = numbers("position_mm", position_mm, None, 3, finite=False)
     tool = tool_of(machine, tool_mm, len(position_mm))
     matrix = np.zeros((len(position_mm), 3, len(ERRORS)))
     for term in coefficients(machine.chain, machine.squareness_reference):

@@ -494,7 +494,7 @@ def checked_points(machine: Machine, errors: ErrorTable, position_mm: FloatArray
     """Return positions as numbers, or raise if they are not of shape (n, 3), or the others are not what they should be."""
     of_kind("machine", machine, Machine)
     of_kind("errors", errors, ErrorTable)
-    return numbers("position_mm", position_mm, None, 3)
+    return numbers("position_mm", position_mm, None, 3, finite=False)
 
 
 def checked_out(out: FloatArray | None, shape: tuple[int, ...]) -> FloatArray:
