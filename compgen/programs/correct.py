@@ -251,8 +251,11 @@ class ProgramWriter:
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
             if block.count:
-                self.target_mm = np.array(pieces.command_mm[rows][-1])
-                self.written_mm = np.array(self.target_mm)
+                # axes that a move in machine coordinates does not name stay where they were written to go
+                letters = {word[0][0] for word in block.words if word[0] in (*AXES, *(f"{axis}1" for axis in AXES))}
+                there = np.array([not letters or axis in letters for axis in AXES])
+                self.target_mm = np.where(there, pieces.command_mm[rows][-1], self.target_mm)
+                self.written_mm = np.where(there, pieces.command_mm[rows][-1], self.written_mm)
             return [block.text]
         if block.kind == "cycle":
             return [self._cycle(block, batch.moves, pieces.command_mm, last, offset)]

@@ -162,6 +162,27 @@ def test_a_unit_that_changes_after_a_cycle_was_defined_is_refused():
         moves_of(f"{START['siemens']}{MCALL}G70\nX1\nMCALL\nM30\n", "siemens")
 
 
+@pytest.mark.parametrize(
+    ("dialect", "home"),
+    [
+        ("fanuc", "G91 G28 Z0."),
+        ("fanuc", "G53 G0 Z0.\nG91"),
+        ("linuxcnc", "G53 G0 Z0.\nG91"),
+        ("grbl", "G53 G0 Z0.\nG91"),
+        ("siemens", "SUPA G0 Z0\nG91"),
+        ("heidenhain-iso", "G00 Z+0 M91*\nG91*"),
+    ],
+)
+def test_axes_that_stay_while_another_goes_to_a_place_of_the_machine_stay_corrected(tmp_path, dialect, home):
+    """X is written 10 um less and stays so while Z goes to machine zero: an increment after that is no longer by 10 um."""
+    mark = "*" if dialect == "heidenhain-iso" else ""
+    start = {"siemens": "G71 G90 G17 G54", "heidenhain-iso": "%P G71 *\nG90 G17*"}.get(dialect, "G21 G90 G17 G54")
+    text = f"{start}\nG0 X5. Y5. Z5.{mark}\n{home}\nG0 X5.{mark}\nG90 Z5.{mark}\nG1 X50. F9{mark}\nM30{mark}\n"
+    result, corrected = run(tmp_path, text, shift(x=10.0, y=20.0), dialect, SHOP)
+    assert result.accepted, result.reasons
+    assert re.findall(r"G0 X[+]?([\d.]+)", corrected) == ["4.99", "5."]
+
+
 def test_an_axis_that_no_block_has_named_since_is_said(tmp_path):
     """After G55 only X is named: Y stays where it is, uncorrected there, and that is said with the line."""
     text = START["fanuc"] + f"G99 {DRILL['fanuc']}G55\nX30.\nX40.\nG80\nM30\n"
