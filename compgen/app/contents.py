@@ -666,7 +666,7 @@ def plan_page(project: Project, state: ProjectState) -> dict[str, Any]:
         facts = project.facts(step, "plan.json")
         predicted = facts.get("u") or {**facts.get("curves", {}), **facts.get("squareness", {})}
         rows = [
-            (name, item.get("u_max_where_read", item.get("u_max", item.get("u"))), item.get("unit", ""))
+            (name, item.get("u_max_where_read") or item.get("u_max", item.get("u")), item.get("unit", ""))
             for name, item in predicted.items()
         ]
         views = list(project.pages_of(step))

@@ -564,7 +564,7 @@ def _without_problems(step: Step, output: str) -> Step:
 
 @action("plan", "plan/make")
 def make_plan(runner: Runner, state: ProjectState) -> None:
-    """Predict what circles, an artefact or a laser tracer will determine; of nothing: what to measure next."""
+    """Predict what circles, an artefact or a laser tracer will determine, before anything is measured."""
     machine, project = _machine_of(state), runner.project
     typed = {name: _field(name) for name in ("circles", "poses")}
     words = [f"--circle={text.strip()}" for text in typed["circles"].split(";") if text.strip()]
@@ -573,9 +573,9 @@ def make_plan(runner: Runner, state: ProjectState) -> None:
     words += [f"--{name}={path}" for name, paths in given.items() for path in paths]
     words += [f"--poses={typed['poses']}"] * bool(given["artefact"] and typed["poses"])
     words += ["--grid"] * bool(given["stations"] and not given["points"])
-    known = state.current("identify")
-    if not words and known is not None:
-        words = ["--errors", f"{known.folder}/identified.errors.csv"]
+    if not words:
+        project.set_aside(folder)
+        raise InputError("give circles, an artefact or the stations of a tracer")
     words = ["plan", machine, *words, *_language(), "--out", folder]
     step = Step(0, "plan", "Plan of a measurement", [words], folder, data={"typed": typed})
     runner.start("planning the measurement", "plan", [StepTask(step)])
