@@ -41,8 +41,8 @@ SMOOTH_LENGTH, ROUGH_LENGTH, ROUGH = 0.3, 0.03, 0.1
 SCATTERED, MOST_LEVELS = 31, 60
 #: An error of this size, mm at a lever of a metre, that the readings would not notice is not shown by them.
 NOTHING_MM = 1.0
-#: Levels closer than this are one, mm.
-SAME_MM = 1e-4
+#: Levels closer than this are one, mm; levels of readings, as a share of the travel.
+SAME_MM, CLOSE = 1e-4, 1e-3
 #: Added to the diagonal of a prior covariance, relative to it, against rounding.
 JITTER = 1e-9
 #: An error is listed if its standard uncertainty is at most this share of its prior, a curve and a squareness: what the
@@ -140,8 +140,18 @@ def state_layout(machine: Machine, levels_mm: Sequence[FloatArray], names: Seque
 
 
 def reading_levels(axis: Axis, position_mm: FloatArray) -> FloatArray:
-    """Return the levels of an axis at which readings determine its curves: their own, or a grid for scattered ones."""
-    levels = np.unique(np.round(position_mm[np.isfinite(position_mm)], 4))
+    """Return the levels of an axis at which readings determine its curves: their own, or a grid for scattered ones.
+
+    Readings of a plate that lies a little askew share their levels: what a curve does from one ball of a row to the next
+    is noise, and was taken for a rough curve.
+    """
+    closest, own = CLOSE * axis.length_mm, list[float]()
+    for level in np.unique(np.round(position_mm[np.isfinite(position_mm)], 4)).tolist():
+        if not own or level - own[-1] > closest:
+            own.append(level)
+    levels = np.array(own)
+    apart = np.abs(levels[:, None] - axis.nodes_mm).min(axis=1, initial=np.inf)
+    levels = np.asarray(levels[(apart <= SAME_MM) | (apart > closest)])
     if len(levels) + len(axis.nodes_mm) <= MOST_LEVELS:
         return levels
     return np.linspace(*axis.range_mm, SCATTERED)
