@@ -210,7 +210,8 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
         factor = np.diag(np.maximum(errors.uncertainties(), FINEST * unit))
     # a table of another program may have another gauge
     part, values = common_gauge_part(machine, errors), errors.values()
-    return posterior_of_values(machine, known.error, known.position_mm, values - part @ values, factor - part @ factor)
+    values, factor = values - part @ values, factor - part @ factor
+    return posterior_of_values(machine, known.error, known.position_mm, values, factor, taken_off=part)
 
 
 @dataclass(frozen=True)

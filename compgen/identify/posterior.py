@@ -461,12 +461,17 @@ def root_of(covariance: FloatArray) -> FloatArray:
 
 
 def posterior_of_values(
-    machine: Machine, names: Sequence[str], position_mm: FloatArray, value: FloatArray, factor: FloatArray
+    machine: Machine,
+    names: Sequence[str],
+    position_mm: FloatArray,
+    value: FloatArray,
+    factor: FloatArray,
+    taken_off: FloatArray | None = None,
 ) -> Posterior:
     """Return the posterior of a machine of which error values are known (k,), with a factor (k, r) of their covariance.
 
     Values whose errors the chain does not show are left out. The sizes of the machine file stay, but for a machine that is
-    worse than its class.
+    worse than its class. ``taken_off`` (k, k) is the part of the values that their gauge took off.
     """
     own = set(state_names(machine))
     rows = np.array([name in own for name in names], dtype=bool)
@@ -480,7 +485,8 @@ def posterior_of_values(
     if not kept:
         return solve_posterior(machine, layout, (), spans, learn=False)
     part = factor[rows]
-    read = Observations.of_values(layout, kept, at, value[rows], part @ part.T)
+    gauge = None if taken_off is None else taken_off[np.ix_(rows, rows)]
+    read = Observations.of_values(layout, kept, at, value[rows], part @ part.T, taken_off=gauge)
     return solve_posterior(machine, layout, (Information.of(read),), spans, learn=False)
 
 

@@ -71,6 +71,7 @@ from compgen.identify.posterior import (
 )
 from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
+from compgen.kinematics.gauge import common_gauge_part
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import full_grid
 
@@ -142,11 +143,22 @@ class Source:
             rows = np.flatnonzero(kept)
             few = lengths.part(rows[:: 1 + len(rows) // MOST_LENGTHS])
             return length_observations(machine, layout, few, options, around)
-        if isinstance(self.measurement, Deviations) and self.alone is not None and self.alone.adjustment is not None:
-            known = joint_covariance(self.alone)
-            values = self.alone.errors.values()
-            return Observations.of_values(layout, known.error, known.position_mm, values, known.errors_covariance)
+        known = self.measurement is not None and not isinstance(self.measurement, Artefact)
+        if known and self.alone is not None and self.alone.adjustment is not None:
+            return self._adjusted_values(machine, layout, self.alone)
         return self.observed(machine, layout, options, around)
+
+    def _adjusted_values(self, machine: Machine, layout: ErrorParameters, alone: Identification) -> Observations:
+        """The values at the nodes that the readings alone determine, with their joint covariance.
+
+        Between two nodes they are drawn straight: at a reference point there the true curve is bent, and what it differs
+        by was taken off the values, and is in the squareness.
+        """
+        known, values = joint_covariance(alone), alone.errors.values()
+        taken_off = common_gauge_part(machine, alone.errors) if machine.curves == "linear" else None
+        return Observations.of_values(
+            layout, known.error, known.position_mm, values, known.errors_covariance, taken_off=taken_off
+        )
 
     def _as_alone(self, found: Observations) -> Observations:
         """Readings without those rejected alone, with the uncertainties found alone; calibration data follow and stay."""

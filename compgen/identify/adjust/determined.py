@@ -83,13 +83,16 @@ class Observations:
         position_mm: FloatArray,
         value: FloatArray,
         covariance: FloatArray,
+        taken_off: FloatArray | None = None,
     ) -> Observations:
         """Return error values with a covariance as independent readings of unit variance; no zero-variance directions.
 
         Values without uncertainty (a curve where it is zero by definition) are ignored. Every curve counts as read
-        everywhere.
+        everywhere. ``taken_off`` (k, k) is the part of the values that their gauge took off.
         """
         design = layout.value_rows(names, position_mm)
+        if taken_off is not None:
+            design = design - taken_off @ design
         size, direction = np.linalg.eigh(covariance)
         seen = size > 1e-12 * size[-1]
         whiten = (direction[:, seen] / np.sqrt(size[seen])).T
