@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -88,12 +89,17 @@ FAMILIES: dict[str, Callable[[Array, Generator], Array]] = {
 }
 
 
-def of_the_prior(share: Array, rng: Generator) -> Array:
-    """A draw of the process that the program assumes: Matern 5/2 of 0.3 of the travel, a tenth of it exponential of 0.03."""
-    d = np.abs(share[:, None] - share[None, :])
+@cache
+def _root_of_the_prior(count: int) -> Array:
+    d = np.abs(np.subtract.outer(np.linspace(0.0, 1.0, count), np.linspace(0.0, 1.0, count)))
     s = np.sqrt(5.0) * d / 0.3
     kernel = (1.0 + s + s**2 / 3.0) * np.exp(-s) + 0.1**2 * np.exp(-d / 0.03)
-    return np.asarray(np.linalg.cholesky(kernel + 1e-8 * np.eye(len(share))) @ rng.normal(size=len(share)))
+    return np.asarray(np.linalg.cholesky(kernel + 1e-8 * np.eye(count)))
+
+
+def of_the_prior(share: Array, rng: Generator) -> Array:
+    """A draw of the process that the program assumes: Matern 5/2 of 0.3 of the travel, a tenth of it exponential of 0.03."""
+    return np.asarray(_root_of_the_prior(len(share)) @ rng.normal(size=len(share)))
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from compgen.foreign import open_measurement
 from compgen.foreign.converted import given_errors
 from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.any_measurement import MixedMeasurement
+from compgen.identify.axis_tests import identify_circles
 from compgen.identify.options import StatedNumbers
 from compgen.identify.together import Source, identify_together
 from compgen.kinematics.exact_chain import tip_position
@@ -396,7 +397,7 @@ def test_circles_enter_an_adjustment_with_their_joint_covariance(small_machine):
     circles = circles_of(small_machine, table)
     circles = circles.part(np.flatnonzero(circles.direction == 1))  # the reversals of the axes tie the planes
     with pytest.warns(CompgenWarning, match="in one direction only"):
-        alone = identify_bare(small_machine, circles)
+        alone = identify_circles(small_machine, circles)
     prior, weights = alone.values_factor @ alone.values_factor.T, np.array([1.0, 0.0, 0.0])
     assert abs(prior[0, 1]) > 0.1 * prior[0, 0]
     u_rad = float(np.sqrt(prior[0, 0]))
@@ -408,20 +409,34 @@ def test_circles_enter_an_adjustment_with_their_joint_covariance(small_machine):
     assert found.errors.values() == pytest.approx(alone.errors.values() + gain * u_rad, abs=1e-10)
     u = found.errors.uncertainties() / found.u_scale
     assert u == pytest.approx(np.sqrt(np.diag(prior - np.outer(gain, weights @ prior))), rel=1e-6)
-    assert set(found.details["within_circles"]) == {"EC0Y", "EB0Z", "EA0Z"}  # nothing tells how the guides are bent
 
 
-def test_circles_and_straightness_together_give_the_squareness_over_the_travel(tmp_path, small_machine, truth):
-    """A circle shows the squareness within its diameter; the slopes of the bent guides there are known, and taken off."""
+def closely(machine, table, count=41):
+    """A table at closely spaced positions, as a level or a straightedge reads it."""
+    curves = {}
+    for name, curve in table.curves.items():
+        at = np.linspace(*machine.axes[error_named(name).axis].range_mm, count)
+        curves[name] = compgen.Curve(at, curve.at(at), np.full(count, curve.u[0]))
+    return compgen.ErrorTable(curves)
+
+
+def test_a_circle_gives_the_squareness_over_the_travel_as_far_as_guides_are_known(tmp_path, small_machine, truth):
+    """It shows the squareness within its diameter: straightness and angles there, once measured, are taken off."""
     flat = truth.only(*(name for name in truth.names if error_named(name).kind != "angular"))
     circles = circles_of(small_machine, flat)
-    alone = identify_bare(small_machine, circles)
-    assert abs(alone.errors.squareness["EC0Y"][0] - flat.squareness["EC0Y"][0]) > 10e-6
-    straight = flat.only(*(name for name in flat.curves if error_named(name).is_straightness)).replace(metadata={})
-    paths = written(tmp_path, c_circle_csv=format_circles(circles), s_errors_csv=format_errors(straight))
-    found = identify_bare(small_machine, open_measurement(paths))
-    for name in flat.squareness:
-        value, u = found.errors.squareness[name]
-        assert abs(value - flat.squareness[name][0]) < 4.0 * u + 1e-6, name
-        assert u < 5e-6
-    assert not found.details["within_circles"]
+    straight = closely(small_machine, flat.only(*(name for name in flat.curves if error_named(name).is_straightness)))
+    turns = truth.only(*(name for name in truth.curves if error_named(name).kind == "angular"))
+    level = closely(small_machine, turns.with_values(values=np.zeros(len(turns.values()))))
+    files = {"c_circle_csv": format_circles(circles), "s_errors_csv": format_errors(straight)}
+    some = written(tmp_path, **files)
+    every = written(tmp_path, **files, l_errors_csv=format_errors(level))
+    known = []
+    for paths in (some[:1], some, every):
+        found = identify_bare(small_machine, open_measurement(paths)).errors.squareness
+        known.append(np.array([found[name] for name in flat.squareness]))
+    for values in known[1:]:
+        assert np.all(np.abs(values[:, 0] - [value for value, _ in flat.squareness.values()]) < 2.0 * values[:, 1])
+    assert (
+        known[0][0, 1] > 20e-6 and known[1][0, 1] > 20e-6
+    )  # angles that nobody read move the tool along the circle, too
+    assert known[2][:, 1].max() < 5e-6
