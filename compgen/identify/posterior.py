@@ -43,6 +43,8 @@ SCATTERED, MOST_LEVELS = 31, 60
 NOTHING_MM = 1.0
 #: Levels closer than this are one, mm; levels of readings, as a share of the travel.
 SAME_MM, CLOSE = 1e-4, 1e-3
+#: Ends of a travel that differ by more than this belong to another machine, mm.
+OTHER_TRAVEL_MM = 20.0
 #: Added to the diagonal of a prior covariance, relative to it, against rounding.
 JITTER = 1e-9
 #: An error is listed if its standard uncertainty is at most this share of its prior, a curve and a squareness: what the
@@ -492,8 +494,14 @@ def posterior_of_values(
 
 def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
     """Return the posterior that a covariance file keeps, for its machine."""
-    layout = state_layout(machine, stored.levels_mm, stored.names)
-    if layout.size != len(stored.mean):
+    # measured with tables active, the travel of the state is wider by what they move
+    ends = [(float(at[0]), float(at[-1])) for at in stored.levels_mm]
+    far = max(np.abs(np.subtract(end, axis.range_mm)).max() for end, axis in zip(ends, machine.axes, strict=True))
+    pairs = zip(machine.axes, ends, stored.levels_mm, strict=True)
+    x, y, z = (replace(axis, range_mm=end, nodes_mm=at) for axis, end, at in pairs)
+    machine = replace(machine, axes=(x, y, z), curves="linear")
+    layout = error_parameters(machine, stored.names)
+    if far > OTHER_TRAVEL_MM or layout.size != len(stored.mean):
         raise InputError(
             f"the covariance file belongs to another travel than that of machine {machine.name!r}; identify the errors again"
         )
