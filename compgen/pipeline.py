@@ -23,7 +23,8 @@ from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.errors import CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.data.prior import NONE, PriorSettings
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
 from compgen.identify.any_measurement import (
@@ -43,6 +44,7 @@ from compgen.resources import LANGUAGES
 if TYPE_CHECKING:
     from compgen.fit import FitOptions, FitResult
     from compgen.identify.monte_carlo import SelfCheck
+    from compgen.identify.stated import Shown
     from compgen.plan.next_best import NextBest
     from compgen.tables import Export, ReadTables, SafetyLimits, Verification
     from compgen.tables.active import ActiveTables
@@ -218,20 +220,28 @@ def add_identification(output: OutputFolder, files: Mapping[str, str | bytes]) -
 def identified_reversal(result: Identification) -> ReversalCurves | None:
     """Return the reversals that are well above their uncertainty and worth a table; None if there are none.
 
-    They include the backlash of the machine file, which was removed from the readings.
+    Those of other instruments and of typed numbers count before those that lengths show, to which the backlash of the
+    machine file belongs that was removed from the readings.
     """
-    found = result.reversal_curves
+    machine, taken_out = result.layout.machine, result.corrections.get("effects", {})
+    found = _of_stops(result)
+    found = effects.with_effects_reversal(machine, found, taken_out) if taken_out else found
+    if found is None or result.reversal_curves is None:
+        return found or result.reversal_curves
+    return ReversalCurves({**found.curves, **result.reversal_curves.curves}, result.reversal_curves.metadata)
+
+
+def _of_stops(result: Identification) -> ReversalCurves | None:
+    """Reversals that lengths show at stops which were approached from both sides."""
     # a reversal belongs to curves that are the mean of both directions, so the readings must refer to that mean
-    if found is None and result.reversal is not None and result.reversal.removed:
-        curves = {}
-        for name, axis in result.reversal.axes.items():
-            for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
-                if abs(value) > SIGNIFICANT * u and abs(value) >= WORTH_MM:
-                    key = (AXES.index(name), component)
-                    curves[key] = Curve(np.zeros(1), np.array([value]), np.array([u]))
-        found = ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
-    taken_out = result.corrections.get("effects", {})
-    return effects.with_effects_reversal(result.layout.machine, found, taken_out) if taken_out else found
+    if result.reversal is None or not result.reversal.removed:
+        return None
+    curves = {}
+    for name, axis in result.reversal.axes.items():
+        for component, (value, u) in enumerate(zip(axis.vector_mm, axis.u_mm, strict=True)):
+            if abs(value) > SIGNIFICANT * u and abs(value) >= WORTH_MM:
+                curves[AXES.index(name), component] = Curve(np.zeros(1), np.array([value]), np.array([u]))
+    return ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
 
 
 def fit_files(result: FitResult) -> dict[str, str]:
@@ -327,6 +337,7 @@ def identify_bare(
     from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.foreign.converted import given_errors
+    from compgen.identify.stated import is_stated
     from compgen.tables.active import without_active
 
     if active is None and isinstance(measurement, ErrorTable):
@@ -337,6 +348,7 @@ def identify_bare(
         whole = all(
             not part.squareness if isinstance(part, ErrorTable) else isinstance(part, AxisRuns)
             for _, part in measurement.parts
+            if not is_stated(part)
         )
         known = {name: given_errors(machine, table, whole=whole) for name, table in tables_of.items()}
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
@@ -350,13 +362,81 @@ def identify_bare(
     return replace(result, corrections={**result.corrections, "active_tables": report})
 
 
-def with_reversal(result: Identification, stated: ReversalCurves | None) -> Identification:
-    """Return the identification with reversals that are known otherwise; each takes the place of a measured one of its axis."""
+def identify_beside(
+    machine: Machine,
+    measurement: Measurement | ErrorTable,
+    numbers: StatedNumbers,
+    options: IdentifyOptions | None = None,
+    active: ActiveTables | None = None,
+) -> Identification:
+    """Identify as :func:`identify_bare`, beside numbers that were typed: they are adjusted together with what was measured.
+
+    ``measurement`` has the squareness and scale of the numbers among its parts already.
+
+    Raises
+    ------
+    InputError
+        for a number that contradicts a measurement of the same, and for a reversal of which the sign is open.
+    """
+    from compgen.identify import stated
+
+    if numbers.squareness or numbers.scale:
+        alone = _measured_alone(machine, stated.without_stated(measurement), options, active)
+        if alone is not None:
+            stated.check_errors(numbers, alone)
+    result = identify_bare(machine, measurement, options, active)
+    if not (numbers.backlash or isinstance(measurement, MixedMeasurement)):
+        return result
+    shown = stated.shown_reversals(measurement, result)
+    own = effects.effects_reversal(machine)
+    stated.check_signs(numbers, {**shown, **({} if own is None else {axis: own for axis, _ in own.curves})})
+    return with_reversal(stated.with_contradictions(result, shown), numbers.reversal(), shown)
+
+
+def _measured_alone(
+    machine: Machine,
+    measurement: Measurement | ErrorTable | None,
+    options: IdentifyOptions | None,
+    active: ActiveTables | None,
+) -> Identification | None:
+    """Identify what was measured, with no prior; None where that is not determined. What is to say is said elsewhere."""
+    if measurement is None:
+        return None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        try:
+            return identify_bare(replace(machine, prior=PriorSettings(class_name=NONE)), measurement, options, active)
+        except CompgenError:
+            return None
+
+
+def with_reversal(result: Identification, stated: ReversalCurves | None, shown: Shown | None = None) -> Identification:
+    """Return the identification with reversals that were typed, each adjusted together with what was measured of it.
+
+    Parameters
+    ----------
+    stated : reversals along axes; None for none.
+    shown : those that were measured, by axis; None for those of the result.
+
+    Raises
+    ------
+    InputError
+        for a number that contradicts what was measured, or the machine file.
+    """
     if stated is None:
         return result
-    measured = {} if result.reversal_curves is None else result.reversal_curves.curves
-    metadata = {"machine": result.layout.machine.name}
-    return replace(result, reversal_curves=ReversalCurves({**measured, **stated.curves}, metadata))
+    from compgen.identify.stated import joined_reversal, shown_reversals
+
+    machine = result.layout.machine
+    measured = shown_reversals(None, result) if shown is None else shown
+    own = effects.effects_reversal(machine)
+    curves = {} if result.reversal_curves is None else dict(result.reversal_curves.curves)
+    for (axis, along), number in stated.curves.items():
+        sources = measured.get(axis, ())
+        if not sources and own is not None and (axis, along) in own.curves:
+            sources = [("the machine file", own.curves[axis, along])]
+        curves[axis, along] = joined_reversal(axis, number, sources)
+    return replace(result, reversal_curves=ReversalCurves(curves, {"machine": machine.name}))
 
 
 def _write_results(
@@ -477,13 +557,12 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         tables.usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
     numbers = stated or StatedNumbers()
+    numbers.reversal()  # wrong numbers are found before the work begins
     measurement = open_measurement(measurements, instrument, stated=numbers.errors(machine))
     provenance = provenance_of(machine.file, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = with_reversal(
-            identify_bare(machine, measurement, identify_options, active), numbers.reversal()
-        )
+        identification = identify_beside(machine, measurement, numbers, identify_options, active)
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     smoothing = fit_options or FitOptions()

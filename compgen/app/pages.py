@@ -690,6 +690,8 @@ def make_sheet(runner: Runner, state: ProjectState, item: int) -> str | None:
 @action("measurement", "numbers")
 def state_numbers(runner: Runner, state: ProjectState) -> None:
     """Take numbers that are known without a file, with unit and uncertainty as one types them."""
+    from compgen.identify.stated import check_signs
+
     numbers: dict[str, list[str]] = {}
     for option, names in (("squareness", SQUARENESS_NAMES), ("backlash", AXES), ("scale", AXES)):
         for name in names:
@@ -697,7 +699,7 @@ def state_numbers(runner: Runner, state: ProjectState) -> None:
             if value:
                 numbers.setdefault(option, []).append(f"{name}={value}")
     stated = StatedNumbers(**{key: dict(word.split("=", 1) for word in words) for key, words in numbers.items()})
-    stated.reversal()
+    check_signs(stated, {})
     path = contents.machine_file(runner.project, state)
     if path is None:
         raise InputError("choose or describe the machine first")

@@ -33,11 +33,10 @@ from compgen.pipeline import (
     add_identification,
     failure_reported,
     identification_files,
-    identify_bare,
+    identify_beside,
     next_measurements,
     proposed_keys,
     provenance_of,
-    with_reversal,
 )
 from compgen.report.terminal import advice_text, identification_table
 
@@ -117,7 +116,7 @@ def identify_command(
         measurement = open_measurement(measurements, instrument, stated=stated.errors(machine))
         show(f"identifying: {describe(measurement)}")
         with failure_reported(out):
-            result = with_reversal(identify_bare(machine, measurement, options, active), stated.reversal())
+            result = identify_beside(machine, measurement, stated, options, active)
         checked = None
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):

@@ -15,7 +15,7 @@ from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
+from compgen.data.names import AXES, LARGEST, MM_PER_UM, RAD_PER_URAD, SMALLEST, SQUARENESS_NAMES
 from compgen.data.toml_files import flag, not_negative, option
 from compgen.errors import InputError, nearest
 from compgen.identify.adjust.propagation import SystematicInputs
@@ -362,7 +362,7 @@ ANGLES = {"urad": RAD_PER_URAD, "um/m": RAD_PER_URAD, "µrad": RAD_PER_URAD, "µ
 LENGTHS = {"um": MM_PER_UM, "µm": MM_PER_UM, "mm": 1.0}
 #: No machine tool has more; a larger number has another unit.
 LARGEST_MM, LARGEST_RAD = 2.0, 0.1
-_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 _STATED = re.compile(
     rf"({_NUMBER})(?:\s*/\s*({_NUMBER}))?(?:\s*(?:±|\+-|\+/-)\s*({_NUMBER}))?\s*([a-zA-Zµ\"]+(?:/[a-z]+)?)?"
 )
@@ -372,6 +372,12 @@ SQUARENESS = {
     "EB0Z": ("Z to X", "the angle between +X and +Z is smaller than 90 degrees"),
     "EA0Z": ("Z to Y", "the angle between +Y and +Z is larger than 90 degrees"),
 }
+#: The comment ``source`` of errors that are numbers of the command line.
+STATED_SOURCE = "numbers of the command line"
+#: What says that a number is a reversal value B of ISO 230-2.
+_REVERSAL = re.compile(r"[Bb]\s*=\s*")
+#: A number without a unit that is below this was hardly read in the unit that is meant then, but in the other one.
+_LEAST = {"urad": (1.0, "mm/m"), "um": (0.5, "mm")}
 _ABOUT = {
     key: name for name, keys in (("EC0Y", "C XY YX"), ("EB0Z", "B XZ ZX"), ("EA0Z", "A YZ ZY")) for key in keys.split()
 }
@@ -402,8 +408,9 @@ class StatedNumbers:
     )
     backlash: Mapping[str, str] = option(
         None,
-        "Lost motion of an axis at reversal, um: X=6, X=6±1, X=0.006mm. Positive where the axis stays behind.",
-        metavar="AXIS=VALUE[±U][UNIT]",
+        "Lost motion of an axis at reversal, um: X=6, X=6±1, X=0.006mm. Positive where the axis stays behind. As the reversal "
+        "value of ISO 230-2, which is negative there: X=B=-6.",
+        metavar="AXIS=[B=]VALUE[±U][UNIT]",
         factory=dict,
     )
     scale: Mapping[str, str] = option(
@@ -425,7 +432,17 @@ class StatedNumbers:
         """
         if not (self.squareness or self.scale):
             return None
-        squareness = {}
+        squareness, curves = self.squarenesses(), {}
+        for letter, (value, u) in self.scales().items():
+            axis = AXES.index(letter)
+            reference = machine.reference_point_mm[axis]
+            at = np.unique([*machine.axes[axis].range_mm, reference])
+            curves[f"E{letter}{letter}"] = Curve(at, value * (at - reference), np.abs(u * (at - reference)))
+        return ErrorTable(curves, squareness, {"machine": machine.name, "source": STATED_SOURCE})
+
+    def squarenesses(self) -> dict[str, tuple[float, float]]:
+        """Return squareness errors with their standard uncertainty, rad; InputError for what is not understood."""
+        found = {}
         for name, text in self.squareness.items():
             if name not in SQUARENESS_NAMES:
                 axes = re.search(r"([XYZ])\W?([XYZ])$", name.upper())
@@ -438,15 +455,30 @@ class StatedNumbers:
                 what = f"{name!r} is not a squareness error; {'this may be' if key in _ABOUT else 'these are'} {'; '.join(shown)}"
                 what += " (drawings: docs/instruments.md)"
                 raise InputError(what, field="--squareness")
-            squareness[name] = _value(text, ANGLES, "--squareness", name)
-        curves = {}
-        for letter, text in self.scale.items():
-            axis = _axis(letter, "--scale")
-            value, u = _value(text, ANGLES, "--scale", letter)
-            reference = machine.reference_point_mm[axis]
-            at = np.unique([*machine.axes[axis].range_mm, reference])
-            curves[f"E{letter}{letter}"] = Curve(at, value * (at - reference), np.abs(u * (at - reference)))
-        return ErrorTable(curves, squareness, {"machine": machine.name, "source": "numbers of the command line"})
+            found[name] = _value(text, ANGLES, "--squareness", name)
+        return found
+
+    def scales(self) -> dict[str, tuple[float, float]]:
+        """Return scale errors by axis with their standard uncertainty, rad; InputError for what is not understood."""
+        return {
+            _axis(letter, "--scale"): _value(text, ANGLES, "--scale", letter) for letter, text in self.scale.items()
+        }
+
+    def backlashes(self) -> dict[str, tuple[float, float]]:
+        """Return reversal values B by axis with their standard uncertainty, mm: minus the backlash, or as stated with B=.
+
+        InputError for what is not understood.
+        """
+        found = {}
+        for letter, text in self.backlash.items():
+            name, own = _axis(letter, "--backlash"), _REVERSAL.sub("", text.strip())
+            value, u = _value(own, LENGTHS, "--backlash", letter)
+            found[name] = (value if self.says_reversal_value(letter) else -value), u
+        return found
+
+    def says_reversal_value(self, letter: str) -> bool:
+        """Whether a number is given as reversal value of ISO 230-2 (X=B=-6), not as backlash."""
+        return _REVERSAL.match(self.backlash[letter].strip()) is not None
 
     def reversal(self) -> ReversalCurves | None:
         """Return the backlash as reversals (positive minus negative approach), mm; None without any.
@@ -456,18 +488,17 @@ class StatedNumbers:
         InputError
             for axes, numbers and units that are not understood.
         """
-        curves = {}
-        for letter, text in self.backlash.items():
-            axis = _axis(letter, "--backlash")
-            value, u = _value(text, LENGTHS, "--backlash", letter)
-            curves[axis, axis] = Curve(np.zeros(1), np.array([-value]), np.array([u]))
+        curves = {
+            (AXES.index(letter), AXES.index(letter)): Curve(np.zeros(1), np.array([value]), np.array([u]))
+            for letter, (value, u) in self.backlashes().items()
+        }
         return ReversalCurves(curves) if curves else None
 
 
-def _axis(letter: str, option_name: str) -> int:
+def _axis(letter: str, option_name: str) -> str:
     if letter not in AXES:
         raise InputError(f"{letter!r} is not an axis; expected X, Y or Z", field=option_name)
-    return AXES.index(letter)
+    return letter
 
 
 def _value(text: str, units: Mapping[str, float], option_name: str, name: str) -> tuple[float, float]:
@@ -481,10 +512,30 @@ def _value(text: str, units: Mapping[str, float], option_name: str, name: str) -
             f"({', '.join(key for key in units if key.isascii())}; {next(iter(units))} without{ratio}), for example 25±3",
             field=option_name,
         )
-    by = 1.0 / float(found[2]) if found[2] else units[unit or next(iter(units))]
+    if unit is None and not found[2]:
+        _check_size(found, units, option_name, name)
+    length = float(found[2]) if found[2] else 1.0
+    if not SMALLEST < length < LARGEST:
+        raise InputError(f"{text!r} for {name}: the length of a ratio is above zero, mm", field=option_name)
+    by = 1.0 / length if found[2] else units[unit or next(iter(units))]
     value, u = float(found[1]) * by, abs(float(found[3]) * by) if found[3] else np.nan
-    if abs(value) > (LARGEST_MM if units is LENGTHS else LARGEST_RAD):
+    most = LARGEST_MM if units is LENGTHS else LARGEST_RAD
+    if not abs(value) <= most or u > most:
         raise InputError(
             f"{text!r} for {name} is too large to be an error of a machine; check the unit", field=option_name
         )
     return value, float(u)
+
+
+def _check_size(found: re.Match[str], units: Mapping[str, float], option_name: str, name: str) -> None:
+    """Ask for the unit of a number without one that is far too small for the usual one: EC0Y=0.02 of a drawing is mm/m."""
+    usual = next(iter(units))
+    least, larger = _LEAST[usual]
+    if 0.0 < max(abs(float(found[1])), abs(float(found[3] or 0.0))) < least:
+        in_usual = float(found[1]) * units[larger] / units[usual]
+        text = found[0].strip()
+        raise InputError(
+            f"{name}={text}: a number without a unit is {usual}, and this one looks like {larger}; write {name}={text}{larger} "
+            f"for {in_usual:g} {usual}, or {name}={text}{usual}",
+            field=option_name,
+        )

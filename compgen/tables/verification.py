@@ -573,6 +573,9 @@ IN_TABLES = 1e-9
 ZERO_MM = 1e-9
 #: Points that are tried at a time for a correction that is not zero.
 FEW_POINTS = 512
+#: A constant of the tables is said where it exceeds this share of the error without rigid motion, and where the share of the
+#: error that is left grows by so much without it.
+SHIFT_SHARE, SHIFT_GAIN = 0.25, 0.03
 #: A control that cannot express more than this share of the largest error gives a partial compensation.
 PARTIAL_SHARE = 0.1
 
@@ -790,7 +793,8 @@ class Verification(Drawable):
     that the best table of this control leaves (without a constant offset if the control cannot apply one), and
     ``uncorrected_um`` gives the errors behind it with the largest displacement that remains. ``reservations`` are
     remarks of the control on tables that exceed no limit: what is inferred, has no room, or is unknown. ``remarks`` are those
-    on the measurement, and ``proposed`` the keys of ``result.json`` on what to measure next.
+    on the measurement, and ``proposed`` the keys of ``result.json`` on what to measure next. ``frame_shift_um`` is what the
+    tables add at the reference point: the constant by which a control that can add one shifts the whole frame.
 
     Examples
     --------
@@ -832,6 +836,7 @@ class Verification(Drawable):
     gain: ProbableGain | None = None
     remarks: tuple[str, ...] = ()
     proposed: Mapping[str, Any] = field(default_factory=dict)
+    frame_shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def accepted(self) -> bool:
@@ -899,7 +904,29 @@ class Verification(Drawable):
 
     @property
     def figure(self) -> str:
-        """What the tables do, in one figure: rms over the volume, with its limits."""
+        """What the tables do, in one figure: rms over the volume, with its limits, and how much of it is a shift of the frame."""
+        return self._as_it_stands + (f"; {self._shift_text}" if self._shift_text else "")
+
+    @property
+    def _shift_text(self) -> str:
+        """That a constant of the tables is no gain; empty if it is none of what they gain, or not worth a word."""
+        before, after = self.before_rigid_removed.rms_um, self.after_rigid_removed.rms_um
+        left, left_as_it_stands = after / max(before, 1e-12), self.after.rms_um / max(self.before.rms_um, 1e-12)
+        small = float(np.linalg.norm(self.frame_shift_um)) < max(WORSE_FROM_UM, SHIFT_SHARE * before)
+        if small or left < left_as_it_stands + SHIFT_GAIN:
+            return ""
+        parts = [
+            f"{letter} {um:+.1f} um" for letter, um in zip(AXES, self.frame_shift_um, strict=True) if abs(um) >= 0.05
+        ]
+        return (
+            f"a part of that is a constant of the tables ({', '.join(parts)} at the reference point), which shifts the frame "
+            "and is no gain: with the best-fit rigid motion removed, what is known of the errors goes from "
+            f"{um_text(before)} to {um_text(after)} um rms"
+        )
+
+    @property
+    def _as_it_stands(self) -> str:
+        """What the tables do with the reference point fixed."""
         if self.gain is not None:
             before, low, high, after, most = self.gain.rounded
             return f"the error over the volume goes from {before} um rms ({low} to {high}) to {after}, at most {most}"
@@ -970,6 +997,7 @@ class Verification(Drawable):
             "after_uncertainty": None if self.uncertainty is None else self.uncertainty.as_dict(),
             "unrepresentable_um": self.unrepresentable_um,
             "uncorrected_um": self.uncorrected_um,
+            "frame_shift_um": list(self.frame_shift_um),
             "next_command": self.next_command or None,
             **self.proposed,
             "judged_with_tools": self.tools,
@@ -1112,7 +1140,15 @@ def verify(
         tools=machine.tool_range_text,
         objections=() if gain is None else tuple(gain.reservations),
         gain=gain,
+        frame_shift_um=_frame_shift_um(machine, tables),
     )
+
+
+def _frame_shift_um(machine: Machine, tables: ReadTables) -> tuple[float, float, float]:
+    """Return what tables add at the reference point, X, Y, Z: the constant in them, which shifts the whole frame."""
+    place_mm = np.array([machine.reference_point_mm])
+    x, y, z = (tables.mean_correction(machine, place_mm)[0] / MM_PER_UM).tolist()
+    return x, y, z
 
 
 def reasons_against(

@@ -375,3 +375,26 @@ def test_deviations_that_are_zero_or_too_small_are_asked_about(kind, factor, tex
     assert text in message and "--small-deviations" in message and path.name in message
     code, _, _ = run(tmp_path, path, "--small-deviations")
     assert code in (0, 1)  # taken as they are: zeros give tables of zeros, which are no success
+
+
+@pytest.mark.parametrize("reference_mm", [(0.0, 0.0, 0.0), (-200.0, -150.0, -100.0)])
+def test_a_constant_trim_is_no_gain_and_the_headline_says_so(tmp_path, reference_mm):
+    """Tables over single axes cannot correct a squareness: its mean ends up in them as a constant, a shift of the frame."""
+    axes = "".join(
+        f"[axes.{a}]\nrange_mm = [{low}, 0.0]\nnodes = 3\n" for a, low in zip("XYZ", (-400, -300, -200), strict=True)
+    )
+    machine = tmp_path / "mill.toml"
+    machine.write_text(f'name = "mill"\nchain = "WFYXZT"\nreference_point_mm = {list(reference_mm)}\n{axes}')
+    machine = load_machine(str(machine))
+    at = np.array([-400.0, 0.0])
+    errors = ErrorTable({"EXX": Curve(at, 5e-5 * (at - reference_mm[0]), np.full(2, 3e-4))}, {"EC0Y": (1.2e-4, 2e-6)})
+    done = export_and_verify(machine, errors, errors, "linuxcnc-comp", tmp_path / "o").verification
+    left = done.after_rigid_removed.rms_um / done.before_rigid_removed.rms_um
+    assert left > done.after.rms_um / done.before.rms_um + 0.03  # what the constant makes look better
+    size = abs(done.frame_shift_um[0])
+    assert size > 5.0
+    assert f"a constant of the tables (X {done.frame_shift_um[0]:+.1f} um" in done.headline
+    assert "is no gain: with the best-fit rigid motion removed" in done.headline
+    assert json.loads((tmp_path / "o" / "result.json").read_text())["frame_shift_um"] == list(done.frame_shift_um)
+    # tables that correct everything need no remark
+    assert "no gain" not in export_and_verify(machine, errors, errors, "isg-csv", tmp_path / "p").verification.headline
