@@ -23,7 +23,6 @@ from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.data.prior import NONE, PriorSettings
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
@@ -383,7 +382,7 @@ def identify_beside(
     if numbers.squareness or numbers.scale:
         alone = _measured_alone(machine, stated.without_stated(measurement), options, active)
         if alone is not None:
-            stated.check_errors(numbers, alone)
+            stated.check_errors(numbers, alone, stated.u_scale_of_runs(machine, measurement))
     result = identify_bare(machine, measurement, options, active)
     if not (numbers.backlash or isinstance(measurement, MixedMeasurement)):
         return result
@@ -399,13 +398,13 @@ def _measured_alone(
     options: IdentifyOptions | None,
     active: ActiveTables | None,
 ) -> Identification | None:
-    """Identify what was measured, with no prior; None where that is not determined. What is to say is said elsewhere."""
+    """Identify what was measured; None where that is not determined. What is to say is said elsewhere."""
     if measurement is None:
         return None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)
         try:
-            return identify_bare(replace(machine, prior=PriorSettings(class_name=NONE)), measurement, options, active)
+            return identify_bare(machine, measurement, options, active)
         except CompgenError:
             return None
 

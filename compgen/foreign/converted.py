@@ -49,6 +49,7 @@ from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
 from compgen.identify.identification import metadata_of, without_adjustment
+from compgen.identify.stated import factor_of_numbers, is_stated
 from compgen.instruments.sixdof_instrument import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns | Artefact
@@ -225,6 +226,7 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
         rank=values,
         unknowns=values,
         iterations=0,
+        values_factor=factor_of_numbers(errors) if known and is_stated(table) else None,
         method="given",
         details={
             "file": table.metadata.get("source", ""),

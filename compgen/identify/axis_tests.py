@@ -160,6 +160,13 @@ U_LASER, U_READ_K, U_NOT_READ_K = 1.5e-6, 0.05, 0.3
 USUAL_EXPANSION = 11.5e-6
 
 
+def u_scale_of(machine: Machine, runs: AxisRuns) -> float:
+    """Standard uncertainty of the scale of axis runs, per mm: of the laser, and of the temperature."""
+    expansion = np.mean([axis.expansion_um_per_m_k or 1e6 * USUAL_EXPANSION for axis in machine.axes]) * 1e-6
+    read = any(name.startswith("temp_") for name in runs.covariates)
+    return float(np.hypot(U_LASER, expansion * (U_READ_K if read else U_NOT_READ_K)))
+
+
 def axis_observations(machine: Machine, layout: ErrorParameters, runs: AxisRuns, prior: PriorSettings) -> Observations:
     """Return the means of axis runs as readings of the errors of a layout, at the lines where they were measured.
 
@@ -206,9 +213,7 @@ def axis_observations(machine: Machine, layout: ErrorParameters, runs: AxisRuns,
         places.append(np.where(np.arange(3) == axis, everywhere, np.nan))
         shows.append(np.tile([item.error.axis == axis for item in layout.curves], (count, 1)))
     # proper unknowns: the scale common to all, and the angles of lines nobody stated, each of unit variance
-    expansion = np.mean([axis.expansion_um_per_m_k or 1e6 * USUAL_EXPANSION for axis in machine.axes]) * 1e-6
-    read = any(name.startswith("temp_") for name in runs.covariates)
-    u_scale = float(np.hypot(U_LASER, expansion * (U_READ_K if read else U_NOT_READ_K)))
+    u_scale = u_scale_of(machine, runs)
     count, width = sum(map(len, values)), 1 + sum(item.shape[1] for item in others)
     block, row, column = np.zeros((count, width)), 0, 1
     proper = np.ones(width, dtype=bool)

@@ -534,6 +534,7 @@ def _check_size(found: re.Match[str], units: Mapping[str, float], option_name: s
     if 0.0 < max(abs(float(found[1])), abs(float(found[3] or 0.0))) < least:
         in_usual = float(found[1]) * units[larger] / units[usual]
         text = found[0].strip()
+        usual = "um/m" if option_name == "--scale" else usual
         raise InputError(
             f"{name}={text}: a number without a unit is {usual}, and this one looks like {larger}; write {name}={text}{larger} "
             f"for {in_usual:g} {usual}, or {name}={text}{usual}",

@@ -17,12 +17,14 @@ from compgen.data.circles import Circles
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
-from compgen.data.names import AXES, COVERAGE, MM_PER_UM, RAD_PER_URAD
+from compgen.data.machine import Machine
+from compgen.data.names import AXES, COVERAGE, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.effects.active import added, effects_reversal
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.identify.adjust.determined import FINEST, Observations
+from compgen.identify.adjust.unknowns import ErrorParameters
 from compgen.identify.any_measurement import Measurement, MixedMeasurement
-from compgen.identify.axis_tests import identify_circles, two_way_mean
-from compgen.identify.covariance import joint_covariance
+from compgen.identify.axis_tests import SAME_TARGET_MM, identify_circles, two_way_mean, u_scale_of
 from compgen.identify.identification import Identification
 from compgen.identify.options import STATED_SOURCE, StatedNumbers
 
@@ -32,6 +34,8 @@ ASSUMED_UM, ASSUMED_URAD = 1.0, 5.0
 
 #: Reversals along axes, with the name of what showed them.
 Shown = Mapping[int, Sequence[tuple[str, Curve]]]
+#: Readings that take away less than this share of the variance of the prior say nothing.
+NOTHING = 1e-6
 
 
 def is_stated(part: object) -> bool:
@@ -47,26 +51,112 @@ def without_stated(measurement: Measurement | ErrorTable) -> Measurement | Error
     return parts[0][1] if len(parts) == 1 else MixedMeasurement(parts)
 
 
-def check_errors(numbers: StatedNumbers, measured: Identification) -> None:
-    """Raise InputError for a typed squareness or scale that contradicts the measured one."""
+def given_numbers(result: Identification) -> bool:
+    """Whether errors that were given are numbers that were typed."""
+    return result.method == "given" and result.details.get("file") == STATED_SOURCE
+
+
+def factor_of_numbers(errors: ErrorTable) -> FloatArray:
+    """Return a factor of the covariance of typed numbers, a column each, in the order of the table: a scale moves both ends."""
+    columns = []
+    for name, rows in errors.rows().items():
+        column = np.zeros(len(errors.values()))
+        if name in errors.squareness:
+            column[rows] = errors.squareness[name][1]
+        else:
+            curve, reference_mm = errors.curves[name], errors.curves[name].position_mm[errors.curves[name].u == 0.0]
+            column[rows] = curve.u * np.sign(curve.position_mm - reference_mm[0])
+        columns.append(column)
+    return np.column_stack(columns)
+
+
+def stated_observations(layout: ErrorParameters, errors: ErrorTable, *, lines: bool) -> Observations:
+    """Return typed numbers as readings of the errors of a layout; each number counts once, also where it rules two ends.
+
+    A scale is the slope of a curve from end to end of the travel, which says nothing of its shape. With ``lines`` the curve
+    is a line, as least squares without a prior need it. A number that states no uncertainty has that of a granite square.
+    """
+    errors = errors.only(*(name for name, _ in layout.columns()))
+    names, at = list(errors.squareness), [np.nan] * len(errors.squareness)
+    values, u = ([pair[k] for pair in errors.squareness.values()] for k in (0, 1))
+    rows = layout.value_rows(names, np.array(at))
+    for name, curve in errors.curves.items():
+        away = curve.position_mm - layout.machine.reference_point_mm[error_named(name).axis]
+        ends = np.abs(away) > SAME_TARGET_MM
+        on_curve = layout.value_rows([name] * len(away), curve.position_mm)
+        slope = np.tile((on_curve[-1] - on_curve[0]) / (away[-1] - away[0]), (len(away), 1))
+        rows = np.vstack([rows, on_curve[ends] / away[ends, None] if lines else slope[ends]])
+        values += (curve.value[ends] / away[ends]).tolist()
+        u += (curve.u[ends] / np.abs(away[ends])).tolist()
+        names, at = [*names, *[name] * int(ends.sum())], [*at, *curve.position_mm[ends].tolist()]
+    at_mm, known = np.full((len(names), 3), np.nan), np.nan_to_num(u, nan=RAD_PER_URAD * ASSUMED_URAD)
+    at_mm[np.arange(len(names)), [error_named(name).axis for name in names]] = at
+    return Observations(
+        design=rows,
+        others=np.zeros((len(names), 0)),
+        value=np.array(values),
+        # the ends of a scale share what is known of it
+        sigma=np.sqrt([names.count(name) for name in names]) * np.maximum(known, RAD_PER_URAD * FINEST),
+        at_mm=at_mm,
+        shows=np.array(names)[:, None]
+        == np.array([curve.error.name for curve in layout.curves], dtype=object)[None, :],
+    )
+
+
+def u_scale_of_runs(machine: Machine, measurement: Measurement | ErrorTable | None) -> float:
+    """Standard uncertainty of the scale of the axis runs in a measurement, per mm; zero if there are none."""
+    parts = measurement.parts if isinstance(measurement, MixedMeasurement) else (("", measurement),)
+    return max((u_scale_of(machine, part) for _, part in parts if isinstance(part, AxisRuns)), default=0.0)
+
+
+def check_errors(numbers: StatedNumbers, measured: Identification, u_scale: float) -> None:
+    """Raise InputError for a typed squareness or scale that contradicts the measured one.
+
+    ``u_scale`` is the uncertainty of the scale of the instrument where there is no prior, which contains it otherwise.
+    """
     for name, typed in numbers.squarenesses().items():
         if name in measured.errors.squareness:
-            _compare("--squareness", name, typed, measured.errors.squareness[name])
+            _compare("--squareness", name, typed, _squareness(measured, name))
     for letter, typed in numbers.scales().items():
         name = f"E{letter}{letter}"
         if name in measured.errors.curves and len(measured.errors.curves[name].value) > 1:
-            _compare("--scale", letter, typed, _slope(measured, name))
+            _compare("--scale", letter, typed, _slope(measured, name, u_scale))
 
 
-def _slope(measured: Identification, name: str) -> tuple[float, float]:
-    """Slope of a curve over its positions, by least squares, and its standard uncertainty, rad."""
-    curve = measured.errors.curves[name]
-    away = curve.position_mm - curve.position_mm.mean()
-    gain = away / float(away @ away)
-    if measured.has_covariance:
-        rows = joint_covariance(measured).errors_factor[measured.errors.rows()[name]]
-        return float(gain @ curve.value), float(np.linalg.norm(gain @ rows))
-    return float(gain @ curve.value), float(np.linalg.norm(gain * curve.u))
+def _squareness(measured: Identification, name: str) -> tuple[float, float]:
+    """A squareness over the travel and its standard uncertainty, rad, by the readings without its own prior."""
+    found = measured.posterior
+    if found is None:
+        return measured.errors.squareness[name]
+    curve = found.curve(name, np.zeros(1))
+    return _without_prior(float(curve.value[0]), float(curve.u[0]), found.squareness_sd[name])
+
+
+def _slope(measured: Identification, name: str, u_scale: float) -> tuple[float, float]:
+    """Slope of a curve over its positions and its standard uncertainty, rad.
+
+    The number may be the slope from end to end or that of the best line: the difference of both adds to the uncertainty.
+    """
+    own = measured.errors.curves[name]
+    at, found = own.position_mm, measured.posterior
+    away = at - at.mean()
+    best, ends = away / float(away @ away), np.zeros(len(at))
+    ends[[0, -1]] = np.array([-1.0, 1.0]) / float(np.ptp(at))
+    apart = float((best - ends) @ own.value)
+    if found is None:
+        known = np.nan_to_num(own.u, nan=ASSUMED_UM * MM_PER_UM)
+        return float(ends @ own.value), float(np.linalg.norm([*(best * known), apart, u_scale]))
+    prior = found.processes[name].covariance(at, at)
+    u = float(np.linalg.norm(ends @ found.values_factor([name], [at])))
+    sd = float(np.sqrt(ends @ prior @ ends))
+    value, u = _without_prior(float(ends @ found.curve(name, at).value), u, sd)
+    return value, float(np.hypot(u, apart))
+
+
+def _without_prior(mean: float, u: float, sd: float) -> tuple[float, float]:
+    """Return what the readings say of a number, of which the posterior is a mean with u, and the prior zero with sd."""
+    left = 1.0 - (u / sd) ** 2
+    return (mean / left, u / float(np.sqrt(left))) if left > NOTHING else (mean, np.inf)
 
 
 def _compare(option: str, name: str, typed: tuple[float, float], found: tuple[float, float]) -> None:
@@ -83,8 +173,8 @@ def _compare(option: str, name: str, typed: tuple[float, float], found: tuple[fl
     stated = "not given, 5 assumed" if np.isnan(typed[1]) else f"{typed_u / RAD_PER_URAD:.3g}"
     raise InputError(
         f"{name} = {typed[0] / RAD_PER_URAD:.4g} {unit} (u: {stated}) contradicts what was measured, "
-        f"{found[0] / RAD_PER_URAD:.4g} {unit} (u: {found_u / RAD_PER_URAD:.3g}): En = {en:.1f}, 1 is the limit.{hint} Check sign "
-        "and unit, or leave one of the two out",
+        f"{found[0] / RAD_PER_URAD:.4g} {unit} (u: {found_u / RAD_PER_URAD:.3g}): En = {en:.1f}, 1 is the limit.{hint} Check "
+        "sign and unit, or leave one of the two out",
         field=option,
     )
 
@@ -158,9 +248,9 @@ def _compare_reversal(axis: int, typed: tuple[float, float], source: str, curve:
     stated = f"not given, {ASSUMED_UM:g} assumed" if np.isnan(typed[1]) else f"{typed[1] / MM_PER_UM:.3g}"
     raise InputError(
         f"{letter}: a reversal value B of {typed[0] / MM_PER_UM:+.4g} um (u: {stated}) contradicts that of {source}, "
-        f"B = {mean / MM_PER_UM:+.4g} um (u: {u_mean / MM_PER_UM:.3g}): En = {en:.1f}, 1 is the limit.{turned} B is negative where "
-        f"the axis stays behind, and --backlash positive: B = -6 um is {letter}=6, or {letter}=B=-6. Correct the number, or "
-        "leave it out",
+        f"B = {mean / MM_PER_UM:+.4g} um (u: {u_mean / MM_PER_UM:.3g}): En = {en:.1f}, 1 is the limit.{turned} B is negative "
+        f"where the axis stays behind, and --backlash positive: B = -6 um is {letter}=6, or {letter}=B=-6. Correct the "
+        "number, or leave it out",
         field="--backlash",
     )
 
@@ -214,7 +304,9 @@ def with_contradictions(result: Identification, shown: Shown) -> Identification:
     for axis, sources in shown.items():
         for (one, first), (other, second) in zip(sources, sources[1:], strict=False):
             (a, u_a), (b, u_b) = _mean(first), _mean(second)
-            expanded = COVERAGE * float(np.linalg.norm([u_a, u_b, np.std(first.value), np.std(second.value)]))
+            expanded = COVERAGE * float(
+                np.linalg.norm([u_a, u_b, float(np.std(first.value)), float(np.std(second.value))])
+            )
             if abs(a - b) > max(expanded, ASSUMED_UM * MM_PER_UM):
                 found.append(
                     f"{one} and {other} disagree in the reversal of {AXES[axis]}: B = {a / MM_PER_UM:+.3g} and "

@@ -69,6 +69,7 @@ from compgen.identify.posterior import (
     state_layout,
     with_information,
 )
+from compgen.identify.stated import given_numbers, stated_observations
 from compgen.identify.tracer_lengths import length_observations
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.gauge import common_gauge_part
@@ -98,6 +99,8 @@ class Source:
         readings and circles enter as the errors that they determine, with their joint covariance: stations, dead lengths and
         rejected readings are already settled. Axis runs and known errors enter value by value.
         """
+        if self.alone is not None and given_numbers(self.alone):
+            return stated_observations(layout, self.alone.errors, lines=True)
         if isinstance(self.measurement, Deviations):
             found = position_observations(machine, layout, self.measurement, options, around)
             return self._as_alone(found)
@@ -113,7 +116,7 @@ class Source:
             raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
         if isinstance(self.measurement, Circles):
             return circle_observations(machine, layout, self.measurement, self.alone)
-        if self.alone.method == "sixdof":
+        if self.alone.method == "sixdof" and self.alone.has_covariance:
             names, positions, values, factor, _ = projected(machine, layout, self.alone)
             return Observations.of_values(layout, names, positions, values, factor @ factor.T)
         if self.alone.has_covariance and self.alone.method not in ("deviations", "axis-runs", "given"):
@@ -131,6 +134,8 @@ class Source:
         Axis runs enter with the angles along their lines and the scale of their laser, circles reading by reading. Lengths
         that were adjusted with other nodes than those of the machine enter reading by reading, too.
         """
+        if self.alone is not None and given_numbers(self.alone):
+            return stated_observations(layout, self.alone.errors, lines=False)
         if isinstance(self.measurement, AxisRuns):
             return axis_observations(machine, layout, self.measurement, machine.prior)
         if isinstance(self.measurement, Circles) and self.alone is not None:
@@ -288,7 +293,8 @@ def with_prior(
         return replace(result, posterior_source=lambda: apart, details=details)
     full = result.adjustment is not None and same_nodes(machine, result)
     whole = set(result.errors.names) if full else _kept(machine, parts, result, options, found)
-    listed = [name for name in ERROR_NAMES if name in found.shown or name in whole]
+    typed = {name for part in parts if part.alone and given_numbers(part.alone) for name in part.alone.errors.names}
+    listed = [name for name in ERROR_NAMES if name in found.shown or name in whole or name in typed]
     if not listed:
         raise UndeterminedError("the readings show none of the machine's errors better than the prior does", [])
     curves, squareness, positions = {}, {}, []
@@ -384,6 +390,12 @@ def _kept(
             if curve.position_mm[0] > low + 1e-6 or curve.position_mm[-1] < high - 1e-6:
                 continue  # its zero is beyond what was measured
             if np.any(np.abs(curve.value - mean.value) > MOST_OFF * mean.u + 1e-6 * found.processes[name].s):
+                continue
+        elif (
+            name in SQUARENESS_NAMES
+        ):  # that of a circle is the one within its diameter, and less certain over the travel
+            mean = found.curve(name, np.zeros(1))
+            if abs(result.errors.squareness[name][0] - mean.value[0]) > SQUARENESS_OFF * mean.u[0]:
                 continue
         kept.add(name)
     return kept
@@ -757,6 +769,8 @@ MOST_LENGTHS = 8000
 NEARLY = 0.1
 #: Least-squares values stay where they are within so many standard uncertainties of the posterior mean.
 MOST_OFF = 1.0
+#: The same of a squareness.
+SQUARENESS_OFF = 0.25
 #: E_n number from which a disagreement is a contradiction; between 1 and this it is a reservation.
 CONTRADICTS = 1.5
 #: A value is shared by two parts if one of them takes this share of the variance that the other leaves.

@@ -36,6 +36,8 @@ SEEN = 1e-6
 WHOLLY = 1.0 - 1e-4
 #: Standard uncertainty of values that state none, and the smallest allowed, um and urad.
 USUAL_U, FINEST = 1.0, 1e-3
+#: A column below this share of the largest is rounding: its error is not read. Scaled up, it would be the whole answer.
+ROUNDING = 1e-9
 #: Largest number of positions of each error that represent all at which it was read.
 MOST_SHOWN = 50
 #: A value is determined if less than this share of it is outside the determined directions.
@@ -318,7 +320,8 @@ def _seen_directions(
         size = float(np.linalg.norm(own, axis=0).max(initial=0.0))
         if not size:
             continue
-        lever = np.maximum(np.linalg.norm(own, axis=0), 1e-9 * size)
+        own = np.where(np.linalg.norm(own, axis=0) > ROUNDING * size, own, 0.0)
+        lever = np.maximum(np.linalg.norm(own, axis=0), ROUNDING * size)
         rest = own / lever
         rest = rest - explained @ (explained.T @ rest)
         left, values, right = np.linalg.svd(rest, full_matrices=False)
