@@ -114,7 +114,7 @@ def part(folder: Path, name: str, share: float) -> Path:
         f"H{k},{a:.4f},{b:.4f},0,{p:.6f},{q:.6f}"
         for k, ((a, b), (p, q)) in enumerate(zip(points, measured, strict=True))
     ]
-    path.write_text("\n".join(["feature,x_mm,y_mm,z_mm,mx_mm,my_mm", *rows]) + "\n")
+    path.write_text("\n".join(["# origin_mm = 0, 0, 0", "feature,x_mm,y_mm,z_mm,mx_mm,my_mm", *rows]) + "\n")
     return path
 
 

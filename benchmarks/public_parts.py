@@ -100,7 +100,7 @@ def identified(nominal: Array, measured: Array, machine: compgen.Machine, folder
     """
     path = folder / "plate.part.csv"
     rows = "".join(f"{x},{y},{mx},{my}\n" for (x, y), (mx, my) in zip(nominal, measured, strict=True))
-    path.write_text("x_mm,y_mm,mx_mm,my_mm\n" + rows)
+    path.write_text("# origin_mm = 0, 0, 0\nx_mm,y_mm,mx_mm,my_mm\n" + rows)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         found = identify_measurement(machine, read_measurement([path]), IdentifyOptions(part_scale="free"))

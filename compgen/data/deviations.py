@@ -211,9 +211,9 @@ def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
     """Read one or more ``*.part.csv`` files: measured minus nominal coordinates, each set-up in its own frame.
 
     A feature is where the tool was when it was made, so its deviation is the error of the machine at the nominal
-    position, seen from the unknown pose of the part. The nominal coordinates are machine coordinates; a comment ``#
-    origin_mm = X, Y, Z`` gives the part's origin in them. Without ``z_mm`` all features are at the height of the
-    origin.
+    position, seen from the unknown pose of the part. The comment ``# origin_mm = X, Y, Z`` says where the zero of the nominal
+    coordinates was in machine coordinates (0, 0, 0 if they are machine coordinates). Without ``z_mm`` all features are at the
+    height of the origin.
 
     Returns
     -------
@@ -223,8 +223,8 @@ def read_parts(files: str | Path | Sequence[str | Path]) -> Deviations:
     Raises
     ------
     InputError
-        for a file without a measured coordinate, uncertainties for other coordinates than the measured ones, features
-        far from their nominal places.
+        for a file without a measured coordinate or without ``origin_mm``, uncertainties for other coordinates than the
+        measured ones, features far from their nominal places.
     """
     tables = _PARTS.read_tables(files)
     for table in tables:
@@ -250,12 +250,23 @@ def _part(table: CsvTable) -> Deviations:
     del values["feature"]
     nominal_mm = np.column_stack([values.pop("xy_mm"), values.pop("z_mm")])
     values["metadata"]["measured"] = PART
-    return Deviations(nominal_mm + _origin(table), values.pop("measured_mm") - nominal_mm, **values)
+    origin_mm = _origin(table)
+    if origin_mm is None:
+        raise InputError(
+            "does not say where the part was: its coordinates count from a zero of the part, and the errors depend on the place "
+            "in the machine. Add the comment '# origin_mm = X, Y, Z' with the machine coordinates of that zero (the work offset, "
+            "e.g. of G54), or '# origin_mm = 0, 0, 0' if the nominal coordinates are machine coordinates",
+            file=table.path,
+            field="comment origin_mm",
+        )
+    return Deviations(nominal_mm + origin_mm, values.pop("measured_mm") - nominal_mm, **values)
 
 
-def _origin(table: CsvTable) -> FloatArray:
-    """Return the part's origin in machine coordinates, mm, from the comment ``origin_mm``; zeros without it."""
-    text = table.metadata.get("origin_mm", "0, 0, 0")
+def _origin(table: CsvTable) -> FloatArray | None:
+    """Return the origin of a part or artefact in machine coordinates, mm, from the comment ``origin_mm``; None without it."""
+    text = table.metadata.get("origin_mm")
+    if text is None:
+        return None
     try:
         values = np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError:
@@ -355,8 +366,9 @@ def read_artefacts(files: str | Path | Sequence[str | Path]) -> Artefact:
             nominal_mm=nominal_mm, setup=setup.ravel().astype(np.int64) + first, calibrated=known, **values
         )
         missing = np.isnan(found.measured_mm).all(axis=0)
-        shifted = np.where(missing, found.nominal_mm + _origin(table), found.nominal_mm)
-        parts.append(replace(found, nominal_mm=shifted))
+        origin_mm = _origin(table)
+        place_mm = np.zeros(3) if origin_mm is None else origin_mm
+        parts.append(replace(found, nominal_mm=np.where(missing, found.nominal_mm + place_mm, found.nominal_mm)))
         first = int(found.setup.max()) + 1
     return join_artefacts(parts)
 

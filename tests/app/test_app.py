@@ -158,7 +158,9 @@ def test_large_residuals_are_explained_and_accepting_the_tables_is_a_box_to_tick
     rows = [
         f"H{k},{a:.4f},{b:.4f},0,{p:.6f},{q:.6f}" for k, ((a, b), (p, q)) in enumerate(zip(nominal, made, strict=True))
     ]
-    (tmp_path / "holes.part.csv").write_text("\n".join(["feature,x_mm,y_mm,z_mm,mx_mm,my_mm", *rows]) + "\n")
+    (tmp_path / "holes.part.csv").write_text(
+        "\n".join(["# origin_mm = 0, 0, 0", "feature,x_mm,y_mm,z_mm,mx_mm,my_mm", *rows]) + "\n"
+    )
     site.do("machine/describe", MILL)
     site.do("measurement/add", upload(tmp_path / "holes.part.csv"))
     site.do("identify")

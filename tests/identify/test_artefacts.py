@@ -118,7 +118,9 @@ def test_the_sign_is_the_opposite_of_that_of_a_part(tmp_path, machine, errors):
     rows = probed(machine, errors, [(0.0, 0.0, 0.0)])
     path = written(tmp_path / "plate.artefact.csv", rows, "u_probe_um = 0.3")
     as_part = tmp_path / "same.part.csv"
-    as_part.write_text(path.read_text().replace("feature,", "temp_feature_c,").replace("H", ""))
+    as_part.write_text(
+        "# origin_mm = 0, 0, 0\n" + path.read_text().replace("feature,", "temp_feature_c,").replace("H", "")
+    )
     probe, part = (identify_measurement(machine, open_measurement([item])) for item in (path, as_part))
     slopes = [
         np.polyfit(item.errors.curves["EXX"].position_mm, item.errors.curves["EXX"].value, 1)[0]

@@ -64,7 +64,7 @@ def turned(points, degrees, offset=(0.0, 0.0), scale=1.0):
     return scale * points @ np.array([[np.cos(a), np.sin(a)], [-np.sin(a), np.cos(a)]]) + offset
 
 
-def part(path, nominal, measured, comments=(), **columns):
+def part(path, nominal, measured, comments=("origin_mm = 0, 0, 0",), **columns):
     names = ["x_mm", "y_mm", "mx_mm", "my_mm", *columns]
     rows = np.column_stack([nominal, measured, *columns.values()])
     text = "".join(f"# {line}\n" for line in comments) + ",".join(names) + "\n"
@@ -169,7 +169,9 @@ def test_temperatures_in_the_file_do_what_the_thermometer_says(mill, tmp_path):
     shrunk = displaced(*points.T) * (1.0 + 23e-6 * (20.5 - 25.0))
     hot, cool = np.full(len(points), 25.0), np.full(len(points), 20.5)
     columns = {"temp_machined_c": hot, "temp_part_c": cool}
-    path = part(tmp_path / "a.part.csv", points, shrunk, ["expansion_um_per_m_k = 23"], **columns)
+    path = part(
+        tmp_path / "a.part.csv", points, shrunk, ["expansion_um_per_m_k = 23", "origin_mm = 0, 0, 0"], **columns
+    )
     plain = part(tmp_path / "b.part.csv", points, displaced(*points.T))
     with_them, without = (identify_measurement(mill, read_measurement([name])) for name in (path, plain))
     assert np.allclose(with_them.errors.curves["EXX"].value, without.errors.curves["EXX"].value, atol=2e-5)
@@ -181,9 +183,9 @@ def test_temperatures_in_the_file_do_what_the_thermometer_says(mill, tmp_path):
 def test_names_of_features_are_for_people(tmp_path):
     """A report of a coordinate measuring machine names its features: neither refused nor warned of."""
     rows = ["1,1,1.1,1", "9,1,9.1,1", "1,9,1.1,9"]
-    (tmp_path / "plain.part.csv").write_text("x_mm,y_mm,mx_mm,my_mm\n" + "\n".join(rows) + "\n")
+    (tmp_path / "plain.part.csv").write_text("# origin_mm = 0, 0, 0\nx_mm,y_mm,mx_mm,my_mm\n" + "\n".join(rows) + "\n")
     named = "\n".join(f"{name},{row}" for name, row in zip(("H1", "", "H=3"), rows, strict=True))
-    (tmp_path / "named.part.csv").write_text(f"feature,x_mm,y_mm,mx_mm,my_mm\n{named}\n")
+    (tmp_path / "named.part.csv").write_text(f"# origin_mm = 0, 0, 0\nfeature,x_mm,y_mm,mx_mm,my_mm\n{named}\n")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         plain, found = read_parts(tmp_path / "plain.part.csv"), read_parts(tmp_path / "named.part.csv")
@@ -249,7 +251,7 @@ def test_several_heights_and_all_components_show_the_angles_too(tmp_path):
     grid = [np.linspace(*axis.range_mm, 13) for axis in machine.axes]
     points = np.stack(np.meshgrid(*grid, indexing="ij"), axis=-1).reshape(-1, 3)
     field = compgen.exact_error(machine, truth, points)
-    text = "x_mm,y_mm,z_mm,mx_mm,my_mm,mz_mm\n"
+    text = "# origin_mm = 0, 0, 0\nx_mm,y_mm,z_mm,mx_mm,my_mm,mz_mm\n"
     rows = np.column_stack([points, points + field])
     plate = tmp_path / "p.part.csv"
     plate.write_text(text + "".join(",".join(f"{value:.7f}" for value in row) + "\n" for row in rows))
@@ -264,8 +266,13 @@ BAD = [
     (lambda text: text.replace("mx_mm,my_mm", "my_mm,mx_mm"), "axes exchanged"),
     (lambda text: text.replace("x_mm,y_mm,mx", "y_mm,x_mm,mx", 1), "axes exchanged"),
     (lambda text: text[: len(text) // 2], "fields|truncated"),
-    (lambda text: "# origin_mm = 1, 2\n" + text, "origin_mm = '1, 2' is not three numbers"),
-    (lambda text: "# origin_mm = 900, 0, 0\n" + text, "outside the travel"),
+    (lambda text: text.replace("0, 0, 0", "1, 2"), "origin_mm = '1, 2' is not three numbers"),
+    (lambda text: text.replace("0, 0, 0", "0, 0, nan"), "origin_mm = '0, 0, nan' is not three numbers"),
+    (lambda text: text.replace("0, 0, 0", "900, 0, 0"), "outside the travel"),
+    (
+        lambda text: text.replace("# origin_mm = 0, 0, 0\n", ""),
+        "does not say where the part was.*'# origin_mm = 0, 0, 0' if",
+    ),
 ]
 
 
@@ -276,6 +283,24 @@ def test_what_cannot_be_right_is_refused(mill, tmp_path, change, message):
     path.write_text(change(path.read_text()))
     with pytest.raises(InputError, match=message):
         identify_measurement(mill, read_measurement([path]))
+
+
+def test_one_of_several_parts_that_does_not_say_where_it_was_is_named(mill, tmp_path, capsys):
+    from compgen.cli import cli
+    from compgen.cli.common import run_command
+
+    points, _ = drilled(9)
+    stated = part(tmp_path / "a.part.csv", points, displaced(*points.T))
+    silent = part(tmp_path / "b.part.csv", points + [1.0, 0.0], displaced(*points.T) + [1.0, 0.0], ())
+    for words in (["identify"], ["run", "--controller", "isg-csv"]):
+        files = [str(tmp_path / "mill.toml"), str(stated), str(silent)]
+        assert run_command(cli, [words[0], *files, *words[1:], "--out", str(tmp_path / "o")]) == 2
+        said = capsys.readouterr().err
+        assert "b.part.csv" in said
+        assert "a.part.csv" not in said
+        assert not (tmp_path / "o").exists()
+    assert run_command(cli, ["import", str(silent)]) == 2
+    assert "# origin_mm = X, Y, Z" in capsys.readouterr().err
 
 
 def test_measured_coordinates_in_inches_are_refused(mill, tmp_path):
