@@ -21,6 +21,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
 from compgen.data.names import AXES, ERROR_NAMES
 from compgen.data.prior import PriorSettings, prior_schema, read_prior
+from compgen.data.repeatability import EXPANSION_SHARE, Repeatability
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.resources import data_folder
 
@@ -313,6 +314,11 @@ class Axis(Displayed):
     screw_pitch_mm: float | None = toml_files.setting(
         toml_files.positive, None, meaning="pitch of the screw, mm: used to search for periodic errors"
     )
+    u_expansion_um_per_m_k: float | None = toml_files.setting(
+        toml_files.not_negative,
+        None,
+        meaning="standard uncertainty of expansion_um_per_m_k, um/m/K (a fifth of it if not stated): used by recalibration",
+    )
 
     def __post_init__(self) -> None:
         low, high = numbers("range_mm", self.range_mm, 2).tolist()
@@ -322,6 +328,14 @@ class Axis(Displayed):
         if len(nodes) < 2 or (np.diff(nodes) <= 0.0).any():
             raise InputError("expected at least two positions in ascending order, mm", field="nodes_mm")
         object.__setattr__(self, "nodes_mm", nodes)
+
+    @property
+    def u_expansion(self) -> float:
+        """Standard uncertainty of the expansion coefficient, 1/K; 0 if scales are not corrected for temperature."""
+        if self.expansion_um_per_m_k is None:
+            return 0.0
+        stated, usual = self.u_expansion_um_per_m_k, EXPANSION_SHARE * abs(self.expansion_um_per_m_k)
+        return 1e-6 * (usual if stated is None else stated)
 
     @property
     def length_mm(self) -> float:
@@ -407,6 +421,9 @@ class Machine(Displayed):
         toml_files.choice(*MM_PER_UNIT),
         None,
         meaning="unit in which the control keeps its offsets and tables, mm (if not stated) or inch: LINEAR_UNITS of LinuxCNC",
+    )
+    repeatability: Repeatability = toml_files.table_setting(
+        Repeatability, meaning="how well the machine repeats from one calibration to the next"
     )
     travel_margin_mm: float = toml_files.setting(
         _margin,

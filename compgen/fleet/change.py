@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any
@@ -17,7 +17,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.fleet.decisions import excluded
-from compgen.fleet.records import MachineRecord
+from compgen.fleet.records import AFTER, IdentificationRecord, MachineRecord, TableRecord
 from compgen.fleet.store import Store, at_one_moment, counting
 from compgen.identify.covariance import (
     Covariance,
@@ -51,8 +51,9 @@ LEAST_P = 1e-9
 class Change:
     """Change of the machine over its volume, rigid motion removed, um.
 
-    ``expected_rms_um`` is the rms due to the uncertainties alone; ``p_value`` the probability of at least this change
-    if the machine had not changed.
+    ``expected_rms_um`` is the rms due to the uncertainties alone, and to how well the machine repeats where that counts;
+    ``p_value`` the probability of at least this change if the machine had not changed. ``largest`` says what changed most
+    significantly, over how many of the last calibrations; ``known_from`` with how many earlier ones it was compared.
     """
 
     rms_um: float
@@ -60,6 +61,8 @@ class Change:
     expected_rms_um: float
     p_value: float
     confidence: float
+    largest: str = ""
+    known_from: int = 1
 
     @property
     def significant(self) -> bool:
@@ -124,7 +127,7 @@ def likeness(
     """
     position_mm = volume_points(machine)
     motion = small_motion(position_mm)
-    change = _compared(machine, new, old, position_mm)
+    change = compared_fields(machine, new, old, position_mm)
     moved, noise = change.value, change.noise
     free = _directions(machine, new[0], position_mm, motion)
     best: Likeness | None = None
@@ -184,7 +187,7 @@ def change_between(
     confidence: float,
 ) -> Change:
     """Compare two identifications (errors with covariance) of the same machine over its volume."""
-    found = _compared(machine, new, old, volume_points(machine))
+    found = compared_fields(machine, new, old, volume_points(machine))
     sizes = sizes_of(found.size / MM_PER_UM)
     count = len(found.size)
     return Change(
@@ -196,7 +199,7 @@ def change_between(
     )
 
 
-def _compared(machine: Machine, new: Known, old: Known, position_mm: FloatArray) -> Difference:
+def compared_fields(machine: Machine, new: Known, old: Known, position_mm: FloatArray) -> Difference:
     """Difference of the fields at points (n, 3) without rigid motion; errors without covariance count as exact."""
     fields: list[Uncertain] = []
     for errors, covariance in (new, old):
@@ -225,6 +228,10 @@ def volume_points(machine: Machine) -> FloatArray:
 # to the last node, and ``bow``, the height of the middle above the ends. A squareness error has one figure, ``value``.
 
 
+#: The state of a machine that the active tables are for.
+STATE_NOW = -1
+#: Key in the figures of tables: whether nothing makes it doubtful what the measurement behind them shows.
+SOUND = "sound"
 #: A figure is not observable if its weights keep less than this share of their size in the common gauge.
 NOTHING_LEFT = 1e-6
 #: A calibration that shows less than this share of the errors of the richest one is left out.
@@ -239,6 +246,15 @@ class Calibration:
     errors: ErrorTable
     covariance: Covariance
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
+
+
+def axis_temperatures(channels: Mapping[str, Mapping[str, float]]) -> FloatArray | None:
+    """Return the mean temperature of each scale, (3,), degC: its own channel, else the mean of all; None without any."""
+    means = {name: float(figures["mean"]) for name, figures in channels.items()}
+    if not means:
+        return None
+    rest = sum(means.values()) / len(means)
+    return np.array([means.get(f"temp_{letter}_c", means.get("temp_ambient_c", rest)) for letter in "xyz"])
 
 
 @dataclass(frozen=True)
@@ -316,14 +332,73 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
         errors = store.errors_of(record)
         covariance = covariance_or_independent(errors, store.covariance_of(record))
         if covariance is not None and record.measurement_id not in left_out:
-            logged = measured[record.measurement_id].temperatures_c
-            means = {name: float(figures["mean"]) for name, figures in logged.items()}
-            found.append(Calibration(record.measured_at, errors, covariance, means))
+            logged = mean_temperatures(measured[record.measurement_id].temperatures_c)
+            found.append(Calibration(record.measured_at, errors, covariance, logged))
             ids.append(record.id)
     if not found:
         raise InputError(f"the store has no identified errors of {machine.name!r} with uncertainties; measure it first")
     newest = next(item for item in records if item.id == ids[-1])
     return found, ids, store.machine_of(newest)
+
+
+def mean_temperatures(channels: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Return the mean of each channel, degC."""
+    return {name: float(figures["mean"]) for name, figures in channels.items()}
+
+
+@at_one_moment
+def calibrations_before(
+    store: Store,
+    machine: MachineRecord,
+    tables: Sequence[TableRecord],
+    active: IdentificationRecord,
+    new: Calibration,
+) -> tuple[list[Calibration], list[int]]:
+    """Return what a new calibration is compared with: those before it, oldest first, and which state each is of.
+
+    The last state is that of the active tables, which begins with the calibration behind them; every version that became
+    active began a new one. Left out are calibrations that a person excluded, that were held back because it was doubtful
+    what they show, or that show fewer errors.
+    """
+    left_out, measured = excluded(store, machine), store.measured(machine)
+    doubted = {t.identification_id for t in tables if not t.summary.get(SOUND, "likeness" not in t.summary)}
+    records = []
+    for record in counting(store, machine):
+        if record.measurement_id == active.measurement_id:
+            records.append(active)
+        elif record.measurement_id not in left_out and record.id not in doubted and record.measured_at <= new.at:
+            records.append(record)
+    place = next(k for k, record in enumerate(records) if record.id == active.id)
+    records = records[min(place, max(len(records) - MOST_COMPARED, 0)) :]
+    swaps = [item for item in store.decisions(machine) if AFTER[item.kind] == "active"]
+    by_table = {table.id: measured[table.identification_id] for table in tables}
+    began = {by_table[item.table_id] for item in swaps if item.table_id is not None}
+    states = _states_of_machine(records, began, active, swaps[-1].at)
+    logged = {item.id: item.temperatures_c for item in store.measurements(machine)}
+    found, kept = [], []
+    for record, state in zip(records, states, strict=True):
+        errors = store.errors_of(record)
+        covariance = covariance_or_independent(errors, store.covariance_of(record))
+        if covariance is not None and {*new.errors.names} <= {*errors.names}:
+            means = mean_temperatures(logged[record.measurement_id])
+            found.append(Calibration(record.measured_at, errors, covariance, means))
+            kept.append(state)
+    return found, kept
+
+
+def _states_of_machine(
+    records: Sequence[IdentificationRecord], began: Container[int], active: IdentificationRecord, since: datetime
+) -> list[int]:
+    """Number the states of a machine: every measurement whose tables became active began one.
+
+    That of the active tables, :data:`STATE_NOW`, ends where the next began, and goes on when they were made active again.
+    """
+    states = np.cumsum([record.measurement_id in began for record in records]).tolist()
+    own = next(state for state, record in zip(states, records, strict=True) if record.id == active.id)
+    return [
+        STATE_NOW if state == own or record.measured_at > since else state
+        for state, record in zip(states, records, strict=True)
+    ]
 
 
 def with_all_errors(
@@ -356,8 +431,13 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
     weight = np.where(np.isin(error, SQUARENESS_NAMES), 0.0, curve_weights(error))
     changes = gauge_changes(gauge_directions(machine, told), error, position)
     keep = np.asarray(np.eye(len(error)) - gauge_part(changes, np.diag(weight)))
-    names, maps = np.array(error), []
-    for item in history:  # each with a matrix (k, k_i) that interpolates its values linearly at the common nodes
+    names, known = np.array(error), {}
+    for (
+        item
+    ) in history:  # by the layout of the values: a matrix (k, k_i) that interpolates them linearly at the common nodes
+        layout = (item.covariance.error, item.covariance.position_mm.tobytes())
+        if layout in known:
+            continue
         given = np.array(item.covariance.error)
         matrix = np.zeros((len(names), len(given)))
         for name in dict.fromkeys(error):
@@ -366,7 +446,8 @@ def aligned(machine: Machine, history: Sequence[Calibration]) -> Aligned:
                 matrix[np.ix_(rows, columns)] = 1.0
             else:
                 matrix[np.ix_(rows, columns)] = hat_matrix(item.covariance.position_mm[columns], position[rows])
-        maps.append(keep @ matrix)
+        known[layout] = keep @ matrix
+    maps = [known[item.covariance.error, item.covariance.position_mm.tobytes()] for item in history]
     values = [
         each @ values_at_nodes(item.errors, item.covariance.error, item.covariance.position_mm)
         for each, item in zip(maps, history, strict=True)
@@ -456,3 +537,246 @@ def holm(p_values: Sequence[float]) -> list[float]:
         highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[k]))
         result[k] = highest
     return result
+
+
+# Whether a machine has changed, given how well it repeats.
+#
+# A machine that has not changed is found again within its repeatability, which the uncertainty of a measurement does not
+# contain: scales follow temperatures that nobody reads, a part is clamped again. In six directions, three scales and three
+# squarenesses, the mean of the last w calibrations is therefore compared with the mean of all n before them since tables
+# were last made active,
+#
+#     t = (mean of the last w - mean of those before) / (s sqrt(1/w + 1/n)),    s^2 = (F r s0^2 + SS) / (F + N)
+#
+# with the repeatability s0 (:mod:`compgen.data.repeatability`; as if known from four degrees of freedom), and the sum of squares
+# SS of the calibrations before about their mean, with N degrees of freedom; earlier tables have means of their own. What the
+# other two scales, or squarenesses, tell of the repeatability is r = (4 + SS' / s0'^2) / (4 + N'), which counts as F = 4 + N',
+# at most 8, degrees of freedom: one of the three may repeat worse than the others. A scale
+# that is corrected for its temperature T may have a wrong expansion coefficient: y = level + c (T - 20 degC), c normal with the
+# uncertainty of the coefficient, which is one more observation. The other shapes of the errors are compared as a field: the
+# sum of squares against that of the uncertainties, which the calibrations before scale (F-test).
+
+
+#: Degrees of freedom with which the repeatability counts as known.
+KNOWN_FROM = 4.0
+#: At most as many with the other directions of the same kind.
+KNOWN_FROM_OTHERS = 8.0
+#: Share of the error probability for the six directions; the rest is for all other shapes.
+FOR_DIRECTIONS = 0.75
+#: The last calibrations are averaged over up to so many; over up to the second number where the history is longer.
+WINDOW, LONG_WINDOW = 3, 10
+#: At most so many of the last calibrations are compared.
+MOST_COMPARED = 60
+REFERENCE_C = 20.0
+
+
+@dataclass(frozen=True)
+class Direction:
+    """One direction of change: name and unit in reports; ``weight`` (k,) reads it from the values, ``shape`` (k,) is one unit.
+
+    ``axis`` is that of a scale (mm/mm), None for a squareness (rad).
+    """
+
+    name: str
+    unit: str
+    weight: FloatArray
+    shape: FloatArray
+    axis: int | None
+
+
+def change_since(
+    machine: Machine, history: Sequence[Calibration], levels: Sequence[int], confidence: float, *, corrected: bool
+) -> Change:
+    """Compare the last calibration, with those before it, with the calibrations since the active tables.
+
+    Parameters
+    ----------
+    history : calibrations, oldest first; the last is the new one.
+    levels : which calibrations are of one state of the machine, (n,): those with the number of the last are compared with
+        it, the first of them is behind the active tables; the others show how well the machine repeats.
+    corrected : scales were corrected for their temperatures where the machine file has an expansion coefficient.
+    """
+    data, level = aligned(machine, history), np.array(levels)
+    position_mm = volume_points(machine)
+    motion = small_motion(position_mm)
+    design = error_design(machine, data.field_covariance(len(history) - 1), position_mm).reshape(position_mm.size, -1)
+    directions = _six_directions(data)
+    tested = _tested(data, history, level, directions, corrected=corrected)
+    own = np.flatnonzero(level == level[-1])
+    count = max(len(_windows(len(own))) * len(directions), 1)
+    p_value, said = min(((p * count / FOR_DIRECTIONS, text) for p, text, _ in tested), default=(1.0, ""))
+    p_rest = _p_of_other_shapes(data, level, directions, motion, design) / (1.0 - FOR_DIRECTIONS)
+    if p_rest < min(p_value, 1.0):
+        said = "other shapes than scales and squareness"
+    first = history[own[0]]
+    found = compared_fields(machine, _known(history[-1]), _known(first), position_mm)
+    sizes = sizes_of(found.size / MM_PER_UM)
+    own_shapes = motion.taken_out(design @ np.array([item.shape for item in directions]).reshape(-1, design.shape[1]).T)
+    repeats = sum(2.0 * s2 * float(shape @ shape) for (_, _, s2), shape in zip(tested, own_shapes.T, strict=True))
+    return Change(
+        rms_um=sizes.rms,
+        max_um=sizes.largest,
+        expected_rms_um=float(np.sqrt((found.noise + repeats) / len(found.size))) / MM_PER_UM,
+        p_value=min(1.0, p_value, p_rest),
+        confidence=confidence,
+        largest=said if min(p_value, p_rest) < 1.0 else "",
+        known_from=len(own) - 1,
+    )
+
+
+def _known(item: Calibration) -> Known:
+    return item.errors, item.covariance
+
+
+def _windows(count: int) -> range:
+    """Over how many of the last calibrations of ``count`` the mean is taken."""
+    return range(1, min(max(WINDOW, min(LONG_WINDOW, (count - 1) // 2)), count - 1) + 1)
+
+
+def _six_directions(data: Aligned) -> list[Direction]:
+    """Scales and squarenesses that the calibrations show, in the common gauge."""
+    found, names = [], np.array(data.error)
+    for figure, weight in zip(data.figures, data.weights, strict=True):
+        name, own, shape = figure.error, data.columns(figure.error), np.zeros(len(names))
+        if figure.part == "value":
+            shape[own] = 1.0
+            found.append(Direction(name, "urad", weight, shape, None))
+        elif figure.part == "line" and error_named(name).kind == "linear" and not error_named(name).is_straightness:
+            axis, at = error_named(name).axis, data.position_mm[own]
+            shape[own] = at - at.mean()
+            travel = float(np.ptp(at))
+            found.append(Direction(f"scale of {'XYZ'[axis]}", "um/m", weight / travel, shape, axis))
+    return found
+
+
+def _tested(
+    data: Aligned,
+    history: Sequence[Calibration],
+    level: NDArray[np.int_],
+    directions: Sequence[Direction],
+    *,
+    corrected: bool,
+) -> list[tuple[float, str, float]]:
+    """Smallest error probability over the windows, the change in words, and the variance of one calibration, by direction."""
+    series = [_series(data, history, item, corrected=corrected) for item in directions]
+    own, best = np.flatnonzero(level == level[-1]), [(1.0, "", item.s0**2) for item in series]
+    for window in _windows(len(own)):
+        before = np.ones(len(level), dtype=bool)
+        before[own[-window:]] = False
+        steps = [_step(item, level, before, own[-window:]) for item in series]
+        over = "" if window == 1 else f" over the last {window} measurements"
+        for k, (direction, step) in enumerate(zip(directions, steps, strict=True)):
+            kind = direction.axis is None
+            others = [steps[j] for j, item in enumerate(directions) if j != k and (item.axis is None) == kind]
+            p_value, variance = _t_test(step, series[k].s0, others)
+            if p_value <= best[k][0]:
+                said = f"{direction.name} {1e6 * step.size:+.1f} {direction.unit}{over}"
+                best[k] = p_value, said, variance
+    return best
+
+
+@dataclass(frozen=True)
+class Series:
+    """Values of one direction, (n,), with the repeatability ``s0`` of one.
+
+    ``warm`` (n,) is a covariate, none of zeros, whose coefficient counts as an observation of zero with this ``weight``, in
+    units of s0.
+    """
+
+    value: FloatArray
+    s0: float
+    warm: FloatArray | None = None
+    weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """Change of the last values of a series against those before.
+
+    Its variance is ``spread`` times that of one value; ``squares`` is the sum of squares of those before about what they are
+    explained by, in s0^2, with ``freedom`` degrees of freedom.
+    """
+
+    size: float
+    spread: float
+    squares: float
+    freedom: int
+
+
+def _series(data: Aligned, history: Sequence[Calibration], direction: Direction, *, corrected: bool) -> Series:
+    value, machine = data.value @ direction.weight, data.machine
+    u = np.array([np.linalg.norm(direction.weight @ factor) for factor in data.factor])
+    warm, u_expansion = None, 0.0
+    if direction.axis is not None and corrected and machine.axes[direction.axis].u_expansion > 0.0:
+        u_expansion = machine.axes[direction.axis].u_expansion
+        warm = _temperatures_of(history, direction.axis)
+    known = machine.repeatability
+    repeats = 1e-6 * known.squareness_urad if direction.axis is None else known.scale(temperatures=warm is not None)
+    s0 = float(np.sqrt(repeats**2 + np.mean(u**2)))
+    return Series(value, s0) if warm is None else Series(value, s0, warm - REFERENCE_C, s0 / u_expansion)
+
+
+def _temperatures_of(history: Sequence[Calibration], axis: int) -> FloatArray | None:
+    """Temperature of a scale in every calibration, (n,), degC; None unless all logged it."""
+    found = [
+        axis_temperatures({name: {"mean": mean} for name, mean in item.temperatures_c.items()}) for item in history
+    ]
+    return None if any(item is None for item in found) else np.array([item[axis] for item in found if item is not None])
+
+
+def _step(series: Series, level: NDArray[np.int_], before: NDArray[np.bool_], last: NDArray[np.intp]) -> Step:
+    """Compare the mean of the ``last`` values with those ``before``."""
+    states = np.unique(level[before])
+    matrix = (level[before][:, None] == states).astype(np.float64)
+    new = (level[last[-1]] == states).astype(np.float64)
+    target, warm = series.value[before], series.warm
+    if warm is not None:
+        matrix = np.vstack([np.column_stack([matrix, warm[before]]), [*np.zeros(len(states)), series.weight]])
+        new, target = np.append(new, warm[last].mean()), np.append(target, 0.0)
+    normal = np.linalg.inv(matrix.T @ matrix)
+    found = normal @ (matrix.T @ target)
+    squares = float(np.sum((target - matrix @ found) ** 2)) / series.s0**2
+    size, spread = float(series.value[last].mean() - new @ found), 1.0 / len(last) + float(new @ normal @ new)
+    return Step(size, spread, squares, int(np.count_nonzero(before)) - len(states))
+
+
+def _t_test(step: Step, s0: float, others: Sequence[Step] = ()) -> tuple[float, float]:
+    """Return the error probability of a step, and the variance of one value; ``others`` repeat as this direction does."""
+    from scipy.special import stdtr  # imported here: few comparisons are tests
+
+    known = KNOWN_FROM + sum(item.freedom for item in others)
+    ratio = (KNOWN_FROM + sum(item.squares for item in others)) / known
+    known = min(known, KNOWN_FROM_OTHERS)
+    freedom = known + step.freedom
+    variance = s0**2 * (known * ratio + step.squares) / freedom
+    t = step.size / np.sqrt(variance * step.spread)
+    return float(2.0 * stdtr(freedom, -abs(t))), variance
+
+
+def _p_of_other_shapes(
+    data: Aligned, level: NDArray[np.int_], directions: Sequence[Direction], motion: SmallMotion, design: FloatArray
+) -> float:
+    """Error probability of the change in all shapes but the six directions, over the volume."""
+    from scipy.special import fdtrc  # imported here: few comparisons are tests
+
+    keep = np.eye(data.value.shape[1])
+    for item in directions:
+        keep -= np.outer(item.shape, item.weight)
+    _, sizes, shapes = np.linalg.svd(motion.taken_out(design @ keep), full_matrices=False)
+    read = (sizes[:, None] * shapes)[sizes > 1e-9 * sizes[0]]  # of the fields in directions of their own: as long
+    fields, factors = data.value @ read.T, [read @ factor for factor in data.factor]
+    own = np.flatnonzero(level == level[-1])[:-1]
+    change = fields[-1] - fields[own].mean(axis=0)
+    gram = factors[-1] @ factors[-1].T + sum(factors[k] @ factors[k].T for k in own) / len(own) ** 2
+    mean, squares = float(np.trace(gram)), float(np.sum(gram**2))
+    if mean <= 0.0:
+        return 1.0
+    seen, expected, free = 0.0, 0.0, 0
+    for state in np.unique(level[:-1]):
+        rows = np.flatnonzero(level[:-1] == state)
+        seen += float(np.sum((fields[rows] - fields[rows].mean(axis=0)) ** 2))
+        expected += (1.0 - 1.0 / len(rows)) * sum(float(np.sum(factors[k] ** 2)) for k in rows)
+        free += len(rows) - 1
+    scale = (KNOWN_FROM + (free * seen / expected if expected > 0.0 else 0.0)) / (KNOWN_FROM + free)
+    count = mean * mean / squares
+    return float(fdtrc(count, count * (KNOWN_FROM + free), float(change @ change) / mean / scale))

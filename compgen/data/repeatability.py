@@ -1,0 +1,44 @@
+"""How well a machine repeats from one calibration to the next, and how fast it drifts: section ``[repeatability]``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from compgen.data import toml_files
+
+#: Default repeatability of a scale: 0.3 K of steel; where temperatures are read, what is left of them, um/m.
+SCALE_UM_PER_M, SCALE_CORRECTED_UM_PER_M = 3.5, 1.0
+#: Uncertainty of an expansion coefficient that the machine file does not state, share of the coefficient.
+EXPANSION_SHARE = 0.2
+
+_size = toml_files.bounded("a standard deviation from 0.001 to 10000", minimum=1e-3, maximum=1e4)
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """How much calibrations of an unchanged machine differ (standard deviations), and what it may drift.
+
+    ``scale_um_per_m`` None: 3.5, or 1 where temperatures are read and the scales corrected for them. ``drift_...`` are of
+    a month, and grow with the square root of the time.
+    """
+
+    scale_um_per_m: float | None = toml_files.setting(
+        _size,
+        None,
+        meaning="standard deviation of the scale of an axis from one calibration to the next, um/m (3.5 if not stated; 1 where "
+        "temperatures are read)",
+    )
+    squareness_urad: float = toml_files.setting(
+        _size, 1.0, meaning="standard deviation of a squareness from one calibration to the next, urad"
+    )
+    drift_scale_um_per_m: float = toml_files.setting(
+        _size, 5.0, meaning="what a scale may drift in a month, standard deviation, um/m"
+    )
+    drift_squareness_urad: float = toml_files.setting(
+        _size, 5.0, meaning="what a squareness may drift in a month, standard deviation, urad"
+    )
+
+    def scale(self, *, temperatures: bool) -> float:
+        """Return the standard deviation of a scale, mm/mm, with or without temperatures that were corrected for."""
+        usual = SCALE_CORRECTED_UM_PER_M if temperatures else SCALE_UM_PER_M
+        return 1e-6 * (usual if self.scale_um_per_m is None else self.scale_um_per_m)
