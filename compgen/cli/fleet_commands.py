@@ -122,6 +122,16 @@ notify_option = click.option(
 )
 
 
+backup_option = click.option(
+    "--backup",
+    multiple=True,
+    type=PATH,
+    metavar="FILE",
+    help="Backup of the control that was made with the measurement, which shows which tables were on: a file (may be several) "
+    "or a folder. In the inbox: NAME.backup.EXT beside the measurement.",
+)
+
+
 def opened(job: Job, use: Callable[[Store], Any]) -> Any:
     """Do something with the store of a job and close it."""
     from compgen.fleet.store import open_store
@@ -136,11 +146,18 @@ def opened(job: Job, use: Callable[[Store], Any]) -> Any:
 @recal_command.command("run")
 @click.argument("machines", nargs=-1)
 @job_option
+@backup_option
 @fleet_options
 @notify_option
 @json_option
 def run_command(
-    machines: tuple[str, ...], job: Job, workers: int, cluster: str | None, command: str | None, as_json: bool
+    machines: tuple[str, ...],
+    job: Job,
+    backup: tuple[Path, ...],
+    workers: int,
+    cluster: str | None,
+    command: str | None,
+    as_json: bool,
 ) -> int:
     """Read the inboxes of MACHINES (default: all) once, process new measurements, publish the tables.
 
@@ -150,10 +167,19 @@ def run_command(
     \b
     Example:
       volcomp recal run --job /etc/compgen/recal.toml --json
+      volcomp recal run mill-1 --backup NC_CEC.INI
       volcomp recal run --workers 8
     """
     from compgen.fleet.runner import run_fleet
 
+    if backup:
+        from compgen.fleet.actions import attach_backup
+
+        if len(machines) != 1:
+            raise InputError(
+                "a backup is that of one machine; name it: volcomp recal run MACHINE --backup FILE", field="--backup"
+            )
+        attach_backup(job, machines[0], backup)
     with stopped_by_signals() as stop:
         chosen = job.with_notify(_words(command))
         result = run_fleet(chosen, machines, workers=workers, cluster=cluster, stop=stop.is_set)
@@ -612,11 +638,18 @@ def exclude_command(
 @recal_command.command("reprocess")
 @click.argument("machine")
 @options_of(ReprocessRequest, "given", build=dict)
+@backup_option
 @job_option
 @who_option(reason=True)
 @json_option
 def reprocess_command(
-    machine: str, given: dict[str, Any], job: Job, actor: str | None, reason: str, as_json: bool
+    machine: str,
+    given: dict[str, Any],
+    backup: tuple[Path, ...],
+    job: Job,
+    actor: str | None,
+    reason: str,
+    as_json: bool,
 ) -> int:
     """Identify and export again from a stored measurement of MACHINE, with the present job, machine and instrument files.
 
@@ -630,7 +663,8 @@ def reprocess_command(
     """
     from compgen.fleet.actions import reprocess
 
-    done = reprocess(job, machine, ReprocessRequest(actor=actor_of(actor), reason=reason, **given))
+    request = ReprocessRequest(actor=actor_of(actor), reason=reason, backup=backup, **given)
+    done = reprocess(job, machine, request)
     table = done.table
     if as_json:
         facts = {"id": done.measurement.id, "name": done.measurement.name, "sha256": done.measurement.sha256}

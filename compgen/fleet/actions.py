@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from compgen.data.machine import load_machine
 from compgen.errors import CompgenError, InputError
-from compgen.fleet import claims, decisions, logs
+from compgen.fleet import claims, decisions, inbox, logs
 from compgen.fleet.claims import keep_result
 from compgen.fleet.decisions import check_person
+from compgen.fleet.evidence import Held, held_by
 from compgen.fleet.job import Job, MachineJob
 from compgen.fleet.process import process, without_folder
-from compgen.fleet.publish import begin_folder, check_folder, notify, publish, set_aside
+from compgen.fleet.publish import begin_folder, check_folder, note_empty_folder, notify, publish, set_aside
 from compgen.fleet.records import (
     ADOPTED,
     HELD_BACK,
@@ -30,6 +32,7 @@ from compgen.fleet.records import (
     TableRecord,
 )
 from compgen.fleet.store import Clock, Store, open_store
+from compgen.fleet.tables_on import LOOKED_BACK
 from compgen.kinematics.kernel_switch import one_thread
 
 
@@ -128,6 +131,66 @@ def adopt(job: Job, name: str, actor: str, reason: str, *, clock: Clock | None =
         return moved
 
 
+def attach_backup(
+    job: Job, name: str, paths: Sequence[Path], measurement: str | None = None, *, clock: Clock | None = None
+) -> MeasurementRecord:
+    """Store a backup of a machine's control as evidence of what it held during a measurement, and return that one.
+
+    Parameters
+    ----------
+    paths : files of the backup, or folders that contain them.
+    measurement : which one, as in a :class:`ReprocessRequest`; None: the one that waits to be processed, the inbox
+        included, or the last one if none waits.
+
+    Raises
+    ------
+    InputError
+        if several measurements wait, there is none, or no control of the job can read the files.
+    """
+    machine_job = job.machine(name)
+    files = inbox.read_backup(machine_job, [file for path in paths for file in _files_at(path)])
+    with closing(open_store(job.store, clock=clock)) as store:
+        machine = store.add_machine(name)
+        check_folder(store, machine, machine_job.out)
+        inbox.receive(store, machine, machine_job)
+        chosen = _meant(store, machine, machine_job) if measurement is None else _chosen(store, machine, measurement)
+        held = read_held(store, machine, machine_job, {file: content for file, (content, _) in files.items()})
+        store.add_evidence(machine, chosen, files, "command")
+        logs.info("backup received", machine=name, measurement=chosen.name, shows=held.words)
+        return chosen
+
+
+def _files_at(path: Path) -> list[Path]:
+    """The files of a backup at a path, which may be a link such as ``active``."""
+    try:
+        real = path.resolve(strict=True)
+        return sorted(file for file in real.iterdir() if file.is_file()) if real.is_dir() else [real]
+    except OSError as error:
+        raise InputError(f"cannot be read: {error.strerror or error}", file=path, field="--backup") from error
+
+
+def _meant(store: Store, machine: MachineRecord, job: MachineJob) -> MeasurementRecord:
+    """The measurement to which a backup without a name belongs."""
+    measured = {*store.measured(machine).values()}
+    known = store.measurements(machine)
+    settings = job.settings_sha256()
+    attempts = store.attempts(machine)
+    failed = {item.measurement_id for item in attempts if item.outcome == "failed" and item.settings_sha256 == settings}
+    waiting = [item for item in known if item.id not in measured and item.id not in failed]
+    if len(waiting) > 1:
+        listed = ", ".join(item.name for item in waiting[:10])
+        raise InputError(
+            f"{len(waiting)} measurements of {machine.name} wait ({listed}); put each backup beside its measurement, as "
+            "NAME.backup.EXT",
+            field="--backup",
+        )
+    if not known:
+        raise InputError(
+            f"there is no measurement of {machine.name} to which the backup could belong", field="--backup"
+        )
+    return waiting[0] if waiting else max(known, key=lambda item: item.id)
+
+
 def carried_out(
     job: Job, name: str, decide: Callable[[Store, MachineRecord], DecisionRecord], clock: Clock | None = None
 ) -> DecisionRecord:
@@ -136,7 +199,7 @@ def carried_out(
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)
         check_folder(store, machine, machine_job.out)
-        begin_folder(store, machine, machine_job.out)
+        note_empty_folder(store, machine, machine_job.out)
         decision = decide(store, machine)
         _follow(store, machine_job, machine, "The decision is recorded")
         return decision
@@ -175,6 +238,17 @@ class Reprocessed:
         return 1 if self.table.state in HELD_BACK else 0
 
 
+def read_held(store: Store, machine: MachineRecord, job: MachineJob, files: Mapping[str, bytes]) -> Held:
+    """Read a backup of a machine's control; InputError if no control of the job can read it."""
+    known = [table for table in store.tables(machine) if table.accepted]
+    try:
+        return held_by(store, load_machine(job.machine), job.controllers, known[-LOOKED_BACK:], files)
+    except InputError as error:
+        raise InputError(
+            f"is no backup that {' or '.join(job.controllers)} can read: {error}", field="--backup"
+        ) from error
+
+
 def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | None = None) -> Reprocessed:
     """Process a stored measurement of a machine again by the present job, and publish the result.
 
@@ -194,6 +268,10 @@ def reprocess(job: Job, name: str, request: ReprocessRequest, *, clock: Clock | 
     if not request.reason.strip() or not request.actor.strip():
         raise InputError("processing a measurement again needs a reason and a name", field="--reason")
     check_person(request.actor)
+    if request.backup:
+        with closing(open_store(job.store, clock=clock)) as store:
+            number = str(_chosen(store, store.machine(name), request.measurement).id)
+        attach_backup(job, name, request.backup, number, clock=clock)
     with closing(open_store(job.store, clock=clock)) as store:
         machine = store.machine(name)
         check_folder(store, machine, machine_job.out)

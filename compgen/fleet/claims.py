@@ -402,7 +402,12 @@ def _insert(store: Store, connection: sa.Connection, machine: MachineRecord, cla
     ]
     if rows:
         connection.execute(sa.insert(database.table_files), rows)
-    attempt = {"outcome": "done", "message": "", "settings_sha256": new.settings_sha256, "seconds": new.seconds}
+    attempt = {
+        "outcome": "done",
+        "message": new.evidence,
+        "settings_sha256": new.settings_sha256,
+        "seconds": new.seconds,
+    }
     _add_attempt(store, connection, machine, claim, attempt)
     return table_id
 
@@ -444,6 +449,18 @@ def keep_failure(
     def action(connection: sa.Connection) -> None:
         release(store, connection, claim)
         attempt = {"outcome": "failed", "message": message, "settings_sha256": settings_sha256, "seconds": seconds}
+        _add_attempt(store, connection, machine, claim, attempt)
+
+    store.write(action)
+    forget(store, claim)
+
+
+def keep_confirmation(store: Store, machine: MachineRecord, claim: Claim, evidence: str, settings_sha256: str) -> None:
+    """Record that evidence was looked at, and that it confirms what the measurement was judged with."""
+
+    def action(connection: sa.Connection) -> None:
+        release(store, connection, claim)
+        attempt = {"outcome": "done", "message": evidence, "settings_sha256": settings_sha256, "seconds": 0.0}
         _add_attempt(store, connection, machine, claim, attempt)
 
     store.write(action)

@@ -10,7 +10,7 @@ import re
 import stat
 import zipfile
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -20,11 +20,18 @@ from compgen.data.csv_files import MOST_COLUMNS
 from compgen.data.files import sha256_of
 from compgen.errors import InputError, visible
 from compgen.fleet.job import MachineJob, OtherInbox
-from compgen.fleet.records import NewMeasurement
+from compgen.fleet.records import MachineRecord, NewMeasurement
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from compgen.fleet.store import Store
+
+#: Name of a backup of the control beside a measurement: NAME.backup.EXT; EXT may have several parts.
+BACKUP = re.compile(r"(.+?)\.backup(?:\.(.+))?", re.IGNORECASE | re.DOTALL)
+_MEASUREMENT = re.compile(
+    r"(.+)\.(lengths|deviations|sixdof|axis|circle|part|artefact|sphere|bar|errors)\.(csv|npz|parquet)"
+)
 #: Comments of a measurement file that give the time of measurement, and the tables that were on (a version, or "none").
 TIME_KEYS = ("measured_at", "date")
 ACTIVE_KEY = "active_table"
@@ -51,10 +58,14 @@ class InboxProblem:
 
 @dataclass(frozen=True)
 class InboxContents:
-    """What an inbox contains: measurements (the paths of their files) and problems."""
+    """What an inbox contains: measurements (the paths of their files) and problems.
+
+    ``backups``: paths of backups of the control by the name of the measurement to which they belong.
+    """
 
     groups: tuple[tuple[Path, ...], ...]
     problems: tuple[InboxProblem, ...]
+    backups: Mapping[str, tuple[Path, ...]] = field(default_factory=dict)
 
 
 def scan(job: MachineJob, now: datetime) -> InboxContents:
@@ -67,6 +78,7 @@ def scan(job: MachineJob, now: datetime) -> InboxContents:
         )
     groups: list[tuple[Path, ...]] = []
     problems: list[InboxProblem] = []
+    backups: dict[str, list[Path]] = {}
     for entry in entries:
         if entry.name.startswith("."):
             continue
@@ -75,20 +87,85 @@ def scan(job: MachineJob, now: datetime) -> InboxContents:
                 problems.append(InboxProblem(str(entry), "is a link to a folder; put the folder itself into the inbox"))
                 continue
             files = sorted(entry.iterdir()) if entry.is_dir() else [entry]
-            named = [path for path in files if not path.name.startswith(".") and _is_named(path, job.patterns)]
+            files = [path for path in files if not path.name.startswith(".")]
+            own = [path for path in files if is_backup(path.name)]
+            named = [path for path in files if path not in own and _is_named(path, job.patterns)]
             # links, pipes and devices are reported when they are read
             group = tuple(path for path in named if path.is_symlink() or not path.is_dir())
-            # a file this new may still be being written; one from the future (a clock set back) is not
-            ages = [now.timestamp() - path.lstat().st_mtime for path in group]
-            if group and not any(0.0 <= age < job.settle_s for age in ages):
+            for name, path in _backups(entry, own or files, group):
+                backups.setdefault(name, []).append(path)
+            if group and not _is_new(job, group, now):
                 groups.append(group)
         except OSError as error:
             problems.append(InboxProblem(str(entry), f"cannot be read: {error.strerror or error}"))
-    return InboxContents(tuple(groups), tuple(problems))
+    whole = {name: tuple(sorted(paths)) for name, paths in backups.items() if not _is_new(job, paths, now)}
+    return InboxContents(tuple(groups), tuple(problems), whole)
+
+
+def _is_new(job: MachineJob, paths: Iterable[Path], now: datetime) -> bool:
+    """Whether a file may still be being written; one from the future (a clock set back) is not."""
+    with contextlib.suppress(FileNotFoundError):
+        ages = [now.timestamp() - path.lstat().st_mtime for path in paths]
+        return any(0.0 <= age < job.settle_s for age in ages)
+    return True
+
+
+def _backups(entry: Path, files: Iterable[Path], group: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
+    """Backups of the control, each with the name of its measurement.
+
+    They are files NAME.backup.EXT, the files in a folder NAME.backup, and backups in the folder of a measurement.
+    """
+    folder = BACKUP.fullmatch(entry.name)
+    for path in files:
+        named = BACKUP.fullmatch(path.name)
+        if entry.is_dir() and folder is not None and not folder[2]:
+            if not path.is_dir():
+                yield folder[1], path
+        elif named is not None and is_backup(path.name):
+            yield _name_of(group) if entry.is_dir() and group else named[1], path
+
+
+def _name_of(group: tuple[Path, ...]) -> str:
+    """Name of a measurement: that of its file, or of the folder of its files."""
+    return group[0].name if len(group) == 1 else group[0].parent.name
 
 
 def _is_named(path: Path, patterns: Iterable[str]) -> bool:
     return any(fnmatchcase(path.name, pattern) for pattern in patterns)
+
+
+def names_of(measurement: str) -> set[str]:
+    """Return the names by which a backup may refer to a measurement: that of its file, also without its ends.
+
+    >>> sorted(names_of("2026-01-05.lengths.csv"))
+    ['2026-01-05', '2026-01-05.lengths', '2026-01-05.lengths.csv']
+    """
+    found, kind = {measurement}, _MEASUREMENT.fullmatch(measurement)
+    if kind is not None:
+        found |= {kind[1], f"{kind[1]}.{kind[2]}"}
+    return found | ({Path(measurement).stem} if Path(measurement).suffix else set())
+
+
+def is_backup(name: str) -> bool:
+    """Whether a file is a backup of a control by its name; a copy of a measurement is not.
+
+    >>> is_backup("a.backup.ini"), is_backup("a.backup.lengths.csv"), is_backup("a.ini")
+    (True, False, False)
+    """
+    found = BACKUP.fullmatch(name)
+    return found is not None and bool(found[2]) and _MEASUREMENT.fullmatch(name) is None
+
+
+def backup_part(name: str) -> str:
+    """Return the name of a file of a backup without that of the measurement.
+
+    >>> backup_part("a.backup.joint0-x.comp"), backup_part("a.backup.ini"), backup_part("NC_CEC.INI")
+    ('joint0-x.comp', 'backup.ini', 'NC_CEC.INI')
+    """
+    found = BACKUP.fullmatch(name)
+    if found is None or not found[2]:
+        return name
+    return found[2] if "." in found[2] else f"backup.{found[2]}"
 
 
 def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str, bytes], datetime]:
@@ -108,8 +185,26 @@ def read_files(job: MachineJob, group: tuple[Path, ...]) -> tuple[str, dict[str,
         content, state = _read_regular(path, left, folder_is_real=path.parent != job.inbox)
         contents[path.name], left = content, left - len(content)
         times.append(state.st_mtime)
-    name = group[0].name if len(group) == 1 else group[0].parent.name
-    return visible(name, flat=True), contents, datetime.fromtimestamp(max(times), UTC)
+    return visible(_name_of(group), flat=True), contents, datetime.fromtimestamp(max(times), UTC)
+
+
+def receive(store: Store, machine: MachineRecord, job: MachineJob) -> None:
+    """Store the measurements that are in the inbox; what cannot be read is reported by the next pass over the machine."""
+    for group in scan(job, store.now()).groups:
+        with contextlib.suppress(InputError):
+            store.add_measurement(machine, measurement_of(*read_files(job, group)))
+
+
+def read_backup(job: MachineJob, paths: Iterable[Path]) -> dict[str, tuple[bytes, datetime]]:
+    """Read the files of a backup: contents and time of change by name; InputError as for :func:`read_files`."""
+    found: dict[str, tuple[bytes, datetime]] = {}
+    left = round(job.max_size_mb * 1e6)
+    for path in paths:
+        content, state = _read_regular(path, left, folder_is_real=path.parent != job.inbox)
+        found[path.name], left = (content, datetime.fromtimestamp(state.st_mtime, UTC)), left - len(content)
+    if len(found) > MOST_FILES:
+        raise InputError(f"contains {len(found)} files; a backup has at most {MOST_FILES}")
+    return found
 
 
 def digest_of(contents: Mapping[str, bytes]) -> str:
@@ -211,7 +306,12 @@ def _listed(box: OtherInbox) -> list[tuple[Path, int]]:
         folders = [entry for entry in entries if entry.is_dir() and not entry.is_symlink()]
         for path in [*entries, *(path for folder in folders for path in sorted(folder.iterdir()))]:
             state = path.lstat()
-            if _is_named(path, box.patterns) and stat.S_ISREG(state.st_mode) and state.st_size > 0:
+            if (
+                _is_named(path, box.patterns)
+                and not is_backup(path.name)
+                and stat.S_ISREG(state.st_mode)
+                and state.st_size > 0
+            ):
                 found.append((path, state.st_size))
     return found
 

@@ -22,6 +22,7 @@ from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.files import name_problem, read_bytes, read_text, sha256_of, write_file
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, error_named
+from compgen.data.repeatability import Repeatability
 from compgen.data.toml_files import Section, accepted, accepts, part_setting, setting, table_setting, take_settings
 from compgen.errors import InputError, nearest
 from compgen.resources import LANGUAGES
@@ -235,8 +236,9 @@ class Policy:
     )
     confidence: float = setting(
         _confidence,
-        0.95,
-        meaning="The change against the active tables does not exceed its uncertainty with this confidence.",
+        0.98,
+        meaning="The change against the active tables does not exceed what measurements and repeatability explain, with this "
+        "confidence.",
     )
     min_shrink_um: float = setting(
         toml_files.not_negative,
@@ -264,6 +266,12 @@ class Policy:
         30.0,
         meaning="It was measured within this time, or within an hour more (daylight-saving time), of a decision that "
         "changed the active tables, and does not state which were active. 0: the times are certain.",
+    )
+    evidence: Literal["preferred", "required"] = setting(
+        toml_files.choice("preferred", "required"),
+        "preferred",
+        meaning="required: no backup of the control shows which tables were on; preferred: none shows it, and the machine "
+        "seems to have changed by more than drift explains.",
     )
 
 
@@ -359,6 +367,11 @@ class MachineJob:
         factory=dict,
         meaning="Limits of the drift, by error or of the volume.",
     )
+    repeatability: Mapping[str, float] = part_setting(
+        lambda: toml_files.section_schema(Repeatability),
+        factory=dict,
+        meaning="Keys of the section of this name in the machine file, which they override.",
+    )
     others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
     settings: str = field(default="", compare=False, repr=False)
     original: Path | None = field(default=None, compare=False, repr=False)
@@ -378,11 +391,16 @@ class MachineJob:
         files = [machine, self.instrument]
         digests = [sha256_of(read_bytes(path)) for path in files if path is not None]
         own = {"controllers": self.controllers, "measured_with": self.measured_with, "identify": dict(self.identify)}
-        rules = {"policy": asdict(self.policy), "unverified": self.allow_unverified, "templates": str(self.templates)}
+        policy = asdict(self.policy)
+        if policy["evidence"] == Policy.evidence:  # as before there was this key
+            del policy["evidence"]
+        rules = {"policy": policy, "unverified": self.allow_unverified, "templates": str(self.templates)}
         if self.max_minutes != MachineJob.max_minutes:  # with more time, what took too long is tried again
             rules["max_minutes"] = self.max_minutes
         if self.language != LANGUAGES[0]:
             rules["language"] = self.language
+        if self.repeatability:
+            rules["repeatability"] = dict(self.repeatability)
         found = sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
         if known and found not in known:
             load_machine(self.machine)
@@ -535,17 +553,21 @@ def _schedule(job: MachineJob, keys: Section) -> Schedule | None:
 
 
 def _mappings(keys: Section) -> dict[str, Mapping[str, Any]]:
-    """The sections ``identify``, in the units of the file, and ``tolerances``, in mm and rad by error or "volume"."""
+    """The sections ``identify`` and ``repeatability``, in the units of the file, and ``tolerances``, in mm and rad."""
     section = keys.section("tolerances", required=False)
     given = {key: section.take(key, toml_files.positive, None) for key in _TOLERANCES}
     section.finish()
     tolerances = {_TOLERANCES[key][0]: size * _TOLERANCES[key][1] for key, size in given.items() if size is not None}
+    section = keys.section("repeatability", required=False)
+    stated = toml_files.stated_settings(Repeatability, section)
+    section.finish()
     section = keys.section("identify", required=False)
     found: dict[str, Any] = {name: section.take(name, check, None) for name, check in _identify_checks().items()}
     section.finish()
     found["temperature"] = found["temperature"] is not False
     found["small_deviations"] = found["small_deviations"] or None  # keeps the hash unchanged
-    return {"tolerances": tolerances, "identify": {name: item for name, item in found.items() if item is not None}}
+    options = {name: item for name, item in found.items() if item is not None}
+    return {"tolerances": tolerances, "repeatability": stated, "identify": options}
 
 
 # --- what is made from a job ---------------------------------------------------------------------------------------

@@ -22,12 +22,23 @@ from compgen.data.files import FOLDERS, read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, load_machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import CompgenWarning, InputError
-from compgen.fleet.change import Change, change_between
+from compgen.errors import CompgenWarning
+from compgen.fleet.change import (
+    SOUND,
+    STATE_NOW,
+    Calibration,
+    Change,
+    calibrations_before,
+    change_between,
+    change_since,
+    mean_temperatures,
+)
 from compgen.fleet.decisions import active_table
+from compgen.fleet.evidence import tables_read
 from compgen.fleet.inbox import holds_one_of, whose
 from compgen.fleet.job import MachineJob, Policy
 from compgen.fleet.records import (
+    HELD_BACK,
     RESERVATION,
     IdentificationRecord,
     MachineRecord,
@@ -38,16 +49,15 @@ from compgen.fleet.records import (
 )
 from compgen.fleet.store import Store, counting
 from compgen.fleet.tables_on import (
-    STATED,
     Case,
     Judgement,
     Past,
-    judge_assumption,
     judge_likeness,
-    judge_statement,
+    judge_states,
+    judge_tables_on,
+    removed_tables,
     span_of,
-    tables_read,
-    tables_taken,
+    what_it_held,
 )
 from compgen.identify import IdentifyOptions, joint_covariance
 from compgen.identify.covariance import FILE_NAME as COVARIANCE
@@ -225,7 +235,7 @@ def _identified(result: RunResult) -> tuple[ErrorTable, Covariance | None]:
 
 
 def judge_change(judgement: Judgement, case: Case, result: RunResult, active: ActiveState) -> Change | None:
-    """Compare with the errors behind the active tables: the change must exceed its uncertainty."""
+    """Compare with the calibrations since those behind the active tables: the change must exceed what the machine repeats."""
     errors, covariance = _identified(result)
     new = covariance_or_independent(errors, covariance)
     old_errors = case.store.errors_of(active.identification)
@@ -233,12 +243,21 @@ def judge_change(judgement: Judgement, case: Case, result: RunResult, active: Ac
     if new is None or old is None:
         judgement.hold.append("the uncertainty of the errors is not known, so the change cannot be judged")
         return None
-    change = change_between(case.machine, (errors, new), (old_errors, old), case.job.policy.confidence)
+    measured, confidence = case.measurement, case.job.policy.confidence
+    calibration = Calibration(measured.measured_at, errors, new, mean_temperatures(measured.temperatures_c))
+    known, levels = calibrations_before(case.store, case.record, case.past.tables, active.identification, calibration)
+    corrected, machine = case.job.identify.get("temperature", True) is not False, case.machine
+    if measured.measured_at < active.identification.measured_at:  # held for that: the history is of later times
+        change = change_between(machine, (errors, new), (old_errors, old), confidence)
+    else:
+        change = change_since(machine, [*known, calibration], [*levels, STATE_NOW], confidence, corrected=corrected)
     judgement.figures["change"] = change.summary()
     if not change.significant:
         judgement.hold.append(
             f"the change against version {active.version} ({change.rms_um:.2f} um rms) is within its uncertainty "
-            f"({change.expected_rms_um:.2f} um rms expected, p = {change.p_value:.3f})"
+            f"({change.expected_rms_um:.2f} um rms expected, p = {change.p_value:.3f}, {1.0 - confidence:.2g} needed, "
+            f"{change.known_from} earlier measurement{'s' if change.known_from > 1 else ''})"
+            + (f"; most significant: {change.largest}" if change.largest else "")
         )
     return change
 
@@ -360,23 +379,31 @@ def process(
     machine = load_machine(job.machine)
     if job.original is not None:  # the name used in manifest and messages
         machine = replace(machine, source=job.original, copy=machine.source)
-    past = store.together(
-        lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
-    )
+    machine = replace(machine, repeatability=replace(machine.repeatability, **job.repeatability))
+    past = _past_of(store, record)
     said = measurement.active_table if stated is None else stated
-    taken = tables_taken(job, measurement, past, said)
+    evidence = next((item for item in reversed(store.evidence(record)) if item.measurement_id == measurement.id), None)
     contents = store.contents_of(measurement)
+    held = what_it_held(store, machine, job, past, evidence)
+    on = removed_tables(store, machine, job, measurement, past, said, held, by_person=stated is not None)
     case = Case(
-        store, job, record, machine, measurement, past, store.now(), said, stated is not None, taken,
-        span_of(measurement, contents)
-    )  # fmt: skip
+        store=store,
+        job=job,
+        record=record,
+        machine=machine,
+        measurement=measurement,
+        past=past,
+        now=store.now(),
+        said=said,
+        by_person=stated is not None,
+        evidence=evidence,
+        held=held,
+        span=span_of(measurement, contents),
+        on=on,
+    )
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        was_active = None if taken is None else tables_read(store, machine, taken, job.controllers[0])
-        if taken is not None and was_active is None:
-            text = f"version {taken.version} was active, but contains no tables of {job.controllers[0]}"
-            raise InputError(f"{text}; is the control right?")
         outcome = run(
             machine,
             write_files(Path(folder) / "measurement", contents),
@@ -385,7 +412,7 @@ def process(
             identify_options=IdentifyOptions(**job.identify),
             templates=job.templates,
             allow_unverified=job.allow_unverified,
-            active=None if was_active is None else ActiveTables(was_active),
+            active=None if on.tables is None else ActiveTables(on.tables),
             instrument=job.instrument,
             limits=SafetyLimits(job.policy.max_step_um),
             language=job.language,
@@ -397,13 +424,56 @@ def process(
         result = _result(Path(folder) / "out", machine, outcome, judgement)
     kept = NewResult(
         **result,
-        active_table_id=None if taken is None else taken.id,
+        active_table_id=None if on.version is None else on.version.id,
+        evidence="" if evidence is None else evidence.key,
         approve=job.approval == "auto",
         settings_sha256=settings,
         seconds=time.monotonic() - started,
     )
-    on = active_of(past.tables)
-    return Processed(kept, None if on is None else on.id)
+    now_active = active_of(past.tables)
+    return Processed(kept, None if now_active is None else now_active.id)
+
+
+def confirmation(store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord) -> str:
+    """Return the key of a backup that came later and shows what a measurement was judged with; "" to judge it again.
+
+    Tables that are held back are judged again in any case: the backup may be what they waited for.
+    """
+    evidence = next((item for item in reversed(store.evidence(record)) if item.measurement_id == measurement.id), None)
+    made = [item for item in store.identifications(record) if item.measurement_id == measurement.id]
+    if evidence is None or not made:
+        return ""
+    last, past = max(made, key=lambda item: item.revision), _past_of(store, record)
+    tables = [table for table in past.tables if table.identification_id == last.id and table.state not in HELD_BACK]
+    if not tables:
+        return ""
+    held = what_it_held(store, load_machine(job.machine), job, past, evidence)
+    version = (
+        None if isinstance(held, str | None) else next((t.id for t in past.tables if t.version == held.version), None)
+    )
+    none = not isinstance(held, str | None) and held.tables is None
+    was_known = "evidence" not in tables[-1].summary and last.active_table_id == version
+    return evidence.key if was_known and (version is not None or none) else ""
+
+
+def again_of(store: Store, record: MachineRecord, measurement: MeasurementRecord) -> dict[str, Any]:
+    """Return the fields of a result that say how often a measurement was identified, and why again."""
+    done = [item for item in store.identifications(record) if item.measurement_id == measurement.id]
+    if not done:
+        return {}
+    names = [item.names for item in store.evidence(record) if item.measurement_id == measurement.id]
+    why = (
+        f"{measurement.name} processed again with the backup {names[-1]}"
+        if names
+        else f"{measurement.name} processed again"
+    )
+    return {"revision": 1 + max(item.revision for item in done), "reason": why}
+
+
+def _past_of(store: Store, record: MachineRecord) -> Past:
+    return store.together(
+        lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
+    )
 
 
 def without_folder(message: str) -> str:
@@ -454,28 +524,28 @@ def _judged(case: Case, result: RunResult, contents: Mapping[str, bytes]) -> Jud
         if item.verification.accepted:
             assert item.read is not None
             new[item.verification.controller] = item.read
-    if active is not None and result.accepted and shows_all(judgement, case.store, result, active):
+    if active is not None and shows_all(judgement, case.store, result, active) and result.accepted:
         judge_change(judgement, case, result, active)
         judge_tables(judgement, case.machine, result, new, active)
     if result.accepted:
         apply_limits(judgement, case.machine, new, {} if active is None else active.tables, policy)
-    judge_misfit(judgement, result)
     judgement.figures["active_version"] = None if active is None else active.version
     judgement.figures["result"] = {item.verification.controller: item.verification.summary() for item in result.results}
     if not result.accepted:
         reasons = [reason for item in result.results for reason in item.verification.reasons]
         judgement.hold[:0] = list(dict.fromkeys(reasons))
-    judge_order(judgement, case)
-    if case.said is not None:
-        judgement.figures[STATED] = case.said
-        if not case.by_person:
-            judge_statement(judgement, case)
-    elif case.job.measured_with == "active":
-        judge_assumption(judgement, case)
-    if result.accepted:
-        judge_likeness(judgement, case, _identified(result))
+    before, temperature_c = len(judgement.hold), policy.temperature_c
+    judge_misfit(judgement, result)
+    judge_tables_on(judgement, case)
+    judge_likeness(judgement, case, _identified(result))
+    judge_states(judgement, case, _identified(result))
     judge_twins(judgement, case)
     judge_identity(judgement, case, contents)
+    doubted = len(judgement.hold) > before or bool(
+        temperature_c and _temperature(temperature_c, case.measurement.temperatures_c)
+    )
+    judgement.figures[SOUND] = not doubted
+    judge_order(judgement, case)
     return judgement
 
 

@@ -69,23 +69,36 @@ def check_folder(store: Store, machine: MachineRecord, folder: Path) -> None:
 
 
 def begin_folder(store: Store, machine: MachineRecord, folder: Path) -> list[str]:
-    """Publish into a folder that has nothing of any store, before anything is judged or decided; return what to say.
+    """Publish into a folder that has nothing of any store, before anything is judged; return what to say."""
+    if not _is_empty(folder):
+        return []
+    said = note_empty_folder(store, machine, folder)
+    publish(store, machine, folder)
+    return said
 
-    If the store has made tables active, it may be an older one (a copy, or a restored database): no ledger shows
-    otherwise. From then on it does not know which tables are on, as after `recal adopt`.
+
+def note_empty_folder(store: Store, machine: MachineRecord, folder: Path) -> list[str]:
+    """Record that a folder has nothing of any store although this one has made tables active; return what to say.
+
+    The store may be an older one (a copy, or a restored database): no ledger shows otherwise. From then on it does not know
+    which tables are on, as after `recal adopt`.
     """
-    seen, said = _look(folder), []
-    if seen.pointer is not None or seen.ledger_text is not None or seen.versions:
+    if not _is_empty(folder):
         return []
     known = [item.at for item in store.events(machine) if item.kind in (ADOPTED, RESTORED)]
     swaps = [item.at for item in store.decisions(machine) if AFTER[item.kind] == "active"]
-    if swaps and not (known and max(known) >= swaps[-1]):  # else this is known, and until when the history counts
-        at = store.now().isoformat(timespec="seconds")
-        said = [f"the folder was empty at {at}, although this store has made tables active; it may be an older store"]
-        store.add_event(ADOPTED, "folder", said[0], machine)
-        logs.warning("empty folder", machine=machine.name, folder=str(folder))
-    publish(store, machine, folder)
-    return said
+    if not swaps or (known and max(known) >= swaps[-1]):  # the latter is known, and until when the history counts
+        return []
+    at = store.now().isoformat(timespec="seconds")
+    said = f"the folder was empty at {at}, although this store has made tables active; it may be an older store"
+    store.add_event(ADOPTED, "folder", said, machine)
+    logs.warning("empty folder", machine=machine.name, folder=str(folder))
+    return [said]
+
+
+def _is_empty(folder: Path) -> bool:
+    seen = _look(folder)
+    return seen.pointer is None and seen.ledger_text is None and not seen.versions
 
 
 def publish(store: Store, machine: MachineRecord, folder: Path) -> TableRecord | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
+from pathlib import Path
 from typing import Any, Literal
 
 from compgen.data.names import ERROR_NAMES, error_named
@@ -22,6 +23,8 @@ DecisionKind = Literal["propose", "hold", "refuse", "supersede", "approve", "rej
 CLOCK = "clock"
 #: A machine's folder was given to this store, or was found to be empty: the store does not know which tables are on.
 ADOPTED = "adopted"
+#: A backup of the control came with a measurement.
+EVIDENCE = "evidence"
 #: The history comes from a backup, whose last entry is of the time that is the subject of the event.
 RESTORED = "restored"
 #: Prefix of a reason that is shown with the tables but does not hold them back.
@@ -145,6 +148,30 @@ class EventRecord:
 
 
 @dataclass(frozen=True)
+class EvidenceRecord:
+    """A backup of the control that came with a measurement: what it held while the machine was measured.
+
+    ``files`` are name, SHA-256 and time of change of each file, ``source`` is where it came from. ``key`` identifies the
+    contents: a measurement was judged with this evidence if an attempt at it has this message.
+    """
+
+    measurement_id: int
+    source: str
+    files: Sequence[tuple[str, str, str]]
+    at: datetime
+
+    @property
+    def key(self) -> str:
+        """Identify names and contents."""
+        return " ".join(["evidence", *(f"{name}:{digest}" for name, digest, _ in self.files)])
+
+    @property
+    def names(self) -> str:
+        """Names of the files."""
+        return ", ".join(name for name, _, _ in self.files)
+
+
+@dataclass(frozen=True)
 class StoredTableFile:
     """One file of a set of tables: its control, name and contents."""
 
@@ -172,7 +199,8 @@ class NewResult:
 
     ``hold`` lists why the policy holds the tables back, ``reservations`` what is shown with them; with ``approve`` the
     tables become active at once unless held or not accepted. ``revision`` counts how often the measurement has been
-    identified; from the second time on ``actor`` and ``reason`` say who requested it and why.
+    identified; from the second time on ``actor`` and ``reason`` say who requested it and why. ``evidence`` is the key of the
+    backup that showed which tables were on, "" for none.
     """
 
     machine_text: bytes
@@ -193,6 +221,7 @@ class NewResult:
     actor: str = ""
     reason: str = ""
     reservations: Sequence[str] = ()
+    evidence: str = ""
 
 
 def reservations_of(reasons: Sequence[str]) -> list[str]:
@@ -292,6 +321,7 @@ class ReprocessRequest:
     """Measurement to be processed again (None: the newest), who requests it and why; neither may be empty.
 
     ``active_table`` states which tables were on during the measurement, a version or "none"; None: as the file states.
+    ``backup`` are files of the control that show it.
     """
 
     measurement: str | None = option(
@@ -307,3 +337,4 @@ class ReprocessRequest:
         "not certain; default: what file, job and history say.",
         metavar="VERSION|none",
     )
+    backup: tuple[Path, ...] = ()

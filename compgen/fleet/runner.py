@@ -12,20 +12,29 @@ import time
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import asdict, dataclass, replace
+from datetime import datetime
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from compgen.data.files import FOLDERS, read_bytes, remove_abandoned_folders, working_folder
+from compgen.data.files import FOLDERS, read_bytes, remove_abandoned_folders, sha256_of, working_folder
 from compgen.data.machine import load_machine
 from compgen.errors import CompgenError, InputError, visible
 from compgen.fleet import claims, inbox, logs
 from compgen.fleet.claims import Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
-from compgen.fleet.process import FOLDER, process, without_folder, write_files
+from compgen.fleet.process import FOLDER, again_of, confirmation, process, without_folder, write_files
 from compgen.fleet.publish import begin_folder, check_folder, is_published, notify, publish, untold
-from compgen.fleet.records import HELD_BACK, OPEN, MachineRecord, MeasurementRecord, TableRecord, active_of
+from compgen.fleet.records import (
+    HELD_BACK,
+    OPEN,
+    AttemptRecord,
+    MachineRecord,
+    MeasurementRecord,
+    TableRecord,
+    active_of,
+)
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.parallel import (
@@ -196,6 +205,7 @@ class _Pass:
         self.messages: list[str] = []
         self.processed: list[str] = []
         self.present: set[str] = set()
+        self.backups: dict[str, dict[str, tuple[bytes, datetime]]] = {}
         self.failed = False
         self.internal = False
         self.again = False
@@ -211,6 +221,11 @@ class _Pass:
                 place = str(getattr(error, "file", None) or group[0])
                 problems.append((place, str(getattr(error, "message", error))))
         self.present = {inbox.digest_of(contents) for _, contents, _ in received}
+        for name, paths in found.backups.items():
+            try:
+                self.backups[name] = inbox.read_backup(self.job, paths)
+            except CompgenError as error:
+                problems.append((str(paths[0]), str(getattr(error, "message", error))))
         unchanged = None if problems else self.store.together(self._unchanged)
         if unchanged is not None:
             return unchanged
@@ -225,6 +240,8 @@ class _Pass:
             self._problem("inbox", *problem)
         for item in received:
             self.store.add_measurement(self.machine, inbox.measurement_of(*item))
+        for measurement, name in self._new_evidence():
+            self.store.add_evidence(self.machine, measurement, self.backups[name], "inbox")
         settings = self.job.settings_sha256()  # a missing machine file ends the pass here; files taken so far are kept
         if self.elsewhere is None:
             self.process_all(settings)
@@ -251,9 +268,38 @@ class _Pass:
         except InputError:
             return None
         told = not self.job.notify or not untold(store, machine)
-        if self._waiting(settings) or not told or not is_published(store, machine, self.job.out):
+        if (
+            self._new_evidence()
+            or self._waiting(settings)
+            or not told
+            or not is_published(store, machine, self.job.out)
+        ):
             return None
         return self._outcome(active_of(store.tables(machine, figures=False)), settings)
+
+    def _new_evidence(self) -> list[tuple[MeasurementRecord, str]]:
+        """Backups in the inbox that are not yet evidence of the measurements whose names they have.
+
+        A measurement that is in the inbox now comes first, else the last one of that name. The same file is not evidence
+        twice: beside a new measurement it is a forgotten one, unless it was written again.
+        """
+        found, known = [], self.store.evidence(self.machine) if self.backups else []
+        for name, files in self.backups.items():
+            same = [item for item in self.store.measurements(self.machine) if name in inbox.names_of(item.name)]
+            here = [item for item in same if item.sha256 in self.present] or sorted(same, key=lambda item: item.id)[-1:]
+            listed = {(file, sha256_of(content), time.isoformat()) for file, (content, time) in files.items()}
+            for measurement in here:
+                own = [item for item in known if item.measurement_id == measurement.id]
+                if own and {(file, digest) for file, digest, _ in own[-1].files} == {item[:2] for item in listed}:
+                    continue
+                other = next((item for item in known if {*item.files} == listed), None)
+                if other is None:
+                    found.append((measurement, name))
+                    continue
+                text = f"was evidence of measurement {other.measurement_id} already, so it does not show what was on during "
+                text += f"measurement {measurement.id} ({measurement.name}); make another backup of the control"
+                self._problem("backup", name, f"{other.names} {text}", fail=False)
+        return found
 
     def _problem(self, kind: str, subject: str, message: str, *, fail: bool = True) -> None:
         """Report a problem; it is stored if the store does not know it yet."""
@@ -265,12 +311,26 @@ class _Pass:
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)
 
     def _waiting(self, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
-        """Return measurements without a result, in order of measurement; failed ones only if the settings changed."""
-        attempts = [item for item in self.store.attempts(self.machine) if item.settings_sha256 == settings]
-        done = {*self.store.measured(self.machine).values()} | {
-            i.measurement_id for i in attempts if i.outcome == "failed"
+        """Return measurements without a result, in order of measurement; failed ones only if the settings changed.
+
+        A measurement also waits if a backup of the control has come since it was judged.
+        """
+        attempts = self.store.attempts(self.machine)
+        failed = {item.measurement_id: item.at for item in attempts if self._is_failure(item, settings)}
+        measured = {*self.store.measured(self.machine).values()}
+        judged = {(item.measurement_id, item.message) for item in attempts if item.outcome == "done"}
+        shown = {item.measurement_id: item for item in self.store.evidence(self.machine)}  # the last of each
+        fresh = {
+            key
+            for key, item in shown.items()
+            if (key, item.key) not in judged and not (key in failed and failed[key] >= item.at)
         }
+        done = ({*failed} | measured) - fresh
         return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
+
+    @staticmethod
+    def _is_failure(attempt: AttemptRecord, settings: str) -> bool:
+        return attempt.outcome == "failed" and attempt.settings_sha256 == settings
 
     def process_all(self, settings: str) -> None:
         """Process waiting measurements; if another runner has one, the later ones are left to it as well."""
@@ -284,7 +344,8 @@ class _Pass:
             seen.add(measurement.id)
             try:
                 with one_thread():  # the same bytes whatever the number of processors
-                    claims.work_on(self.store, measurement, partial(self._keep, measurement, settings))
+                    again = measurement.id in self.store.measured(self.machine).values()
+                    claims.work_on(self.store, measurement, partial(self._keep, measurement, settings), again=again)
             except ClaimLostError as error:
                 self.messages.append(f"{measurement.name}: {error}; the next run tries again")
                 self.again = True
@@ -295,7 +356,8 @@ class _Pass:
         started = time.monotonic()
         try:
             with claims.renewal(self.store, claim), limited(60.0 * self.job.max_minutes):
-                done = process(self.store, self.job, self.machine, measurement)
+                confirmed = confirmation(self.store, self.job, self.machine, measurement)
+                done = None if confirmed else process(self.store, self.job, self.machine, measurement)
         except ClaimLostError:
             raise
         except Exception as error:
@@ -309,7 +371,12 @@ class _Pass:
                 self.internal, message = True, f"internal error: {type(error).__name__}: {error}"
             keep_failure(self.store, self.machine, claim, message, settings, time.monotonic() - started)
             return
-        table = keep_result(self.store, self.machine, claim, done.result, done.judged_against)
+        if done is None:
+            claims.keep_confirmation(self.store, self.machine, claim, confirmed, settings)
+            self.messages.append(f"{measurement.name}: the backup of the control confirms which tables were on")
+            return
+        result = replace(done.result, **again_of(self.store, self.machine, measurement))
+        table = keep_result(self.store, self.machine, claim, result, done.judged_against)
         self.processed.append(measurement.name)
         fields = {"version": table.version, "state": table.state, "reasons": list(table.reasons)}
         logs.info("measurement processed", machine=self.job.name, measurement=measurement.name, **fields)

@@ -16,6 +16,7 @@ from compgen.fleet.job import Cron, Job, Schedule
 from compgen.fleet.records import (
     AFTER,
     AUTOMATIC,
+    EVIDENCE,
     HELD_BACK,
     OPEN,
     AttemptRecord,
@@ -26,7 +27,7 @@ from compgen.fleet.records import (
     active_of,
     reservations_of,
 )
-from compgen.fleet.store import Store, at_one_moment
+from compgen.fleet.store import Store, at_one_moment, evidence_in
 
 Record = TypeVar("Record")
 
@@ -164,6 +165,10 @@ def history(store: Store, machine: MachineRecord | None = None) -> list[HistoryE
             what, actor, reason = said_of(event)
             version = int(event.subject.removeprefix("version "))
             add(event.at, 3, event, event.kind, version, actor, f"measurement {what}: {reason}")
+        elif event.kind == EVIDENCE:
+            shown = evidence_in(event)
+            text = f"{shown.names} with {named.get(shown.measurement_id, event.subject)} ({shown.source})"
+            add(event.at, 3, event, event.kind, None, "", text)
         elif event.kind != "notified":
             add(event.at, 3, event, event.kind, None, "", f"{event.subject}: {event.message}")
     return [entry for _, _, entry in sorted(entries, key=lambda item: (item[0], item[1], item[2].number))]

@@ -7,6 +7,7 @@ measurement adds, are in :mod:`compgen.fleet.claims`.
 from __future__ import annotations
 
 import errno
+import json
 import os
 import re
 import shutil
@@ -31,10 +32,12 @@ from compgen.errors import CompgenError, InputError
 from compgen.fleet import database
 from compgen.fleet.database import StoreError, engine_of, first_line, inserted, put_blobs, retried, shown, upgrade
 from compgen.fleet.records import (
+    EVIDENCE,
     RESTORED,
     AttemptRecord,
     DecisionRecord,
     EventRecord,
+    EvidenceRecord,
     IdentificationRecord,
     MachineRecord,
     MeasurementRecord,
@@ -430,6 +433,32 @@ class Store:
         """Return the events of a machine (or all), oldest first."""
         return [EventRecord(*row) for row in self._of_machine(_EVENTS, database.events, machine)]
 
+    def add_evidence(
+        self,
+        machine: MachineRecord,
+        measurement: MeasurementRecord,
+        files: Mapping[str, tuple[bytes, datetime]],
+        source: str,
+    ) -> EvidenceRecord:
+        """Store a backup of the control, contents and times of its files by name, as evidence for a measurement."""
+
+        def action(connection: sa.Connection) -> EvidenceRecord:
+            digests = put_blobs(connection, [content for content, _ in files.values()])
+            listed = [
+                [database.plain(name), digest, time.isoformat()]
+                for (name, (_, time)), digest in zip(files.items(), digests, strict=True)
+            ]
+            row = {"machine_id": machine.id, "kind": EVIDENCE, "subject": f"measurement {measurement.id}"}
+            text, now = json.dumps({"source": source, "files": listed}), self.now(connection)
+            connection.execute(sa.insert(database.events).values(**row, message=text, at=now))
+            return EvidenceRecord(measurement.id, source, tuple((a, b, c) for a, b, c in listed), now)
+
+        return self.write(action)
+
+    def evidence(self, machine: MachineRecord) -> list[EvidenceRecord]:
+        """Return the backups that came with measurements of a machine, oldest first; the last of a measurement counts."""
+        return [evidence_in(event) for event in self.events(machine) if event.kind == EVIDENCE]
+
     def blob(self, sha256: str) -> bytes:
         """Return contents by their SHA-256; StoreError if they are damaged."""
         return inflated(sha256, self.read(lambda connection: connection.execute(_BLOB, {"sha256": sha256}).scalar()))
@@ -509,6 +538,13 @@ class _StoreFile:
             return False if error.sqlite_errorcode == sqlite3.SQLITE_NOTADB else None
         self._rows = {table: row for table, row in newest.items() if row is not None}
         return True
+
+
+def evidence_in(event: EventRecord) -> EvidenceRecord:
+    """Return the evidence that an event of kind ``EVIDENCE`` records."""
+    said = json.loads(event.message)
+    files = tuple((str(name), str(digest), str(time)) for name, digest, time in said["files"])
+    return EvidenceRecord(int(event.subject.split()[1]), str(said["source"]), files, event.at)
 
 
 def files_of(connection: sa.Connection, table_id: int) -> list[StoredTableFile]:

@@ -8,27 +8,41 @@ the compensation, or apply it twice. The ``judge_...`` functions add reasons to 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 
+from compgen.data.comparison import rms
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
+from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
-from compgen.fleet.change import likeness, volume_points
-from compgen.fleet.inbox import duration_s, time_in
+from compgen.fleet.change import axis_temperatures, likeness, volume_points
+from compgen.fleet.evidence import (
+    DriftSizes,
+    Explanations,
+    Held,
+    TableState,
+    explained,
+    held_by,
+    possible_states,
+    tables_read,
+)
+from compgen.fleet.inbox import duration_s, names_of, time_in
 from compgen.fleet.job import MachineJob
 from compgen.fleet.records import (
     ADOPTED,
     AFTER,
     CLOCK,
+    RESERVATION,
     RESTORED,
     DecisionRecord,
     EventRecord,
+    EvidenceRecord,
     IdentificationRecord,
     MachineRecord,
     MeasurementRecord,
@@ -38,12 +52,25 @@ from compgen.fleet.records import (
 )
 from compgen.fleet.store import Store
 from compgen.identify.covariance import Covariance
-from compgen.tables import ReadTables, parse_tables
+from compgen.tables import ReadTables
 
 #: A clock that was not set to daylight-saving time, or back, is wrong by this in addition to what clocks differ by.
 DAYLIGHT_SAVING = timedelta(hours=1)
 #: Key in a version's figures: which tables were on, as stated by a file or a person.
 STATED = "active_table_stated"
+#: Prior probability that the tables were as the history, the file or a person says, and as a backup shows.
+ASSUMED, BELIEVED = 0.97, 0.999
+#: The rest: none were on, another version, a version times a factor, single tables or an axis of a version.
+STATES = {"none": 0.2, "version": 0.3, "factor": 0.2, "part": 0.3}
+#: Tables are held if what is assumed is less probable than this; with a backup, if states that explain the change by drift
+#: alone are together more probable than the second.
+CERTAIN, CONTRADICTED = 0.9, 0.5
+#: States that differ by less over the volume do no harm, mm rms.
+HARMLESS_MM = 0.25 * MM_PER_UM
+#: At most so many explanations are named, and only these, with their probabilities.
+MOST_NAMED, LEAST_NAMED = 4, 0.01
+#: Statement of a backup that is no stored version.
+OTHER = "other"
 #: A change is compared with at most this many of the newest versions that were active.
 LOOKED_BACK = 20
 
@@ -111,12 +138,26 @@ class Past:
 
 
 @dataclass(frozen=True)
+class TablesOn:
+    """The tables that are removed from readings: as parsed (None: none), which stored version they are, and in words.
+
+    ``by_evidence``: a backup of the control shows that they were on.
+    """
+
+    tables: ReadTables | None
+    version: TableRecord | None
+    words: str
+    by_evidence: bool = False
+
+
+@dataclass(frozen=True)
 class Case:
     """One measurement to be judged: the job of its machine, what the store knows of the machine, the current time.
 
     ``said`` states which tables were on during the measurement, by the file or, with ``by_person``, by a person; None if
-    neither states it. ``taken`` are the tables whose effect is removed from the readings, None if none were on. ``span``:
-    earliest and latest time at which a reading may have been taken.
+    neither states it. ``evidence`` is the backup that came with it, ``held`` what it shows, or why it cannot be read.
+    ``span``: earliest and latest time at which a reading may have been taken. ``on`` are the tables whose effect is removed
+    from the readings.
     """
 
     store: Store
@@ -128,12 +169,19 @@ class Case:
     now: datetime
     said: str | None
     by_person: bool
-    taken: TableRecord | None
+    evidence: EvidenceRecord | None
+    held: Held | str | None
     span: tuple[datetime, datetime]
+    on: TablesOn
+
+    @property
+    def taken(self) -> TableRecord | None:
+        """The stored version whose effect is removed, None if it is none of them."""
+        return self.on.version
 
     @property
     def version_taken(self) -> int | None:
-        """Version of the tables whose effect is removed."""
+        """Number of the stored version whose effect is removed."""
         return None if self.taken is None else self.taken.version
 
     @property
@@ -142,14 +190,38 @@ class Case:
         return timedelta(minutes=self.job.policy.clock_minutes)
 
 
-def tables_read(store: Store, machine: Machine, table: TableRecord, control: str) -> ReadTables | None:
-    """Parse the table files of one control, without manifest and notes; None if there are none."""
-    names = table.summary.get("tables", {}).get(control, [])
-    files = {file.name: file.content for file in store.table_files(table) if file.controller == control}
-    return parse_tables(machine, {name: files[name] for name in names}, control) if names else None
+def removed_tables(
+    store: Store,
+    machine: Machine,
+    job: MachineJob,
+    measurement: MeasurementRecord,
+    past: Past,
+    said: str | None,
+    held: Held | str | None,
+    *,
+    by_person: bool,
+) -> TablesOn:
+    """Return the tables to remove from the readings: as a person states, a backup shows, the file states, the history says.
+
+    A backup shows what a control held, not whether it acted: if the job says that tables are switched off to measure, they
+    were.
+    """
+    stated_on = said is not None and version_said(said) is not None
+    on = job.measured_with == "active" or stated_on
+    if isinstance(held, Held) and not by_person and (held.tables is None or on):
+        version = next((table for table in past.tables if table.version == held.version), None)
+        return TablesOn(held.tables, version, held.words, by_evidence=True)
+    version = _version_then(job, measurement, past, said)
+    if version is None:
+        return TablesOn(None, None, "no tables")
+    read = tables_read(store, machine, version, job.controllers[0])
+    if read is None:
+        text = f"version {version.version} was active, but contains no tables of {job.controllers[0]}"
+        raise InputError(f"{text}; is the control right?")
+    return TablesOn(read, version, f"version {version.version}")
 
 
-def tables_taken(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
+def _version_then(job: MachineJob, measurement: MeasurementRecord, past: Past, said: str | None) -> TableRecord | None:
     """Return the tables that were active during the measurement: as stated, else as the job says."""
     tables = past.tables
     version = None if said is None else version_said(said)
@@ -171,6 +243,20 @@ def tables_taken(job: MachineJob, measurement: MeasurementRecord, past: Past, sa
     return next((table for table in tables if table.id == then), None)
 
 
+def what_it_held(
+    store: Store, machine: Machine, job: MachineJob, past: Past, evidence: EvidenceRecord | None
+) -> Held | str | None:
+    """Read the backup that came with a measurement; a text says why it cannot be read, None: there is none."""
+    if evidence is None:
+        return None
+    files = {name: store.blob(digest) for name, digest, _ in evidence.files}
+    known = [table for table in past.tables if table.accepted][-LOOKED_BACK:]
+    try:
+        return held_by(store, machine, job.controllers, known, files)
+    except InputError as error:
+        return str(error)
+
+
 def span_of(measurement: MeasurementRecord, contents: Mapping[str, bytes]) -> tuple[datetime, datetime]:
     """Return the earliest and the latest time at which a reading may have been taken.
 
@@ -182,6 +268,124 @@ def span_of(measurement: MeasurementRecord, contents: Mapping[str, bytes]) -> tu
         at = measurement.measured_at if stated is None else stated[0]
         ends += [at - lasted, at + lasted]
     return min(ends), max(ends)
+
+
+def judge_tables_on(judgement: Judgement, case: Case) -> None:
+    """Apply the rules about which tables were on that do not look at the errors: by evidence, statement or time."""
+    if case.said is not None:
+        judgement.figures[STATED] = case.said
+    judgement.figures["tables_on"] = {"assumed": case.on.words, "by_evidence": case.on.by_evidence}
+    _judge_backup(judgement, case)
+    if case.on.by_evidence:
+        judgement.figures[STATED] = _statement(case)
+    elif case.said is not None:
+        if not case.by_person:
+            judge_statement(judgement, case)
+    elif case.job.measured_with == "active":
+        judge_assumption(judgement, case)
+
+
+def _statement(case: Case) -> str:
+    """What a backup states, as a file would: a version, none, or something that is neither."""
+    if case.on.tables is None:
+        return "none"
+    return f"v{case.version_taken}" if case.taken is not None else OTHER
+
+
+# --- what a backup of the control shows -------------------------------------------------------------------------------
+
+
+def _judge_backup(judgement: Judgement, case: Case) -> None:
+    """Hold if a backup is missing though required, cannot be read, contradicts a statement, or is of another time."""
+    name, files = case.job.name, "" if case.evidence is None else case.evidence.names
+    if isinstance(case.held, str):
+        judgement.hold.append(f"the backup of the control ({files}) cannot be read: {case.held}")
+    if not isinstance(case.held, Held):
+        if case.job.policy.evidence == "required":
+            judgement.hold.append(
+                "the policy requires evidence of which tables were on (evidence = required): " + how_to_show(case)
+            )
+        return
+    held, assumed = case.held, case.on.words
+    judgement.figures["evidence"] = {
+        "files": files, "source": getattr(case.evidence, "source", ""), "tables": held.words, "version": held.version
+    }  # fmt: skip
+    if not case.on.by_evidence and not case.by_person:  # the job says that tables are switched off
+        if case.said is None:
+            judgement.hold.append(
+                f"the backup of the control ({files}) contains {held.words}, and does not show whether it acted; the job says "
+                f"that {name} is measured with its tables off. If they were: {how_to_state(name, case.measurement, 'none')}"
+            )
+        return
+    said = None if case.said is None else version_said(case.said)
+    if case.said is not None and said != (None if held.tables is None else held.version or OTHER):
+        judgement.hold.append(
+            f"{'a person' if case.by_person else 'the file'} states that {_was(_named(said))} on, but the backup of the control "
+            f"({files}) shows {held.words}; {_was(assumed)} removed from the readings"
+        )
+    _judge_time_of_backup(judgement, case, held)
+    expected = _expected(case)
+    if expected is not None and expected != (None if held.tables is None else held.version or OTHER):
+        judgement.reservations.append(
+            f"{RESERVATION}the backup of the control shows {held.words}, but by the history {_named(expected)} should have been "
+            "on: load the right tables"
+        )
+
+
+def _named(version: int | str | None) -> str:
+    return "no tables" if version is None else f"version {version}"
+
+
+def _was(words: str) -> str:
+    """Add the verb to tables in words.
+
+    >>> _was("version 2"), _was("no tables")
+    ('version 2 was', 'no tables were')
+    """
+    return f"{words} {'were' if words.startswith(('no tables', 'tables')) else 'was'}"
+
+
+def _expected(case: Case) -> int | str | None:
+    """The version that was active during the measurement by the history; what the backup shows if that is not known."""
+    held = case.held
+    assert isinstance(held, Held)
+    own = None if held.tables is None else held.version or OTHER
+    if case.past.swaps(case.measurement.measured_at) is None:
+        return own
+    version = _version_then(replace(case.job, measured_with="active"), case.measurement, case.past, None)
+    return None if version is None else version.version
+
+
+def _judge_time_of_backup(judgement: Judgement, case: Case, held: Held) -> None:
+    """Hold if the active tables changed between the measurement and its backup, unless it shows those of before.
+
+    What a control holds after such a decision says nothing about what it held before, and readings may be from before and
+    after.
+    """
+    evidence, (first, last) = case.evidence, case.span
+    assert evidence is not None
+    written = max(datetime.fromisoformat(time) for _, _, time in evidence.files)
+    made = written if first <= written <= evidence.at else evidence.at
+    swaps = [item for item in case.past.decisions if AFTER[item.kind] == "active" and first < item.at < max(last, made)]
+    if not swaps:
+        return
+    earlier = active_id([item for item in case.past.decisions if item.sequence < swaps[0].sequence])
+    before = next((table.version for table in case.past.tables if table.id == earlier), None)
+    if (None if held.tables is None else held.version or OTHER) != before:
+        judgement.hold.append(
+            f"the active tables were changed at {_day(swaps[0].at)}, between the first reading ({_day(first)}) and the backup of "
+            f"the control ({_day(made)}), which shows {held.words}: it does not show what was on before; "
+            f"{how_to_state(case.job.name, case.measurement, 'VERSION|none')}"
+        )
+
+
+def how_to_show(case: Case) -> str:
+    """Tell a person how to show which tables were on."""
+    stem = sorted(names_of(case.measurement.name), key=len)[0]
+    return (
+        f"put a backup of the control that was made with the measurement beside it, as {stem}.backup.EXT, or `volcomp recal "
+        f"run {case.job.name} --backup FILE`"
+    )
 
 
 # --- what files, persons and the time say -----------------------------------------------------------------------------
@@ -310,7 +514,7 @@ def judge_likeness(judgement: Judgement, case: Case, new: tuple[ErrorTable, Cova
     The change is relative to the errors behind the active tables, or the last active ones; it is compared with what
     each version that is or was active adds.
     """
-    machine, taken = case.machine, case.version_taken
+    machine = case.machine
     were_active, last = _were_active(case)
     if last is None:
         return
@@ -323,13 +527,108 @@ def judge_likeness(judgement: Judgement, case: Case, new: tuple[ErrorTable, Cova
     if found is None:
         return
     judgement.figures["likeness"] = found.summary()
-    assumed = "no tables were" if taken is None else f"version {taken} was"
+    assumed = _was(case.on.words)
     seems, what = ("was on", "what") if found.sign > 0 else ("was off", "the opposite of what")
     version = f"v{found.field.split()[1]}" if found.sign > 0 else "none"
     judgement.hold.append(
         f"the machine seems to have changed by {what} {found.field} adds ({found.words()}): as if {found.field} {seems} "
         f"while the machine was measured, but the evaluation assumed that {assumed} on; "
         f"{how_to_state(case.job.name, case.measurement, version)}; if the machine has really changed, approve with --override"
+    )
+
+
+def judge_states(judgement: Judgement, case: Case, new: tuple[ErrorTable, Covariance | None]) -> None:
+    """Hold if tables in another state than assumed explain the change of the errors, or nothing but a jump does.
+
+    The states are each version, and its usual distortions as a whole and in its single tables, each together with what the
+    machine repeats and drifts, or a jump. Without a backup of the control a jump is not believed: what was on may be a state
+    that is not in the list, such as edited tables. A backup is believed unless the data contradict it.
+    """
+    versions, last = _were_active(case)
+    if last is None:
+        return
+    old_errors = case.store.errors_of(last)
+    if set(old_errors.names) != set(new[0].names):
+        return
+    states = possible_states(case.machine, versions, volume_points(case.machine))
+    removed = np.zeros_like(states[0].field_mm)
+    if case.on.tables is not None:
+        removed = case.on.tables.mean_correction(case.machine, volume_points(case.machine))
+    others = [item for item in states if rms(np.linalg.norm(item.field_mm - removed, axis=1)) > HARMLESS_MM]
+    assumed = BELIEVED if case.on.by_evidence else ASSUMED
+    extra = np.array([np.zeros_like(removed), *(item.field_mm - removed for item in others)])
+    share = {
+        kind: (1.0 - assumed) * STATES[kind] / sum(item.kind == kind for item in others)
+        for kind in {item.kind for item in others}
+    }
+    prior = np.array([assumed, *(share[item.kind] for item in others)])
+    old = (old_errors, case.store.covariance_of(last))
+    found = explained(case.machine, new, old, extra, prior, _drift_sizes(case, last))
+    likeliest = _likeliest(case, others, found)
+    judgement.figures["tables_on"] |= {
+        "change_um": found.rms_um,
+        "drift_um": found.drift_um,
+        "assumed_and_drift": float(found.without_jump[0]),
+        "hypotheses": [{"tables": words, "probability": share} for words, share in likeliest],
+    }
+    listed = "; ".join(f"{words}: {_percent(share)}" for words, share in likeliest)
+    contradicted = float(np.sum(found.without_jump[1:])) > CONTRADICTED
+    if contradicted if case.on.by_evidence else found.probability[0] < CERTAIN:
+        what = (
+            "contradict the backup of the control"
+            if case.on.by_evidence
+            else f"do not fit that {_was(case.on.words)} on"
+        )
+        judgement.hold.append(
+            f"the readings {what}: the machine seems to have changed by {found.rms_um:.1f} um rms; what explains it: {listed}; "
+            f"{how_to_show(case)}; if the machine has really changed, approve with --override"
+        )
+    elif found.without_jump[0] < CERTAIN and _needs_evidence(case):
+        judgement.hold.append(
+            f"the machine seems to have changed by {found.rms_um:.1f} um rms, more than drift explains (about "
+            f"{found.drift_um:.1f} um), and no backup of the control shows which tables were on; what explains it: "
+            f"{listed}; {how_to_show(case)}; if the machine has really changed, approve with --override"
+        )
+
+
+def _needs_evidence(case: Case) -> bool:
+    """Whether the tables that were on are taken from the history or the file alone, on a machine measured with tables on."""
+    return case.job.measured_with == "active" and not case.on.by_evidence and not case.by_person
+
+
+def _likeliest(case: Case, others: Sequence[TableState], found: Explanations) -> list[tuple[str, float]]:
+    """The states with the highest probabilities, in words: of what was assumed, with and without a jump of the machine."""
+    drift, total = float(found.without_jump[0]), float(found.probability[0])
+    known = [
+        (f"{case.on.words} as assumed, and drift", drift),
+        (f"{case.on.words} as assumed, and a jump of the machine", total - drift),
+    ]
+    known += [(item.words, float(share)) for item, share in zip(others, found.probability[1:], strict=True)]
+    known.sort(key=lambda item: -item[1])
+    return [item for item in known[:MOST_NAMED] if item[1] >= LEAST_NAMED]
+
+
+def _percent(share: float) -> str:
+    """Write a probability.
+
+    >>> _percent(0.123), _percent(0.9994), _percent(1.0)
+    ('12 %', 'over 99 %', 'over 99 %')
+    """
+    return f"{100.0 * share:.2g} %" if share < 0.995 else "over 99 %"
+
+
+def _drift_sizes(case: Case, last: IdentificationRecord) -> DriftSizes:
+    """What the machine may drift since the errors that the change is relative to."""
+    days = abs(case.measurement.measured_at - last.measured_at) / timedelta(days=1)
+    measured = {item.id: item for item in case.past.measurements}
+    kelvin = None
+    if last.measurement_id in measured:
+        now, then = (
+            axis_temperatures(item.temperatures_c) for item in (case.measurement, measured[last.measurement_id])
+        )
+        kelvin = None if now is None or then is None else now - then
+    return DriftSizes.between(
+        case.machine, days, kelvin, corrected=case.job.identify.get("temperature", True) is not False
     )
 
 

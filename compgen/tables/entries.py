@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from decimal import Decimal
 from functools import cached_property
@@ -182,6 +182,38 @@ def _with_number(item: Any, here: str, place: str, index: int, step: float) -> A
         _with_number(value, part, place, index, step) if _within(place, part) else value
         for value, part in zip(item, parts, strict=True)
     )
+
+
+def with_factor(tables: Any, places: Container[str], factor: float) -> Any:
+    """Return tables in which all numbers at these places (of :func:`numbers_of`) are multiplied; whole numbers are rounded."""
+    return _with_factor(tables, "", places, factor)
+
+
+def _with_factor(item: Any, here: str, places: Container[str], factor: float) -> Any:
+    if isinstance(item, np.ndarray):
+        if here not in places:
+            return item
+        return np.rint(factor * item).astype(item.dtype) if item.dtype.kind in "iu" else factor * item
+    if isinstance(item, int | float | Decimal | np.number):
+        if here not in places:
+            return item
+        whole = isinstance(item, int | np.integer)
+        return (
+            type(item)(factor) * item if isinstance(item, Decimal) else round(factor * item) if whole else factor * item
+        )
+    if is_dataclass(item) and not isinstance(item, type):
+        parts = {part.name: getattr(item, part.name) for part in fields(item) if part.compare and part.init}
+        changed = {name: _with_factor(value, f"{here}.{name}", places, factor) for name, value in parts.items()}
+        different = {name: value for name, value in changed.items() if value is not parts[name]}
+        return replace(item, **different) if different else item
+    if isinstance(item, Mapping):
+        made = {key: _with_factor(value, f"{here}[{key}]", places, factor) for key, value in item.items()}
+        return made if any(made[key] is not value for key, value in item.items()) else item
+    if isinstance(item, Sequence) and not isinstance(item, str | bytes):
+        listed = [_with_factor(value, f"{here}[{k}]", places, factor) for k, value in enumerate(item)]
+        same = all(new is old for new, old in zip(listed, item, strict=True))
+        return item if same else type(item)(listed)  # type: ignore[call-arg]
+    return item
 
 
 def _within(place: str, here: str) -> bool:

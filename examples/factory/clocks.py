@@ -172,7 +172,7 @@ def carried_out(name: str, folder: Path, seed: int = 1) -> Case:
     except StoreError as error:
         state, said = "stopped", str(error)
     left = year.factory.left_um(NAME, year.now, _tables(year, out / "active"))
-    new = sorted(year.job.machine(machine).out.glob("proposed/HELD-*"))
+    new = sorted(year.job.machine(machine).out.glob("proposed/[HN]*"))  # held, or not accepted
     would = year.factory.left_um(NAME, year.now, _tables(year, new[-1])) if new else None
     return Case(name, state, said, left, would, _bytes(out) == before)
 
@@ -185,7 +185,8 @@ def _bytes(out: Path) -> dict[str, bytes]:
 
 def _tables(year: Year, folder: Path):
     control = CONTROL[NAME]
-    return read_tables(year.factory.machine(NAME), [folder / "NC_CEC.INI"], control)
+    (path,) = folder.glob("*NC_CEC.INI")  # NOT-ACCEPTED-NC_CEC.INI if they are refused
+    return read_tables(year.factory.machine(NAME), [path], control)
 
 
 def main() -> None:

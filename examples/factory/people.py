@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from compgen.fleet import actions, decisions
 from compgen.fleet.job import Job
-from compgen.fleet.records import TableRecord
+from compgen.fleet.records import RESERVATION, TableRecord
 from compgen.fleet.store import Clock, open_store
 
 
@@ -21,11 +21,12 @@ def opinion(table: TableRecord, *, crashed: bool, has_tables: bool) -> Decision:
     """What Ada, who is in charge, decides about one proposed or held version."""
     if table.state == "pending":
         return Decision("approve", "ada", "")
-    reasons = " ".join(table.reasons)
-    limit_only = all("the correction changes by up to" in reason for reason in table.reasons)
+    held = [reason for reason in table.reasons if not reason.startswith(RESERVATION)]
+    reasons = " ".join(held)
+    limit_only = all("the correction changes by up to" in reason for reason in held)
     if crashed and limit_only:
         return Decision("override", "ada", "the crash of 20 June moved axis Y; a gauge block shows the same")
-    if not has_tables and "degC are allowed" in reasons and len(table.reasons) == 1:
+    if not has_tables and "degC are allowed" in reasons and len(held) == 1:
         return Decision("override", "ada", "first tables; the hall is cold, and none would be worse")
     if "days old" in reasons:
         return Decision("reject", "ada", "an old file")

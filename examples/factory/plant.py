@@ -221,7 +221,15 @@ class Factory:
         notes = {**lengths.metadata, **(true if says is None else says)}
         path = job.machine(name).inbox / f"{at:%Y-%m-%d}{part}.lengths.csv"
         path.write_text(format_lengths(replace(lengths, metadata=notes)))
+        if tables is not None and says is None:
+            self._back_up(job, name, path)
         return path
+
+    def _back_up(self, job: Job, name: str, path: Path) -> None:
+        """Put a backup of the control, which has loaded the active tables, beside a measurement."""
+        for file, _ in active_tables(job, name, self.machine(name)).files:
+            content = (job.machine(name).out / "active" / file).read_bytes()
+            (path.parent / f"{path.name.removesuffix('.lengths.csv')}.backup.{file}").write_bytes(content)
 
     def measure_deviations(self, job: Job, name: str, at: datetime, *, sign: float) -> Path:
         """Deviations of the bare machine at its nodes; with sign = -1 they are written the wrong way round."""

@@ -22,6 +22,9 @@ from compgen.fleet.publish import LEDGER
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import backup, open_store, restore
 
+#: A control without tables.
+NO_TABLES = "%_N_NC_CEC_INI\nCHANDATA(1)\nM17\n"
+
 
 @pytest.fixture(scope="session")
 def site_with_version_2(site_with_tables, tmp_path_factory, small_machine, small_machine_file, small_errors):  # noqa: F811
@@ -31,7 +34,7 @@ def site_with_version_2(site_with_tables, tmp_path_factory, small_machine, small
     made = site_in(folder, small_machine, small_machine_file, small_errors)
     made.now += timedelta(days=9)
     backup(made.job.store, folder / "old.sqlite")
-    made.measure("drift", drifted(small_errors, 40.0), on=made.on(), seed=2)
+    made.measure("drift", drifted(small_errors, 40.0), on=made.on(), seed=2, shown=True)
     assert made.run().active == 2
     return folder
 
@@ -123,6 +126,7 @@ def test_an_older_backup_that_went_on_is_recognised_by_the_contents(second, list
     (second.folder / "elsewhere/active").unlink()
     (second.inbox / "drift.deviations.csv").unlink()
     second.measure("other", drifted(small_errors, 90.0), seed=5, active_table="none")
+    (second.inbox / "other.backup.INI").write_text(NO_TABLES)
     second.job = read_job(second.folder / "recal.toml")
     assert second.run().active == 2
     (second.folder / "recal.toml").write_text(text)
@@ -211,7 +215,7 @@ def test_what_others_put_below_proposed_stays(second, small_errors):
     theirs.mkdir(parents=True)
     (theirs / "keep.txt").write_text("mine")
     second.write(approval="manual")
-    second.measure("a", drifted(small_errors, 80.0), on=second.on(), seed=4)
+    second.measure("a", drifted(small_errors, 80.0), on=second.on(), seed=4, shown=True)
     second.run()
     (second.out / "proposed/v0003/remarks.txt").write_text("looks good")
     (second.out / "proposed/v0003/NC_CEC.INI").write_text("edited by hand")

@@ -400,6 +400,7 @@ class Proposal:
     measurement: MeasurementRecord | None
     change: Mapping[str, Any]
     likeness: Mapping[str, Any]
+    evidence: Mapping[str, Any]
     comparisons: Sequence[VolumeComparison]
     squareness: Sequence[ErrorComparison]
     curves: Sequence[Chart]
@@ -427,6 +428,7 @@ def proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table:
         measured[0] if measured else None,
         _mapping(table.summary.get("change")),
         _mapping(table.summary.get("likeness")),
+        _mapping(table.summary.get("evidence")),
         comparisons(table),
         _squareness(now, before),
         _curves(now, before),
