@@ -264,6 +264,7 @@ def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
     Example:
       volcomp recal status --json
     """
+    from compgen.fleet.records import WITHOUT_PRIOR
     from compgen.fleet.status import status
 
     found = opened(job, lambda store: status(store, job, machines))
@@ -275,7 +276,11 @@ def status_command(machines: tuple[str, ...], job: Job, as_json: bool) -> int:
         (
             item.machine,
             item.state,
-            "-" if item.active is None else str(item.active),
+            "-"
+            if item.active is None
+            else f"{item.active} ({WITHOUT_PRIOR})"
+            if item.without_prior
+            else str(item.active),
             ", ".join(map(str, item.waiting)) or "-",
             item.last_measured or "-",
             item.schedule or "-",

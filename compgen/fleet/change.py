@@ -17,7 +17,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.fleet.decisions import excluded
-from compgen.fleet.records import AFTER, IdentificationRecord, MachineRecord, TableRecord
+from compgen.fleet.records import AFTER, WITHOUT_PRIOR, IdentificationRecord, MachineRecord, TableRecord, comparable
 from compgen.fleet.store import Store, at_one_moment, counting
 from compgen.identify.covariance import (
     Covariance,
@@ -323,9 +323,10 @@ class Aligned:
 def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibration], list[int], Machine]:
     """Return the calibrations of a machine with known uncertainty, their identification ids, and the newest machine file.
 
-    Calibrations that a person excluded are left out. InputError if there are none.
+    Left out are calibrations that a person excluded, and those whose uncertainty is another one than that of the newest
+    (:func:`compgen.fleet.records.comparable`). InputError if there are none.
     """
-    left_out, records = excluded(store, machine), counting(store, machine)
+    left_out, records = {*excluded(store, machine), *with_other_prior(store, machine)}, counting(store, machine)
     measured = {item.id: item for item in store.measurements(machine)}
     found, ids = [], []
     for record in records:
@@ -341,6 +342,20 @@ def calibrations_of(store: Store, machine: MachineRecord) -> tuple[list[Calibrat
     return found, ids, store.machine_of(newest)
 
 
+def with_other_prior(store: Store, machine: MachineRecord) -> dict[int, str]:
+    """Return the measurements whose uncertainties cannot be compared with those of the newest, and why, by id."""
+    left_out = excluded(store, machine)
+    records = [item for item in counting(store, machine) if item.measurement_id not in left_out]
+    again = f"`volcomp recal reprocess {machine.name} --measurement {{}} --reason TEXT` identifies it again"
+    words = {True: f"{WITHOUT_PRIOR}, the newest with one", False: "with a prior, the newest without"}
+    return {
+        item.measurement_id: f"the measurement of {item.measured_at:%Y-%m-%d} is left out: it was identified "
+        f"{words[item.without_prior]}; {again.format(item.measurement_id)}"
+        for item in records
+        if not comparable(item.summary, records[-1].summary)
+    }
+
+
 def mean_temperatures(channels: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Return the mean of each channel, degC."""
     return {name: float(figures["mean"]) for name, figures in channels.items()}
@@ -353,12 +368,13 @@ def calibrations_before(
     tables: Sequence[TableRecord],
     active: IdentificationRecord,
     new: Calibration,
+    figures: Mapping[str, Any],
 ) -> tuple[list[Calibration], list[int]]:
     """Return what a new calibration is compared with: those before it, oldest first, and which state each is of.
 
     The last state is that of the active tables, which begins with the calibration behind them; every version that became
     active began a new one. Left out are calibrations that a person excluded, that were held back because it was doubtful
-    what they show, or that show fewer errors.
+    what they show, that show fewer errors, or whose uncertainty is another one than that of the new, by its ``figures``.
     """
     left_out, measured = excluded(store, machine), store.measured(machine)
     doubted = {t.identification_id for t in tables if not t.summary.get(SOUND, "likeness" not in t.summary)}
@@ -379,7 +395,8 @@ def calibrations_before(
     for record, state in zip(records, states, strict=True):
         errors = store.errors_of(record)
         covariance = covariance_or_independent(errors, store.covariance_of(record))
-        if covariance is not None and {*new.errors.names} <= {*errors.names}:
+        shows_all = {*new.errors.names} <= {*errors.names}
+        if covariance is not None and shows_all and comparable(record.summary, figures):
             means = mean_temperatures(logged[record.measurement_id])
             found.append(Calibration(record.measured_at, errors, covariance, means))
             kept.append(state)
@@ -551,7 +568,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 # with the repeatability s0 (:mod:`compgen.data.repeatability`; as if known from four degrees of freedom), and the sum of squares
 # SS of the calibrations before about their mean, with N degrees of freedom; earlier tables have means of their own. What the
 # other two scales, or squarenesses, tell of the repeatability is r = (4 + SS' / s0'^2) / (4 + N'), which counts as F = 4 + N',
-# at most 8, degrees of freedom: one of the three may repeat worse than the others. A scale
+# at most 10, degrees of freedom: one of the three may repeat worse than the others. A scale
 # that is corrected for its temperature T may have a wrong expansion coefficient: y = level + c (T - 20 degC), c normal with the
 # uncertainty of the coefficient, which is one more observation. The other shapes of the errors are compared as a field: the
 # sum of squares against that of the uncertainties, which the calibrations before scale (F-test).
@@ -560,7 +577,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 #: Degrees of freedom with which the repeatability counts as known.
 KNOWN_FROM = 4.0
 #: At most as many with the other directions of the same kind.
-KNOWN_FROM_OTHERS = 8.0
+KNOWN_FROM_OTHERS = 10.0
 #: Share of the error probability for the six directions; the rest is for all other shapes.
 FOR_DIRECTIONS = 0.75
 #: The last calibrations are averaged over up to so many; over up to the second number where the history is longer.

@@ -175,6 +175,9 @@ identifications = sa.Table(
     sa.Column("revision", sa.Integer, nullable=False, server_default=sa.text("1")),  # number of its identification
     sa.UniqueConstraint("measurement_id", "revision"),
 )
+#: Class of the prior of an identification; those of earlier programs have none.
+PRIOR_CLASS = identifications.c.summary[("prior", "class")].as_string().label("prior_class")
+NO_PRIOR = (None, "none")
 tables = sa.Table(
     "tables",
     metadata,

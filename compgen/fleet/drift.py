@@ -30,6 +30,7 @@ from compgen.fleet.change import (
     holm,
     volume_points,
     with_all_errors,
+    with_other_prior,
 )
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import MachineRecord, active_of
@@ -735,15 +736,20 @@ class Drift:
 
 def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings) -> Drift:
     """Return the drift of a machine in the store; the calibration behind its active tables is the reference."""
-    (history, ids, model), tables, left_out = store.together(
-        lambda: (calibrations_of(store, machine), store.tables(machine, figures=False), excluded(store, machine))
+    (history, ids, model), tables, left_out, other = store.together(
+        lambda: (
+            calibrations_of(store, machine),
+            store.tables(machine, figures=False),
+            excluded(store, machine),
+            with_other_prior(store, machine),
+        )
     )
     history, ids, fewer = with_all_errors(history, ids)
     active = active_of(tables)
     known = active is not None and active.identification_id in ids
     reference = ids.index(active.identification_id) if known and active is not None else 0
     found = drift_report(model, history, replace(settings, reference=reference), name=machine.name)
-    return replace(found, notes=(*found.notes, *fewer, *left_out.values()))
+    return replace(found, notes=(*found.notes, *fewer, *left_out.values(), *other.values()))
 
 
 def drift_report(

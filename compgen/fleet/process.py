@@ -46,6 +46,7 @@ from compgen.fleet.records import (
     NewResult,
     StoredTableFile,
     active_of,
+    comparable,
 )
 from compgen.fleet.store import Store, counting
 from compgen.fleet.tables_on import (
@@ -236,18 +237,24 @@ def _identified(result: RunResult) -> tuple[ErrorTable, Covariance | None]:
 
 def judge_change(judgement: Judgement, case: Case, result: RunResult, active: ActiveState) -> Change | None:
     """Compare with the calibrations since those behind the active tables: the change must exceed what the machine repeats."""
-    errors, covariance = _identified(result)
+    (errors, covariance), figures = _identified(result), result.identification.summary()
     new = covariance_or_independent(errors, covariance)
     old_errors = case.store.errors_of(active.identification)
     old = covariance_or_independent(old_errors, case.store.covariance_of(active.identification))
+    if not comparable(figures, active.identification.summary):
+        judgement.hold.append(_other_prior(case.job.name, active))
+        return None
     if new is None or old is None:
         judgement.hold.append("the uncertainty of the errors is not known, so the change cannot be judged")
         return None
     measured, confidence = case.measurement, case.job.policy.confidence
     calibration = Calibration(measured.measured_at, errors, new, mean_temperatures(measured.temperatures_c))
-    known, levels = calibrations_before(case.store, case.record, case.past.tables, active.identification, calibration)
+    known, levels = calibrations_before(
+        case.store, case.record, case.past.tables, active.identification, calibration, figures
+    )
     corrected, machine = case.job.identify.get("temperature", True) is not False, case.machine
-    if measured.measured_at < active.identification.measured_at:  # held for that: the history is of later times
+    # held for its age, as the history is of later times; or it shows more errors than were known before
+    if measured.measured_at < active.identification.measured_at or STATE_NOW not in levels:
         change = change_between(machine, (errors, new), (old_errors, old), confidence)
     else:
         change = change_since(machine, [*known, calibration], [*levels, STATE_NOW], confidence, corrected=corrected)
@@ -260,6 +267,17 @@ def judge_change(judgement: Judgement, case: Case, result: RunResult, active: Ac
             + (f"; most significant: {change.largest}" if change.largest else "")
         )
     return change
+
+
+def _other_prior(name: str, active: ActiveState) -> str:
+    """Say that uncertainties with and without a prior are not compared, and what to do."""
+    without, record = active.identification.without_prior, active.identification
+    return (
+        f"the errors behind version {active.version} were identified {'without a' if without else 'with a'} prior, and these "
+        f"{'with one' if without else 'without'}: the uncertainties cannot be compared, so the change cannot be judged; "
+        f"`volcomp recal reprocess {name} --measurement {record.measurement_id} --reason TEXT` identifies the earlier "
+        "measurement again, and `volcomp recal approve --override` accepts either version"
+    )
 
 
 def judge_tables(

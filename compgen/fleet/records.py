@@ -99,6 +99,11 @@ class IdentificationRecord:
     measured_at: datetime
     revision: int = 1
 
+    @property
+    def without_prior(self) -> bool:
+        """Whether its uncertainties have nothing of errors that were not measured (:func:`has_prior`)."""
+        return not has_prior(self.summary)
+
 
 @dataclass(frozen=True)
 class TableRecord:
@@ -222,6 +227,33 @@ class NewResult:
     reason: str = ""
     reservations: Sequence[str] = ()
     evidence: str = ""
+
+
+#: Mark of what was identified without a prior.
+WITHOUT_PRIOR = "without prior"
+
+
+def has_prior(figures: Mapping[str, Any]) -> bool:
+    """Whether an identification, by its figures, had a prior: not one of an earlier program, nor of class none.
+
+    >>> has_prior({"prior": {"class": "general"}}), has_prior({"prior": {"class": "none"}}), has_prior({})
+    (True, False, False)
+    """
+    prior = figures.get("prior")
+    return isinstance(prior, Mapping) and prior.get("class", "none") != "none"
+
+
+def comparable(first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+    """Whether the uncertainties of two identifications, by their figures, may be compared.
+
+    Both have a prior, or neither; or the readings alone determine what the one with the prior found, and the other found
+    it as well.
+    """
+    if has_prior(first) == has_prior(second):
+        return True
+    known, other = (first, second) if has_prior(first) else (second, first)
+    found = {*known.get("identified", ())}
+    return bool(found) and found <= {*known.get("determined", ())} and found <= {*other.get("identified", ())}
 
 
 def reservations_of(reasons: Sequence[str]) -> list[str]:

@@ -37,7 +37,7 @@ class MachineStatus:
     """Status of one machine; times are ISO texts in UTC.
 
     ``state``: "new" (not measured yet), "ok", "waiting" (for a person's decision), "held" (the newest tables are held
-    back or refused) or "failed" (the last attempt failed).
+    back or refused) or "failed" (the last attempt failed). ``without_prior``: so were the active tables made.
     """
 
     machine: str
@@ -49,6 +49,7 @@ class MachineStatus:
     last_measured: str | None
     message: str
     schedule: str
+    without_prior: bool = False
 
     def summary(self) -> dict[str, Any]:
         """Return the fields by name."""
@@ -81,7 +82,7 @@ def status(store: Store, job: Job, names: Sequence[str] = ()) -> list[MachineSta
     tables = _grouped(store.tables(one, figures=False))
     measured = _grouped(store.measurements(one))
     attempts = _grouped(store.attempts(one))
-    decided = _grouped(store.decisions(one))
+    decided, unknown = _grouped(store.decisions(one)), store.without_prior(one)
     found = []
     for item in chosen:
         machine = known.get(item.name)
@@ -104,6 +105,7 @@ def status(store: Store, job: Job, names: Sequence[str] = ()) -> list[MachineSta
                 last_measured=_iso(max(times)) if times else None,
                 message=message,
                 schedule=schedule_text(item.schedule),
+                without_prior=active is not None and active.identification_id in unknown,
             )
         )
     return found
@@ -202,7 +204,7 @@ class FleetRow:
 
     ``waiting``: versions that wait for a person, newest first; ``pending``: whether one of them is not held back;
     ``newest``: state of the newest version; ``failure``: why the last attempt failed, if it did; ``reserved``: whether
-    the verdict on the active tables has reservations.
+    the verdict on the active tables has reservations; ``without_prior``: whether they were made without a prior.
     """
 
     machine: MachineRecord
@@ -215,6 +217,7 @@ class FleetRow:
     measurements: int
     failure: str
     reserved: bool = False
+    without_prior: bool = False
 
     @property
     def status(self) -> str:
@@ -276,7 +279,8 @@ def _row(
     versions = sorted((row.version for row in waiting), reverse=True)
     pending = any(AFTER[row.kind] == "pending" for row in waiting)
     reserved = version is not None and bool(reservations_of(active.reasons))
-    return FleetRow(machine, version, since, versions, pending, newest, *measured, failure, reserved)
+    unknown = version is not None and active.prior_class in database.NO_PRIOR
+    return FleetRow(machine, version, since, versions, pending, newest, *measured, failure, reserved, unknown)
 
 
 def _queries() -> dict[str, sa.Select[Any]]:
@@ -321,8 +325,10 @@ def _active(newest: sa.Subquery) -> sa.Select[Any]:
     kinds = [kind for kind, after in AFTER.items() if after == "active"]
     last = _newest_decisions(decisions.c.kind.in_(kinds), [decisions.c.machine_id])
     top = newest.c.version.label("newest")
-    query = sa.select(decisions.c.machine_id, tables.c.version, decisions.c.at, tables.c.reasons, top)
-    query = query.select_from(last.outerjoin(tables, tables.c.id == decisions.c.table_id))
+    columns = (decisions.c.machine_id, tables.c.version, decisions.c.at, tables.c.reasons, database.PRIOR_CLASS, top)
+    of_table = last.outerjoin(tables, tables.c.id == decisions.c.table_id)
+    found = database.identifications
+    query = sa.select(*columns).select_from(of_table.outerjoin(found, found.c.id == tables.c.identification_id))
     return query.outerjoin(newest, newest.c.machine_id == decisions.c.machine_id)
 
 

@@ -59,6 +59,7 @@ _together: ContextVar[tuple[Store, sa.Connection, dict[Any, Any]] | None] = Cont
 
 _MACHINE = sa.select(database.machines).where(database.machines.c.name == sa.bindparam("name"))
 _BLOB = sa.select(database.blobs.c.deflated).where(database.blobs.c.sha256 == sa.bindparam("sha256"))
+_PRIORS: sa.Select[Any] = sa.select(database.identifications.c.id, database.PRIOR_CLASS)
 _ATTEMPTS: sa.Select[Any] = sa.select(database.attempts).order_by(database.attempts.c.id)
 _EVENTS: sa.Select[Any] = sa.select(database.events).order_by(database.events.c.id)
 _DECISIONS: sa.Select[Any] = sa.select(database.decisions).order_by(
@@ -357,6 +358,14 @@ class Store:
         rows = self._of_machine(_IDENTIFICATIONS, database.identifications, machine)
         found = [IdentificationRecord(**row._mapping) for row in rows]
         return sorted(found, key=lambda item: (item.measured_at, item.id))
+
+    def without_prior(self, machine: MachineRecord | None = None) -> set[int]:
+        """Return the ids of identifications without a prior (:func:`compgen.fleet.records.has_prior`)."""
+        return {
+            key
+            for key, name in self._of_machine(_PRIORS, database.identifications, machine)
+            if name in database.NO_PRIOR
+        }
 
     def identification(self, identification_id: int) -> IdentificationRecord:
         """Return the identified errors with this id."""

@@ -73,8 +73,8 @@ def test_other_directions_tell_how_the_machine_repeats():
     p_value, size, variance = compared([1, 2, 3, 7], others=([0, 1, 2, 0], [0, 0, 3, 9]))
     assert (size, variance) == (pytest.approx(5.0), pytest.approx(1.4))
     assert p_value == pytest.approx(2.0 * stats.t.sf(5.0 / np.sqrt(1.4 * 4.0 / 3.0), 10))
-    longer = [0, 1, 0, 1, 0, 1, 0, 1, 4]  # N' = 14: no more than 8; r = (4 + 2 * 2) / 18, SS = 2
-    assert compared(longer, others=(longer, longer))[2] == pytest.approx((8.0 * 8.0 / 18.0 + 2.0) / (8.0 + 7.0))
+    longer = [0, 1, 0, 1, 0, 1, 0, 1, 4]  # N' = 14: no more than 10; r = (4 + 2 * 2) / 18, SS = 2
+    assert compared(longer, others=(longer, longer))[2] == pytest.approx((10.0 * 8.0 / 18.0 + 2.0) / (10.0 + 7.0))
 
 
 def test_a_coefficient_that_is_known_exactly_changes_nothing_and_an_unknown_one_explains_the_warmth():

@@ -29,6 +29,7 @@ from compgen.fleet.records import (
     StoredTableFile,
     TableRecord,
     active_of,
+    comparable,
 )
 from compgen.fleet.store import Store, at_one_moment, counting
 
@@ -180,7 +181,10 @@ class ErrorHistory:
 
 @dataclass(frozen=True)
 class History:
-    """Everything that a machine's page shows, newest first; charts run from old to new."""
+    """Everything that a machine's page shows, newest first; charts run from old to new.
+
+    ``without_prior``: identifications that had none.
+    """
 
     machine: MachineRecord
     active: TableRecord | None
@@ -192,6 +196,7 @@ class History:
     trends: Sequence[ErrorHistory]
     temperature: Chart | None
     versions: Mapping[int, int]
+    without_prior: Collection[int] = ()
 
     @property
     def open(self) -> list[TableRecord]:
@@ -221,6 +226,7 @@ def history(store: Store, errors_of: ErrorCache, machine: MachineRecord) -> Hist
         trends(errors_of, counting(store, machine)[-CHARTED:], set(excluded(store, machine))),
         _temperatures(measurements[-CHARTED:]),
         {table.id: table.version for table in tables},
+        store.without_prior(machine),
     )
 
 
@@ -371,13 +377,16 @@ class FileView:
 
 @dataclass(frozen=True)
 class ErrorComparison:
-    """One error, as identified now and for the active tables, in ``unit``; ``expanded`` belongs to the change."""
+    """One error, as identified now and for the active tables, in ``unit``.
+
+    ``expanded`` belongs to the change; None if one was identified with a prior and the other without.
+    """
 
     name: str
     unit: str
     now: float
     before: float | None
-    expanded: float
+    expanded: float | None
 
     @property
     def change(self) -> float | None:
@@ -387,7 +396,7 @@ class ErrorComparison:
     @property
     def significant(self) -> bool:
         """Whether the change exceeds its expanded uncertainty."""
-        return self.change is not None and abs(self.change) > self.expanded
+        return self.change is not None and self.expanded is not None and abs(self.change) > self.expanded
 
 
 @dataclass(frozen=True)
@@ -406,6 +415,7 @@ class Proposal:
     curves: Sequence[Chart]
     files: Sequence[FileView]
     decisions: Sequence[DecisionRecord]
+    without_prior: bool = False
 
 
 def find_table(store: Store, machine: MachineRecord, version: int) -> TableRecord | None:
@@ -430,10 +440,11 @@ def proposal(store: Store, errors_of: ErrorCache, machine: MachineRecord, table:
         _mapping(table.summary.get("likeness")),
         _mapping(table.summary.get("evidence")),
         comparisons(table),
-        _squareness(now, before),
+        _squareness(now, before, alike=behind is None or comparable(identification.summary, behind.summary)),
         _curves(now, before),
         file_views(store, table, active),
         [item for item in store.decisions(machine) if item.table_id == table.id],
+        identification.without_prior,
     )
 
 
@@ -480,12 +491,13 @@ def _number(value: Any) -> float | None:
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _squareness(now: ErrorTable, before: ErrorTable | None) -> list[ErrorComparison]:
+def _squareness(now: ErrorTable, before: ErrorTable | None, *, alike: bool) -> list[ErrorComparison]:
+    """Compare the squareness errors; without the uncertainty of the change where the two are not ``alike``."""
     found = []
     for name, (value, u) in now.squareness.items():
         error = error_named(name)
         old, old_u = (None, 0.0) if before is None else before.squareness.get(name, (None, 0.0))
-        expanded = COVERAGE * float(np.hypot(u, old_u)) / error.si_per_unit
+        expanded = COVERAGE * float(np.hypot(u, old_u)) / error.si_per_unit if alike or old is None else None
         old = None if old is None else old / error.si_per_unit
         found.append(ErrorComparison(name, error.unit, value / error.si_per_unit, old, expanded))
     return found
