@@ -377,7 +377,9 @@ def identify_beside(
     InputError
         for a number that contradicts a measurement of the same, and for a reversal of which the sign is open.
     """
-    from compgen.identify import stated
+    if not (numbers.squareness or numbers.scale or numbers.backlash or isinstance(measurement, MixedMeasurement)):
+        return identify_bare(machine, measurement, options, active)
+    from compgen.identify import stated  # loaded only where it is needed
 
     if numbers.squareness or numbers.scale:
         alone = _measured_alone(machine, stated.without_stated(measurement), options, active)

@@ -209,6 +209,10 @@ RUN = Field("run", ("run",), CsvTable.labels, digits=0)
 RUN_DEVIATION = Field("deviation_mm", ("deviation_um",), deviations_um, MM_PER_UM, digits=4)
 
 
+#: Files with fewer rows are compared as they are written.
+FEW_ROWS = 5
+
+
 @dataclass(frozen=True)
 class Schema:
     """The fields of one kind of record.
@@ -264,6 +268,10 @@ class Schema:
                 if table.columns == earlier.columns:
                     what = f"contains the same rows as {earlier.path}; give each measurement only once"
                     raise InputError(what, file=table.path)
+                if len(table) == len(earlier) >= FEW_ROWS and _readings(table) == _readings(earlier):
+                    what = f"contains the same readings as {earlier.path}, under other run numbers, labels or times, in another "
+                    what += "order or written with other digits; give each measurement only once"
+                    raise InputError(what, file=table.path)
         return tables
 
     def values(self, table: CsvTable) -> dict[str, Any]:
@@ -301,6 +309,21 @@ class Schema:
             columns |= cells
             digits |= dict.fromkeys(cells, field.digits)
         return format_csv({**columns, **(others or {})}, metadata, digits | dict(decimals or {}))
+
+
+def _readings(table: CsvTable) -> list[tuple[str, ...]]:
+    """The rows of a file without numbers of runs, labels and times, in an order of their own."""
+    counted = {*LABEL_COLUMNS, "run", "time_s", "order"}
+    columns = [[_plain(cell) for cell in table.columns[name]] for name in sorted(set(table.columns) - counted)]
+    return sorted(zip(*columns, strict=True))
+
+
+def _plain(cell: str) -> str:
+    """A cell with its number, if it is one, in one way of writing."""
+    try:
+        return f"{float(cell):.9g}"
+    except ValueError:
+        return cell.strip()
 
 
 def _chained(parts: Sequence[object], name: str) -> list[Any]:

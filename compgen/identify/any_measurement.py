@@ -33,9 +33,6 @@ if TYPE_CHECKING:
     from compgen.identify.posterior import Posterior
     from compgen.identify.six_dof import SixDofMeasurement
 
-#: Deviations that are all smaller than this are refused: 100 um written in mm.
-SMALLEST_UM = 0.1
-
 
 OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | Circles | Artefact | SixDofMeasurement"
 
@@ -198,31 +195,36 @@ def _least_squares(machine: Machine, measurement: OneKind, chosen: IdentifyOptio
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
     from compgen.data.deviations import Artefact, Deviations
-    from compgen.identify.axis_tests import identify_axis_runs, identify_circles
+    from compgen.identify.axis_tests import check_ways, identify_axis_runs, identify_circles
     from compgen.identify.positions import identify_artefact, identify_deviations
     from compgen.identify.six_dof import identify_sixdof
+    from compgen.identify.slips import check_sizes
 
-    if isinstance(measurement, Deviations | AxisRuns) and not chosen.small_deviations:
-        # deviations that are all zero, or so small that their unit must be another one
-        measured = measurement.deviation_mm[np.isfinite(measurement.deviation_mm)]
-        largest_um = float(np.max(np.abs(measured), initial=0.0)) / MM_PER_UM
-        if largest_um < SMALLEST_UM:
-            message = "all deviations are zero; was nothing measured? Give the measured values"
-            if largest_um:
-                message = f"the largest deviation is {largest_um:.3g} um, too small for a machine tool; are the values "
-                message += "in mm, a thousand times too small for um? Give them in um"
-            file = measurement.origin[0][0] if measurement.origin else None
-            raise InputError(f"{message}, or add --small-deviations if they are right", file=file)
+    if isinstance(measurement, Deviations | AxisRuns | Circles) and not chosen.small_deviations:
+        check_sizes(measurement)
     _check_options(measurement, chosen)
     if isinstance(measurement, Deviations):
-        return identify_deviations(machine, measurement, chosen)
+        return _with_slips(identify_deviations(machine, measurement, chosen), measurement)
     if isinstance(measurement, Artefact):
         return identify_artefact(machine, measurement, chosen)
     if isinstance(measurement, AxisRuns):
-        return identify_axis_runs(machine, measurement)
+        return _with_slips(identify_axis_runs(machine, measurement), measurement)
     if isinstance(measurement, Circles):
-        return identify_circles(machine, measurement)
+        check_ways(machine, measurement)
+        return _with_slips(identify_circles(machine, measurement), measurement)
     return identify_sixdof(machine, measurement)
+
+
+def _with_slips(result: Identification, measurement: Deviations | AxisRuns | Circles) -> Identification:
+    """Return a result with objections to runs that disagree with the others in a pattern, and doubts about copies."""
+    from compgen.data.axis_runs import AxisRuns
+    from compgen.identify.slips import copies, patterns
+
+    found = patterns(measurement)
+    doubled = copies(measurement) if isinstance(measurement, AxisRuns) else ()
+    for text in (*found, *doubled):
+        warnings.warn(text, CompgenWarning, stacklevel=2)
+    return replace(result, objections=(*result.objections, *found), doubts=(*result.doubts, *doubled))
 
 
 def _check_options(measurement: OneKind, options: IdentifyOptions) -> None:

@@ -319,6 +319,58 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     )
 
 
+#: Comment of a file of circles: the axes do run ahead, the directions are right.
+AHEAD = "runs_ahead"
+
+
+def check_ways(machine: Machine, circles: Circles) -> None:
+    """Ask whether clockwise and counter-clockwise are exchanged, where every axis of a circle would run ahead at reversal.
+
+    Each file and plane is judged by itself. The comment ``# runs_ahead = true`` says that the axes do so.
+
+    Raises
+    ------
+    InputError
+        with the reversals that the file shows.
+    """
+    if circles.metadata.get(AHEAD, "").lower() == "true":
+        return
+    files = [str(file) for file, _ in circles.origin] or [""] * len(circles)
+    for file, plane in dict.fromkeys(zip(files, circles.plane.tolist(), strict=True)):
+        rows = np.flatnonzero((np.array(files) == file) & (circles.plane == plane))
+        ahead = _ahead(machine, circles.part(rows))
+        if len(ahead) < 2:
+            continue
+        shown = " and ".join(f"{AXES[axis]} {value / MM_PER_UM:+.3g} um" for axis, value in ahead.items())
+        first, second = list(PLANES)[plane]
+        raise InputError(
+            f"the reversals of {shown} in {first}{second} say that both axes run ahead; an axis with play stays behind. Are "
+            f"clockwise and counter-clockwise exchanged? 1 is counter-clockwise, from +{first} to +{second}: exchange 1 and -1 "
+            "in the column direction, or, if the axes do run ahead (too much backlash compensation), add the comment "
+            f"'# {AHEAD} = true'",
+            file=file or None,
+            field="column direction",
+        )
+
+
+def _ahead(machine: Machine, circles: Circles) -> dict[int, float]:
+    """Reversals by axis, mm, if all that are beyond their uncertainty are positive; empty otherwise."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)  # said when the circles are identified
+        columns = _columns(machine, circles, circle_positions(machine, circles))
+    try:
+        solution = _Solution.of(circles, columns)
+    except UndeterminedError:
+        return {}
+    found = {
+        int(column.key): float(solution.value[k])
+        for k, column in enumerate(columns)
+        if column.kind == "reversal" and solution.shown[k]
+        and abs(solution.value[k]) > max(SIGNIFICANT * solution.u[k], WORTH_MM)
+    }  # fmt: skip
+    return found if all(value > 0.0 for value in found.values()) else {}
+
+
 def circle_observations(
     machine: Machine, layout: ErrorParameters, circles: Circles, found: Identification
 ) -> Observations:

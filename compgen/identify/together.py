@@ -754,6 +754,7 @@ def _common(parts: Sequence[Source], known: Sequence[Identification]) -> Identif
         systematic=None,
         steps={},
         objections=tuple(dict.fromkeys(chain.from_iterable(result.objections for result in known))),
+        doubts=tuple(dict.fromkeys(chain.from_iterable(result.doubts for result in known))),
         misfit=next((result.misfit for result in known if result.misfit is not None and result.misfit.beyond), None),
     )
 
