@@ -10,6 +10,7 @@ each axis, with factors that are common mistakes.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -116,7 +117,7 @@ def _read(machine: Machine, control: str, files: Mapping[str, bytes]) -> ReadTab
         for name, content in files.items():
             path = Path(folder) / backup_part(name)
             if path.name not in ("manifest.json", "preflight.md"):
-                path.write_bytes(content)
+                path.write_bytes(content.removeprefix(codecs.BOM_UTF8))  # editors add it
                 paths.append(path)
         try:
             return read_tables(machine, paths, control, foreign=True)

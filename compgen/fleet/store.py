@@ -14,7 +14,7 @@ import shutil
 import sqlite3
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from contextvars import ContextVar
 from copy import copy
@@ -306,6 +306,16 @@ class Store:
         """Return the measurement from which a machine's set of tables was made."""
         behind = self.measured(machine)[table.identification_id]
         return next(item for item in self.measurements(machine) if item.id == behind)
+
+    def same_tables_of_others(self, machine: MachineRecord, digests: Collection[str]) -> list[tuple[str, int]]:
+        """Return (machine, version) of tables of other machines with files of these SHA-256 that no tables of this one have."""
+        files, tables = database.table_files, database.tables
+        query = sa.select(files.c.sha256, tables.c.machine_id, database.machines.c.name, tables.c.version)
+        query = query.join(tables, tables.c.id == files.c.table_id)
+        query = query.join(database.machines, database.machines.c.id == tables.c.machine_id)
+        rows = self._rows(query.where(files.c.sha256.in_(set(digests))).order_by(tables.c.id))
+        own = {row.sha256 for row in rows if row.machine_id == machine.id}
+        return [(row.name, row.version) for row in rows if row.sha256 not in own and row.machine_id != machine.id]
 
     def same_files_of_others(self, machine: MachineRecord, measurement: MeasurementRecord) -> list[tuple[str, str]]:
         """Return (machine, measurement in words) of other machines that also received one of the measurement's files.

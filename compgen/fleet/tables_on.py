@@ -60,11 +60,12 @@ DAYLIGHT_SAVING = timedelta(hours=1)
 STATED = "active_table_stated"
 #: Prior probability that the tables were as the history, the file or a person says, and as a backup shows.
 ASSUMED, BELIEVED = 0.97, 0.999
+#: Prior probability that a backup which shows another stored version than the history says is an old file.
+MISFILED = 0.05
 #: The rest: none were on, another version, a version times a factor, single tables or an axis of a version.
 STATES = {"none": 0.2, "version": 0.3, "factor": 0.2, "part": 0.3}
-#: Tables are held if what is assumed is less probable than this; with a backup, if states that explain the change by drift
-#: alone are together more probable than the second.
-CERTAIN, CONTRADICTED = 0.9, 0.5
+#: Tables are held if what is assumed is less probable than the first, what a backup shows than the second.
+CERTAIN, BELIEVABLE = 0.9, 0.5
 #: States that differ by less over the volume do no harm, mm rms.
 HARMLESS_MM = 0.25 * MM_PER_UM
 #: At most so many explanations are named, and only these, with their probabilities.
@@ -307,6 +308,7 @@ def _judge_backup(judgement: Judgement, case: Case) -> None:
             )
         return
     held, assumed = case.held, case.on.words
+    _judge_owner(judgement, case)
     judgement.figures["evidence"] = {
         "files": files, "source": getattr(case.evidence, "source", ""), "tables": held.words, "version": held.version
     }  # fmt: skip
@@ -329,6 +331,17 @@ def _judge_backup(judgement: Judgement, case: Case) -> None:
         judgement.reservations.append(
             f"{RESERVATION}the backup of the control shows {held.words}, but by the history {_named(expected)} should have been "
             "on: load the right tables"
+        )
+
+
+def _judge_owner(judgement: Judgement, case: Case) -> None:
+    """Hold if the backup has files of another machine: with no history, no reading contradicts it."""
+    assert case.evidence is not None
+    found = case.store.same_tables_of_others(case.record, [digest for _, digest, _ in case.evidence.files])
+    if found:
+        others = ", ".join(dict.fromkeys(f"{name} (version {version})" for name, version in found))
+        judgement.hold.append(
+            f"the backup of the control ({case.evidence.names}) has files of {others}: make one of the control of {case.job.name}"
         )
 
 
@@ -549,6 +562,11 @@ def judge_states(judgement: Judgement, case: Case, new: tuple[ErrorTable, Covari
         return
     old_errors = case.store.errors_of(last)
     if set(old_errors.names) != set(new[0].names):
+        if _needs_evidence(case) and set(old_errors.names) < set(new[0].names):
+            judgement.hold.append(
+                "more errors were measured than for the tables that were active last, so the change of the machine does not show "
+                f"which tables were on; {how_to_show(case)}; or approve with --override"
+            )
         return
     states = possible_states(case.machine, versions, volume_points(case.machine))
     removed = np.zeros_like(states[0].field_mm)
@@ -562,6 +580,10 @@ def judge_states(judgement: Judgement, case: Case, new: tuple[ErrorTable, Covari
         for kind in {item.kind for item in others}
     }
     prior = np.array([assumed, *(share[item.kind] for item in others)])
+    if case.on.by_evidence and (case.on.tables is None or case.taken is not None):
+        expected = _expected(case)
+        usual = [item.kind in ("none", "version") and item.words == _named(expected) for item in others]
+        prior[1:][usual] = MISFILED
     old = (old_errors, case.store.covariance_of(last))
     found = explained(case.machine, new, old, extra, prior, _drift_sizes(case, last))
     likeliest = _likeliest(case, others, found)
@@ -572,8 +594,7 @@ def judge_states(judgement: Judgement, case: Case, new: tuple[ErrorTable, Covari
         "hypotheses": [{"tables": words, "probability": share} for words, share in likeliest],
     }
     listed = "; ".join(f"{words}: {_percent(share)}" for words, share in likeliest)
-    contradicted = float(np.sum(found.without_jump[1:])) > CONTRADICTED
-    if contradicted if case.on.by_evidence else found.probability[0] < CERTAIN:
+    if found.probability[0] < (BELIEVABLE if case.on.by_evidence else CERTAIN):
         what = (
             "contradict the backup of the control"
             if case.on.by_evidence

@@ -22,6 +22,7 @@ from compgen.fleet import actions
 from compgen.fleet.inbox import backup_part, is_backup, names_of
 from compgen.fleet.job import read_job
 from compgen.fleet.records import ReprocessRequest
+from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
 from compgen.tables import read_tables
 
@@ -476,6 +477,91 @@ def test_data_that_contradict_the_backup_wait(at, small_errors):
     site.put("third", changed(small_errors, 1.2), None, site.files(2), seed=3)
     assert site.run().state == "held"
     assert "the readings contradict the backup of the control" in " ".join(site.tables()[-1].reasons)
+
+
+@pytest.mark.parametrize(("on", "shown"), [(2, 1), (1, 2), (None, 1)])
+@pytest.mark.parametrize("control", ["siemens-cec", "isg-csv"])
+def test_a_backup_of_another_version_than_was_on_waits(at, small_errors, control, on, shown):
+    """An old file, or one that was copied and never loaded; the machine has drifted twice as far as usual."""
+    site = at(control)
+    site.put("third", changed(small_errors, 1.6), on and site.files(on), site.files(shown), seed=3)
+    assert site.run().state == "held"
+    assert "the readings contradict the backup of the control" in " ".join(site.tables()[-1].reasons)
+
+
+@pytest.mark.parametrize("control", ["siemens-cec", "isg-csv"])
+def test_two_faults_at_once_are_taken_from_the_backup_and_contradicted_without_them(at, small_errors, control):
+    """One table lost and the others with the opposite sign; once they were on, once not."""
+    site = at(control)
+    held = edited(control, site.files(2), lambda value, table: 0 if table == LOST[control] else -value)
+    truth = changed(small_errors, 3.5)
+    site.put("third", truth, held, held, seed=3)
+    assert site.run().active == 3 and off_urad(site, truth) < 1.0
+    site.now += timedelta(days=5)
+    site.put("fourth", truth, site.files(3), held, seed=4)
+    assert site.run().active == 3
+    assert "the readings contradict the backup of the control" in " ".join(site.tables()[-1].reasons)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"),
+        lambda content: b"\xef\xbb\xbf" + content,
+        lambda content: content + b"\n\n",
+    ],
+    ids=["line ends", "byte order mark", "blank lines"],
+)
+def test_bytes_that_mean_nothing_do_not_make_other_tables(at, small_errors, change):
+    site = at("siemens-cec")
+    site.put("third", changed(small_errors, 3.5), site.files(1), seed=3)
+    site.backup("third", {name: change(content) for name, content in site.files(1).items()})
+    assert site.run().active == 3
+    assert site.tables()[-1].summary["evidence"]["version"] == 1
+
+
+def test_a_backup_of_another_machine_waits_although_no_history_contradicts_it(at, small_errors):
+    """The first measurement of a second machine comes with the backup of the first one's control."""
+    site = at("siemens-cec")
+    path = site.folder / "recal.toml"
+    text = path.read_text()
+    for old, new in (
+        ("mill]", "lathe]"),
+        ("mill.policy", "lathe.policy"),
+        ('"inbox"', '"inbox-2"'),
+        ('"out"', '"out-2"'),
+    ):
+        text = text.replace(old, new)
+    path.write_text(path.read_text() + text)
+    (site.folder / "inbox-2").mkdir()
+    site.job = read_job(path)
+    site.put("first", changed(small_errors, 5.0), None, site.files(2), seed=9)
+    for file in site.inbox.glob("first.*"):
+        file.rename(site.folder / "inbox-2" / file.name)
+    (outcome,) = run_jobs(site.job, ["lathe"], clock=lambda: site.now).outcomes
+    assert (outcome.state, outcome.active) == ("held", None)
+    assert (
+        "(first.backup.NC_CEC.INI) has files of mill (version 2): make one of the control of lathe"
+        in outcome.messages[0]
+    )
+
+
+def test_more_errors_than_before_do_not_show_which_tables_were_on(at, small_errors):
+    site = at("isg-csv")
+    path = site.folder / "mill.toml"
+    whole = path.read_text()
+    store = open_store(site.job.store)
+    names = [name for name in store.errors_of(store.identifications()[-1]).names if name != "EAX"]
+    store.close()
+    path.write_text(f"errors = {names}\n".replace("'", '"') + whole)
+    site.put("third", changed(small_errors, 3.5), site.files(2), site.files(2), seed=3)
+    assert site.run().state == "held"  # the active tables correct EAX
+    site.command("approve", "mill", "3", "--override", "--reason", "a test")
+    path.write_text(whole)
+    site.now += timedelta(days=5)
+    site.put("fourth", changed(small_errors, 3.6), site.files(3), seed=4)
+    assert site.run().active == 3
+    assert "more errors were measured than for the tables that were active last" in " ".join(site.tables()[-1].reasons)
 
 
 def test_a_real_jump_with_a_backup_does_not_wait(at, small_errors):
