@@ -336,7 +336,6 @@ def identify_bare(
     from compgen.data.circles import Circles
     from compgen.data.deviations import Deviations
     from compgen.foreign.converted import given_errors
-    from compgen.identify.stated import is_stated
     from compgen.tables.active import without_active
 
     if active is None and isinstance(measurement, ErrorTable):
@@ -347,7 +346,6 @@ def identify_bare(
         whole = all(
             not part.squareness if isinstance(part, ErrorTable) else isinstance(part, AxisRuns)
             for _, part in measurement.parts
-            if not is_stated(part)
         )
         known = {name: given_errors(machine, table, whole=whole) for name, table in tables_of.items()}
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)

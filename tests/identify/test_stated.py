@@ -182,6 +182,24 @@ def test_a_number_about_another_error_is_no_contradiction():
         assert {"EYY", "EC0Y", "EA0Z"} <= set(found.errors.names)
 
 
+ARMS = {"EYX": Curve(np.array([0.0, 300.0]), np.array([0.0, 3e-3]), np.full(2, 5e-4)),
+        "EXY": Curve(np.array([0.0, 300.0]), np.array([0.0, 6e-3]), np.full(2, 5e-4))}  # fmt: skip
+
+
+@pytest.mark.parametrize("prior", [FIXED, NONE])
+def test_a_number_beside_both_arms_of_a_square_is_compared_with_them_and_they_count_once(prior):
+    """The number is usually what the same arms give (docs/instruments.md: -30 urad): together they would count twice."""
+    square = ErrorTable(ARMS, {}, {"source": "granite square"})
+    found = beside(mill(prior), StatedNumbers(squareness={"EC0Y": "-29±3"}), square).errors.squareness["EC0Y"]
+    assert (1e6 * found[0], 1e6 * found[1]) == pytest.approx((-29.0, 3.0), rel=0.02)
+    with pytest.raises(
+        InputError, match=r"EC0Y = 30 urad .* contradicts what was measured, -30\.?\d* urad.*opposite sign"
+    ):
+        beside(mill(prior), StatedNumbers(squareness={"EC0Y": "30±3"}), square)
+    scaled = beside(mill(prior), StatedNumbers(scale={"X": "12±3"}), square).errors.squareness["EC0Y"]
+    assert 1e6 * scaled[0] == pytest.approx(-30.0, rel=0.05)  # a scale says nothing of the arms
+
+
 def test_without_a_prior_a_circle_and_a_number_make_no_other_squareness():
     """EB0Z and EA0Z came out as -5400 and -4800 urad: their columns are rounding errors of 1e-16."""
     found = beside(mill(NONE, chain="WYXFZT"), StatedNumbers(squareness={"EC0Y": "30±3"}), circle())
