@@ -154,7 +154,9 @@ def open_archive(path: str | Path) -> LengthArchive:
             members = {item.filename.removesuffix(".npy"): _member(source, stream, item) for item in archive.infolist()}
     except FileNotFoundError as error:
         raise InputError("no such file", file=source) from error
-    except (zipfile.BadZipFile, ValueError, EOFError, struct.error, OSError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # what reads archives raises errors of many kinds: struct, tokenize, zlib
         raise InputError(
             f"is not an archive of numpy (.npz), or is truncated or damaged ({error})", file=source
         ) from error

@@ -386,7 +386,7 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
     errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
     if not artefact.calibrated.all() and {"EXX", "EYY", "EZZ"} & set(solution.partly):
         warnings.warn(
-            "an artefact that is not calibrated does not show a common scale of the axes: it is taken as zero; give a length "
+            f"an artefact that is not calibrated does not show a common scale of the axes: {_open_scale(machine)}; give a length "
             "as well, for example an axis run (*.axis.csv)",
             CompgenWarning,
             stacklevel=3,
@@ -411,6 +411,14 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
             "tied_nodes_mm": {name: nodes.tolist() for name, nodes in solution.unreached.items()},
         },
     )
+
+
+def _open_scale(machine: Machine) -> str:
+    """What becomes of a scale that no reading shows."""
+    if machine.prior.is_none:
+        return "it is unknown, and so is the uncertainty of the positioning errors"
+    um_per_m = 1e6 * machine.prior.scale("EXX")
+    return f"their uncertainty contains one of {um_per_m:.3g} um/m, as the class of the machine lets expect"
 
 
 def _robust(

@@ -129,7 +129,10 @@ def state_layout(machine: Machine, levels_mm: Sequence[FloatArray], names: Seque
     """Return the unknowns with nodes at the given levels, the nodes of the machine, the ends and the reference point."""
     axes = []
     for k, axis in enumerate(machine.axes):
-        along = np.concatenate([axis.nodes_mm, levels_mm[k]])
+        few = np.unique(
+            np.linspace(0, len(axis.nodes_mm) - 1, min(len(axis.nodes_mm), MOST_LEVELS)).round().astype(int)
+        )
+        along = np.concatenate([axis.nodes_mm[few], levels_mm[k]])
         along = along[(along > axis.range_mm[0] + SAME_MM) & (along < axis.range_mm[1] - SAME_MM)]
         nodes = np.array([*axis.range_mm, machine.reference_point_mm[k]])
         far = np.abs(along[:, None] - nodes[None, :]).min(axis=1) > SAME_MM
@@ -555,9 +558,11 @@ def _learnt(
     shown = [name for name, span in layout.columns() if seen[span].any()]
     spans = {name: span for name, span in layout.columns() if seen[span].any()}
     covariance = _hyperprior(every)
-    at_shown = np.array([every.index(name) for name in shown])
+    at_shown = np.array([every.index(name) for name in shown], dtype=np.int64)
     precision = np.linalg.inv(covariance[np.ix_(at_shown, at_shown)])
     low = -np.inf if prior.learn == "both" else 0.0
+    if not shown:  # readings of which rounding leaves nothing
+        return processes, sizes
     starts = np.cumsum([0, *(span.stop - span.start for span in spans.values())])[:-1]
     information, vector = known.matrix[np.ix_(seen, seen)], known.vector[seen]
 
@@ -622,7 +627,30 @@ def solve_posterior(
     Sources whose residuals exceed their noise get more of it; a machine that is worse than its class gets larger sizes,
     and ``worse`` says so; ``passes`` limits how often. With ``learn`` the readings change the size of each error, unless the
     machine file says no.
+
+    Raises
+    ------
+    InputError
+        for values and uncertainties so different in size that no number is left after rounding.
     """
+    try:
+        return _solved_posterior(machine, layout, information, spans_mm, learn=learn, passes=passes)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            "the readings and their uncertainties differ so much in size that nothing is left after rounding; check the units of "
+            "values and uncertainties"
+        ) from None
+
+
+def _solved_posterior(
+    machine: Machine,
+    layout: ErrorParameters,
+    information: Sequence[Information],
+    spans_mm: FloatArray,
+    *,
+    learn: bool,
+    passes: int,
+) -> Posterior:
     names, prior, parts = tuple(name for name, _ in layout.columns()), machine.prior, list(information)
     usual = processes_of(machine, prior, names)
     of_class = {name: prior.size(name) for name in layout.squareness}

@@ -345,7 +345,10 @@ class Follower:
         for k, block in enumerate(every, line):
             if not self.done and block.strip():
                 self.number = numbers[k]
-                self._block(block)
+                try:
+                    self._block(block)
+                except (ArithmeticError, ValueError):  # an arc about nowhere: the reader says why it refuses it
+                    self.done = True
         return line + len(every)
 
     def _taken(self) -> Moves:

@@ -27,6 +27,7 @@ from compgen.programs.dialects import MARK, Dialect, codes_that_stay
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
 from compgen.programs.runs import (
     LONGEST_BLOCK,
+    MOST_TURNS,
     P_WORD,
     R_WORD,
     RADIUS_TOLERANCE_MM,
@@ -1207,8 +1208,8 @@ class Reader:
         if (radius is None and math.hypot(dx, dy) < 1e-9) or turn == 0.0:
             turn = 2.0 * math.pi
         more = values.get("TURN", values.get("P", 1.0) - 1.0 if self.dialect.name == "linuxcnc" else 0.0)
-        if more < 0 or more != int(more):
-            self._fail("expected a whole number of turns")
+        if not 0 <= more <= MOST_TURNS or more != int(more):
+            self._fail(f"expected a whole number of turns, at most {MOST_TURNS}")
         turn += 2.0 * math.pi * more
         self._move(CCW if ccw else CW, end, arc=tuple(centre), sweep=turn if ccw else -turn)
 

@@ -19,6 +19,8 @@ LETTERS = b"XYZIJKRPNFSGM"
 R_WORD, P_WORD, COLUMNS = 6, 7, 8
 #: Distances of start and end of an arc from its centre may differ by this much, mm.
 RADIUS_TOLERANCE_MM = 0.02
+#: Most full turns of one arc; every turn becomes many moves.
+MOST_TURNS = 1000
 #: The longest block, characters.
 LONGEST_BLOCK = 4096
 #: Semicolons that end a block, with the blanks about them; it begins where such characters begin, so that it is tried once.
@@ -214,7 +216,8 @@ def centres_and_sweeps(
     u = np.where(by_radius, 0.5 * (start[0] + end[0]) - side * dy, given[0])
     v = np.where(by_radius, 0.5 * (start[1] + end[1]) + side * dx, given[1])
     first, second = np.hypot(start[0] - u, start[1] - v), np.hypot(end[0] - u, end[1] - v)
-    wrong |= ~(np.abs(first - second) <= RADIUS_TOLERANCE_MM) | (first == 0.0) | (turns < 0) | (turns != np.rint(turns))
+    wrong |= ~(np.abs(first - second) <= RADIUS_TOLERANCE_MM) | (first == 0.0) | ~((turns >= 0) & (turns <= MOST_TURNS))
+    wrong |= turns != np.rint(turns)
     turn = np.arctan2(end[1] - v, end[0] - u) - np.arctan2(start[1] - v, start[0] - u)
     turn = np.where(ccw, turn, -turn) % (2.0 * np.pi)
     turn[(~by_radius & (chord < 1e-9)) | (turn == 0.0)] = 2.0 * np.pi

@@ -218,6 +218,16 @@ def test_damaged_and_compressed_files_are_refused(columns, tmp_path):
         open_archive(path)
 
 
+@pytest.mark.parametrize("bad", [b"(", b"'\\'", b"{'a", b"9" * 60, b"\xff\xfe"])
+def test_a_damaged_header_of_a_column_is_bad_input(columns, tmp_path, bad):
+    path = written(tmp_path, columns)
+    whole = path.read_bytes()
+    at = whole.index(b"\x93NUMPY") + 10
+    path.write_bytes(whole[:at] + bad + whole[at + len(bad) :])
+    with pytest.raises(InputError, match="is not an archive"):
+        open_archive(path)
+
+
 def test_a_small_archive_is_what_a_text_file_is(machine, columns, tmp_path):
     few = {name: values[:4000] if values.shape == (COUNT,) else values for name, values in columns.items()}
     lengths = compgen.read_lengths(written(tmp_path, few))

@@ -1,11 +1,14 @@
 """Plates measured with the machine's probe: against known errors, by an independent formula of the probe readings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import compgen
 from compgen.data.deviations import read_artefacts
 from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.foreign import open_measurement
 from compgen.identify import IdentifyOptions, identify_measurement
@@ -94,6 +97,26 @@ def test_a_plate_that_is_only_nominal_tells_its_errors_by_turning(tmp_path, mach
     assert any(name in text for text in found.unobservable for name in ("EXX: part of it", "EYY: part of it"))
     wrong = written(tmp_path / "once.artefact.csv", rows[:36], "u_probe_um = 0.3")  # taken as calibrated
     assert identify_measurement(machine, open_measurement([wrong]), IdentifyOptions(reject=False)).rms_um > 5.0
+
+
+@pytest.mark.parametrize("chosen", ["general", "large", "none"])
+def test_a_scale_that_no_reading_shows_is_unknown_and_not_zero(tmp_path, machine, errors, chosen):
+    """The uncertainty of the mean slope of X and Y is that of the prior, 15 um/m times the class; without one it is unknown."""
+    rows = probed(
+        machine, errors, [(0.0, 0.0, 0.0), (90.2, 2.0, 1.0), (180.1, -3.0, 2.0), (0.1, 50.0, 30.0)], form_mm=0.02
+    )
+    path = written(tmp_path / "plate.artefact.csv", rows, "calibrated = false", "u_probe_um = 0.3")
+    machine = replace(machine, prior=PriorSettings(class_name=chosen, learn="no"))
+    said = "it is unknown" if chosen == "none" else f"one of {15 if chosen == 'general' else 45} um/m"
+    with pytest.warns(CompgenWarning, match=f"does not show a common scale of the axes: .*{said}"):
+        found = identify_bare(machine, open_measurement([path]))
+    if chosen == "none":
+        assert np.isnan(found.errors.curves["EXX"].u).any()
+        return
+    ends, size = np.array([-200.0, 200.0]), {"general": 15.0, "large": 45.0}[chosen]
+    factor = found.posterior.values_factor(["EXX", "EYY"], [ends, ends])
+    mean_slope = np.array([-1.0, 1.0, -1.0, 1.0]) / 800.0
+    assert 1e6 * np.linalg.norm(mean_slope @ factor) > 0.9 * size / np.sqrt(2.0)
 
 
 def test_one_length_gives_a_turned_plate_its_scale(tmp_path, machine, errors):

@@ -6,6 +6,7 @@ A small run of ``benchmarks/prior_coverage.py``, and what must hold exactly.
 import importlib.util
 import sys
 import warnings
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -29,8 +30,9 @@ from virtual_shop import (
     together,
 )
 
+from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.prior import PriorSettings
-from compgen.errors import CompgenWarning
+from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import identify
 from compgen.identify.axis_tests import identify_axis_runs
 from compgen.identify.posterior import not_measured, worse_text
@@ -282,3 +284,30 @@ def test_between_and_beyond_the_readings_u_grows(kind):
     beyond = curve.curve("EXX", np.linspace(inner, high, 6)).u
     assert np.all(np.diff(beyond) > 0.0)
     assert beyond[-1] > 3.0 * beyond[0] and beyond[-1] > 1e-3
+
+
+def test_a_machine_with_very_many_nodes_has_a_state_of_few():
+    """A thousand nodes of an axis made a state of six thousand numbers, and an answer in a quarter of an hour."""
+    shop = case(0, family="smooth", seed=9)
+    axis = shop.machine.axes[0]
+    fine = replace(axis, nodes_mm=np.linspace(*axis.range_mm, 1001))
+    machine = replace(shop.machine, axes=(fine, *shop.machine.axes[1:]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        many, few = (identify_bare(item, shop.runs("X")) for item in (machine, shop.machine))
+    assert len(many.posterior.state) < 2000
+    at = np.linspace(*axis.range_mm, 7)
+    one, other = (found.posterior.curve("EXX", at) for found in (many, few))
+    assert one.value == pytest.approx(other.value, abs=0.2 * other.u.max())
+    assert one.u == pytest.approx(other.u, rel=0.2, abs=1e-6)
+
+
+def test_readings_of_which_rounding_leaves_nothing_are_no_internal_error():
+    """A value of 24 km among errors of um: beside it no other reading counts."""
+    shop = case(0, family="smooth", seed=9)
+    at = np.linspace(*shop.machine.axes[0].range_mm, 5)
+    errors = ErrorTable({"EXX": Curve(at, np.array([0.0, 1e-3, 2.4e7, 1e-3, 0.0]), np.full(5, 1e-9))})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        with suppress(UndeterminedError, InputError):
+            identify_bare(shop.machine, errors)

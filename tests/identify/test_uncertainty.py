@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -404,6 +405,25 @@ def test_damaged_bytes_are_noticed(written, tmp_path):
     content[len(content) // 2] ^= 0xFF
     path = tmp_path / "damaged.npz"
     path.write_bytes(content)
+    with pytest.raises(InputError, match="truncated or damaged"):
+        read_covariance(path)
+
+
+def with_member(path, name, content):
+    """The same archive with other bytes in one of its arrays."""
+    with zipfile.ZipFile(path) as archive:
+        members = {item: archive.read(item) for item in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for item, raw in (members | {name: content(members[name])}).items():
+            archive.writestr(item, raw)
+
+
+@pytest.mark.parametrize("bad", [b"(", b"'\\'", b"{'a", b"9" * 60, b"import os", b"\xff\xfe"])
+def test_a_damaged_header_of_an_array_is_bad_input_whatever_numpy_makes_of_it(written, tmp_path, bad):
+    """Numpy reads a header as an expression of Python: a byte in it gave an error of its tokenizer, and exit code 3."""
+    path = tmp_path / "damaged.npz"
+    path.write_bytes((written[2] / FILE_NAME).read_bytes())
+    with_member(path, "factor.npy", lambda raw: raw[:10] + bad + raw[10 + len(bad) :])
     with pytest.raises(InputError, match="truncated or damaged"):
         read_covariance(path)
 

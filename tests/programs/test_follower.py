@@ -261,6 +261,43 @@ def test_a_writer_that_is_wrong_is_not_accepted(tmp_path, monkeypatch, letter, b
     assert result.file.startswith("NOT-ACCEPTED-")
 
 
+@pytest.mark.parametrize("end", ["", "\n"])
+@pytest.mark.parametrize(
+    ("arc", "words"),
+    [
+        ("G2 X60. Y30.", "without centre or radius"),
+        ("G3 X60.", "without centre or radius"),
+        ("G2 X60. Y30. I0. J0.", "expected one radius"),
+        ("G2 X50. Y20. R5.", "give no arc"),
+        ("G2 X60. Y30. R0.", "give no arc"),
+    ],
+)
+@pytest.mark.parametrize("dialect", ["grbl", "linuxcnc", "fanuc"])
+def test_an_arc_about_nowhere_is_refused_also_as_the_last_line(tmp_path, dialect, arc, words, end):
+    """The follower is ahead of the reader by a last line without an end: it divided by zero, exit code 3."""
+    program = tmp_path / "p.nc"
+    program.write_text(f"G21 G90 G54\nG0 Z50.\nG0 X10. Y10.\nG1 X50. Y20. F500.\n{arc}{end}")
+    with pytest.raises(InputError, match=words) as found:
+        predict_part(model_of(mill(), cycle_errors(), None), program, dialect, SHOP)
+    assert found.value.line == 5
+
+
+@pytest.mark.parametrize(
+    ("turns", "refused"), [("3", False), ("1001", False), ("1002", True), ("1000000", True), ("1e30", True)]
+)
+def test_an_arc_of_a_million_turns_is_refused(tmp_path, turns, refused):
+    """P1000000 of LinuxCNC (TURN of SINUMERIK): the corrected program would have had hundreds of millions of blocks."""
+    turns = f"{float(turns):.0f}"
+    program = tmp_path / "p.nc"
+    program.write_text(f"G21 G90 G54 G17\nG0 X10 Y10 Z50\nG1 X50 Y20 F500\nG2 X50 Y20 I5 J0 P{turns}\nM2\n")
+    reader = Reader(mill(), DIALECTS["linuxcnc"], SHOP, str(program))
+    if refused:
+        with pytest.raises(InputError, match="whole number of turns, at most 1000"):
+            reader.batch(program.read_bytes(), 1)
+    else:
+        assert len(reader.batch(program.read_bytes(), 1).moves)
+
+
 def test_lines_that_are_made_to_last_take_a_time_that_grows_with_them():
     """Blanks, digits, signs and open brackets: twice as many take about twice as long, not four times."""
     for dialect in DIALECTS:
