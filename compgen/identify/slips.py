@@ -182,17 +182,17 @@ def _by_way(what: str, table: _Table, named: Callable[[float], str]) -> Iterator
 
 
 def _patterns(repeats: Repeats) -> Iterator[str]:
+    agreeing = _agreeing(repeats.values)
     for k, run in enumerate(repeats.runs):
-        others = np.delete(repeats.values, k, axis=0)
-        usual = np.median(others, axis=0)
-        if any((np.abs(repeats.values[k] - other) == 0.0).all() for other in others) or not np.ptp(usual):
+        alike = [j for j in agreeing if j != k] or [j for j in range(len(repeats.runs)) if j != k]
+        others = repeats.values[alike]
+        usual, own, scatter = np.median(others, axis=0), repeats.values[k], _scatter(others)
+        if any((np.abs(own - other) == 0.0).all() for other in others) or not np.ptp(usual):
             continue
-        own, scatter = repeats.values[k], _scatter(others)
-        before = _rms(_level(own - usual))
-        plain = _rms(own - usual)
-        best: tuple[float, str] | None = None
+        level, plain = _rms(_level(own - usual)), _rms(own - usual)
+        best: tuple[float, float, str] | None = None
         for after, text, at_level in _slips(repeats, k, usual):
-            was = before if at_level else plain
+            was = level if at_level else plain
             if (
                 was < WORTH_MM
                 or was < BETTER * max(after, scatter)
@@ -200,20 +200,41 @@ def _patterns(repeats: Repeats) -> Iterator[str]:
             ):
                 continue
             if best is None or after < best[0]:
-                best = (
-                    after,
-                    f"{text}: then it differs by {after / MM_PER_UM:.2g} um rms, as it is by {was / MM_PER_UM:.2g} um",
-                )
-        if best is not None:
-            second = len(repeats.runs) == 2
-            if second and k == 0:
-                continue  # which of the two is wrong, nothing tells: said once
-            against = f"run {repeats.runs[0]}" if second else "the other runs"
-            wrong = " (one of the two is wrong)" if second else ""
-            yield (
-                f"{repeats.what}, run {run} disagrees with {against} in a pattern, which is no noise{wrong}: it agrees with "
-                f"{'it' if second else 'them'} if {best[1]}; correct the file, or leave the run out"
-            )
+                best = after, was, text
+        if best is not None and not (len(repeats.runs) == 2 and k == 0):  # of two, it is said once
+            yield _told(repeats, run, alike, best)
+
+
+def _told(repeats: Repeats, run: int, alike: Sequence[int], best: tuple[float, float, str]) -> str:
+    """Say which run disagrees with which others, in which pattern, and by how much."""
+    names = ", ".join(str(repeats.runs[j]) for j in alike)
+    against = (
+        "the other runs" if len(alike) == len(repeats.runs) - 1 > 1 else f"run{'s' if len(alike) > 1 else ''} {names}"
+    )
+    unsure = " (which of them is right, the file does not tell)" if 2 * len(alike) <= len(repeats.runs) else ""
+    after_um, was_um = best[0] / MM_PER_UM, best[1] / MM_PER_UM
+    return (
+        f"{repeats.what}, run {run} disagrees with {against} in a pattern, which is no noise{unsure}: it agrees if {best[2]}: "
+        f"then it differs by {after_um:.2g} um rms, as it is by {was_um:.2g} um; correct the file, or leave the run out"
+    )
+
+
+def _agreeing(values: FloatArray) -> list[int]:
+    """Indices of the runs (runs, n) that agree with each other, the larger group: all of them if there is no other."""
+    level = values - values.mean(axis=1, keepdims=True)
+    apart = np.sqrt(np.mean((level[:, None] - level[None, :]) ** 2, axis=2))
+    middle = int(np.argmin(np.sort(apart, axis=1)[:, : len(values) // 2 + 1].sum(axis=1)))
+    order = np.argsort(apart[middle], kind="stable")
+    size = np.maximum(apart[middle][order], 0.1 * WORTH_MM)
+    if len(values) < 3:
+        return list(range(len(values)))
+    step = size[2:] / size[1:-1]
+    if step.max() <= BETTER:
+        return list(range(len(values)))
+    cut = int(np.argmax(step)) + 2
+    if 2 * cut == len(values) and 0 not in order[:cut]:  # two halves: that of the first run, in both directions
+        return sorted(order[cut:].tolist())
+    return sorted(order[:cut].tolist())
 
 
 def _slips(repeats: Repeats, k: int, usual: FloatArray) -> Iterator[tuple[float, str, bool]]:
@@ -239,8 +260,8 @@ def _slips(repeats: Repeats, k: int, usual: FloatArray) -> Iterator[tuple[float,
         True,
     )
     if repeats.back is not None:
-        back = np.delete(repeats.back, k, axis=0)
-        turned = np.concatenate([own - np.median(back, axis=0), repeats.back[k] - usual])
+        back, there = np.delete(repeats.back, k, axis=0), np.delete(repeats.values, k, axis=0)
+        turned = np.concatenate([own - np.median(back, axis=0), repeats.back[k] - np.median(there, axis=0)])
         yield _rms(turned), "its directions are exchanged (1 and -1)", False
         yield _rms(own - np.median(back, axis=0)), "it was measured in the other direction than labelled", False
 
