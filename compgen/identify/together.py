@@ -298,6 +298,7 @@ def with_prior(
     if not listed:
         raise UndeterminedError("the readings show none of the machine's errors better than the prior does", [])
     curves, squareness, positions = {}, {}, []
+    known = _in_its_gauge(machine, result.errors.only(*whole), found)
     for name in listed:
         own = result.errors.curves.get(name)
         if name in SQUARENESS_NAMES:
@@ -305,17 +306,19 @@ def with_prior(
             mean = found.curve(name, at)
             value, u = float(mean.value[0]), float(mean.u[0])
             if name in whole:  # as it was stated or measured
-                value, stated = result.errors.squareness[name]
-                u = float(_as_stated(np.hypot([u], [value - mean.value[0]]), np.array([stated]))[0])
+                (value, stated), (likely, u) = result.errors.squareness[name], known.squareness[name]
+                u = float(_as_stated(np.hypot([u], [value - likely]), np.array([stated]))[0])
             squareness[name] = (value, u)
         else:
             at = _output_mm(machine, name, own, whole=name in whole)
             mean = found.curve(name, at)
             if own is not None and name in whole:
-                kept = np.isin(at, own.position_mm)
+                kept, likely_u = np.isin(at, own.position_mm), known.curves[name].u
                 stated_u = np.where(kept, np.interp(at, own.position_mm, own.u), np.nan)
                 values = np.where(kept, own.at(at), mean.value)
-                mean = Curve(at, values, _as_stated(np.hypot(mean.u, values - mean.value), stated_u))
+                off = np.where(kept, values - known.curves[name].at(at), 0.0)
+                own_u = np.where(kept, np.interp(at, own.position_mm, likely_u), mean.u)
+                mean = Curve(at, values, _as_stated(np.hypot(own_u, off), stated_u))
             curves[name] = mean
         positions.append(at)
     errors = ErrorTable(curves, squareness, result.errors.metadata)
@@ -353,6 +356,19 @@ def with_prior(
             "posterior_means": [name for name in listed if name not in whole],
         },
     )
+
+
+def _in_its_gauge(machine: Machine, table: ErrorTable, found: Posterior) -> ErrorTable:
+    """The posterior of the values of a table, which is zero at a reference point between two nodes if drawn straight."""
+    if not table.names:
+        return table
+    places = [table.curves[name].position_mm if name in table.curves else np.zeros(1) for name in table.names]
+    mean = np.concatenate([found.curve(name, at).value for name, at in zip(table.names, places, strict=True)])
+    factor = found.values_factor(table.names, places)
+    if machine.curves == "linear":
+        taken_off = common_gauge_part(machine, table)
+        mean, factor = mean - taken_off @ mean, factor - taken_off @ factor
+    return table.with_values(mean, np.linalg.norm(factor, axis=1))
 
 
 def _as_stated(u: FloatArray, stated: FloatArray) -> FloatArray:
