@@ -28,6 +28,12 @@ def machine(request, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def least_squares(machine):
+    """The machine without a prior: what the plate itself says."""
+    return replace(machine, prior=PriorSettings(class_name="none"))
+
+
+@pytest.fixture(scope="module")
 def errors():
     at, zero = np.linspace(-200.0, 200.0, 5), np.zeros(5)
     curves = {
@@ -64,7 +70,8 @@ def written(path, rows, *comments):
     return path
 
 
-def test_a_calibrated_plate_gives_squareness_scale_and_straightness(tmp_path, machine, errors):
+def test_a_calibrated_plate_gives_squareness_scale_and_straightness(tmp_path, least_squares, errors):
+    machine = least_squares
     path = written(tmp_path / "plate.artefact.csv", probed(machine, errors, [(0.4, 3.0, -2.0)]), "u_probe_um = 0.3")
     found = identify_bare(machine, open_measurement([path]))
     assert found.method == "artefact"
@@ -136,8 +143,9 @@ def test_one_length_gives_a_turned_plate_its_scale(tmp_path, machine, errors):
     assert found.errors.squareness["EC0Y"][0] == pytest.approx(EC0Y, abs=8e-6)
 
 
-def test_the_sign_is_the_opposite_of_that_of_a_part(tmp_path, machine, errors):
+def test_the_sign_is_the_opposite_of_that_of_a_part(tmp_path, least_squares, errors):
     """A machine that travels too far makes holes too far apart, and measures true holes too close together."""
+    machine = least_squares
     rows = probed(machine, errors, [(0.0, 0.0, 0.0)])
     path = written(tmp_path / "plate.artefact.csv", rows, "u_probe_um = 0.3")
     as_part = tmp_path / "same.part.csv"

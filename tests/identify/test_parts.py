@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import compgen
 from compgen.data.deviations import read_parts
+from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import IdentifyOptions, identify_measurement
 from compgen.identify.any_measurement import read_measurement
@@ -29,6 +31,11 @@ nodes = 6
 """
 #: Truth in the plane, mm and rad, by formulas of this test; straightness is zero at both ends of the travel.
 EC0Y, SLOPE_X, SLOPE_Y = 64e-6, 9e-6, -6e-6
+
+
+def without_prior(machine):
+    """For what the readings themselves say: least squares."""
+    return replace(machine, prior=PriorSettings(class_name="none"))
 
 
 def exx(x):
@@ -208,14 +215,23 @@ def test_two_set_ups_have_a_pose_each(mill, tmp_path):
 def test_nodes_without_a_hole_are_said_and_their_uncertainty_grows(mill, tmp_path):
     points, rng = drilled(6, reach=160.0)
     path = part(tmp_path / "p.part.csv", points, displaced(*points.T) + rng.normal(0, 1e-3, points.shape))
-    with pytest.warns(CompgenWarning, match=r"no reading reaches EXX at -330, 330 mm.*--range from-data"):
+    said = r"no reading reaches EXX at -330, 330 mm.*the uncertainty of an extrapolation"
+    with pytest.warns(CompgenWarning, match=said):
         found = identify_measurement(mill, read_measurement([path]))
     curve = found.errors.curves["EXX"]
     assert curve.u[-1] > 2.0 * curve.u[-2]
-    shorter = identify_measurement(mill, read_measurement([path]), IdentifyOptions(travel="from-data"))
-    curve = shorter.errors.curves["EXX"]
+    assert np.all(np.abs(curve.value - exx(curve.position_mm)) < 3.0 * curve.u + 1e-6)
+    value, u = found.errors.squareness["EC0Y"]
+    assert abs(value - EC0Y) < 2.0 * u
+    # the squareness of straightness errors that are zero at 160 mm: a different number, which the readings determine
+    with pytest.warns(CompgenWarning, match=said):
+        short, whole = (
+            identify_measurement(without_prior(mill), read_measurement([path]), IdentifyOptions(travel=travel))
+            for travel in ("from-data", "machine")
+        )
+    curve = short.errors.curves["EXX"]
     assert (curve.position_mm[0], curve.position_mm[-1]) == (-160.0, 160.0)
-    assert shorter.errors.squareness["EC0Y"][1] < found.errors.squareness["EC0Y"][1]
+    assert short.errors.squareness["EC0Y"][1] < whole.errors.squareness["EC0Y"][1]
 
 
 def test_deviations_without_z_at_one_height_are_taken_the_same_way(mill, tmp_path):
@@ -227,7 +243,7 @@ def test_deviations_without_z_at_one_height_are_taken_the_same_way(mill, tmp_pat
     path = tmp_path / "p.deviations.csv"
     path.write_text("x_mm,y_mm,z_mm,dx_um,dy_um\n" + rows)
     plate = part(tmp_path / "p.part.csv", points, turned(points + moved, 20.0))
-    first, second = (identify_measurement(mill, read_measurement([name])) for name in (path, plate))
+    first, second = (identify_measurement(without_prior(mill), read_measurement([name])) for name in (path, plate))
     assert first.errors.names == second.errors.names
     assert np.allclose(first.errors.curves["EYX"].value, second.errors.curves["EYX"].value, atol=1e-5)
 
