@@ -188,14 +188,14 @@ def test_a_laser_and_circles_make_tables_in_one_command(tmp_path, machine, capsy
     ]
     assert run_command(cli, words) == 0
     result = json.loads((out / "result.json").read_text())
-    # a circle of 200 mm leaves most of a squareness over 500 mm open: only the laser determines something
-    assert result["measured"]["errors"] == ["EXX"]
+    # a circle of 200 mm shows a squareness over 500 mm as far as guides are straight there
+    assert "EXX" in result["measured"]["errors"]
     assert result["verdict"] == "accepted_with_reservations"
     found = compgen.read_errors(out / "identified.errors.csv")
     for name, true in SQUARENESS.items():
         value, u = found.squareness[name]
         assert abs(value - true) < 2.0 * u, name
-        assert 5e-6 < u < 40e-6  # it was 1 urad, the noise alone; 40 urad are assumed without any reading
+        assert 5e-6 < u < 40e-6  # of noise alone it is 1 urad; 40 urad are assumed without any reading
     assert set(result["not_measured"]) == set(observable_errors(machine)) - set(found.names)
     text = (out / "identified.reversal.csv").read_text()
     assert "Y,Y,,4.0" in text or "Y,Y,,3.9" in text

@@ -15,6 +15,7 @@ from compgen.data.deviations import Deviations, format_deviations
 from compgen.data.error_table import format_errors
 from compgen.data.lengths import format_lengths
 from compgen.data.names import error_named
+from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.foreign import open_measurement
 from compgen.foreign.converted import given_errors
@@ -27,6 +28,12 @@ from compgen.kinematics.exact_chain import tip_position
 from compgen.pipeline import identify_bare, with_reversal
 
 NOISE_MM = 3e-4
+
+
+@pytest.fixture(scope="module")
+def least_squares(small_machine):
+    """The machine without a prior: what the readings themselves say."""
+    return replace(small_machine, prior=PriorSettings(class_name="none"))
 
 
 @pytest.fixture(scope="module")
@@ -79,15 +86,19 @@ def test_pitch_of_a_laser_and_a_granite_square_are_joined_as_they_are(tmp_path, 
     assert found.errors.names == ("EXX", "EYY", "EC0Y")
     assert found.errors.squareness["EC0Y"] == pytest.approx((25e-6, 3e-6))
     assert len(found.errors.curves["EXX"].value) == 13  # at the targets, not at the nodes of the machine
-    slope = np.polyfit(found.errors.curves["EYY"].position_mm, found.errors.curves["EYY"].value, 1)[0]
-    assert slope == pytest.approx(-12e-6)
+    scale = found.errors.curves["EYY"]
+    low, high = small_machine.axes[1].range_mm
+    assert scale.at(np.array([low, high])) == pytest.approx([-12e-6 * (low - 100.0), -12e-6 * (high - 100.0)], rel=0.01)
+    assert scale.u[[0, -1]] == pytest.approx(2e-6 * 200.0, rel=0.01)
+    assert scale.u[1] > 5.0 * scale.u[0]  # the number says nothing of what is between the ends
     assert found.reversal_curves.curves[2, 2].value.tolist() == [-6e-3]  # an axis that stops short
     assert joint_covariance(found).errors_covariance[-1, -1] == pytest.approx(9e-12)
 
 
 def test_runs_beside_lengths_narrow_what_they_are_about_and_leave_the_rest(
-    tmp_path, small_machine, truth, small_lengths_file
+    tmp_path, least_squares, truth, small_lengths_file
 ):
+    small_machine = least_squares
     alone = identify_bare(small_machine, open_measurement([small_lengths_file]))
     (path,) = written(tmp_path, x_axis_csv=format_axis_runs(runs_of(small_machine, alone.errors, 0)))
     found = identify_bare(small_machine, open_measurement([small_lengths_file, path]))
@@ -104,7 +115,8 @@ def test_runs_beside_lengths_narrow_what_they_are_about_and_leave_the_rest(
     assert found.errors.curves["EZZ"].u == pytest.approx(alone.errors.curves["EZZ"].u, rel=0.02)
 
 
-def test_a_plane_and_runs_determine_what_neither_does_alone(tmp_path, small_machine, truth):
+def test_a_plane_and_runs_determine_what_neither_does_alone(tmp_path, least_squares, truth):
+    small_machine = least_squares
     paths = written(
         tmp_path,
         p_deviations_csv=format_deviations(plane_of(small_machine, truth)),
@@ -127,7 +139,8 @@ def test_a_plane_and_runs_determine_what_neither_does_alone(tmp_path, small_mach
     assert np.sqrt(np.mean(compgen.without_rigid_motion(position, left)[:, :2] ** 2)) < 2 * NOISE_MM
 
 
-def test_what_is_rejected_alone_does_not_come_back_in_the_mixture(tmp_path, small_machine, truth):
+def test_what_is_rejected_alone_does_not_come_back_in_the_mixture(tmp_path, least_squares, truth):
+    small_machine = least_squares
     plane = plane_of(small_machine, truth)
     clean, wrong = plane.deviation_mm.copy(), plane.deviation_mm.copy()
     wrong[7, 0] += 0.05  # a hole that was read wrong by 50 um
@@ -342,13 +355,21 @@ def of(found, truth, name):
     return curve.value, curve.u, truth.curves[name].at(curve.position_mm)
 
 
-def test_one_station_adds_nothing_alone_and_takes_nothing_away(tmp_path, small_machine, truth, small_lengths_file):
+def test_one_station_adds_nothing_alone_and_takes_nothing_away(
+    tmp_path, small_machine, least_squares, truth, small_lengths_file
+):
     """A station beside a laser: the positioning of X stays, all that one station cannot separate is named."""
     lengths = some_stations(small_lengths_file, "S2")
     lengths.length_mm[5] += 0.5  # a reading that belongs to nothing
     truth = compgen.read_errors(small_lengths_file.parent / "truth.errors.csv")
     runs = runs_of(small_machine, truth, 0)
-    found = identify_bare(small_machine, MixedMeasurement((("t", lengths), ("x", runs))))
+    mixture = MixedMeasurement((("t", lengths), ("x", runs)))
+    found = identify_bare(small_machine, mixture)
+    assert found.errors.names[0] == "EXX"
+    for name in found.errors.names:  # a little of everything, with the uncertainty that this is
+        value, u, known = of(found, truth, name)
+        assert np.max(np.abs(value - known) / np.maximum(u, 1e-9)) < 3.0, name
+    found = identify_bare(least_squares, mixture)
     assert found.errors.names == ("EXX",)
     value, u, known = of(found, truth, "EXX")
     assert np.max(np.abs(value - known) / np.maximum(u, 1e-9)) < 4.0

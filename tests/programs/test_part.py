@@ -21,6 +21,7 @@ from compgen.programs.path import PLANE_AXES, ExactModel
 from compgen.report.part_page import part_page
 from compgen.tables import export, read_tables
 from machines import machine_of
+from virtual_shop import drawn_truth, of_the_prior
 
 SETUP = Setup({"G54": (100.0, 100.0, -80.0)}, {"1": (0.0, 0.0, 20.0)}, gauge_mm=(0.0, 0.0, -50.0))
 PART = """%
@@ -304,6 +305,27 @@ def test_the_uncertainty_is_the_scatter_of_machines_drawn_from_it(tmp_path, make
     assert scatter[~shown] == pytest.approx(said[~shown], abs=1e-3)
     assert shown.sum() > 40
     assert scatter[shown] / said[shown] == pytest.approx(np.ones(shown.sum()), abs=0.2)
+
+
+def test_what_nobody_measured_is_in_the_uncertainty_as_machines_of_the_class_scatter(tmp_path):
+    """Only EC0Y is known. Machines of class "general" are drawn by formulas of ``tests/virtual_shop.py``."""
+    general = replace(mill(), prior=PriorSettings(class_name="general", learn="no"))
+    known = ErrorTable({}, {"EC0Y": (20e-6, 0.5e-6)})
+    stated = predicted(tmp_path, known, lambda: general)[1]
+    drawn, rng = [], np.random.default_rng(8)
+    for _ in range(150):
+        truth = drawn_truth(general, rng, of_the_prior, spread=0.0)
+        every = {}
+        for name, (at, value) in truth.curves.items():
+            nodes = np.linspace(at[0], at[-1], 41)
+            every[name] = Curve(nodes, np.interp(nodes, at, value), np.zeros(41))
+        squareness = {name: (value, 0.0) for name, value in truth.squareness.items()} | known.squareness
+        found = predicted(tmp_path, ErrorTable(every, squareness), unassuming)[1]
+        drawn.append([found[key].error for key in stated])
+    scatter, said = np.std(drawn, axis=0), np.array([item.u for item in stated.values()])
+    shown = said > 0.1
+    assert shown.sum() > 20
+    assert scatter[shown] / said[shown] == pytest.approx(np.ones(shown.sum()), abs=0.25)
 
 
 def holes_of(text):
