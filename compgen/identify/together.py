@@ -665,26 +665,44 @@ def _agreement(
     """Largest E_n number of each error between the readings of one part and all others, by name of the part.
 
     What a part changes in the posterior of the others, m - m_0, has the covariance S_0 - S. The coverage factor is chosen
-    to give the probability of a false alarm for all values of a part together.
+    to give the probability of a false alarm for all values of a part together. Errors have the sizes that one side or the
+    other needs by itself: what only both together need is no larger machine, it is the disagreement.
     """
     from scipy.special import stdtrit  # imported here: slow to load
 
-    layout, whole, result = found.layout, np.einsum("ij,ij->i", found.factor, found.factor), {}
+    layout, result = found.layout, {}
     for k in range(len(parts)) if len(parts) > 2 else range(1):
         rest = [item for j, item in enumerate(information) if j != k]
-        other = with_information(found, rest)
-        less = np.einsum("ij,ij->i", other.factor, other.factor)
-        gained = less - whole
-        seen = gained > SHARED * less
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ratio = np.where(seen, np.abs(found.state - other.state) / np.sqrt(gained), 0.0)
-        factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(int(np.count_nonzero(seen)), 1)))
+        sides = [
+            solve_posterior(found.machine, layout, side, found.spans_mm, learn=False) for side in ([information[k]], rest)
+        ]
+        sizes = _larger_sizes(found, sides)
+        both = with_information(sizes, information)
+        changes = [_changes(with_information(sizes, side), both) for side in ([information[k]], rest)]
+        ratio = np.fmax(*changes)  # of the part by the others, and of the others by the part
+        count = sum(int(np.count_nonzero(np.isfinite(change))) for change in changes)
+        factor = -float(stdtrit(MANY, FALSE_ALARM / 2.0 / max(count, 1)))
         result[parts[k].name] = {
-            name: float(ratio[columns].max(initial=0.0)) / factor
+            name: float(np.nanmax(ratio[columns])) / factor
             for name, columns in layout.columns()
-            if seen[columns].any()
+            if np.isfinite(ratio[columns]).any()
         }
     return result
+
+
+def _changes(less: Posterior, more: Posterior) -> FloatArray:
+    """What further readings change in the state of a posterior, over the uncertainty of that change; nan if they show nothing."""
+    before, after = (np.einsum("ij,ij->i", item.factor, item.factor) for item in (less, more))
+    gained = before - after
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(gained > SHARED * before, np.abs(more.state - less.state) / np.sqrt(gained), np.nan)
+
+
+def _larger_sizes(found: Posterior, sides: Sequence[Posterior]) -> Posterior:
+    """A posterior with the larger of the sizes that either of two posteriors has for each error."""
+    processes = {name: max((side.processes[name] for side in sides), key=lambda item: item.s) for name in found.processes}
+    squareness = {name: max(side.squareness_sd[name] for side in sides) for name in found.squareness_sd}
+    return replace(found, processes=processes, squareness_sd=squareness)
 
 
 def _disagreements(agreement: Mapping[str, Mapping[str, float]]) -> tuple[list[str], list[str]]:

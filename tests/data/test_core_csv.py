@@ -326,10 +326,10 @@ def test_nothing_is_there_before_commit(tmp_path):
 def test_a_second_file_that_cannot_be_written_leaves_nothing_behind(tmp_path, monkeypatch):
     genuine = files._write_temporary
 
-    def full_disk(target: Path, content: bytes) -> Path:
+    def full_disk(target: Path, content: bytes, mode: int | None = None) -> Path:
         if target.name == "b":
             raise OSError(28, "No space left on device")
-        return genuine(target, content)
+        return genuine(target, content, mode)
 
     monkeypatch.setattr(files, "_write_temporary", full_disk)
     out = OutputFolder(tmp_path / "new" / "out")
