@@ -79,11 +79,15 @@ from compgen.kinematics.many_points import full_grid
 
 @dataclass(frozen=True)
 class Source:
-    """One of several measurements: its name, the measurement, and what it determines alone (None: too little)."""
+    """One of several measurements: its name, the measurement, and what it determines alone (None: too little).
+
+    ``fitting`` says which of its lengths fit the model where these were adjusted with the other measurements only.
+    """
 
     name: str
     measurement: object
     alone: Identification | None
+    fitting: NDArray[np.bool_] | None = None
 
     @property
     def new_lengths(self) -> int:
@@ -144,7 +148,9 @@ class Source:
         if isinstance(lengths, Lengths) and not (
             self.alone and same_nodes(machine, self.alone) and at_nodes(machine, lengths.position_mm)
         ):
-            kept = np.ones(len(lengths), dtype=bool) if self.alone is None else self.alone.accepted
+            kept = self.fitting if self.alone is None else self.alone.accepted
+            if kept is None:
+                kept = np.ones(len(lengths), dtype=bool)
             rows = np.flatnonzero(kept)
             few = lengths.part(rows[:: 1 + len(rows) // MOST_LENGTHS])
             return length_observations(machine, layout, few, options, around)
@@ -286,6 +292,7 @@ def with_prior(
     """
     if machine.prior.is_none:
         return _without_prior(machine, parts, result, options)
+    parts = _with_fitting(parts, result)
     found, information = posterior_of(machine, parts, options, result, learn=True)
     if result.method in ("sixdof", "merged"):  # six errors of an axis at once, in the gauge of the instrument
         details = {**result.details, "posterior_means": []}
@@ -356,6 +363,19 @@ def with_prior(
             "posterior_means": [name for name in listed if name not in whole],
         },
     )
+
+
+def _with_fitting(parts: Sequence[Source], result: Identification) -> list[Source]:
+    """The parts with the lengths that were rejected when all were adjusted together."""
+    found, first = [], 0
+    for part in parts:
+        count = part.new_lengths
+        if part.measurement is not None and part.alone is not None:
+            count = len(part.alone.accepted)
+        new = part.new_lengths and first + count <= len(result.accepted)
+        found.append(replace(part, fitting=result.accepted[first : first + count]) if new else part)
+        first += count
+    return found
 
 
 def _in_its_gauge(machine: Machine, table: ErrorTable, found: Posterior) -> ErrorTable:
@@ -674,7 +694,8 @@ def _agreement(
     for k in range(len(parts)) if len(parts) > 2 else range(1):
         rest = [item for j, item in enumerate(information) if j != k]
         sides = [
-            solve_posterior(found.machine, layout, side, found.spans_mm, learn=False) for side in ([information[k]], rest)
+            solve_posterior(found.machine, layout, side, found.spans_mm, learn=False)
+            for side in ([information[k]], rest)
         ]
         sizes = _larger_sizes(found, sides)
         both = with_information(sizes, information)
@@ -700,7 +721,9 @@ def _changes(less: Posterior, more: Posterior) -> FloatArray:
 
 def _larger_sizes(found: Posterior, sides: Sequence[Posterior]) -> Posterior:
     """A posterior with the larger of the sizes that either of two posteriors has for each error."""
-    processes = {name: max((side.processes[name] for side in sides), key=lambda item: item.s) for name in found.processes}
+    processes = {
+        name: max((side.processes[name] for side in sides), key=lambda item: item.s) for name in found.processes
+    }
     squareness = {name: max(side.squareness_sd[name] for side in sides) for name in found.squareness_sd}
     return replace(found, processes=processes, squareness_sd=squareness)
 

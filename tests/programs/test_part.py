@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from programs.make import mill
+from virtual_shop import drawn_truth, of_the_prior
 
 import compgen
 from compgen.data.error_table import Curve, ErrorTable
@@ -21,7 +22,6 @@ from compgen.programs.path import PLANE_AXES, ExactModel
 from compgen.report.part_page import part_page
 from compgen.tables import export, read_tables
 from machines import machine_of
-from virtual_shop import drawn_truth, of_the_prior
 
 SETUP = Setup({"G54": (100.0, 100.0, -80.0)}, {"1": (0.0, 0.0, 20.0)}, gauge_mm=(0.0, 0.0, -50.0))
 PART = """%
