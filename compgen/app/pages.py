@@ -69,7 +69,7 @@ from compgen.data.machine import load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
 from compgen.data.prior import class_named
-from compgen.errors import CompgenError, InputError, number_text, visible
+from compgen.errors import CompgenError, InputError, number_text, um_text, visible
 from compgen.fleet.dashboard.guard import (
     HEADERS,
     check_host,
@@ -1112,7 +1112,7 @@ def make_app(workbench: Workbench) -> Flask:
         unit=lambda text: LABEL.get(text, text),
         readable=_readable,
         thousands=thousands,
-        um=lambda value: number_text(value, 2).replace("-", "\N{MINUS SIGN}"),
+        um=_um,
         described=describe_error,
     )
     app.jinja_env.globals.update(
@@ -1186,6 +1186,12 @@ def _unexpected(error: Exception) -> tuple[str, int]:
     _report_fault(error)
     text = "This is a bug in the program; the terminal shows where. What was shown as saved is saved."
     return render_template("error.html", title="Internal error", text=text, number=0), 500
+
+
+def _um(value: Any, u_um: Any = None) -> str:
+    """A figure in um with the digits that its expanded uncertainty leaves; as in the report."""
+    text = number_text(value, 2) if not isinstance(u_um, int | float) else um_text(value, u_um=u_um)
+    return text.replace("-", "\N{MINUS SIGN}")
 
 
 def _figure(value: Any, digits: int = 3) -> str:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from compgen.errors import InputError, visible_line
+
+if TYPE_CHECKING:  # NumPy is loaded where arrays are checked: help and completion of commands do without
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: What makes an object that is expected, by its name.
 _MADE_BY = {
@@ -77,7 +79,7 @@ def names_of(name: str, value: Any) -> list[str]:
 
 def labels_of(name: str, value: Any) -> Sequence[str]:
     """Return an argument that must be a sequence of texts, not a single one."""
-    if isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "UO":
+    if _is_array(value) and value.ndim == 1 and value.dtype.kind in "UO":
         value = value.tolist()
     if isinstance(value, str | bytes) or not isinstance(value, Sequence):
         raise InputError(f"expected a sequence of names, got {_described(value)}", field=name)
@@ -88,7 +90,7 @@ def labels_of(name: str, value: Any) -> Sequence[str]:
 
 
 def numbers(
-    name: str, value: Any, *shape: int | None, unknown: bool = False, least: float = -np.inf, finite: bool = True
+    name: str, value: Any, *shape: int | None, unknown: bool = False, least: float = -math.inf, finite: bool = True
 ) -> NDArray[np.float64]:
     """Return an argument that must be an array of real, finite numbers.
 
@@ -101,6 +103,8 @@ def numbers(
     least : smallest number.
     finite : False: any real numbers; what depends on an infinite or unknown one is that, too.
     """
+    import numpy as np
+
     found = _real(name, value)
     if found.ndim != len(shape) or any(size not in (None, own) for size, own in zip(shape, found.shape, strict=True)):
         expected = ", ".join("n" if size is None else str(size) for size in shape)
@@ -113,7 +117,7 @@ def numbers(
             raise InputError(
                 f"contains {found[~good][0]:g}, which is not finite; give finite numbers{hint}", field=name
             )
-    if least > -np.inf and (found < least).any():
+    if least > -math.inf and (found < least).any():
         raise InputError(f"contains {np.nanmin(found):g}; expected numbers of at least {least:g}", field=name)
     return found
 
@@ -126,6 +130,8 @@ def vectors(name: str, value: Any) -> NDArray[np.float64]:
 
 def whole_numbers(name: str, value: Any, size: int) -> NDArray[np.int64]:
     """Return an argument that must be an array of ``size`` whole numbers; the same object if it is one of int64."""
+    import numpy as np
+
     if type(value) is np.ndarray and value.dtype.kind in "iu" and value.shape == (size,):
         return value.astype(np.int64, copy=False)
     found = numbers(name, value, size)
@@ -136,6 +142,8 @@ def whole_numbers(name: str, value: Any, size: int) -> NDArray[np.int64]:
 
 def _real(name: str, value: Any) -> NDArray[np.float64]:
     """Return an argument as an array of float64; InputError for masked, complex, boolean and ragged ones, and for text."""
+    import numpy as np
+
     if isinstance(value, np.ma.MaskedArray):
         raise InputError("is a masked array; give the numbers alone, or nan where that is allowed", field=name)
     if type(value) is np.ndarray and value.dtype == np.float64:
@@ -152,10 +160,14 @@ def _real(name: str, value: Any) -> NDArray[np.float64]:
     return found.astype(np.float64)
 
 
+def _is_array(value: Any) -> bool:
+    return type(value).__module__.partition(".")[0] == "numpy" and hasattr(value, "dtype") and hasattr(value, "shape")
+
+
 def _described(value: Any) -> str:
     """Return what was given, in a few words."""
     if isinstance(value, str | PathLike):
         return f"{'a path' if not isinstance(value, str) else 'the text'} {visible_line(value)[:60]!r}"
-    if isinstance(value, np.ndarray):
+    if _is_array(value):
         return f"an array of shape {value.shape}"
     return "None" if value is None else f"an object of type {type(value).__name__}"

@@ -217,9 +217,9 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
 class StoredPosterior:
     """A posterior without its machine, as a covariance file keeps it.
 
-    ``levels_mm`` are the levels of the state on X, Y and Z; ``names`` the errors, ``sizes`` (errors, 3) of each the size
-    and the scale of its prior and its rough part; ``mean`` (p,) and ``factor`` (p, r) of the state; ``spans_mm`` (3, 2)
-    where the readings were; ``prior`` the section of the machine file, with what was raised.
+    ``levels_mm`` are the levels of the state on X, Y and Z; ``names`` the errors, ``sizes`` (errors, 4) of each the size
+    and the scale of its prior, its rough part, and the size of a measured slope; ``mean`` (p,) and ``factor`` (p, r) of the
+    state; ``spans_mm`` (3, 2) where the readings were; ``prior`` the section of the machine file, with what was raised.
     """
 
     levels_mm: tuple[FloatArray, FloatArray, FloatArray]
@@ -266,7 +266,7 @@ class StoredPosterior:
         except KeyError as error:
             raise ValueError(f"{error.args[0]} is missing") from error
         finite = all(np.isfinite(array).all() for key, array in numbers.items() if key != "spans_mm")
-        shapes = numbers["sizes"].shape == (len(names), 3) and numbers["factor"].shape[:1] == numbers["mean"].shape
+        shapes = numbers["sizes"].shape == (len(names), 4) and numbers["factor"].shape[:1] == numbers["mean"].shape
         known = all(name in ERROR_INDEX for name in names) and isinstance(prior, dict)
         if not (finite and shapes and known and numbers["spans_mm"].shape == (3, 2)):
             raise ValueError("the parts of the posterior do not match")

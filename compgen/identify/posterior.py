@@ -62,6 +62,8 @@ LEARNING_STEPS, ENOUGH_LEARNT = 12, 0.05
 TOO_LARGE, PASSES, FEW_FREE = 1.3, 3, 10
 #: rms of what is determined over its prior beyond which a machine is worse than its class: of one curve, of all.
 WORSE_CURVE, WORSE_ALL = 2.2, 1.5
+#: The size of a slope that was measured, over the slope found: nothing is assumed about it.
+FLAT = 10.0
 #: Factor by which the sizes of a class grow until the machine is no longer worse than it.
 RAISE = 3.0
 
@@ -71,6 +73,8 @@ class Process:
     """Prior of one curve: size ``s`` (mm or rad), ``scale`` per mm, travel and gauge, and the rough part.
 
     ``zero_mm`` are the positions at which the curve is zero: one for positioning and angles, two for straightness.
+    ``slope`` per mm is that of a slope that was measured: about its size nothing is assumed, so that a curve is drawn
+    straight between two readings however steep it is; ``sd`` leaves it out.
     """
 
     name: str
@@ -79,6 +83,7 @@ class Process:
     travel_mm: float
     zero_mm: tuple[float, ...]
     rough: float = ROUGH
+    slope: float = 0.0
 
     def _kernel(self, x: FloatArray, y: FloatArray) -> FloatArray:
         distance = np.abs(x[:, None] - y[None, :]) / self.travel_mm
@@ -96,17 +101,19 @@ class Process:
 
     def covariance(self, x: FloatArray, y: FloatArray) -> FloatArray:
         """Prior covariance of the curve between positions (m,) and (n,), shape (m, n)."""
+        steep = self.slope**2 + self.scale**2
         pins = np.array(self.zero_mm)
         of_x, of_y = self._gauge(x), self._gauge(y)
         found = self._kernel(x, y) - self._kernel(x, pins) @ of_y.T - of_x @ self._kernel(pins, y)
         found += of_x @ self._kernel(pins, pins) @ of_y.T
-        if self.scale:
-            found += self.scale**2 * (x - pins[0])[:, None] * (y - pins[0])[None, :]
+        if steep:
+            found += steep * (x - pins[0])[:, None] * (y - pins[0])[None, :]
         return np.asarray(found)
 
     def sd(self, x: FloatArray) -> FloatArray:
         """Prior standard deviation at positions (m,)."""
-        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance(x, x)), 0.0)))
+        own = replace(self, slope=0.0).covariance(x, x)
+        return np.asarray(np.sqrt(np.maximum(np.diag(own), 0.0)))
 
 
 def processes_of(machine: Machine, prior: PriorSettings, names: Sequence[str]) -> dict[str, Process]:
@@ -437,9 +444,14 @@ class Posterior:
         """Return it as a covariance file keeps it."""
         x, y, z = (axis.nodes_mm for axis in self.machine.axes)
         sizes = [
-            (self.squareness_sd[name], 0.0, 0.0)
+            (self.squareness_sd[name], 0.0, 0.0, 0.0)
             if name in SQUARENESS_NAMES
-            else (self.processes[name].s, self.processes[name].scale, self.processes[name].rough)
+            else (
+                self.processes[name].s,
+                self.processes[name].scale,
+                self.processes[name].rough,
+                self.processes[name].slope,
+            )
             for name in self.names
         ]
         prior = self.prior.stated()
@@ -512,7 +524,7 @@ def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
     sizes = dict(zip(stored.names, stored.sizes.tolist(), strict=True))
     usual = processes_of(machine, prior, stored.names)
     processes = {
-        name: replace(item, s=sizes[name][0], scale=sizes[name][1], rough=sizes[name][2])
+        name: replace(item, s=sizes[name][0], scale=sizes[name][1], rough=sizes[name][2], slope=sizes[name][3])
         for name, item in usual.items()
     }
     squareness = {name: size[0] for name, size in sizes.items() if name in SQUARENESS_NAMES}
@@ -655,8 +667,11 @@ def _solved_posterior(
     usual = processes_of(machine, prior, names)
     of_class = {name: prior.size(name) for name in layout.squareness}
     own: dict[str, float] = {}
+    slopes: dict[str, tuple[float, float]] = {}
     for _ in range(passes):
         larger = processes_of(machine, prior, names) | {n: _grown(usual[n], own[n]) for n in own if n in usual}
+        for name, (slope, shape) in slopes.items():
+            larger[name] = replace(_grown(usual[name], max(1.0, shape)), slope=FLAT * slope)
         sizes = np.array([of_class[n] * own[n] if n in own else prior.size(n) for n in layout.squareness])
         known = _sum(parts, layout.size)
         solved = _solve(layout, larger, sizes, known)
@@ -667,9 +682,11 @@ def _solved_posterior(
         parts = [
             item.scaled(factor) if factor > TOO_LARGE else item for item, factor in zip(parts, noisier, strict=True)
         ]
-        if set(ratios) == set(own) and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
+        steep = _slopes(found, usual)
+        same = set(ratios) == set(own) and set(steep) == set(slopes)
+        if same and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
             break
-        own, prior = {name: max(1.0, ratio) for name, ratio in ratios.items()}, raised
+        own, prior, slopes = {name: max(1.0, ratio) for name, ratio in ratios.items()}, raised, steep
     rough = _rough(found) if passes > 1 else {}
     if rough:
         larger = larger | {name: replace(larger[name], rough=share) for name, share in rough.items()}
@@ -773,6 +790,25 @@ def _over_class(found: Posterior, usual: Mapping[str, Process], of_class: Mappin
         at = np.linspace(*found.machine.axes[error_named(name).axis].range_mm, SCATTERED)
         ratios[name] = float(np.sqrt(np.mean(found.curve(name, at).value ** 2) / np.mean(usual[name].sd(at) ** 2)))
     return ratios
+
+
+def _slopes(found: Posterior, usual: Mapping[str, Process]) -> dict[str, tuple[float, float]]:
+    """Slope per mm about the reference point of each positioning error of which the readings show it, by least squares.
+
+    With the size of what remains over that which the class lets expect: a steep curve need not be a bent one.
+    """
+    slopes = {}
+    for name, process in usual.items():
+        if not process.scale or found.shares[name] > LISTED_CURVE:
+            continue
+        at = np.linspace(*found.machine.axes[error_named(name).axis].range_mm, SCATTERED)
+        away, value = at - process.zero_mm[0], found.curve(name, at).value
+        gain = away / float(away @ away)
+        slope = float(gain @ value)
+        if abs(slope) > 3.0 * float(np.linalg.norm(gain @ found.values_factor([name], [at]))):
+            shape = replace(process, scale=0.0).sd(at)
+            slopes[name] = abs(slope), float(np.linalg.norm(value - slope * away) / np.linalg.norm(shape))
+    return slopes
 
 
 def _worse(ratios: Mapping[str, float]) -> dict[str, float]:

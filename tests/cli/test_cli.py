@@ -468,7 +468,7 @@ def test_two_machines_with_one_name_are_refused_where_that_name_is_used(call, sm
         (("--controller", "isg-csv", "--smoothness", "-1"), "smoothness"),
         (("--controller", "isg-csv", "--smoothness", "nan"), "smoothness"),
         (("--controller", "isg-csv", "--smoothness", "a"), "'a': expected a number"),
-        (("--controller", "isg-csv", "--u-length-um", "-1"), "must be above zero"),
+        (("--controller", "isg-csv", "--u-length-um", "-1"), "-1 is not a standard uncertainty"),
         (("--controller", "isg-csv", "--u-length-um", "nan"), "'nan': expected a finite number"),
         (("--controller", "isg-csv", "--outt", "x"), "No such option"),
         (("--controller", "isg-csv", "--templates", "nowhere"), "no such folder"),
