@@ -145,13 +145,21 @@ class Texts:
             if len(self._known) > 20_000:
                 self._known.clear()
             core = english.strip()
-            found = self._whole(core, least) or self._by_parts(core, least) or (None if _PROSE.search(core) else core)
+            found = self._of_verdict(core, least) or self._whole(core, least) or self._by_parts(core, least)
+            found = found or (None if _PROSE.search(core) else core)
             self._known[english, least] = None if found is None else english.replace(core, found) if core else english
         return self._known[english, least]
 
     def _whole(self, english: str, least: int) -> str | None:
         known = self.messages.get(english)
-        return self._matched(english, least) if known is None and " " in english else known
+        if known is None and " " in english:
+            known = self._matched(english, least)
+        if (
+            known is None and english[:1].isupper() and not english[1:2].isupper()
+        ):  # a message that begins a line of a page
+            known = self._whole(english[0].lower() + english[1:], least)
+            return None if known is None else known[0].upper() + known[1:]
+        return known
 
     def _matched(self, english: str, least: int) -> str | None:
         for letters, longest, message in self._patterns:
@@ -160,6 +168,10 @@ class Texts:
             for pattern in _patterns(message):
                 if match := pattern.fullmatch(english):
                     texts = match.groupdict()
+                    if any(
+                        colon and self._word(name) for name, colon, _ in (t.partition(": ") for t in texts.values())
+                    ):
+                        continue  # a verdict and its sentence are translated one after the other
                     if letters < least and any(_LETTERS.search(text) for text in texts.values()):
                         continue
                     values = {name: self._word(text) or self._complete(text) for name, text in texts.items()}
@@ -171,6 +183,14 @@ class Texts:
                         continue
                     return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
         return None
+
+    def _of_verdict(self, english: str, least: int) -> str | None:
+        """Translate a verdict of several words, e.g. "accepted with reservations", and what follows its colon."""
+        verdict, _, rest = english.partition(": ")
+        if not rest or " " not in verdict or self._word(verdict) is None:
+            return None
+        found = self._complete(rest, least)
+        return None if found is None else f"{self._word(verdict)}: {found}"
 
     def _by_parts(self, english: str, least: int) -> str | None:
         """Translate a name and what follows its colon, several sentences, or parts between semicolons or commas."""

@@ -269,8 +269,10 @@ class Schema:
                     what = f"contains the same rows as {earlier.path}; give each measurement only once"
                     raise InputError(what, file=table.path)
                 if len(table) == len(earlier) >= FEW_ROWS and _readings(table) == _readings(earlier):
-                    what = f"contains the same readings as {earlier.path}, under other run numbers, labels or times, in another "
-                    what += "order or written with other digits; give each measurement only once"
+                    what = (
+                        f"contains the same readings as {earlier.path}, under other run numbers, labels or times, in another "
+                        "order or written with other digits; give each measurement only once"
+                    )
                     raise InputError(what, file=table.path)
         return tables
 

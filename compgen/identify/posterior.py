@@ -921,12 +921,11 @@ def worse_text(found: Posterior) -> str:
     """Return a sentence if the machine is worse than its class, else nothing."""
     if not found.worse:
         return ""
-    listed = ", ".join(
-        f"{name} ({ratio:.1f} times)" for name, ratio in sorted(found.worse.items(), key=lambda x: -x[1])[:4]
-    )
-    more = f" and {len(found.worse) - 4} more" if len(found.worse) > 4 else ""
+    listed = ", ".join(f"{name} {ratio:.1f}" for name, ratio in sorted(found.worse.items(), key=lambda x: -x[1])[:4])
+    if len(found.worse) > 4:
+        listed = f"{listed} and {len(found.worse) - 4} more"
     return (
-        f"the machine is worse than its class {found.prior.stated_class!r}: {listed}{more} of what the class lets expect; "
+        f"the machine is worse than its class {found.prior.stated_class!r}, in multiples of what it lets expect: {listed}; "
         "larger errors are assumed. State class or sizes in [prior] of the machine file"
     )
 

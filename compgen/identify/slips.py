@@ -70,8 +70,10 @@ def _size_um(measurement: Deviations | AxisRuns | Circles, values: FloatArray) -
 def _asked(measurement: Deviations | AxisRuns | Circles, what: str, row: int, largest_um: float) -> InputError:
     message = f"{what}all deviations are zero; was nothing measured? Give the measured values"
     if largest_um:
-        message = f"{what}the largest deviation is {largest_um:.3g} um, too small for a machine tool; are the values in mm, a "
-        message += "thousand times too small for um? Give them in um"
+        message = (
+            f"{what}the largest deviation is {largest_um:.3g} um, too small for a machine tool; are the values in mm, a "
+            "thousand times too small for um? Give them in um"
+        )
     file, line = measurement.origin[row] if measurement.origin else (None, None)
     return InputError(f"{message}, or add --small-deviations if they are right", file=file, line=line if what else None)
 

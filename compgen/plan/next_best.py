@@ -160,7 +160,7 @@ class NextBest:
                 chosen.append(found[0])
         first, *others = chosen
         said = f"{_capital(first.candidate.what)} would reduce u from {um_text(self.u_um)} to {um_text(first.u_after_um)} um"
-        said += "".join(f", {item.candidate.what} to {um_text(item.u_after_um)}" for item in others)
+        said += "".join(f", {item.candidate.what} down to {um_text(item.u_after_um)}" for item in others)
         return f"{self.sentence} {said} (rms over the volume)."
 
     def summary(self) -> dict[str, Any]:

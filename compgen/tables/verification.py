@@ -125,9 +125,11 @@ class Coverage:
         """Return in words what was measured."""
         kinds = list(dict.fromkeys(_kind(name) for name in self.determined))
         known, observable = len(self.determined), len(self.observable)
-        what = f"{' and '.join(kinds)} only, " if len(kinds) in (1, 2) else ""
-        more = f", {len(self.partly)} more in part" if self.partly else ""
-        return f"{what}{known} of {observable} errors measured{more}"
+        if len(kinds) in (1, 2):
+            text = f"{' and '.join(kinds)} only, {known} of {observable} errors measured"
+        else:
+            text = f"{known} of {observable} errors measured"
+        return text + (f", {len(self.partly)} more in part" if self.partly else "")
 
     def as_dict(self) -> dict[str, Any]:
         """Return the object ``measured`` of ``result.json``."""
@@ -321,8 +323,9 @@ def open_text(open_um: Mapping[str, float]) -> str:
     if not open_um:
         return ""
     named = ", ".join(f"{name} {um_text(value)} um" for name, value in list(open_um.items())[:NAMED])
-    more = f" and {len(open_um) - NAMED} more" if len(open_um) > NAMED else ""
-    return f"not known: {named}{more} (u, rms over the volume)"
+    if len(open_um) > NAMED:
+        named = f"{named} and {len(open_um) - NAMED} more"
+    return f"not known: {named} (u, rms over the volume)"
 
 
 def rounded_limits(

@@ -53,7 +53,7 @@ NOT_SHOWN_IN = re.compile(
 )
 #: Single words that pages show: no rule tells them from keys.
 WORDS = (
-    "repeats", "neighbouring readings",
+    "repeats", "neighbouring readings", "curves",
     "table", "head",
     "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
     "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um",
@@ -105,7 +105,8 @@ NO_TEXT = re.compile(
     r"^([Mm]easurement|target|serial|version|[Ss]ample|mat temp) (date|id|no|\d)$|^(file type|exp coeff|air temp|measured at)$|"
     r"^(test date|date time|date of measurement|start time|actual sample rate|[Ss]ample rate|trigger interval)$|"
     r"^error: internal| \| [A-Z]|^run target data$|^Tool lengths: CSV|"
-    r"^Another machine with its errors|^ecart type$|^coverage factor k$|^Position \[|^run\{zero"
+    r"^Another machine with its errors|^ecart type$|^coverage factor k$|^Position \[|^run\{zero|"
+    r"^; sandbox |^recal add$"
 )
 #: Modules whose constants are words that readers look for.
 WITH_WORD_LISTS = ("new_machine.py", "column_names.py", "covariates.py", "cells.py")

@@ -468,11 +468,11 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
     if "as_it_stands" in best["limits"]:
         one, low, high, left, most = best["limits"]["as_it_stands"]
-        known = "" if best["volumetric"] else f" ({best['measured']})"
-        return (
+        text = (
             f"{name} error of the tool tip over the volume goes from {one} µm rms ({low} to {high}) to {left}, at most "
-            f"{most}, with the reference point fixed; 97.5 % limits, with what was not measured{known}."
+            f"{most}, with the reference point fixed; 97.5 % limits, with what was not measured."
         )
+        return text if best["volumetric"] else f"{text} Measured: {best['measured']}."
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
     bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is unknown)"
     if not best["volumetric"]:
