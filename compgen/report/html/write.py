@@ -472,7 +472,7 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
             f"{name} error of the tool tip over the volume goes from {one} µm rms ({low} to {high}) to {left}, at most "
             f"{most}, with the reference point fixed; 97.5 % limits, with what was not measured."
         )
-        return text if best["volumetric"] else f"{text} Measured: {best['measured']}."
+        return text if best["volumetric"] else f"{text} What was measured: {best['measured']}."
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
     bounds = f"± {known} µm (uncertainty of the measurement, k = 2)" if known else "(its uncertainty is unknown)"
     if not best["volumetric"]:
