@@ -23,7 +23,6 @@ pytest.importorskip("waitress", reason="the extra compgen[serve] is not installe
 import app_site as helper
 
 from compgen.data.machine import load_machine
-from compgen.errors import um_text
 from compgen.kinematics import modelled_errors
 
 ROOT = Path(__file__).resolve().parents[2]
