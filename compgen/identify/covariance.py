@@ -439,6 +439,9 @@ def parse_covariance(content: bytes, source: Path) -> Covariance:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}
+            for name, array in members.items():
+                if not isinstance(array, np.ndarray):  # numpy returns the bytes of what does not begin as an array
+                    raise ValueError(f"{name} is not an array")
     except Exception as error:  # what reads archives raises errors of many kinds: struct, tokenize, zlib
         raise InputError(f"cannot be read: is it truncated or damaged? ({error})", file=source) from error
     if str(members.get("format", "")) != FORMAT:

@@ -428,6 +428,15 @@ def test_a_damaged_header_of_an_array_is_bad_input_whatever_numpy_makes_of_it(wr
         read_covariance(path)
 
 
+@pytest.mark.parametrize("name", ["factor", "error", "setup", "machine", "position_mm"])
+def test_a_member_that_is_no_array_is_bad_input(written, tmp_path, name):
+    path = tmp_path / "damaged.npz"
+    path.write_bytes((written[2] / FILE_NAME).read_bytes())
+    with_member(path, f"{name}.npy", lambda raw: b"\x00" + raw[1:])
+    with pytest.raises(InputError, match=f"{name} is not an array"):
+        read_covariance(path)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
