@@ -188,6 +188,12 @@ def test_the_database_refuses_to_change_or_remove_a_row(filled, server, table, a
     assert server.sql(f"SELECT count(*) FROM {table}", name) == before
 
 
+def test_a_result_of_class_none_is_found_to_be_without_prior(filled):
+    assert filled.without_prior() == filled.without_prior(filled.machine("mill")) == {1}
+    named = sa.select(database.identifications.c.summary[("prior", "class")].as_string())
+    assert filled.read(lambda connection: connection.execute(named).scalars().all()) == ["none"]
+
+
 # --- the whole way -------------------------------------------------------------------------------------------------
 
 
