@@ -197,7 +197,15 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
     if machine.prior.is_none:
         return None
     if covariance is not None and covariance.posterior is not None:
-        return covariance.posterior.of(machine)
+        found = covariance.posterior.of(machine)
+        if replace(found.prior, factor=machine.prior.factor) != machine.prior:
+            warnings.warn(
+                f"the errors were identified with the prior of class {found.prior.stated_class!r}, which stays; that stated now "
+                f"({machine.prior.stated_class!r}, [prior] of the machine file or --prior) counts when they are identified again",
+                CompgenWarning,
+                stacklevel=2,
+            )
+        return found
     known = covariance_or_independent(errors, covariance, machine.name)
     if known is None:
         return None

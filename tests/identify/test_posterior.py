@@ -35,6 +35,7 @@ from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import identify
 from compgen.identify.axis_tests import identify_axis_runs
+from compgen.identify.covariance import joint_covariance, posterior_with
 from compgen.identify.posterior import not_measured, worse_text
 from compgen.pipeline import identify_bare
 
@@ -311,3 +312,17 @@ def test_readings_of_which_rounding_leaves_nothing_are_no_internal_error():
         warnings.simplefilter("ignore", CompgenWarning)
         with suppress(UndeterminedError, InputError):
             identify_bare(shop.machine, errors)
+
+
+def test_a_stored_posterior_keeps_its_prior_and_another_one_is_said():
+    """The class stated after the identification: nothing of what was identified changes, silently or otherwise."""
+    shop = case(0, family="smooth", seed=9)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        found = identify_bare(shop.machine, shop.runs("XYZ"))
+    stored = joint_covariance(found)
+    same = posterior_with(shop.machine, found.errors, stored)
+    other = replace(shop.machine, prior=PriorSettings(class_name="router"))
+    with pytest.warns(CompgenWarning, match="identified with the prior of class 'general', which stays.*'router'"):
+        kept = posterior_with(other, found.errors, stored)
+    assert kept.processes == same.processes and kept.prior == same.prior
