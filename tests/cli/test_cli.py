@@ -4,11 +4,14 @@ import ast
 import io
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import click
@@ -759,14 +762,22 @@ def test_no_figure_and_no_verdict_is_cut_off(width, name, small_machine, small_e
     paths = compgen.export(small_machine, small_errors, "isg-csv").write(tmp_path)
     result = compgen.verify(small_machine, compgen.read_tables(small_machine, paths, "isg-csv"), small_errors)
     figures = Residuals(4321.0, 1234.0, 1.0, 1.0, 1.0, 1.0)
-    for reasons, verdict in ((), "accepted"), (("first", "second"), "REJECTED"):
-        wide = replace(result, controller=name, before=figures, after=figures, reasons=reasons, gain=None)
+    limits = (4322.0, 4323.0, 4324.0)  # median, lower and upper
+    gain = replace(
+        result.gain, before_um=(5321.0, 5322.0, 5323.0), after_um=limits, after_rigid_um=(6321.0, 6322.0, 6323.0)
+    )
+    for (reasons, verdict), with_prior in product((((), "accepted"), (("first", "second"), "REJECTED")), (False, True)):
+        wide = replace(result, controller=name, before=figures, after=figures, reasons=reasons)
+        wide = replace(wide, gain=gain if with_prior else None)
         console = Console(width=width, record=True, file=io.StringIO())
         console.print(verification_table([wide]))
         text = console.export_text()
         assert verdict in text
         assert "…" not in text
-        assert min(text.count("4321"), text.count("1234")) >= 2
+        shown = Counter(re.findall(r"\b[1-6][0-9]{3}\b", text.partition("before, after")[0]))
+        # before with both limits, after and its upper one, twice; what the files leave
+        probable = Counter(["5321", "5322", "5323", "4322", "4324", "6321", "6323", "4321", "1234"])
+        assert shown == (probable if with_prior else Counter({"4321": 2, "1234": 2}))
         assert all(reason in text for reason in reasons)
         assert max(map(len, text.splitlines())) <= width
 
