@@ -251,9 +251,10 @@ def _table_of_controls(title: str, *headings: str) -> Table:
     table = Table(
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE, pad_edge=False, collapse_padding=True
     )
-    table.add_column("control", overflow="fold", min_width=12)
+    many = len(headings) > 5  # in 80 characters the verdict has to be whole, too
+    table.add_column("control", overflow="fold", min_width=8 if many else 12)
     for heading in headings:
-        table.add_column(heading, justify="right", overflow="fold", min_width=6)
+        table.add_column(heading, justify="right", overflow="fold", min_width=5 if many else 6)
     table.add_column("verdict", no_wrap=True, min_width=9)
     return table
 
