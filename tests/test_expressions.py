@@ -16,6 +16,8 @@ import compgen
 from compgen.controls.shared.scanner import number_pattern
 from compgen.errors import InputError
 from compgen.programs.dialects import DIALECTS
+from compgen.programs.follower import _COMMENTS, _OTHER_COMMENTS
+from compgen.programs.follower import _runs as block_runs
 
 ROOMS = ("programs", "controls", "foreign")
 FOLDER = Path(compgen.__file__).parent
@@ -28,6 +30,8 @@ MADE = {
     "dialects.head": [(dialect.head(), "match") for dialect in DIALECTS.values()],
     "dialects.without_words": [(dialect.without_words(), "fullmatch") for dialect in DIALECTS.values()],
     "runs.__init__": _DIALECTS,
+    "follower._runs": [(block_runs(name), "match") for name in DIALECTS],
+    "follower.__init__": [(re.compile(comments), "sub") for comments in (*_COMMENTS.values(), _OTHER_COMMENTS)],
     "subprograms.number": [(re.compile(r"\s*(?:N\s*\d+\s*)?[O:]\s*0*(\d+)(?!\d)"), "match")],
     "scanner.number_pattern": [(number_pattern(exponent=3), "fullmatch"), (number_pattern(), "fullmatch")],
     "cells.plain_decimals": [

@@ -682,7 +682,7 @@ def _solved_posterior(
         parts = [
             item.scaled(factor) if factor > TOO_LARGE else item for item, factor in zip(parts, noisier, strict=True)
         ]
-        steep = _slopes(found, usual)
+        steep = _slopes(found, usual, slopes)
         same = set(ratios) == set(own) and set(steep) == set(slopes)
         if same and raised == prior and max(noisier, default=1.0) <= TOO_LARGE:
             break
@@ -792,20 +792,23 @@ def _over_class(found: Posterior, usual: Mapping[str, Process], of_class: Mappin
     return ratios
 
 
-def _slopes(found: Posterior, usual: Mapping[str, Process]) -> dict[str, tuple[float, float]]:
+def _slopes(
+    found: Posterior, usual: Mapping[str, Process], before: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float]]:
     """Slope per mm about the reference point of each positioning error of which the readings show it, by least squares.
 
     With the size of what remains over that which the class lets expect: a steep curve need not be a bent one.
     """
     slopes = {}
     for name, process in usual.items():
-        if not process.scale or found.shares[name] > LISTED_CURVE:
-            continue
+        if not process.scale or not (name in before or DETERMINED < found.shares[name] <= LISTED_CURVE):
+            continue  # what is determined everywhere is drawn by its readings
         at = np.linspace(*found.machine.axes[error_named(name).axis].range_mm, SCATTERED)
         away, value = at - process.zero_mm[0], found.curve(name, at).value
         gain = away / float(away @ away)
         slope = float(gain @ value)
-        if abs(slope) > 3.0 * float(np.linalg.norm(gain @ found.values_factor([name], [at]))):
+        u = float(np.linalg.norm(gain @ found.values_factor([name], [at])))
+        if abs(slope) > 3.0 * u and u < process.scale:
             shape = replace(process, scale=0.0).sd(at)
             slopes[name] = abs(slope), float(np.linalg.norm(value - slope * away) / np.linalg.norm(shape))
     return slopes

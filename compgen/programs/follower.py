@@ -44,7 +44,7 @@ _HEIDENHAIN = re.compile(
 )
 _SIEMENS = re.compile(
     r";[^\n]*+"
-    r"|(?P<name>[XYZ]1(?=\s*+=)|[SM]\d++(?=\s*+=)|[A-Z_]{2}\w*+\s*+(?:\[[^\]\n]*+\]\s*+)?(?==)|[A-Z](?=\s*+[-+=.\d\"]))\s*+=?\s*+"
+    r"|(?P<name>[XYZ]1(?=\s*+=)|[SM]\d++(?=\s*+=)|[A-Z_]{2}\w*+\s*+(?:\[[^\[\]\n]*+\]\s*+)?(?==)|[A-Z](?=\s*+[-+=.\d\"]))\s*+=?\s*+"
     rf"(?:(?P<mode>AC|IC|DC|ACP|ACN)\s*+\(\s*+(?P<inner>{_NUMBER})\s*+\)|\"(?P<text>[^\"\n]*+)\"|(?P<number>{_NUMBER}))"
     r"|(?P<call>[A-Z_]\w*+)\s*+\((?P<inside>(?:\"[^\"\n]*+\"|[^()\"\n]|\([^()\n]*+\))*+)\)"
     r"|(?P<word>[A-Z_]\w*+)",

@@ -566,5 +566,10 @@ def test_a_machine_that_was_measured_keeps_its_values(mill):
     assert {group: set(part) for group, part in plain.groups.items()} == {g: set(p) for g, p in whole.groups.items()}
     for group, part in plain.groups.items():
         for key, item in part.items():
-            assert whole.groups[group][key].value == pytest.approx(item.value, rel=1e-9, abs=1e-9), (group, key)
+            found = whole.groups[group][key]
+            off = abs(found.value - item.value)
+            if "mean over what" in found.meaning:  # a range: what curves do between their nodes makes it larger
+                assert 0.0 < off < found.u, (group, key)
+            else:
+                assert off < 1e-9 * max(1.0, abs(item.value)), (group, key)
     assert whole.groups["volume"]["rms"].u >= 0.5 * plain.groups["volume"]["rms"].u

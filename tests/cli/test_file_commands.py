@@ -154,7 +154,7 @@ def test_a_schema_tells_meaning_unit_default_and_choices(schemas):
     assert set(machine["controllers"]["properties"]) == set(CONTROLLERS)
     assert machine["effects"]["properties"]["backlash_X"]["anyOf"] == [{"required": ["c_um"]}]
     job = schemas["job"]["properties"]["defaults"]["properties"]
-    assert job["policy"]["properties"]["confidence"]["default"] == 0.95
+    assert job["policy"]["properties"]["confidence"]["default"] == 0.98
     trajectory = schemas["scenario"]["properties"]["trajectory"]["properties"]
     assert trajectory["feed_mm_min"]["description"].startswith("path speed between points")
     # every key of a machine, job and scenario says what it means

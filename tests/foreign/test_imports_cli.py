@@ -162,7 +162,9 @@ def test_an_exchange_file_runs_through_the_whole_chain(call, tmp_path, machine):
         "// constructed\n[C0Y]\nVALUE = 0.00002\n[EXX]\nGridpoints = {\n0 0.003\n100 0.007\n200 0.002\n400 0.005\n}\n"
         "[EYX]\nGridpoints = {\n0 0.001\n200 0.006\n400 0.003\n}\n"
     )
-    code, out, err = call("run", machine, path, "--controller", "isg-csv", "--out", tmp_path / "o", "--json")
+    code, out, err = call(
+        "run", machine, path, "--controller", "isg-csv", "--prior", "none", "--out", tmp_path / "o", "--json"
+    )
     assert code == 0, err
     facts = json.loads(out)
     assert facts["identify"]["method"] == "given"
@@ -215,7 +217,7 @@ def test_an_axis_that_goes_too_far_is_told_to_go_less_far_whatever_the_file_and_
     machine.write_text(text)
     measured = {"laser": _laser, "exchange": _exchange, "workbook": _workbook}[source](tmp_path, targets, per_mm)
     code, _, err = call("run", machine, measured, "--controller", "linuxcnc-comp", "--controller", "siemens-eec",
-                        "--out", tmp_path / "o")  # fmt: skip
+                        "--prior", "none", "--out", tmp_path / "o")  # fmt: skip
     assert code == 0, err
     assert (tmp_path / "o" / "report.html").stat().st_size > 10_000
     trims = np.loadtxt(tmp_path / "o" / "linuxcnc-comp" / "joint0-x.comp")

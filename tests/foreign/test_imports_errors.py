@@ -369,7 +369,7 @@ def test_a_workbook_of_runs_angles_and_squareness_in_one_command(call, tmp_path,
     machine.write_text(MACHINE.format(chain=chain))
     angles = [["X axis"], ["Position [mm]", "EBX + [urad]", "EBX - [urad]"], [0, 1, 3], [200, 5, 7], [400, 9, 11]]
     sheets = {"X": axis_sheet("X", 20, 0, 400), "Winkel": angles, "Rechtwinkligkeit": [["EC0Y", "25 urad"]]}
-    code, _, err = call("identify", machine, workbook(tmp_path, sheets), "--out", tmp_path / "o")
+    code, _, err = call("identify", machine, workbook(tmp_path, sheets), "--prior", "none", "--out", tmp_path / "o")
     assert code == 0, err
     errors = read_errors(tmp_path / "o" / "identified.errors.csv")
     # the mean of both directions, 2, 6, 10 urad, zero at the reference point
@@ -431,11 +431,13 @@ def test_how_a_straightedge_lay_does_not_change_a_squareness_that_was_measured_a
     }.items():
         path = workbook(tmp_path, sheets, f"{name}.xlsx")
         out = tmp_path / name
-        code, _, err = call("identify", machine, path, "--out", out / "direct")
+        code, _, err = call("identify", machine, path, "--prior", "none", "--out", out / "direct")
         assert code == 0, err
         code, _, err = call("import", path, "--out", out)
         assert code == 0, err
-        code, _, err = call("identify", machine, *sorted(out.glob("*.csv")), "--out", out / "imported")
+        code, _, err = call(
+            "identify", machine, *sorted(out.glob("*.csv")), "--prior", "none", "--out", out / "imported"
+        )
         assert code == 0, err
         for folder in ("direct", "imported"):
             errors = read_errors(out / folder / "identified.errors.csv")

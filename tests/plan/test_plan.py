@@ -530,7 +530,7 @@ def test_plan_suggests_and_proposes(call, small_machine_file, stations_file, tmp
         (("--grid", "--points", "p.csv"), "either --points FILE or --grid"),
         (("--grid", "--box", "S1:0,1,0,1,0,1"), "--box and --boxes need --suggest"),
         (("--grid", "--suggest", "--box", "S9:0,1,0,1,0,1"), "belongs to no station"),
-        (("--grid", "--u-length-um", "-1"), "must be above zero"),
+        (("--grid", "--u-length-um", "-1"), "-1 is not a standard uncertainty"),
         (("--grid", "--target-um", "-1"), "the target is -1"),
     ],
 )

@@ -217,7 +217,7 @@ def constant_reversal(value_um, axis=0, component=0):
 
 
 def test_points_are_taken_in_both_directions_and_their_mean_is_half_of_the_sum():
-    points = Points(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.array([7.0, 8.0, 9.0]))
+    points = Points(np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), np.tile([7.0, 8.0, 9.0], (2, 1)))
     both = in_both_directions(points)
     assert both.position_mm.tolist() == [*points.position_mm.tolist()] * 2
     assert both.tool_mm.tolist() == [[7.0, 8.0, 9.0]] * 4
