@@ -1,5 +1,6 @@
 """LinuxCNC's own interpreter (``rs274``) reads programs, original and corrected: its moves are ours, to its last decimal."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -34,7 +35,8 @@ def interpreted(program, folder, *, stopped=False):
     folder.joinpath("tool.tbl").write_text("".join(f"T{n} P{n} Z{v[2] / 25.4:.8f} D0\n" for n, v in TOOLS_MM.items()))
     done = subprocess.run(
         ["rs274", "-g", "-v", "sim.var", "-t", "tool.tbl", str(program)],
-        cwd=folder, capture_output=True, text=True, timeout=60, check=False,
+        cwd=folder, env={**os.environ, "HOME": str(folder)},  # its tool table is a shared file, ~/.tool.mmap
+        capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     if stopped:
         assert "PROGRAM_END" not in done.stdout and "is not that of the correction" in done.stderr

@@ -1,5 +1,6 @@
 """Probe programs: run by LinuxCNC's interpreter, or read word by word; their logs lead back to the errors of the machine."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -138,8 +139,9 @@ def test_linuxcnc_itself_runs_the_program_and_logs_machine_coordinates(tmp_path,
     x, y, z = offset_mm
     (tmp_path / "p.ngc").write_text(program.replace("G90 G21", f"G10 L2 P1 X{x} Y{y} Z{z}\nG90 G21", 1))
     done = subprocess.run(
-        ["rs274", "-g", "p.ngc"], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=True
-    )
+        ["rs274", "-g", "p.ngc"], cwd=tmp_path, env={**os.environ, "HOME": str(tmp_path)},
+        capture_output=True, text=True, timeout=60, check=True,
+    )  # fmt: skip
     assert "error" not in done.stderr.lower().replace("errors", "")
     canon = re.findall(r"(STRAIGHT_PROBE|STRAIGHT_FEED|LOG)\((.*)\)", done.stdout)
     low, high = small_machine.lower_mm - 1e-6, small_machine.upper_mm + 1e-6
