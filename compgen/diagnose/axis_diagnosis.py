@@ -24,7 +24,6 @@ from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
 from compgen.diagnose.axis_model import (
     DRIFTS,
     LEAST_GAIN,
-    LEAST_MM,
     OF_RUNS,
     Candidate,
     NoiseGrid,
@@ -80,6 +79,20 @@ NOT_THE_SAME = "the drift is not the same at all positions and in both direction
 #: Limits for the whitened residuals to count as noise: excess kurtosis (the largest in 200 sessions with noise of
 #: memory up to 0.85 was 2.0), and skewness over its standard error.
 JUMPS, LEANS = 3.0, 4.5
+#: Standard uncertainties below which an amount is not confirmed.
+LEAST_SIZE = 2.0
+#: A disturbance of no more readings than this may be a rounding.
+FEW_READINGS = 3
+#: Gain in twice the log likelihood beyond the penalty that a small effect beside a large one needs, and its share.
+LEAST_BESIDE, SMALL_BESIDE = 12.0, 0.2
+#: Chi-square that a small reversal needs beside a change whose chi-square is this many times larger.
+LEAST_REVERSAL_BESIDE, LARGER = 30.0, 4.0
+#: Gain that disturbed readings need beside something unnamed, of which they could be a part.
+LEAST_DISTURBED = 100.0
+#: A constant reversal is named from this share of the scatter of a reading.
+LEAST_OF_SCATTER = 0.1
+#: Largest plausible parameter, as a multiple of what the catalogue gives.
+PLAUSIBLE = 3.0
 #: Usual upper limit of the memory of measurement noise; gain in twice the log likelihood that shows a longer memory;
 #: memory above which the readings count as wandering in any case.
 USUAL_MEMORY, WANDERS, MOST_MEMORY = 0.9, 5.0, 0.94
@@ -94,6 +107,8 @@ ALIKE = 0.7
 AS_WELL = 0.2
 #: Effects whose readings are left out of the figures; all other changes are subtracted.
 LEFT_OUT = ("bad_run", "disturbed_readings")
+#: Effects of a logged column.
+LOGGED = ("thermal_scale", "spindle_growth", "settling", "servo_lag")
 #: Effects that are stored in a machine file; the warm-up of one session is not one of them.
 MACHINE_EFFECTS = ("thermal_scale", "spindle_growth", "servo_lag")
 
@@ -103,7 +118,7 @@ class AxisEffect:
     """A named effect: parameters (value, u) keyed by name, in the unit of the name; ``shift_mm`` (n,) is what it adds.
 
     ``left_out`` are readings (numbers in time) that it makes unusable. ``remains`` says which part of a tentative drift
-    is subtracted anyway and which part stays; empty for all other effects.
+    is subtracted anyway and which part stays; empty for all other effects. ``clear`` is the gain beyond the penalty.
     """
 
     name: str
@@ -121,6 +136,12 @@ class AxisEffect:
     values: FloatArray
     homogeneity_p: float = 1.0
     remains: str = ""
+    clear: float = np.inf
+
+    @property
+    def wald(self) -> float:
+        """Largest of the squares of the parameters over their uncertainties."""
+        return max(((value / u) ** 2 for value, u in self.parameters.values() if u), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -234,7 +255,7 @@ def _findings(
     grid = NoiseGrid(session)
     repeated = session.repeated and grid.freedom >= LEAST_REPEATS
     search = Search(session, grid, candidates_of(session, names) if repeated else [])
-    members = _added(search, search.run(most) if repeated else [], add)
+    members = _added(search, _seen(search, search.run(most)) if repeated else [], add)
     changes = _Changes(search, members)
     source = "repeats" if repeated else "stated" if u_um is not None else "assumed"
     reversal = _Reversal(changes, None if repeated else u_um)
@@ -242,14 +263,27 @@ def _findings(
     if repeated and not unknown:
         unknown = _restless(changes)
     static, irregular = reversal.found(names, add, source)
+    if repeated:
+        static = [_instead(changes, item) if item.name.startswith("backlash") else item for item in static]
     # a reversal is doubtful if it changes with time; a small one also if anything else is unnamed
     if any({"time", "approach"} <= set(other.covariates) for other in unknown):
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
         least = LEAST_WITH_UNKNOWN_RUNS if any("run" in other.covariates for other in unknown) else LEAST_WITH_UNKNOWN
         static = [_doubted(i, "small compared with the unexplained part") if i.gain < least else i for i in static]
+    largest = max((item.gain for item in effects), default=0.0)
+    static = [
+        _doubted(item, "it is small beside what changes with time")
+        if min(item.gain, item.wald) < LEAST_REVERSAL_BESIDE and min(item.gain, item.wald) * LARGER < largest
+        else item
+        for item in static
+    ]
     effects, unknown = [*effects, *static], [*unknown, *irregular]
     if unknown:
+        text = "what has no name may be the cause"
+        effects = [
+            _doubted(e, text) if e.name == "disturbed_readings" and e.gain < LEAST_DISTURBED else e for e in effects
+        ]
         effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
     if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
         first = effects[0]
@@ -279,6 +313,13 @@ def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list
     if len(members) >= most > 0 and search.criteria(members)[1].max() >= LEAST_GAIN:
         unknown.append(AxisUnknown(f"more than {most} changes: the session does not repeat", ("time", "run"), np.nan))
     effects = [_change(changes, k, generic) for k in members if k not in generic]
+    largest = max((item.gain for item in effects), default=0.0)
+    effects = [
+        _doubted(item, "it is small beside the others")
+        if item.gain < SMALL_BESIDE * largest and item.clear < LEAST_BESIDE
+        else item
+        for item in effects
+    ]
     of_runs = [item for item in effects if item.name in OF_RUNS]
     may_be = [{name for name, weight in item.alias if weight > AS_WELL} for item in of_runs]
     one_of_each = len(of_runs) == 2 and any(set(OF_RUNS) <= names for names in may_be)
@@ -295,6 +336,42 @@ def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, 
     off = [session.direction[item.left_out] for item in effects if item.name == "bad_run"]
     alike = off and np.ptp(np.concatenate(off)) == 0
     return ("time", "approach") if alike else ()
+
+
+def _instead(changes: _Changes, item: AxisEffect) -> AxisEffect:
+    """Backlash, or the servo lag or settling that explains the reversal and its change with feed or dwell better."""
+    session, point = changes.session, int(np.argmax(changes.weights))
+    if item.grade == "tentative" or any(e.startswith(("servo_lag", "settling")) for e in changes.names):
+        return item
+    base = np.hstack([np.eye(len(session.targets_mm))[session.target], changes.columns])
+
+    def left(columns: FloatArray) -> float:
+        design = np.hstack([base, columns])
+        pulled = changes.grid.solve(point, np.column_stack([changes.search.y, design]))
+        right = design.T @ pulled[:, 0]
+        inverse = np.linalg.pinv(design.T @ pulled[:, 1:], rcond=1e-10, hermitian=True)
+        return max(float(changes.search.y @ pulled[:, 0] - right @ inverse @ right), session.least_mm**2)
+
+    own = left(session.direction[:, None].astype(np.float64))
+    others = [(left(c.columns), c) for c in changes.search.candidates if c.name.startswith(("servo_lag", "settling"))]
+    if not others:
+        return item
+    least, best = min(others, key=lambda entry: entry[0])
+    gain = changes.freedom * float(np.log(own / least)) - 2.0 * float(np.log(best.scans))
+    if gain < ALIAS or best.effect is None:
+        weight = 1.0 / (1.0 + float(np.exp(np.clip(-0.5 * gain, -50.0, 50.0))))
+        return item if weight < 0.01 else replace(item, alias=((item.name, 1.0 - weight), (best.name, weight)))
+    value, covariance = changes.estimate(base, best.columns)
+    own_parameter = best.effect.card.parameters[0]
+    parameters: dict[str, tuple[float, float | None]] = {
+        own_parameter.name: (
+            float(value[0]) / own_parameter.si_per_unit, float(np.sqrt(covariance[0, 0])) / own_parameter.si_per_unit
+        )
+    } | {key: (number, None) for key, number in best.effect.used(session.readings).items()}  # fmt: skip
+    return replace(
+        item, name=best.name, text=best.text, parameters=parameters, alias=((best.name, 1.0),),
+        shift_mm=best.columns @ value, effect=best.effect, values=value, static=False,
+    )  # fmt: skip
 
 
 def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
@@ -358,6 +435,25 @@ def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
     return members
 
 
+def _seen(search: Search, members: list[int]) -> list[int]:
+    """Members without those that are smaller than the step of the readings, or than their own uncertainty, allows.
+
+    Readings that are rounded alike repeat without scatter, and one that is rounded the other way is a step off.
+    """
+    for k in sorted(members, key=lambda k: search.criteria([other for other in members if other != k])[0][k]):
+        item, changes = search.candidates[k], _Changes(search, members)
+        if item.tier != "named" or not changes.freedom or not (item.free or item.columns.shape[1] == 1):
+            continue
+        rest = [other for other in members if other != k]
+        value, covariance = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+        size = float(np.abs(item.columns @ value).max())
+        step_mm = search.session.step_mm * (1.5 if np.count_nonzero(item.columns) <= FEW_READINGS else 0.5)
+        uncertain = len(value) == 1 and value[0] ** 2 < LEAST_SIZE**2 * covariance[0, 0]
+        if uncertain or size < max(step_mm, 1.5 * search.session.step_mm * item.free):
+            members = rest
+    return members
+
+
 class _Changes:
     """The chosen changes with time, fitted together with the means of the cells, weighted over the noise grid."""
 
@@ -376,6 +472,30 @@ class _Changes:
         self.sigma_mm = float(np.sqrt(self.weights @ self.square / self.freedom))
         points = np.array(self.grid.points)
         self.phi = float(self.weights @ (points[:, 0] * (1.0 - points[:, 1])))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the members."""
+        return [self.search.candidates[k].name for k in self.members]
+
+    def slopes(self) -> FloatArray:
+        """Change of the effects with their time constants of settling, which are known from the readings only, (n, k)."""
+        found = [np.zeros((len(self.session), 0))]
+        for k in self.members:
+            effect = self.search.candidates[k].effect
+            if effect is not None and "tau_s" in effect.settings:
+                other = effect.with_settings({**effect.settings, "tau_s": 1.15 * effect.settings["tau_s"]})
+                columns = other.columns(self.session.readings)
+                found.append(self.search.candidates[k].columns * 0.0 if columns is None else columns)
+        return np.hstack(found)
+
+    @property
+    def rounded_alike(self) -> float:
+        """Share of the error of rounding that repeats have in common: 1 without scatter, 0 where it exceeds the step."""
+        if not self.session.step_mm or not self.freedom:
+            return 0.0
+        scatter = self.search.scatter_mm(self.members) / self.session.step_mm
+        return float(np.exp(-((2.0 * np.pi * scatter) ** 2) / 2.0))
 
     def estimate(self, columns: FloatArray, extra: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Values and covariance of ``extra`` (n, k), fitted with ``columns`` (n, m), both weighted over the grid."""
@@ -406,7 +526,7 @@ def _restless(changes: _Changes) -> list[AxisUnknown]:
     white = np.linalg.cholesky(inverse).T @ left
     scale = float(np.sqrt(np.mean(white**2)))
     rms = float(np.sqrt(np.mean(left**2)))
-    if scale <= LEAST_MM or len(session) < 30:
+    if scale <= max(session.least_mm, session.step_mm) or len(session) < 30:
         return []
     if float(np.mean(white**4)) / scale**4 - 3.0 > JUMPS:
         text = "the readings occasionally jump by more than their scatter, and do not repeat"
@@ -442,7 +562,7 @@ def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
             grid = NoiseGrid(session, scatter, points)
             columns = changes.columns / scatter[:, None]
             square = np.array([_left(grid, k, search.y / scatter, columns) for k in range(len(points))])
-            square = np.maximum(square, grid.freedom * LEAST_MM**2)
+            square = np.maximum(square, grid.freedom * session.least_mm**2)
             own = 2.0 * float(grid.log_likelihoods(square).max()) - 2.0 * float(np.sum(np.log(scatter)))
             gains[change] = own - base
         best = max(gains, key=lambda change: gains[change])
@@ -496,14 +616,57 @@ def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffec
         for parameter, v in zip(item.effect.card.parameters, own, strict=False)
     }
     parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
+    reasons += _size_reasons(item, own, parameters, covariance if len(own) == len(covariance) else np.diag(u[:1] ** 2))
+    if item.name.rpartition("_")[0] in LOGGED and not _holds(changes, member):
+        reasons.append("it does not hold in runs left out of the fit")
     if item.name in DRIFTS:  # refer the readings to the end of the session, the warm state
         shift = shift - shift[-1]
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
     return AxisEffect(
         item.name, "tentative" if reasons else "confirmed", _text(session, item, parameters, alias), parameters, alias,
         float(gains[member]), float(chdtrc(item.columns.shape[1], gains[member])), tuple(reasons), shift, window,
-        False, item.effect, own, p,
+        False, item.effect, own, p, clear=float(criteria[member]),
     )  # fmt: skip
+
+
+def _size_reasons(
+    item: Candidate, values: FloatArray, parameters: Mapping[str, tuple[float, float | None]], covariance: FloatArray
+) -> list[str]:
+    """Why the amount of an effect speaks against it: within its uncertainty, or beyond what machines do."""
+    reasons = []
+    finite = bool(np.isfinite(covariance).all())
+    if not finite or float(values @ np.linalg.pinv(covariance, hermitian=True) @ values) < LEAST_SIZE**2:
+        reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+    for own in item.effect.card.parameters if item.effect is not None else ():
+        value, u = parameters.get(own.name, (0.0, None))
+        if own.plausible > 0 and abs(value) - LEAST_SIZE * (u or 0.0) > PLAUSIBLE * own.plausible:
+            reasons.append(f"its size, {own.name} = {value:.3g}, is not plausible")
+    return reasons
+
+
+def _holds(changes: _Changes, member: int) -> bool:
+    """Whether an effect, fitted to all runs but one, makes the readings of that one fit better, in all runs together."""
+    session, search = changes.session, changes.search
+    rest = [k for k in changes.members if k != member]
+    known, own = np.hstack([changes.grid.cells, search.columns_of(rest)]), search.candidates[member].columns
+    before = after = 0.0
+    for run in np.unique(session.cycle):
+        out = session.cycle == run
+        train, both = ~out, np.hstack([known, own])
+        if not train.any():
+            continue
+        value = np.linalg.lstsq(both[train], search.y[train], rcond=1e-9)[0]
+        # what only this run shows (its level) is fitted to it, with and without the effect
+        shown = known[out][:, known[train].any(axis=0)]
+        left = search.y[out] - shown @ value[: known.shape[1]][known[train].any(axis=0)]
+        moved = left - own[out] @ value[known.shape[1] :]
+        alone = (
+            search.y[out]
+            - shown @ np.linalg.lstsq(known[train], search.y[train], rcond=1e-9)[0][known[train].any(axis=0)]
+        )
+        before += float(np.sum(alone**2))
+        after += float(np.sum(moved**2))
+    return after < before
 
 
 def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str, float], ...]:
@@ -621,7 +784,9 @@ class _Reversal:
         if self.known:
             base = np.eye(len(session.targets_mm))[session.target]
             extra = base[:, self.targets] * session.direction[:, None]
-            self.half, self.covariance = changes.estimate(np.hstack([base, changes.columns]), extra)
+            self.half, self.covariance = changes.estimate(np.hstack([base, changes.columns, changes.slopes()]), extra)
+            # where the scatter is smaller than the step, repeats are rounded alike, and their mean is no better than one
+            self.covariance += np.eye(len(self.half)) * 0.5 * session.least_mm**2 * changes.rounded_alike
             self.freedom = changes.freedom
             return
         up, down = (
@@ -634,9 +799,9 @@ class _Reversal:
         shape = self._shapes(2)
         left = self.half - shape @ np.linalg.lstsq(shape, self.half, rcond=None)[0]
         self.freedom = max(len(self.half) - shape.shape[1], 1)
-        own = max(float(np.sqrt(left @ left / self.freedom)), LEAST_MM)
+        own = max(float(np.sqrt(left @ left / self.freedom)), session.least_mm / 2.0**0.5)
         if u_um is not None:
-            own, self.freedom = u_um * MM_PER_UM / 2.0**0.5, 10_000
+            own, self.freedom = max(u_um * MM_PER_UM, session.least_mm) / 2.0**0.5, 10_000
         self.sigma_mm = own * 2.0**0.5
         self.covariance = np.eye(len(self.half)) * own**2
 
@@ -684,7 +849,11 @@ class _Reversal:
             and (not only or backlash in only)
         ) or (backlash in add):
             mean, square = (smooth[:1], covariance[:1, :1]) if varies else (constant, of_constant)
-            item = self._backlash(backlash, mean, square, everything - left_0, reasons)
+            small = abs(float(mean[0])) < max(
+                LEAST_SIZE * float(np.sqrt(square[0, 0])), LEAST_OF_SCATTER * self.sigma_mm
+            )
+            why = (*reasons, "it is small compared with the scatter of the readings") if small else reasons
+            item = self._backlash(backlash, mean, square, everything - left_0, why)
             effects.append(item if varies else replace(item, alias=self._alias(backlash, lost, left_0)))
         return effects, unknown
 

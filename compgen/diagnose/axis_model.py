@@ -32,8 +32,6 @@ PHI = (0.0, 0.25, 0.5, 0.7, 0.83, 0.92, 0.98)
 WHITE = (0.0, 0.4, 0.8)
 #: Log prior of each memory: what stays similar over more than ten readings is more likely a change than noise.
 LOG_PRIOR = dict(zip(PHI, (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, -3.0), strict=True))
-#: Resolution of the readings: residuals are never assumed to be smaller than this, mm.
-LEAST_MM = 2e-6
 #: Prior variances over sigma^2 that are tried for the coefficients of several columns.
 LAMBDA = np.array([2.0, 20.0, 200.0, 2000.0])
 #: The same for columns of a smooth term that are fitted freely, each with the penalty of a named effect: a large effect
@@ -253,7 +251,12 @@ class Search:
 
     def square(self, members: Sequence[int]) -> FloatArray:
         """Return y'Py (points,) with the members fitted, never below the resolution."""
-        return np.maximum(self._state(members).square, self.grid.freedom * LEAST_MM**2)
+        return np.maximum(self._state(members).square, self.grid.freedom * self.session.least_mm**2)
+
+    def scatter_mm(self, members: Sequence[int]) -> float:
+        """Standard deviation of the readings with the members fitted, as it is, mm."""
+        square = self._state(members).square
+        return float(np.sqrt(max(square[0], 0.0) / max(self.grid.freedom - self.columns_of(members).shape[1], 1)))
 
     def suspects(self) -> tuple[tuple[str, float], ...]:
         """Names with the gain in twice the log likelihood of each on its own, the largest first."""
@@ -305,13 +308,13 @@ class Search:
     def level(self, members: Sequence[int]) -> float:
         """Twice the log likelihood of a set."""
         state = self._state(members)
-        square = np.maximum(state.square, self.grid.freedom * LEAST_MM**2)
+        square = np.maximum(state.square, self.grid.freedom * self.session.least_mm**2)
         return 2.0 * float(self.grid.log_likelihood(square, state.determinant))
 
     def gains(self, members: Sequence[int]) -> FloatArray:
         """Gain of every candidate when added to a set: increase of twice the log likelihood, (candidates,)."""
         state = self._state(members)
-        floor = self.grid.freedom * LEAST_MM**2
+        floor = self.grid.freedom * self.session.least_mm**2
         square = np.maximum(state.square, floor)
         base = 2.0 * float(self.grid.log_likelihood(square, state.determinant))
         found = np.zeros(len(self.candidates))
@@ -602,6 +605,8 @@ FADING, MOST_ONSETS = (0.07, 0.2), 150
 MOST_OF_RUNS, CURVE = 60, 4
 #: Windows of disturbed readings that are tried; if there are k times as many, only every k-th.
 MOST_WINDOWS = 800
+#: Scan positions charged at most for the setting of an effect of a logged column: neighbours are nearly alike.
+MOST_LOGGED_SCANS = 6
 #: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
@@ -646,11 +651,12 @@ def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]
     if not session.in_runs:
         return []
     step = known["step_between_runs"]
-    at = (np.flatnonzero(np.diff(session.leg)) + 1).tolist()
     found = []
-    for k in at:
-        end = int(np.flatnonzero(session.leg == session.leg[k])[-1])
-        found.append(_candidate(session, step.at(float(k)), _runs(session), f"step before {session.window(k, end)}"))
+    for k in range(1, len(session)):
+        end, between = int(np.flatnonzero(session.leg == session.leg[k])[-1]), session.leg[k] != session.leg[k - 1]
+        where = session.window(k, end) if between else session.place(k)
+        scans = _runs(session) if between else float(len(session))
+        found.append(_candidate(session, step.at(float(k)), scans, f"step before {where}"))
     return [item for item in found if item is not None]
 
 
@@ -705,7 +711,7 @@ def _logged(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate
         effect = known[name]
         positions = effect.positions(session.readings)
         every = [effect.at(p) for p in positions] if positions else [effect]
-        for item in (_candidate(session, one, max(len(every), 1)) for one in every):
+        for item in (_candidate(session, one, float(np.clip(len(every), 1, MOST_LOGGED_SCANS))) for one in every):
             if item is not None and _varies(session, item.columns):
                 found.append(item)
     return found
@@ -763,10 +769,6 @@ def _generic(session: AxisSession) -> list[Candidate]:
             add(text, ("run", "x"), _products(cycles, _indicators(session.target)))
     if legs.shape[1] > cycles.shape[1] and session.in_runs:
         add("every direction of every run has a separate level", ("run", "approach"), legs[:, 1:])
-    inside = [k for k in range(1, len(session)) if session.leg[k] == session.leg[k - 1]]
-    for k in inside:
-        way_text = f"run {session.run[k]} {'up' if session.direction[k] > 0 else 'down'}"
-        add(f"jump within {way_text}, before {session.place(k)}", ("time",), _from(session, k), len(inside))
     number = np.arange(len(session), dtype=np.float64)
     onsets = range(1, len(session) - 1, max(1, len(session) // MOST_ONSETS))
     for k in onsets:

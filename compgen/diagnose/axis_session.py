@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
-from compgen.data.names import AXES
+from compgen.data.names import AXES, MM_PER_UM
 from compgen.diagnose.layout import IntArray
 from compgen.effects import Readings
+from compgen.errors import InputError
 
 #: Time order of the readings: as logged, run by run up then down, down then up, all up runs first, rows of the file.
 Order = Literal["auto", "up-down", "down-up", "one-way", "rows"]
@@ -31,6 +32,12 @@ ORDER_TEXTS = {
     "one-way": "all runs up, then all runs down",
     "rows": "the rows of the file",
 }
+#: Resolution of the readings where nothing coarser is known: no scatter is assumed to be smaller, mm.
+LEAST_MM = 2e-6
+#: Readings are on a grid if this share of them is, within this share of its step; so many different ones show it.
+ON_GRID, OFF_GRID, LEAST_VALUES = 0.999, 2e-3, 3
+#: Steps that displays have, metric and inch, in units of a decimal place, the coarsest first.
+DISPLAY_STEPS = (5.08, 5.0, 2.54, 2.5, 2.0, 1.27, 1.0)
 #: Targets closer than this are the same target, mm.
 SAME_TARGET_MM = 1e-4
 
@@ -52,6 +59,7 @@ class AxisSession:
     timed : whether times were logged and used.
     order : where the order comes from, a key of ``ORDER_TEXTS``.
     readings : the same readings in the form that the effects of the catalogue use.
+    step_mm : step in which the readings were displayed or logged, 0 if there is none.
     """
 
     machine: Machine
@@ -69,6 +77,7 @@ class AxisSession:
     timed: bool
     order: str
     readings: Readings
+    step_mm: float = 0.0
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -78,6 +87,11 @@ class AxisSession:
     def letter(self) -> str:
         """Letter of the axis."""
         return AXES[self.axis]
+
+    @property
+    def least_mm(self) -> float:
+        """Least standard deviation of a reading, mm: that of rounding to the step of the readings."""
+        return max(LEAST_MM, self.step_mm / 12.0**0.5)
 
     @property
     def targets_mm(self) -> FloatArray:
@@ -172,10 +186,39 @@ def sessions_of(machine: Machine, runs: AxisRuns, order: Order = "auto") -> list
         found.append(
             AxisSession(
                 machine, axis, rows, position, direction, run, runs.deviation_mm[rows], target.ravel(), cell.ravel(),
-                leg, cycle, time, source == "time", source, readings,
+                leg, cycle, time, source == "time", source, readings, resolution_mm(runs, rows),
             )
         )  # fmt: skip
     return found
+
+
+def resolution_mm(runs: AxisRuns, rows: IntArray) -> float:
+    """Step of the readings, mm: as the file states it (``# resolution_um = 1``), and no less than that of the numbers."""
+    text = runs.metadata.get("resolution_um", "0")
+    try:
+        stated = float(text)
+    except ValueError:
+        stated = np.nan
+    if not 0.0 <= stated < np.inf:
+        message = f"{text[:40]!r} is not a resolution; expected a number in um, e.g. # resolution_um = 0.1"
+        raise InputError(message, file=runs.origin[0][0] if runs.origin else None, field="comment resolution_um")
+    return max(stated * MM_PER_UM, grid_step_mm(runs.deviation_mm[rows]))
+
+
+def grid_step_mm(values_mm: FloatArray) -> float:
+    """Coarsest step of a display (metric or inch) of which all values are multiples, mm; 0 if none.
+
+    Differences count, as a reading may have been set to zero anywhere.
+    """
+    off = values_mm - values_mm[0]
+    for decimal in range(-1, -7, -1):
+        for unit in DISPLAY_STEPS:
+            step = unit * 10.0**decimal
+            number = np.round(off / step)
+            on_grid = np.mean(np.abs(off / step - number) < OFF_GRID) >= ON_GRID
+            if on_grid and len(np.unique(number)) >= LEAST_VALUES:
+                return step
+    return 0.0
 
 
 def _in_time(runs: AxisRuns, rows: IntArray, order: Order) -> tuple[IntArray, FloatArray, str]:

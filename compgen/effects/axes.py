@@ -283,8 +283,9 @@ class CosineError(SingleAxisEffect):
 STEPS = 64
 #: Longest time constant that is tried, as a share of the session, and the shortest, also in readings.
 LONGEST, SHORTEST, SHORTEST_READINGS = 4.0, 0.015, 4.0
-#: Time constants of settling that are tried, s.
-SETTLING_S = (0.3, 0.6, 1.2, 2.5, 5.0, 10.0)
+#: Time constants of settling that are tried, s: so close together that what is left of a settling that lies between two of
+#: them is no backlash.
+SETTLING_S = tuple(np.geomspace(0.2, 15.0, 32).round(4).tolist())
 _WINDOW = (
     Setting("first", "time (or number in chronological order) of the first disturbed reading", needed=True),
     Setting("last", "time (or number) of the last disturbed reading", needed=True),

@@ -21,12 +21,11 @@ from compgen.diagnose import DiagnoseOptions, axis_model, diagnose
 from compgen.diagnose.axis_diagnosis import _levels_off  # noqa: E402
 from compgen.diagnose.axis_model import (  # noqa: E402
     LAMBDA,
-    LEAST_MM,
     NoiseGrid,
     Search,
     candidates_of,  # noqa: E402
 )
-from compgen.diagnose.axis_session import sessions_of  # noqa: E402
+from compgen.diagnose.axis_session import LEAST_MM, grid_step_mm, sessions_of  # noqa: E402
 from compgen.effects import active_effects, listed  # noqa: E402
 from compgen.effects.catalogue import WHAT_TO_DO, what_to_do  # noqa: E402
 from compgen.errors import InputError  # noqa: E402
@@ -473,7 +472,7 @@ def test_what_candidates_bring_is_what_the_covariances_say(gantry, timed, monkey
     names = [c.name for c in candidates]
     warm, bad = names.index("warmup_drift") + 20, names.index("bad_run")
     smooth = next(k for k, c in enumerate(candidates) if c.tier == "generic" and c.columns.shape[1] == 3)
-    checked = [warm + 25, names.index("linear_drift"), names.index("step_between_runs") + 3, smooth,
+    checked = [warm + 25, names.index("linear_drift"), names.index("step_between_runs") + 5, smooth,
                next(k for k, c in enumerate(candidates) if c.free), len(names) - 3]  # fmt: skip
     for members, prior in (([], {}), ([bad], {}), ([warm, bad], {}), ([bad, smooth], {smooth: LAMBDA[1]})):
         base = by_covariance(found, grid, candidates, members, prior)
@@ -556,3 +555,70 @@ def test_a_scenario_that_cannot_be_simulated_is_refused(tmp_path, capsys, text, 
     assert run_command(cli, ["simulate", "zha-gantry", "--scenario", scenario, "--out", str(out)]) == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not out.exists()
+
+
+def in_steps(step_um, seed=0, sigma_um=0.1, runs=4):
+    """Nothing but a curve and scatter below the step in which the display counts."""
+    found = session(seed, runs, sigma_um * step_um, lambda k, direction, run, s: step_um * (4.3 * s + 2.9 * s**2))
+    return replace(found, deviation_mm=step_um * UM * np.round(found.deviation_mm / (step_um * UM)))
+
+
+@pytest.mark.parametrize("step_um", [0.5, 1.0, 2.54, 10.0])
+def test_rounding_of_a_display_is_no_effect(gantry, step_um):
+    runs = in_steps(step_um, seed=5)
+    found = diagnose(gantry, runs)
+    assert grid_step_mm(runs.deviation_mm) == pytest.approx(step_um * UM)
+    assert found.word == "none"
+    # no scatter is smaller than that of rounding: step / sqrt(12)
+    assert found.axes[0].sigma_mm >= step_um * UM / 12**0.5
+
+
+def test_a_reversal_of_several_steps_has_the_uncertainty_of_the_step(gantry):
+    runs = in_steps(1.0, seed=6, sigma_um=0.05)
+    runs = replace(runs, deviation_mm=runs.deviation_mm + 2 * UM * runs.direction)
+    (item,) = diagnose(gantry, runs).axes[0].effects
+    value, u = item.parameters["c_um"]
+    # seven targets, each rounded once up and once down: u = 1 um / sqrt(12 * 2 * 7)
+    assert (item.name, value) == ("backlash_X", pytest.approx(2.0, abs=0.2))
+    assert u == pytest.approx(1 / (12 * 2 * 7) ** 0.5, rel=0.6)
+
+
+def test_a_stated_resolution_that_is_no_number_is_refused(gantry):
+    runs = replace(session(1), metadata={"resolution_um": "fine"})
+    with pytest.raises(InputError, match="resolution"):
+        diagnose(gantry, runs)
+
+
+@pytest.mark.parametrize("at", [20, 37])
+def test_a_step_inside_a_run_is_found_where_it_happened(gantry, at):
+    runs = session(11, sigma_um=0.4)
+    runs = replace(runs, deviation_mm=runs.deviation_mm + 5 * UM * (np.arange(len(runs)) >= at))
+    (item,) = diagnose(gantry, runs).axes[0].effects
+    assert (item.name, item.grade) == ("step_between_runs", "confirmed")
+    assert item.parameters["at"][0] == at
+    assert item.parameters["c_um"][0] == pytest.approx(5.0, abs=4 * item.parameters["c_um"][1])
+
+
+@pytest.mark.parametrize("tau_s", [0.8, 1.7, 3.6])
+def test_settling_between_two_time_constants_leaves_no_backlash(gantry, tau_s):
+    rng = np.random.default_rng(int(10 * tau_s))
+    runs = session(3, sigma_um=0.3)
+    dwell_s = np.exp(rng.uniform(np.log(0.5), np.log(6), len(runs)))
+    late = -9 * UM * runs.direction * np.exp(-dwell_s / tau_s)
+    runs = replace(runs, deviation_mm=runs.deviation_mm + late, covariates={"dwell_s": dwell_s})
+    effects = [item for item in diagnose(gantry, runs).axes[0].effects if item.grade != "tentative"]
+    assert [item.name for item in effects] == ["settling_X"]
+    assert effects[0].parameters["tau_s"][0] == pytest.approx(tau_s, rel=0.15)
+
+
+def test_a_lag_in_a_column_of_feeds_is_no_backlash(gantry):
+    runs = session(4, sigma_um=0.3)
+    feed = np.array([500.0, 3000.0, 1000.0, 5000.0, 2000.0])[runs.run - 1]
+    lag = -1.2e-3 * feed / 60 * runs.direction * 0.05  # 0.06 ms
+    effects = (
+        diagnose(gantry, replace(runs, deviation_mm=runs.deviation_mm + lag, covariates={"feed_mm_min": feed}))
+        .axes[0]
+        .effects
+    )
+    assert [item.name for item in effects] == ["servo_lag_X"]
+    assert effects[0].parameters["tau_ms"][0] == pytest.approx(-0.06, abs=0.01)
