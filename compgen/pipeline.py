@@ -24,6 +24,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.foreign.answers import ImportOptions
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
 from compgen.identify.any_measurement import (
@@ -496,6 +497,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     active: ActiveTables | None = None,
     instrument: str | Path | None = None,
     stated: StatedNumbers | None = None,
+    answers: ImportOptions | None = None,
     limits: SafetyLimits | None = None,
     allow_misfit: bool = False,
     language: str = LANGUAGES[0],
@@ -516,6 +518,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     active : tables that were active during the measurement; the new ones replace them.
     instrument : the instrument file of six-DOF readings.
     stated : squareness, backlash and scales that are known without a file.
+    answers : what files of other programs leave open, as the options of ``volcomp import``.
     limits : limits for the steps of the tables.
     allow_misfit : residuals that are too large, or that a step or a drift explains, are a reservation instead of a
         reason to refuse the tables.
@@ -557,7 +560,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     progress("reading the measurement")
     numbers = stated or StatedNumbers()
     numbers.reversal()  # wrong numbers are found before the work begins
-    measurement = open_measurement(measurements, instrument, stated=numbers.errors(machine))
+    measurement = open_measurement(measurements, instrument, stated=numbers.errors(machine), answers=answers)
     provenance = provenance_of(machine.file, *measurements, instrument)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):

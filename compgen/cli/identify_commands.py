@@ -11,6 +11,7 @@ import click
 from compgen.cli.common import fleet_options, json_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
+    answer_options,
     identify_options,
     instrument_option,
     machine_argument,
@@ -25,6 +26,7 @@ from compgen.data.files import OutputFolder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
+from compgen.foreign.answers import ImportOptions
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
@@ -63,6 +65,7 @@ from compgen.report.terminal import fit_table
 @measurements_argument
 @instrument_option
 @stated_options
+@answer_options
 @out_option
 @identify_options
 @active_options("--controller")
@@ -80,6 +83,7 @@ def identify_command(
     measurements: tuple[Path, ...],
     instrument: Path | None,
     stated: StatedNumbers,
+    answers: ImportOptions,
     out: Path,
     options: IdentifyOptions,
     active: ActiveTables | None,
@@ -113,7 +117,7 @@ def identify_command(
     OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
-        measurement = open_measurement(measurements, instrument, stated=stated.errors(machine))
+        measurement = open_measurement(measurements, instrument, stated=stated.errors(machine), answers=answers)
         show(f"identifying: {describe(measurement)}")
         with failure_reported(out):
             result = identify_beside(machine, measurement, stated, options, active)

@@ -12,6 +12,7 @@ import click
 from compgen.cli.common import PATH, json_option, language_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
+    answer_options,
     controller_option,
     emphasis_options,
     explain_option,
@@ -32,6 +33,7 @@ from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions
+from compgen.foreign.answers import ImportOptions
 from compgen.identify import IdentifyOptions
 from compgen.identify.options import StatedNumbers
 from compgen.pipeline import run
@@ -134,6 +136,7 @@ def report_written(folder: Path, language: str, known: KnownTables | None = None
 @sample_options
 @instrument_option
 @stated_options
+@answer_options
 @out_option
 @identify_options
 @fitting_options
@@ -157,6 +160,7 @@ def run_command(
     controller: tuple[str, ...],
     instrument: Path | None,
     stated: StatedNumbers,
+    answers: ImportOptions,
     out: Path,
     options: IdentifyOptions,
     fitting: FitOptions,
@@ -197,6 +201,7 @@ def run_command(
             progress=show,
             instrument=instrument,
             stated=stated,
+            answers=answers,
         )
         if not no_report:
             show("drawing the report")

@@ -18,6 +18,7 @@ from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.errors import CompgenWarning, InputError, nearest
+from compgen.foreign.answers import ImportOptions
 from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
 from compgen.identify.covariance import covariance_named_by
 from compgen.identify.options import StatedNumbers
@@ -120,6 +121,10 @@ identify_options = options_of(
 
 #: Numbers that are known without a file; the command receives ``stated``.
 stated_options = options_of(StatedNumbers, "stated")
+
+
+#: What files of other programs leave open; the command receives ``answers``.
+answer_options = options_of(ImportOptions, "answers")
 
 
 def fitting_options(command: Command) -> Command:

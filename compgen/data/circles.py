@@ -146,7 +146,7 @@ def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
         for a plane other than XY, YZ and ZX (angles would turn the other way), a direction that is not 1 or -1, a
         centre with a missing coordinate.
     """
-    parts, first = [], 0
+    parts = []
     for table in _CIRCLES.read_tables(files):
         values = _CIRCLES.values(table)
         found = Circles(**values)
@@ -158,10 +158,18 @@ def read_circles(files: str | Path | Sequence[str | Path]) -> Circles:
             given = [name for name in ("centre_x_mm", "centre_y_mm", "centre_z_mm") if name in table.columns]
             text = f"has {' and '.join(given)}; give centre_x_mm, centre_y_mm and centre_z_mm, or none of them"
             raise InputError(text, file=table.path)
-        _, setup = np.unique(found.setup, return_inverse=True)
-        parts.append(replace(found, setup=setup.ravel().astype(np.int64) + first, run=found.run.astype(np.int64)))
-        first = int(parts[-1].setup.max()) + 1
-    return _CIRCLES.joined(parts)
+        parts.append(replace(found, run=found.run.astype(np.int64)))
+    return join_circles(parts)
+
+
+def join_circles(parts: Sequence[Circles]) -> Circles:
+    """Return several records as one, whose set-ups are numbered differently."""
+    renumbered, first = [], 0
+    for part in parts:
+        _, setup = np.unique(part.setup, return_inverse=True)
+        renumbered.append(replace(part, setup=setup.ravel().astype(np.int64) + first))
+        first = int(renumbered[-1].setup.max()) + 1
+    return _CIRCLES.joined(renumbered)
 
 
 def format_circles(circles: Circles) -> str:

@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 from compgen.resources import load_on_first_use
 
 if TYPE_CHECKING:
+    from compgen.foreign.answers import ImportOptions
     from compgen.foreign.converted import describe_native, given_errors
     from compgen.foreign.detect import form_of, import_file
-    from compgen.foreign.findings import Imported, ImportOptions
+    from compgen.foreign.findings import Imported
     from compgen.foreign.source import native_format, open_errors, open_measurement
 
 __all__ = [

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, join_axis_runs, read_axis_runs, read_diagonals
-from compgen.data.circles import Circles, read_circles
+from compgen.data.circles import Circles, join_circles, read_circles
 from compgen.data.csv_files import CsvTable, read_csv
 from compgen.data.deviations import (
     Artefact,
@@ -43,8 +43,9 @@ from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_
 from compgen.errors import CompgenWarning, InputError
 from compgen.fit import FitOptions, fit
 from compgen.fit.zeroing import zero_ends
+from compgen.foreign.answers import ImportOptions
 from compgen.foreign.detect import import_file
-from compgen.foreign.findings import Imported, ImportOptions
+from compgen.foreign.findings import Imported
 from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
@@ -52,7 +53,7 @@ from compgen.identify.identification import metadata_of, without_adjustment
 from compgen.identify.stated import factor_of_numbers, is_stated
 from compgen.instruments.sixdof_instrument import read_sixdof
 
-Plain = Lengths | Deviations | AxisRuns | Artefact
+Plain = Lengths | Deviations | AxisRuns | Artefact | Circles
 #: Number of labels of a column that are shown.
 _SHOWN_LABELS = 8
 _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
@@ -60,18 +61,29 @@ _NATIVE_READERS: dict[str | None, Callable[[Path], Plain]] = {
     "deviations": read_deviations,
     "axis": read_axis_runs,
     "part": read_parts,
+    "circle": read_circles,
+    "artefact": read_artefacts,
 }
 
 
 def converted_parts(
-    paths: Sequence[str | Path], kinds: Sequence[str | None], axis: str | None = None
+    paths: Sequence[str | Path],
+    kinds: Sequence[str | None],
+    axis: str | None = None,
+    answers: ImportOptions | None = None,
 ) -> list[tuple[str, Plain | ErrorTable]]:
     """Return what files of which some are foreign hold, one entry for each kind of measurement and each file of errors.
 
     ``kinds`` are those of the native ones. Where all imported files of a kind say when they were measured, their times count
     from the earliest of them.
     """
-    read = [(Path(path).name, _measured(Path(path), kind, axis)) for path, kind in zip(paths, kinds, strict=True)]
+    given = answers or ImportOptions()
+    given = given if axis is None else replace(given, axis=axis)
+    each = _answers_of([Path(path) for path, kind in zip(paths, kinds, strict=True) if kind is None], given)
+    read = [
+        (Path(path).name, _measured(Path(path), kind, each.get(Path(path), given)))
+        for path, kind in zip(paths, kinds, strict=True)
+    ]
     found = [(name if k == 0 else f"{name} (errors)", data) for name, both in read for k, data in enumerate(both)]
     parts: list[tuple[str, Plain | ErrorTable]] = []
     for kind in dict.fromkeys(type(data) for _, data in found):
@@ -79,12 +91,15 @@ def converted_parts(
         if kind is ErrorTable or len(own) == 1:
             parts += own
             continue
-        if kind is Artefact:
+        if kind is Artefact or kind is Circles:
             parts.append(
-                (", ".join(name for name, _ in own), _joined([data for _, data in own if isinstance(data, Artefact)]))
+                (
+                    ", ".join(name for name, _ in own),
+                    _joined([data for _, data in own if isinstance(data, Artefact | Circles)]),
+                )
             )
             continue
-        measured = [data for _, data in own if not isinstance(data, ErrorTable | Artefact)]
+        measured = [data for _, data in own if not isinstance(data, ErrorTable | Artefact | Circles)]
         dated = all(data.metadata.get("measured_at") and "time_s" in data.covariates for data in measured)
         begun = [datetime.fromisoformat(data.metadata["measured_at"]) for data in measured if dated and not any(kinds)]
         if len({time.tzinfo is None for time in begun}) == 1:
@@ -125,20 +140,52 @@ def _described(table: CsvTable, name: str) -> str:
     return f"{known.min():.6g} to {known.max():.6g}" if known.size else "empty"
 
 
-def _measured(path: Path, kind: str | None, axis: str | None) -> Sequence[Plain | ErrorTable]:
+def _answers_of(paths: Sequence[Path], given: ImportOptions) -> dict[Path, ImportOptions]:
+    """Return what of the answers each of several foreign files asks; of a single one all, also against what it states.
+
+    So the plane of one circle, or the axis of one run, is never put in place of what another file states.
+
+    Raises
+    ------
+    InputError
+        for an answer that no file asks.
+    """
+    if len(paths) < 2 or not given.given():
+        return dict.fromkeys(paths, given)
+    found = {path: _asked(path, given) for path in paths}
+    unused = [name for name in given.given() if not any(name in answers.given() for answers in found.values())]
+    if unused:
+        text = "no file asks this; to change what a file states, convert that one with 'volcomp import FILE --out DIR'"
+        raise InputError(text, field=ImportOptions.flag(unused[0]))
+    return found
+
+
+def _asked(path: Path, given: ImportOptions) -> ImportOptions:
+    """Return the answers that a file asks, one question after the other: an answer may raise another one."""
+    answers = ImportOptions()
+    while True:
+        try:
+            text = " ".join(import_file(path, answers).doubts)
+        except InputError as error:
+            text = str(error)
+        new = [name for name in given.given() if name not in answers.given() and ImportOptions.flag(name) in text]
+        if not new:
+            return answers
+        answers = replace(answers, **{name: getattr(given, name) for name in new})
+
+
+def _measured(path: Path, kind: str | None, answers: ImportOptions) -> Sequence[Plain | ErrorTable]:
     """Return what a file contains: one measurement, and the errors on other sheets of a workbook."""
     if kind in _NATIVE_READERS:
         return [_NATIVE_READERS[kind](path)]
-    item = _settled(path, axis)
+    item = _settled(path, answers)
     if isinstance(item.data, Capture):
         raise InputError("contains a capture over time, from which no errors are identified", file=path)
-    if isinstance(item.data, Circles):
-        raise InputError("contains circles; write them with 'volcomp import --out DIR', and give that file", file=path)
     return [item.data] if item.other_errors is None else [item.data, item.other_errors]
 
 
-def _settled(path: Path, axis: str | None = None) -> Imported:
-    item = import_file(path, ImportOptions(axis=axis))
+def _settled(path: Path, answers: ImportOptions | None = None) -> Imported:
+    item = import_file(path, answers)
     item.check_settled()
     facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
     warnings.warn(f"{path} was read as: {facts} ('volcomp import' shows all)", CompgenWarning, stacklevel=3)
@@ -181,6 +228,8 @@ def _joined(parts: Sequence[Plain]) -> Plain:
                 renumbered.append(replace(part, setup=setup.ravel() + first))
                 first += int(setup.max()) + 1
         return join_artefacts(renumbered)
+    if isinstance(parts[0], Circles):
+        return join_circles([part for part in parts if isinstance(part, Circles)])
     return join_deviations([part for part in parts if isinstance(part, Deviations)])
 
 

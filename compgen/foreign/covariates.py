@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.errors import InputError
+from compgen.foreign.answers import Kind
 from compgen.foreign.column_names import (
     CELSIUS,
     CHANNEL,
@@ -31,7 +32,7 @@ from compgen.foreign.column_names import (
     split_name,
     way,
 )
-from compgen.foreign.findings import Kind, TableFindings
+from compgen.foreign.findings import TableFindings
 from compgen.foreign.source import (
     Order,
     Written,

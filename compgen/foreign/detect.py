@@ -20,16 +20,15 @@ from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, InputError
+from compgen.foreign.answers import TABLE_SIGNS, ImportOptions
 from compgen.foreign.cells import CellGrid, chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
 from compgen.foreign.covariates import surroundings_of
 from compgen.foreign.error_tables import squareness_in
 from compgen.foreign.findings import (
     ABSURD_DECADES,
-    TABLE_SIGNS,
     USUAL_URAD,
     Imported,
-    ImportOptions,
     decades_off,
     unit_of_deviations,
     usual_deviation_mm,
@@ -435,7 +434,9 @@ def _of_grid(grid: CellGrid, options: ImportOptions, form: str) -> Imported:
     plain = options if options.sign in TABLE_SIGNS else replace(options, sign=None)
     try:
         return import_table(grid, plain, form)
-    except InputError:
+    except InputError as error:
+        if error.field in ("--plane", "--origin"):  # an answer that contradicts the file
+            raise
         found = squareness_in(grid, options, form)
         if found is None:
             raise

@@ -11,6 +11,7 @@ import numpy as np
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError, nearest
+from compgen.foreign.answers import ImportOptions
 from compgen.foreign.cells import SQUARENESS_WORDS, CellGrid, plain_decimals
 from compgen.foreign.column_names import (
     FIELDS,
@@ -23,7 +24,7 @@ from compgen.foreign.column_names import (
     split_name,
     unaccented,
 )
-from compgen.foreign.findings import USUAL_URAD, Imported, ImportOptions, TableFindings, usual_deviation_mm
+from compgen.foreign.findings import USUAL_URAD, Imported, TableFindings, usual_deviation_mm
 from compgen.foreign.source import parse_number, shown
 from compgen.identify.options import LARGEST_RAD
 

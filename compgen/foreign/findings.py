@@ -1,45 +1,42 @@
 """Findings about a foreign file: options, result, and the units that its numbers suggest.
 
-:class:`ImportOptions` is the input of the user, :class:`Imported` the result, :class:`TableFindings` the state of a table
-while it is read. Units that a file does not state are judged from the data (:func:`judge_lengths`, :func:`slope_of`).
+:class:`Imported` is the result, :class:`TableFindings` the state of a table while it is read; what the user answers is in
+:mod:`compgen.foreign.answers`. Units that a file does not state are judged from the data (:func:`judge_lengths`,
+:func:`slope_of`).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
-from compgen.data.circles import PLANES, Circles, format_circles
+from compgen.data.circles import Circles, format_circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations, format_artefact, format_deviations
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.lengths import Lengths, format_lengths
-from compgen.data.names import AXES
-from compgen.data.toml_files import option
 from compgen.errors import InputError
+from compgen.foreign.answers import ImportOptions, Kind
 from compgen.foreign.cells import Table
 from compgen.foreign.column_names import (
     MM_PER_LENGTH,
     RAD_PER_ANGLE,
     NamedColumn,
-    covariate_unit,
     is_deviation,
     known_unit,
 )
 from compgen.foreign.laser_files import Capture, format_capture
-from compgen.foreign.source import Order, parse_number, shown
+from compgen.foreign.source import parse_number, shown
 
 # The result of an import: the object, what was understood, and what is in doubt.
 
 
-Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle", "artefact"]
-KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture", "circle", "artefact")
 SUFFIXES = {
     "axis": ".axis.csv",
     "lengths": ".lengths.csv",
@@ -48,9 +45,8 @@ SUFFIXES = {
     "capture": ".capture.csv",
     "circle": ".circle.csv",
     "artefact": ".artefact.csv",
+    "part": ".part.csv",
 }
-#: Answers to ``--sign`` for all tables; the others are for squareness.
-TABLE_SIGNS = ("error", "correction")
 Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
@@ -61,99 +57,6 @@ _WRITERS: dict[type, Callable[[Any], str]] = {
     Circles: format_circles,
     Artefact: format_artefact,
 }
-
-
-@dataclass(frozen=True)
-class ImportOptions:
-    """Input of the user about a file; None or empty: take it from the file.
-
-    Parameters
-    ----------
-    kind : contents of the file.
-    columns : column of the file by field (position, deviation, direction, ...).
-    units : unit by field; the field "value" is for deviations, lengths and errors.
-    axis : X, Y or Z, for files that measure along one axis and do not state it.
-    error : name of the error (EYX, ECX, ...) in the file, for straightness and angles.
-    sign : "error" (measured minus commanded) or "correction" (what is to be added; the sign is reversed on import); of
-        squareness by pairs of axes "angle-above-90", "angle-below-90" or "rotation" (as EC0Y, EB0Z, EA0Z).
-    plane, radius_mm : XY, YZ or ZX, and the nominal radius, of a circular test that does not state them.
-    directions : "labels", "motion" (from the order of the rows) or "alternate" (odd runs up, even runs down).
-    sheet : name of the sheet of a workbook.
-    decimal : decimal mark of a table, if its numbers do not show it.
-    zero_runs : treatment of laser runs that are zero at every target.
-    dates : order of day, month and year if they are numbers.
-    ignore : columns, or sheets of a workbook, to exclude although they contain numbers.
-    base_length_mm : straightness consists of differences over this length, step by step, which are summed.
-    """
-
-    kind: Kind | None = option(None, "What the file contains; default: recognised by its columns.")
-    columns: Mapping[str, str] = option(
-        factory=dict,
-        text="FIELD=COLUMN: position, actual, deviation, correction, direction, run, axis; x, y, z, length, station, "
-        "point; dx, dy, dz, xa, ya, za; angle, radius, plane; "
-        "error, value, EBX (an error); temperature, temp_NAME, time, date, feed, load, tool_x, "
-        "approach_x, repeat, line, block, setup, pose, u_value; run1+, run1-, run2 (a column of one run). May be given "
-        "several times.",
-        name="--map",
-        metavar="FIELD=COLUMN",
-    )
-    units: Mapping[str, str] = option(
-        factory=dict,
-        text="FIELD=UNIT, e.g. deviation=um, position=mm, or UNIT alone for the values; linear=, angle= of errors. um, "
-        "mm, nm, m, in; urad, mrad, arcsec, rad, deg; temp_NAME=degC, K, degF; time=s, ms, min, h; feed=mm/min; load=kg.",
-        name="--unit",
-        metavar="[FIELD=]UNIT",
-    )
-    axis: str | None = option(None, "The axis that moved.", choices=AXES)
-    error: str | None = option(
-        None, "Name of the error in the file (EYX, ECX, ...), for straightness and angles.", metavar="NAME"
-    )
-    sign: Literal["error", "correction", "angle-above-90", "angle-below-90", "rotation"] | None = option(
-        None,
-        "error: measured minus commanded (default if the format defines it); correction: the sign is to be reversed. Of "
-        "squareness by pairs of axes, what a positive number means: angle-above-90, angle-below-90 (between the positive "
-        "axes), rotation (EC0Y, EB0Z, EA0Z of ISO 230-1).",
-    )
-    plane: str | None = option(None, "Plane of a circular test.", choices=tuple(PLANES))
-    radius_mm: float | None = option(None, "Nominal radius of a circular test, mm.")
-    directions: Literal["labels", "motion", "alternate"] | None = option(
-        None,
-        "labels: as in the file; motion: from the order of the rows; alternate: odd runs up, even down.",
-    )
-    sheet: str | None = option(None, "Sheet of a workbook.", metavar="NAME")
-    dates: Order | None = option(None, "Order of dates such as 03/04/2025 (never guessed): day, month, year.")
-    decimal: Literal["comma", "point"] | None = option(
-        None, "Decimal mark of a table; the other one separates thousands (needed if 1,000 is ambiguous)."
-    )
-    zero_runs: Literal["drop", "keep"] | None = option(
-        None, "Laser runs that are zero at every target: not measured (drop) or measured (keep)."
-    )
-    ignore: Sequence[str] = option(
-        (),
-        "Column, or sheet of a workbook, to exclude although it contains numbers (may be given several times).",
-        metavar="NAME",
-    )
-
-    base_length_mm: float | None = option(
-        None,
-        "Columns of straightness contain differences (or slopes, in um/m or arcsec) over the base of a level or mirror, mm, step "
-        "by step, each from its position on; they are summed.",
-        name="--base-length",
-        metavar="MM",
-    )
-
-    def given_unit(
-        self, *keys: str, among: Collection[str] = (*MM_PER_LENGTH, *RAD_PER_ANGLE), what: str = "length or angle"
-    ) -> str | None:
-        """Return the unit that the user gave for the first of some fields that has one, or None."""
-        key = next((key for key in keys if self.units.get(key)), None)
-        if key is None:
-            return None
-        given = self.units[key]
-        unit = next((name for name in (known_unit(given), covariate_unit(given)) if name in among), None)
-        if unit is None:
-            raise InputError(f"{given!r} is not a unit of {what}; use {', '.join(among)}", field=f"--unit {key}")
-        return unit
 
 
 @dataclass(frozen=True)
@@ -191,8 +94,8 @@ class Imported:
         """Raise InputError if something is in doubt."""
         if self.doubts:
             raise InputError(
-                f"leaves open: {'; '.join(self.doubts)}. 'volcomp import' shows what was understood and accepts what is "
-                "missing; pass its result to this command",
+                f"leaves open: {'; '.join(self.doubts)}. run and identify take these options; 'volcomp import' shows what was "
+                "understood and accepts what is missing; pass its result to this command",
                 file=self.path,
             )
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, about_own_lines, is_apart, read_errors
@@ -17,6 +17,9 @@ from compgen.data.files import check_lines, read_bytes
 from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
 from compgen.errors import InputError
 from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
+
+if TYPE_CHECKING:
+    from compgen.foreign.answers import ImportOptions
 
 # Reading foreign files: limits of size, encodings, and kinds of files that cannot be read.
 
@@ -420,6 +423,7 @@ def open_measurement(
     instrument: str | Path | None = None,
     axis: str | None = None,
     stated: ErrorTable | None = None,
+    answers: ImportOptions | None = None,
 ) -> Measurement | ErrorTable:
     """Read measurement files of any kinds, native and foreign ones, and files of errors.
 
@@ -429,6 +433,7 @@ def open_measurement(
     instrument : the instrument TOML of six-DOF readings.
     axis : the axis of foreign files that measure along one and do not state it; native files do.
     stated : errors that are known without a file.
+    answers : what foreign files leave open; each answer is for the files of formats that take it.
 
     Raises
     ------
@@ -447,12 +452,17 @@ def open_measurement(
     measured = [k for k, kind in enumerate(kinds) if kind != "errors"]
     # of a file that has the name of a native one, the native reader says best what is missing
     foreign = any(kinds[k] is None and not Path(paths[k]).name.lower().endswith(_NATIVE_SUFFIXES) for k in measured)
-    apart = [k for k in measured if kinds[k] in ("sixdof", "circle", "artefact")] if foreign else []
+    if answers is not None and answers.given() and not foreign:
+        text = (
+            "answers a question about a file of another program, and all files are in the native format: leave it out"
+        )
+        raise InputError(text, field=answers.flag(answers.given()[0]))
+    apart = [k for k in measured if kinds[k] == "sixdof"] if foreign else []
     plain = [paths[k] for k in measured if k not in apart]
     if foreign:
         from compgen.foreign.converted import converted_parts
 
-        parts += converted_parts(plain, [kinds[k] for k in measured if k not in apart], axis)
+        parts += converted_parts(plain, [kinds[k] for k in measured if k not in apart], axis, answers)
         plain = [paths[k] for k in apart]
     if plain or instrument is not None or not (paths or stated):
         found = read_measurement(plain, instrument)

@@ -22,6 +22,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM
 from compgen.data.records import LARGEST_DEVIATION_UM
 from compgen.errors import InputError, doubled
+from compgen.foreign.answers import ImportOptions, Kind
 from compgen.foreign.cells import CellGrid, find_table
 from compgen.foreign.column_names import (
     FIELDS,
@@ -49,8 +50,6 @@ from compgen.foreign.findings import (
     USUAL_URAD,
     Data,
     Imported,
-    ImportOptions,
-    Kind,
     TableFindings,
     judge_lengths,
     slope_of,
@@ -825,6 +824,21 @@ def _turn(text: str) -> tuple[int, int] | None:
     return (_TURNS[word], int(numbers[0]) if numbers else 0) if len(numbers) < 2 else None
 
 
+#: XZ, ZY and YX are not among the names: their angles would count the other way.
+_PLANE_NAMES = {**{name: k for k, name in enumerate(PLANES)}, "G17": 0, "G19": 1, "G18": 2}
+
+
+def _plane(text: str) -> int:
+    """Return the number of a plane as people write it (XY, X-Y, XY plane, G17 (XY)); -1 for anything else, and for two of them.
+
+    >>> _plane("XY-Ebene"), _plane("Y/Z"), _plane("G18 (ZX)"), _plane("XZ"), _plane("G17 YZ")
+    (0, 1, 2, -1, -1)
+    """
+    words = re.findall(r"G1[789]|[XYZ] ?[-/]? ?[XYZ](?![A-Z])", text.upper())
+    found = {_PLANE_NAMES.get(re.sub(r"[-/ ]", "", word), -1) for word in words}
+    return found.pop() if len(found) == 1 else -1
+
+
 def circles_of(findings: TableFindings) -> Circles:
     """Return the radial deviations of a circular test, from deviations or from radii."""
     _need(findings, "angle")
@@ -834,13 +848,15 @@ def circles_of(findings: TableFindings) -> Circles:
     if unit is None:
         unit = "rad"
         findings.doubts.append("the file states no unit of the angle; give --unit angle=rad or deg")
-    # XZ, ZY and YX are not among the names: their angles would count the other way
-    names = {**{name: k for k, name in enumerate(PLANES)}, "G17": 0, "G19": 1, "G18": 2}
-    stated = findings.options.plane or _above(findings, "plane")[0]
-    planes = (
-        [stated] if "plane" not in findings.fields or stated else findings.table.column(findings.fields["plane"].name)
-    )
-    plane = np.array([names.get(name.strip().upper(), -1) for name in planes], dtype=np.int64)
+    given, stated = findings.options.plane, _above(findings, "plane")[0]
+    if given is not None and _plane(stated) not in (-1, list(PLANES).index(given)):
+        text = f"the file states the plane {shown(stated)}; give --plane {given} for files only that do not state another one"
+        raise InputError(text, file=findings.table.grid.path, field="--plane")
+    if given is None and not stated and "plane" in findings.fields:
+        planes = findings.table.column(findings.fields["plane"].name)
+    else:
+        planes = [given or stated]
+    plane = np.array([_plane(name) for name in planes], dtype=np.int64)
     if (plane < 0).any():
         findings.doubts.append(
             "the file does not state the plane as XY, YZ or ZX; give --plane, if angles count from its first axis"
@@ -938,6 +954,8 @@ def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, Floa
                 message = f"{shown(cell)} is not a direction; write CCW or CW, 1 or -1"
                 raise table.grid.fail(message, line, fields["direction"].name)
         direction = np.array(ways, dtype=np.int64)
+    elif (stated_turn := _turn(_line_above(findings, "direction")[1])) is not None:
+        direction = np.full(len(rows), stated_turn[0])
     else:
         direction = np.ones(len(rows), dtype=np.int64)
         findings.doubts.append(
@@ -957,11 +975,19 @@ def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, Floa
 
 def _above(findings: TableFindings, key: str) -> tuple[str, str | None]:
     """The value that a line above the table states for a field, and its unit; empty without such a line."""
+    name, text = _line_above(findings, key)
+    number = re.fullmatch(r"(\S*\d)\s*(\D*)", text)  # 150 mm, 150mm
+    if key == "plane" or number is None:
+        return text, None
+    return number[1], split_name(name).unit or known_unit(number[2])
+
+
+def _line_above(findings: TableFindings, key: str) -> tuple[str, str]:
+    """The line above the table about a field: its name and what it states; empty without one."""
     for name, text in findings.table.metadata.items():
-        named, words = split_name(name), text.split()
-        if named.word in FIELDS[key] and words:
-            return words[0], named.unit or (known_unit(words[1]) if len(words) == 2 else None)
-    return "", None
+        if split_name(name).word in FIELDS[key] and text.strip():
+            return name, text.strip()
+    return "", ""
 
 
 def _check_sense(findings: TableFindings, angle_rad: FloatArray, direction: IntArray, value_mm: FloatArray) -> None:

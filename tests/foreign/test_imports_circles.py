@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
+import compgen
 from compgen.data.circles import read_circles
-from compgen.errors import InputError
-from compgen.foreign import ImportOptions, import_file
+from compgen.errors import CompgenWarning, InputError
+from compgen.foreign import ImportOptions, import_file, open_measurement
+from compgen.identify.axis_tests import identify_circles
 
 STEPS = np.arange(0, 360, 3)
 
@@ -131,3 +133,69 @@ def test_an_unknown_column_of_numbers_is_a_question(tmp_path):
 def test_tables_of_axes_with_an_angle_are_as_before(tmp_path):
     text = "Axis: X\nPosition [mm];Deviation [um];Direction;Angle [deg]\n0;1.0;+;5\n100;2.0;+;5\n200;3.5;+;5\n"
     assert import_file(written(tmp_path, text)).kind == "axis"
+
+
+SHOP = (
+    "Ballbar test report\nMachine:\tVMC 850\nTest plane:\t{plane}\nTest radius:\t150.0000 mm\n"
+    "Feedrate:\t1000 mm/min\n\nAngle (deg)\tRun 1 CCW (um)\tRun 2 CW (um)\n"
+)
+
+
+def printed(angle_deg, squareness_urad):
+    """Radial deviation of a circle of 150 mm whose axes are not square, um: R - R/2 s sin 2t."""
+    return -0.5 * 150e-3 * squareness_urad * np.sin(2 * np.radians(angle_deg))
+
+
+def shop_file(tmp_path, plane, squareness_urad, name):
+    angle = np.arange(0, 360, 5)
+    rows = "".join(f"{t}\t{d:.3f}\t{d:.3f}\n" for t, d in zip(angle, printed(angle, squareness_urad), strict=True))
+    path = tmp_path / name
+    path.write_text(SHOP.format(plane=plane) + rows)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("plane", "number"),
+    [("XY", 0), ("X-Y", 0), ("Y/Z", 1), ("YZ plane", 1), ("G18 (ZX)", 2), ("ZX", 2)],
+)
+def test_test_plane_and_test_radius_are_read_as_programs_and_people_write_them(tmp_path, plane, number):
+    item = import_file(shop_file(tmp_path, plane, 30.0, "b.txt"))
+    assert item.doubts == ()
+    assert set(item.data.plane) == {number}
+    assert set(item.data.radius_mm) == {150.0}
+
+
+@pytest.mark.parametrize("plane", ["XZ", "G17 YZ", "vertical", "Z-Y"])
+def test_a_plane_that_counts_the_other_way_or_is_unclear_is_asked(tmp_path, plane):
+    (doubt,) = import_file(shop_file(tmp_path, plane, 30.0, "b.txt")).doubts
+    assert "--plane" in doubt
+
+
+def test_ballbar_texts_go_straight_into_an_identification_with_their_signs(tmp_path):
+    files = [shop_file(tmp_path, "XY", 40.0, "a.txt"), shop_file(tmp_path, "?", -25.0, "b.txt")]
+    with pytest.warns(CompgenWarning):
+        circles = open_measurement(files, answers=ImportOptions(plane="YZ"))
+    assert circles.planes == ("XY", "YZ")
+    assert sorted(set(circles.setup)) == [0, 1]
+    with pytest.warns(CompgenWarning, match="centres"):
+        found = identify_circles(compgen.load_machine("zha-gantry"), circles).errors.squareness
+    assert [found["EC0Y"][0], found["EA0Z"][0]] == pytest.approx([40e-6, -25e-6], abs=0.2e-6)
+
+
+def test_an_answer_is_for_the_file_that_asks_and_never_replaces_what_another_one_states(tmp_path):
+    files = [shop_file(tmp_path, "XY", 40.0, "a.txt"), shop_file(tmp_path, "YZ", -25.0, "b.txt")]
+    with pytest.raises(InputError, match="no file asks this"):
+        open_measurement(files, answers=ImportOptions(plane="ZX"))
+    with pytest.raises(InputError, match="states the plane 'XY'"):
+        open_measurement(files[:1], answers=ImportOptions(plane="ZX"))
+    native = tmp_path / "a.circle.csv"
+    native.write_text(import_file(files[0]).files()["a.circle.csv"])
+    with pytest.raises(InputError, match="native format"):
+        open_measurement([native], answers=ImportOptions(plane="XY"))
+
+
+def test_one_direction_may_stand_above_the_table(tmp_path):
+    path = written(
+        tmp_path, "Plane: ZX\nRadius: 100mm\nDirection: CW\nAngle [deg];Deviation [um]\n0;1\n90;2\n180;1\n270;2\n"
+    )
+    assert set(import_file(path).data.direction) == {-1}
