@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
@@ -20,6 +21,7 @@ from compgen.data.toml_files import option
 from compgen.errors import ConvergenceError, InputError, nearest
 from compgen.fit.smoother import Method, Smoother
 from compgen.fit.zeroing import FrameChange
+from compgen.kinematics.kernel_switch import lapack
 
 if TYPE_CHECKING:
     import scipy.sparse as sp
@@ -57,8 +59,8 @@ class CurveReport:
     smoothing_bias_max, smoothing_bias_rms : how much the smoothing flattens a curve like the fitted one, S c - c.
     smoothing_bias : the same per position, shape (n,).
     active_bounds : where the curve touches a bound.
-    solver : ``direct``; ``active set`` when a bound is active (``Clarabel`` or ``OSQP`` if these find the active
-        bounds: curves of more than 301 independent nodes); ``cvxpy`` with user constraints.
+    solver : ``direct``; ``active set`` when a bound is active (``Clarabel`` or ``OSQP`` if only these find the active
+        bounds); ``cvxpy`` with user constraints.
     correlated : whether the covariance of the nodes was used.
     distrusted_mm : nodes to which a robust loss gave less than their full weight.
     """
@@ -138,6 +140,7 @@ class FitResult(Drawable):
 # Bounds on one curve: magnitude, slope, curvature, monotonicity; as numbers and as rows of linear inequalities.
 
 
+BoolArray = NDArray[np.bool_]
 #: Bounds are met to within this fraction of their value.
 KEPT = 1e-9
 #: Names of the bounds in the order of their rows: values (over one node), slopes (two), curvatures (three).
@@ -197,11 +200,18 @@ class Rows:
     """lower <= dense @ x <= upper for the smoother's unknowns: dense (m, n), limits (m,).
 
     n values come first, then n - 1 slopes, then n - 2 curvatures, each over its bound; rows without limits are zero.
+    ``step`` (n - 1,) are the distances between nodes in mm, ``scale`` the bounds of values, slopes and curvatures.
     """
 
     dense: FloatArray
     lower: FloatArray
     upper: FloatArray
+    step: FloatArray
+    scale: tuple[float, float, float]
+
+    def times(self, curves: FloatArray) -> FloatArray:
+        """Values (m, k) of the rows for curves (n, k), zero at the fixed nodes."""
+        return _bounded_values(self.step, self.scale, curves)
 
     @cached_property
     def matrix(self) -> sp.csr_array:
@@ -212,7 +222,7 @@ class Rows:
 
     def excess(self, curve: FloatArray) -> FloatArray:
         """Amount (m,) by which a curve is above (positive) or below (negative) its limits, else 0."""
-        values = self.dense @ curve
+        values = self.times(curve[:, None])[:, 0]
         return np.maximum(values - self.upper, 0.0) + np.minimum(values - self.lower, 0.0)
 
 
@@ -252,16 +262,21 @@ def constraint_rows(
     scale, low, high = slope_limits(bounds, typical)
     if math.isinf(low) and math.isinf(high):
         scale = math.inf
-    slopes = np.diff(turn, axis=0) / (step[:, None] * scale)
-    first, middle, last = (curvature(position_mm) / most_bent).T[:, :, None]
-    bends = first * turn[:-2] + middle * turn[1:-1] + last * turn[2:]
-    dense = np.concatenate([turn / largest, slopes, bends])
+    dense = _bounded_values(step, (largest, scale, most_bent), turn)
     dense[np.abs(dense) < 1e-13 * np.abs(dense).max(initial=0.0)] = 0.0
     count = (n, max(n - 1, 0), max(n - 2, 0))
     lower = np.repeat([-1.0, low, -1.0], count)
     upper = np.repeat([1.0, high, 1.0], count)
     empty = ~dense.any(axis=1)
-    return Rows(dense, np.where(empty, -math.inf, lower), np.where(empty, math.inf, upper))
+    lower, upper = np.where(empty, -math.inf, lower), np.where(empty, math.inf, upper)
+    return Rows(dense, lower, upper, step, (largest, scale, most_bent))
+
+
+def _bounded_values(step: FloatArray, scale: tuple[float, float, float], curves: FloatArray) -> FloatArray:
+    """Values, slopes and curvatures (3 n - 3, k) of curves (n, k), over their bounds."""
+    first, middle, last = (curvature_at(step) / scale[2]).T[:, :, None]
+    bends = first * curves[:-2] + middle * curves[1:-1] + last * curves[2:]
+    return np.concatenate([curves / scale[0], np.diff(curves, axis=0) / (step[:, None] * scale[1]), bends])
 
 
 def active_bounds(position_mm: FloatArray, active: FloatArray, bounds: Bounds) -> tuple[ActiveBound, ...]:
@@ -425,9 +440,8 @@ def _check_key(bound: str, key: str) -> None:
 #
 # in the unknowns of the smoother, with g = Z^T W y. The zero curve satisfies every bound, so the program always has a
 # solution. A free optimum within its bounds is the solution. Otherwise a root F of the inverse of A turns the program
-# into finding the point nearest to the free optimum, x = free + F d with minimum |d|; its multipliers solve a
-# non-negative least-squares problem (Lawson & Hanson 1974, Solving Least Squares Problems, chapter 23). Its active
-# bounds become equations and are corrected one by one until the Karush-Kuhn-Tucker conditions (every bound satisfied,
+# into finding the point nearest to the free optimum, x = free + F d with minimum |d|, by exchange of its active bounds.
+# These become equations and are corrected one by one until the Karush-Kuhn-Tucker conditions (every bound satisfied,
 # every multiplier of the right sign) prove that the curve is optimal. Curves with too many nodes for dense matrices
 # start with the active bounds from a general solver. If active bounds are dependent, their multipliers are not unique;
 # the general solver's curve is then accepted if its duality gap is closed.
@@ -436,12 +450,14 @@ def _check_key(bound: str, key: str) -> None:
 DIRECT, ACTIVE_SET = "direct", "active set"
 #: Multipliers with the wrong sign up to this fraction of the largest are rounding errors.
 _ACTIVE_SET_SIGN = 1e-9
+#: Most exchanges of active rows; an excess below this fraction of the largest of the free optimum does not count.
+_EXCHANGES, _OUTSIDE = 60, 1e-10
 #: Combinations of active rows with a reach below this fraction of the largest are ignored.
 _DEPENDENT = 1e-13
 #: Largest duality gap, as a fraction of the cost of the bounds, of a solution with dependent active rows.
 _GAP = 1e-8
 #: Less than this fraction of the data is zero: rounding errors of a curve that its bounds keep at zero.
-_ROUNDING = 1e-15
+ROUNDING = 1e-15
 _UNTOUCHED: FloatArray = np.zeros(0)
 
 
@@ -467,7 +483,7 @@ def solve_curve(smoother: Smoother, mu: float, position_mm: FloatArray, y: Float
     unit = max(float(np.abs(y).max()), float(np.finfo(float).tiny))  # solvers work best with numbers near 1
     rows = constraint_rows(position_mm, smoother, *bounds.in_unit(unit).limits, bounds.direction)
     found = fit_bounded(smoother, mu, y / unit, rows)
-    return found._replace(curve=np.where(np.abs(found.curve) > _ROUNDING, found.curve * unit, 0.0))
+    return found._replace(curve=np.where(np.abs(found.curve) > ROUNDING, found.curve * unit, 0.0))
 
 
 def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> CurveSolution:
@@ -504,22 +520,67 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Cur
 def _nearest(root: FloatArray, free: FloatArray, rows: Rows) -> FloatArray:
     """Active rows (-1, 0, 1) of the point within the bounds nearest to the free optimum; at least a good guess.
 
-    With d in units of the largest excess e, the rows G F normalised and the right-hand side h = (G free - limit)/e,
-    min |d| subject to -G F d >= h has the multipliers u of min |(-G F)^T u|^2 + (h^T u - 1)^2, u >= 0.
+    With R = G F, the multipliers of the active rows R_a solve R_a R_a^T v = their excess at the free optimum. Rows with
+    a multiplier of the wrong sign leave; of the rows beyond their limit the furthest of each run of neighbours enters
+    (neighbours are nearly dependent: all of them at once would go round in a circle).
+    """
+    reach, value = rows.times(root), rows.times(free[:, None])[:, 0]
+    length = np.linalg.norm(reach, axis=1)
+    used = (length > 0) & (np.isfinite(rows.upper) | np.isfinite(rows.lower))
+    length[~used] = 1.0
+    above, below = (np.where(used, value - limit, -sign * math.inf) / length
+                    for sign, limit in ((1.0, rows.upper), (-1.0, rows.lower)))  # fmt: skip
+    reach /= length[:, None]
+    active, moved = np.zeros(len(value)), np.zeros(len(value))
+    largest = max(float(above.max(initial=0.0)), float(-below.min(initial=0.0)))
+    for _ in range(_EXCHANGES):
+        excess = np.maximum(above - moved, 0.0) + np.maximum(moved - below, 0.0)
+        excess[active != 0] = 0.0
+        enters = _peaks(excess, len(free)) & (excess > _OUTSIDE * largest)
+        if not enters.any():
+            return active
+        active[enters] = np.where(above[enters] > moved[enters], 1.0, -1.0)
+        while True:
+            picked = np.flatnonzero(active)
+            own = reach[picked]
+            _, multiplier, failed = lapack().dposv(
+                own @ own.T, np.where(active[picked] > 0, above[picked], below[picked]), lower=1
+            )
+            if failed:
+                return _by_least_squares(reach, above, below)
+            pull = active[picked] * multiplier
+            wrong = pull < -_ACTIVE_SET_SIGN * np.abs(pull).max(initial=0.0)
+            if not wrong.any():
+                break
+            active[picked[wrong]] = 0.0
+        moved = reach @ (own.T @ multiplier)
+    return _by_least_squares(reach, above, below)
+
+
+def _peaks(excess: FloatArray, n: int) -> BoolArray:
+    """Where values of n nodes, n - 1 slopes and n - 2 curvatures are larger than those beside them."""
+    kinds = np.zeros((3, n + 2))
+    kinds[0, 1:-1], kinds[1, 1:n], kinds[2, 1 : max(n - 1, 1)] = np.split(excess, [n, max(2 * n - 1, n)])
+    peak = (kinds[:, 1:-1] >= kinds[:, :-2]) & (kinds[:, 1:-1] > kinds[:, 2:])
+    return np.concatenate([peak[0], peak[1, : n - 1], peak[2, : max(n - 2, 0)]])
+
+
+def _by_least_squares(reach: FloatArray, above: FloatArray, below: FloatArray) -> FloatArray:
+    """The same active rows by non-negative least squares (Lawson & Hanson 1974, chapter 23), which always ends.
+
+    With d in units of the largest excess and right-hand sides h = excess, min |d| subject to -R d >= h has the
+    multipliers u of min |(-R)^T u|^2 + (h^T u - 1)^2, u >= 0.
     """
     from scipy.optimize import nnls  # imported here: slow to load
 
-    reach, value = rows.dense @ root, rows.dense @ free
-    length = np.linalg.norm(reach, axis=1)
-    above, below = (np.flatnonzero(np.isfinite(limit) & (length > 0)) for limit in (rows.upper, rows.lower))
-    row = np.concatenate([above, below])
-    excess = np.concatenate([value[above] - rows.upper[above], rows.lower[below] - value[below]]) / length[row]
-    sign = np.repeat([1.0, -1.0], [len(above), len(below)])
-    active = np.zeros(len(value))
+    high, low = np.flatnonzero(np.isfinite(above)), np.flatnonzero(np.isfinite(below))
+    row, sign = np.concatenate([high, low]), np.repeat([1.0, -1.0], [len(high), len(low)])
+    excess = np.concatenate([above[high], -below[low]])
+    active = np.zeros(len(reach))
     if not excess.max(initial=0.0) > 0.0:
         return active
     excess /= excess.max()
-    system = np.vstack([-(sign / length[row]) * reach[row].T, excess])
+    system = np.vstack([-sign * reach[row].T, excess])
     try:
         multiplier = nnls(system, np.append(np.zeros(reach.shape[1]), 1.0))[0]
     except RuntimeError:  # too many steps: start the search with the rows furthest outside their limits

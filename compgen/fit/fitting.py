@@ -19,6 +19,8 @@ from compgen.data.machine import Machine
 from compgen.data.names import error_named
 from compgen.errors import ConvergenceError, InputError
 from compgen.fit.bounds import (
+    ACTIVE_SET,
+    ROUNDING,
     Bounds,
     CurveReport,
     CurveSolution,
@@ -29,6 +31,7 @@ from compgen.fit.bounds import (
     curvature_at,
     solve_curve,
 )
+from compgen.fit.interior import Banded, BandedRows, bounded_curves, windows
 from compgen.fit.smoother import (
     REFINEMENTS,
     SETTLED,
@@ -85,16 +88,51 @@ def solve_curves(problems: Sequence[CurveProblem]) -> list[CurveSolution]:
         for k, problem in enumerate(problems)
         if type(problem.smoother) is Smoother and all([other is None for _, other, _ in problem.smoother.steps])
     ]
-    found: dict[int, FloatArray] = {}
+    found: dict[int, CurveSolution] = {}
     if chosen:
         together = [problems[k] for k in chosen]
         stack = Stack.build(together)
         c = stack.solve(np.concatenate([problem.y for problem in together]))
         if c is not None:
-            kept = (~_breaks(stack, together, c)).tolist()
-            bounds = zip(stack.starts.tolist(), (stack.starts + stack.sizes).tolist(), strict=True)
-            found = {k: c[start:end] for k, (start, end), own in zip(chosen, bounds, kept, strict=True) if own}
-    return [CurveSolution(found[k]) if k in found else solve_curve(*problem) for k, problem in enumerate(problems)]
+            curves = np.split(c, stack.starts[1:])
+            broken = _breaks(stack, together, c)
+            found = {k: CurveSolution(own) for k, own, over in zip(chosen, curves, broken, strict=True) if not over}
+            bounded = np.flatnonzero(broken)
+            solved = _bounded([together[k] for k in bounded], [curves[k] for k in bounded])
+            found |= {chosen[k]: own for k, own in zip(bounded, solved, strict=True) if own is not None}
+    return [found[k] if k in found else solve_curve(*problem) for k, problem in enumerate(problems)]
+
+
+def _bounded(problems: Sequence[CurveProblem], free: Sequence[FloatArray]) -> list[CurveSolution | None]:
+    """Solve curves whose ``free`` optimum violates a bound together; None where the conditions were not met.
+
+    Each in the unit of its largest data: solvers work best with numbers near 1.
+    """
+    if not problems:
+        return []
+    unit = [max(float(np.abs(problem.y).max()), float(np.finfo(float).tiny)) for problem in problems]
+    stack = Stack.build(problems)
+    inside = np.ones(len(stack.mu))
+    inside[stack.fixed] = 0.0
+    bend = np.zeros((3, len(inside)))
+    bend[:, :-2] = stack.laid.rows.T
+    bend *= windows(inside) * np.sqrt(stack.mu)
+    weight = inside * stack.laid.weight
+    y = np.concatenate([problem.y / size for problem, size in zip(problems, unit, strict=True)])
+    system = Banded(stack.starts, stack.sizes, weight, inside, bend, weight * y)
+    bounds = [problem.bounds.in_unit(size) for problem, size in zip(problems, unit, strict=True)]
+    rows = BandedRows.of(system, np.concatenate([problem.position_mm for problem in problems]), bounds)
+    start = np.concatenate([own / size for own, size in zip(free, unit, strict=True)])
+    c, active, solved = bounded_curves(system, rows, start)
+    result: list[CurveSolution | None] = []
+    for k, (begin, n, size) in enumerate(zip(stack.starts.tolist(), stack.sizes.tolist(), unit, strict=True)):
+        own = c[begin : begin + n]
+        touched = np.zeros((3, n))
+        touched[list(rows.kinds)] = active[:, begin : begin + n]
+        flat = np.concatenate([touched[0], touched[1, : n - 1], touched[2, : max(n - 2, 0)]])
+        curve = np.where(np.abs(own) > ROUNDING, own * size, 0.0)
+        result.append(CurveSolution(curve, flat, ACTIVE_SET) if solved[k] else None)
+    return result
 
 
 @dataclass(frozen=True)
