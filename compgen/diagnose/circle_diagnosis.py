@@ -25,12 +25,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, stdtr
 
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
+from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
 from compgen.diagnose.verdict import DisplayedDiagnosis
+from compgen.effects import Readings, active_effects, catalogue, section_text
 from compgen.errors import InputError, nearest
 from compgen.identify.axis_tests import SQUARENESS_OF, circle_positions, correlated
 from compgen.kinematics.first_order import c_matrix
@@ -50,6 +54,24 @@ SEARCHED_SHARE = 0.2
 NAMES_PER_MOST = 2
 #: Share of its columns that has to be left beside centre, radius and other names.
 LEAST_VISIBLE = 0.05
+#: An alternative with a smaller weight is not listed.
+LEAST_WEIGHT = 0.02
+#: Standard uncertainties below which an amount is not confirmed; squared time by which a drive may lead its command, ms^2.
+LEAST_SIZE, MOST_LEAD_MS2 = 2.0, 25.0
+#: An effect may differ by direction and quadrant by at most this share of its square; p-value of the test.
+UNEVEN_SHARE, UNEVEN_P = 0.1, 1e-3
+#: What an effect must explain beside a structure without a name, as a multiple of it: of one law, and of any curve.
+LEAST_OF_UNKNOWN, LEAST_OF_ANY_CURVE = 0.8, 30.0
+#: p-value from which what two passes leave over is the same.
+REPEATS_P = 1e-4
+#: Shares of the session that are tried as time constants of a drift; passes that show a level of each.
+DRIFT_SHARES, LEAST_PASSES, MOST_PASSES = (0.1, 0.2, 0.4, 0.8, 1.6, 10.0), 3, 12
+#: Chi-squares that differ by less than this are equal.
+ALIKE_CHI2 = 1e-6
+#: Rounds in which every name is exchanged for a better one beside the others.
+MOST_SWAPS = 3
+#: Share of the readings that lie exactly where an axis reverses, from which they are kept.
+MOST_AT_REVERSALS = 0.1
 #: Canonical correlation from which two effects are not told apart.
 ALIKE = 0.95
 #: A structure in the residuals is unknown from this share of the noise, and from this size, mm.
@@ -58,6 +80,7 @@ UNKNOWN_SHARE, UNKNOWN_MM = 0.5, 1e-4
 UNKNOWN_CORRELATED = 3.0
 #: Times in which a spike may decay (ms), or angles if the feed is not known (degrees).
 SPIKE_MS = (4.0, 8.0, 15.0, 30.0, 60.0, 120.0, 240.0)
+MOST_SPIKE_RAD = 0.2
 SPIKE_DEG = (0.2, 0.4, 0.8, 1.6, 3.2)
 #: A pitch is looked for from this many readings to this share of the radius: a longer one imitates any few lobes.
 PITCH_STEPS, PITCH_SHARE = 4.0, 0.3
@@ -89,6 +112,15 @@ WORDS = {
     "straightness": (
         "the circle in {of} has three or four lobes: guides that are not straight, or scales that are not linear",
         "measure the straightness and the positioning of both axes; a circle shows only part of them",
+    ),
+    "radius_drift": (
+        "all radii in {of} change with time: the gauge, the spindle or the machine warms up",
+        "warm up spindle and gauge, and repeat the circles; measure the drift with the axes at rest: the gauge alone, then "
+        "with the spindle running",
+    ),
+    "radius_level": (
+        "every pass in {of} has another radius: the gauge was set again, or something slipped between the passes",
+        "check ball seats, magnets and clamping, and repeat the circles without touching the gauge",
     ),
     "backlash": (
         "{of} is late after each reversal: steps where it turns",
@@ -136,8 +168,9 @@ class NamedCircleEffect:
     candidate: CircleCandidate
     values: Mapping[str, tuple[float, float]]
     chi2: float
-    alias: tuple[str, ...]
+    alias: tuple[tuple[str, float], ...]
     visible: float
+    reasons: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -270,7 +303,11 @@ def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space:
     """Spikes and periodic errors of every axis, with the settings that explain most beside ``space``."""
     found: list[CircleCandidate] = []
     axes = [axis for axis in range(3) if np.any(circles.radial()[:, axis])]
-    grid = SPIKE_DEG if angular_speed(circles) is None else SPIKE_MS
+    speed = angular_speed(circles)
+    grid = SPIKE_DEG if speed is None else SPIKE_MS
+    if speed is not None:  # the slower the circle, the longer a spike of the same angle
+        longer = [SPIKE_MS[-1] * 2.0**k for k in range(1, 9)]
+        grid = (*SPIKE_MS, *(ms for ms in longer if float(speed.min()) * ms * 1e-3 < MOST_SPIKE_RAD))
     for axis in axes:
         make = partial(spike, circles, axis, len(grid))
         best = max(grid, key=lambda decay, make=make: space.gain(make(decay).columns))
@@ -314,6 +351,56 @@ def noise_floor(circles: Circles, residual_mm: FloatArray, u_um: float | None) -
     return float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)), "neighbouring readings"
 
 
+def _structure(left: FloatArray, floor_mm: float) -> float:
+    """Root mean square of residuals (n,) beyond the noise of single readings, mm; 0 if that is too little."""
+    structure = math.sqrt(max(float(np.mean(left**2)) - floor_mm**2, 0.0))
+    return structure if structure >= max(UNKNOWN_SHARE * floor_mm, UNKNOWN_MM) else 0.0
+
+
+def _repeats(own: Circles, left: FloatArray) -> bool:
+    """Whether two passes leave the same over: alike in one direction, alike or opposite in both.
+
+    Noise that wanders from reading to reading has as much structure as an effect, but it is another one in each pass.
+    """
+    keys = np.column_stack([own.setup, own.radius_mm, own.run, own.direction])
+    _, number = np.unique(keys, axis=0, return_inverse=True)
+    passes = []
+    for k in range(int(number.max()) + 1):
+        rows = np.flatnonzero(number.ravel() == k)
+        passes.append(rows[np.argsort(own.angle_rad[rows])])
+    for i, first in enumerate(passes):
+        for second in passes[i + 1 :]:
+            if len(second) < 8 or len(first) < 8:
+                continue
+            angle = own.angle_rad[first]
+            inside = (angle >= own.angle_rad[second[0]]) & (angle <= own.angle_rad[second[-1]])
+            a, b = left[first][inside], np.interp(angle[inside], own.angle_rad[second], left[second])
+            same_way = own.direction[first[0]] == own.direction[second[0]]
+            if len(a) >= 8 and _p_alike(a, b, one_sided=bool(same_way)) < REPEATS_P:
+                return True
+    return False
+
+
+def _p_alike(a: FloatArray, b: FloatArray, *, one_sided: bool) -> float:
+    """p-value of the correlation of two series (n,), each of them correlated along itself."""
+    a, b = a - a.mean(), b - b.mean()
+    size = float(np.sqrt((a @ a) * (b @ b)))
+    if not size:
+        return 1.0
+    together = 1.0
+    for lag in range(1, len(a) // 4):
+        product = float(a[:-lag] @ a[lag:]) * float(b[:-lag] @ b[lag:]) / size**2
+        if product <= 0 or float(a[:-lag] @ a[lag:]) < 0:
+            break
+        together += 2.0 * product
+    freedom = len(a) / together - 2.0
+    if freedom < 2.0:
+        return 1.0
+    r = min(float(a @ b) / size, 1.0 - 1e-12)
+    t = r * math.sqrt(freedom / (1.0 - min(r**2, 1.0 - 1e-12)))
+    return float(stdtr(freedom, -t)) if one_sided else 2.0 * float(stdtr(freedom, -abs(t)))
+
+
 def unknown_of(circles: Circles, residual_mm: FloatArray, floor_mm: float) -> list[dict[str, Any]]:
     """Structures in the residuals that none of the effects explains, by plane, as in ``diagnosis.json``."""
     found = []
@@ -322,8 +409,8 @@ def unknown_of(circles: Circles, residual_mm: FloatArray, floor_mm: float) -> li
         if not rows.size:
             continue
         own, left = circles.part(rows), residual_mm[rows]
-        structure = math.sqrt(max(float(np.mean(left**2)) - floor_mm**2, 0.0))
-        if structure < max(UNKNOWN_SHARE * floor_mm, UNKNOWN_MM) or correlated(own, left) < UNKNOWN_CORRELATED:
+        structure = _structure(left, floor_mm)
+        if not structure or not _repeats(own, left):
             continue
         power = {}
         for n in HARMONICS:
@@ -366,17 +453,54 @@ class CircleDiagnosis(DisplayedDiagnosis):
     left_out_rms_mm: tuple[float, float]
     floor_mm: float
     floor_source: str
+    reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def acceptable(self) -> bool:
-        """Whether the misfit of the sectors left out shrinks, if something was named."""
+        """Whether it is decided, and the misfit of the sectors left out shrinks, if something was named."""
+        if self.word == "not_decidable":
+            return False
         return not self.effects or self.left_out_rms_mm[1] < self.left_out_rms_mm[0]
+
+    @property
+    def word(self) -> str:
+        """The verdict."""
+        if any(self.grade(item) != "tentative" for item in self.effects):
+            return "named"
+        if self.unknown or self.effects:
+            return "unknown" if self.unknown or any(item.reasons for item in self.effects) else "named"
+        return "not_decidable" if self.reasons else "none"
+
+    def grade(self, item: NamedCircleEffect) -> str:
+        """How sure a name is."""
+        if len(item.alias) > 1 or item.reasons:
+            return "tentative"
+        return "beside_unknown" if self.unknown else "confirmed"
+
+    def extended(self) -> str:
+        """The machine file with the effects that belong to the machine and are not errors of its tables; empty without."""
+        if self.machine.file is None:
+            return ""
+        readings, known, sections = readings_of_circles(self.machine, self.circles), catalogue(), []
+        for item in self.effects:
+            name = item.candidate.name
+            if self.grade(item) == "tentative" or not name.startswith(("backlash", "periodic")):
+                continue
+            effect = known[name].with_settings(dict(item.candidate.settings))
+            units = {one.name: one.si_per_unit for one in effect.card.parameters}
+            values = np.array([item.values.get(key, (0.0, 0.0))[0] * unit for key, unit in units.items()])
+            sections.append(section_text(effect, readings, values))
+        if not sections:
+            return ""
+        text = read_text(self.machine.file).rstrip("\n")
+        return "\n".join([text, "", "", "# found by volcomp diagnose in circles", *sections])
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``diagnosis.json``."""
         rms = [float(np.sqrt(np.mean(values**2))) for values in (self.residual_before_mm, self.residual_after_mm)]
         return {
-            "verdict": "named" if self.effects else "unknown" if self.unknown else "none",
+            "verdict": self.word,
             "effects": [self._effect(item) for item in self.effects],
             "unknown": list(self.unknown),
             "invisible": list(self.invisible),
@@ -390,14 +514,13 @@ class CircleDiagnosis(DisplayedDiagnosis):
                 "noise_floor_source": self.floor_source,
             },
             "advice": self._advice(),
-            "reasons": [],
-            "notes": [f"lines left out: sectors of {SECTOR_DEG:g} degrees, a quarter of them at a time"],
+            "reasons": list(self.reasons),
+            "notes": [*self.notes, f"lines left out: sectors of {SECTOR_DEG:g} degrees, a quarter of them at a time"],
             "evidence": {"readings": len(self.circles), "planes": list(self.circles.planes)},
         }
 
     def _effect(self, item: NamedCircleEffect) -> dict[str, Any]:
         what, todo = item.candidate.words
-        names = [item.candidate.name, *item.alias]
         amount = ""
         if item.candidate.name.startswith("backlash"):
             value, u = item.values["c_um"]
@@ -406,14 +529,14 @@ class CircleDiagnosis(DisplayedDiagnosis):
             amount = f"; amplitude {math.hypot(item.values['s1_um'][0], item.values['c1_um'][0]):.2f} um"
         elif item.values.get("tau_squared_ms2", (0.0, 0.0))[0] < 0:
             amount = "; here it grows: the feed-forward is too strong"
-        grade = "tentative" if item.alias else "beside_unknown" if self.unknown else "confirmed"
         return {
             "name": item.candidate.name,
-            "alias_set": [{"name": name, "weight": 1.0 / len(names)} for name in names],
+            "alias_set": [{"name": name, "weight": round(weight, 4)} for name, weight in item.alias],
             "parameters": {key: {"value": value, "u": u} for key, (value, u) in item.values.items()},
             "settings": dict(item.candidate.settings),
-            "confidence": 1.0 / len(names),
-            "grade": grade,
+            "confidence": round(next(weight for name, weight in item.alias if name == item.candidate.name), 4),
+            "grade": self.grade(item),
+            "reasons": list(item.reasons),
             "visible_fraction": item.visible,
             "chi2": item.chi2,
             "text": what + amount,
@@ -422,7 +545,11 @@ class CircleDiagnosis(DisplayedDiagnosis):
 
     def _advice(self) -> list[str]:
         found = []
-        alike = [f"{item.candidate.name} from {', '.join(item.alias)}" for item in self.effects if item.alias]
+        others = {
+            item.candidate.name: [name for name, _ in item.alias if name != item.candidate.name]
+            for item in self.effects
+        }
+        alike = [f"{name} from {', '.join(same)}" for name, same in others.items() if same]
         if alike:
             found.append(f"measure whole circles in both directions: separates {'; '.join(alike)}")
         delay = [name for name in self.invisible if name.startswith("servo_delay")]
@@ -465,7 +592,12 @@ def diagnose_circles(
     InputError
         for unknown names and too few readings.
     """
+    circles = without_reversals(circles)
     position_mm = circle_positions(machine, circles)
+    active = [effect.change_mm(readings_of_circles(machine, circles)) for effect in active_effects(machine)]
+    for change in active:  # subtract the effects that are already in the machine file
+        if change is not None:
+            circles = replace(circles, deviation_mm=circles.deviation_mm - change)
     # each feed is a path of its own
     feed = circles.covariates.get("feed_mm_min", np.zeros(len(circles)))
     _, path = np.unique(np.column_stack([circles.run, feed]), axis=0, return_inverse=True)
@@ -475,7 +607,7 @@ def diagnose_circles(
     fixed = candidates_of(machine, circles, position_mm)
     show("searching for spikes and periods")
     linear = CircleSpace.of(np.hstack([base, *(item.columns for item in fixed)]), value)
-    every = fixed + searched(machine, circles, position_mm, linear)
+    every = fixed + searched(machine, circles, position_mm, linear) + changing(circles, linear)
     for name in (*only, *add):
         if name not in [item.name for item in every]:
             message = f"{name!r} is not an effect of these circles; {nearest(name, [item.name for item in every])}"
@@ -499,11 +631,138 @@ def diagnose_circles(
         others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
         chi2[item.name] = others.gain(item.columns) / variance
     effects, after = solved(circles, base, named, every, chi2)
+    unknown = unknown_of(circles, after, floor_mm)
+    curves = [item for item in effects if item.candidate.columns.shape[1] > 1]
+    effects = [_beside(circles, item, unknown, (after, floor_mm), variance) for item in effects]
+    doubtful = [item.chi2 * variance for item in curves if item not in effects]
+    effects = [_beside(circles, item, unknown, (after, floor_mm), variance, sum(doubtful)) for item in effects]
+    reasons = [] if unknown or source != "neighbouring readings" else undecided(circles, after, floor_mm)
     show("testing on sectors left out")
     return CircleDiagnosis(
-        machine, circles, tuple(effects), tuple(unknown_of(circles, after, floor_mm)),
-        invisible_of(circles, start, every), start.left, after, left_out(circles, base, named), floor_mm, source,
+        machine, circles, tuple(effects), tuple(unknown), invisible_of(circles, start, every), start.left, after,
+        left_out(circles, base, named), floor_mm, source, tuple(reasons),
     )  # fmt: skip
+
+
+def _beside(
+    circles: Circles,
+    item: NamedCircleEffect,
+    unknown: Sequence[Mapping[str, Any]],
+    left: tuple[FloatArray, float],
+    variance: float,
+    doubtful: float = 0.0,
+) -> NamedCircleEffect:
+    """An effect beside a structure without a name: it may be a part of that, if it does not explain more.
+
+    ``doubtful`` is the sum of squares that curves explain which may be part of it, too.
+    """
+    if not unknown or any("unexplained" in reason for reason in item.reasons):
+        return item
+    after, floor_mm = left
+    planes = [list(PLANES).index(entry["plane"]) for entry in unknown]
+    rows = np.isin(circles.plane, planes) & item.candidate.columns.any(axis=1)
+    structure = float(np.sum(after[rows] ** 2)) - np.count_nonzero(rows) * floor_mm**2 + doubtful
+    any_curve = item.candidate.columns.shape[1] > 1
+    if item.chi2 * variance < (LEAST_OF_ANY_CURVE if any_curve else LEAST_OF_UNKNOWN) * structure:
+        return replace(item, reasons=(*item.reasons, "small compared with the unexplained part"))
+    return item
+
+
+def undecided(circles: Circles, left: FloatArray, floor_mm: float) -> list[str]:
+    """Planes in which one pass leaves a structure over that may be noise: only a repeat would show it."""
+    found = []
+    for k, plane in enumerate(PLANES):
+        rows = np.flatnonzero(circles.plane == k)
+        if (
+            rows.size
+            and _structure(left[rows], floor_mm)
+            and correlated(circles.part(rows), left[rows]) >= UNKNOWN_CORRELATED
+        ):
+            size = float(np.sqrt(np.mean(left[rows] ** 2))) / MM_PER_UM
+            found.append(
+                f"{plane}: {size:.2g} um rms are left over that change slowly along the path; without repeats noise of the "
+                "gauge cannot be told from an effect without a name"
+            )
+    return found
+
+
+def without_reversals(circles: Circles) -> Circles:
+    """Circles without the readings exactly where an axis reverses: they belong to neither side of it."""
+    at = (np.abs(circles.radial()) > 0.5) & (circles.travel() == 0)
+    rows = np.flatnonzero(~at.any(axis=1))
+    return circles if len(circles) - len(rows) > MOST_AT_REVERSALS * len(circles) else circles.part(rows)
+
+
+def readings_of_circles(machine: Machine, circles: Circles) -> Readings:
+    """Circles in the form that the effects of the catalogue use: displacements along the radius."""
+    count = len(circles)
+    return Readings(
+        machine=machine,
+        kind="deviations",
+        position_mm=circle_positions(machine, circles),
+        direction=circles.radial(),
+        tool_mm=np.tile(np.asarray(machine.tool_offset_mm, dtype=np.float64), (count, 1)),
+        stations=(),
+        station=np.zeros(count, dtype=np.int64),
+        range_mm=np.zeros(count),
+        approach=circles.travel(),
+        covariates=circles.covariates,
+        labels={"run": circles.run, "setup": circles.setup},
+    )
+
+
+def time_of(circles: Circles) -> FloatArray:
+    """Time of each reading (n,): as logged, else its number, pass after pass as in the file, each in its direction."""
+    logged = circles.covariates.get("time_s")
+    if logged is not None and np.isfinite(logged).all() and np.ptp(logged) > 0:
+        return logged
+    keys = np.column_stack([circles.plane, circles.setup, circles.radius_mm, circles.run, circles.direction])
+    _, first, number = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    time, at = np.zeros(len(circles)), 0
+    for k in np.argsort(first):
+        rows = np.flatnonzero(number.ravel() == k)
+        way = circles.direction[rows] * circles.angle_rad[rows]
+        if np.count_nonzero(np.diff(way) < 0) > 1:  # more than the one jump of a circle that does not begin at zero
+            rows = rows[np.argsort(way)]
+        time[rows] = at + np.arange(len(rows))
+        at += len(rows)
+    return time
+
+
+def drift(plane: str, own: NDArray[np.bool_], share: FloatArray, tau: float) -> CircleCandidate:
+    """Radii ``own`` that drift with the time constant ``tau``, a share of the session, and are 1 at its end."""
+    column = np.where(own, np.expm1(-share / tau) / math.expm1(-1.0 / tau), 0.0)[:, None]
+    settings = {"time_constant_share": tau}
+    return CircleCandidate(f"radius_drift_{plane}", plane, column, (("c_um", MM_PER_UM),), len(DRIFT_SHARES), settings)
+
+
+def changing(circles: Circles, space: CircleSpace) -> list[CircleCandidate]:
+    """What happens to the radius in time: a drift, and a level of each pass."""
+    time, found = time_of(circles), []
+    for k, plane in enumerate(PLANES):
+        own = circles.plane == k
+        if not own.any():
+            continue
+        share = (time - time[own].min()) / max(float(np.ptp(time[own])), 1e-9)
+        make = partial(drift, plane, own, share)
+        best = max(DRIFT_SHARES, key=lambda tau, make=make: space.gain(make(tau).columns))
+        worth = space.gain(make(best).columns) > SEARCHED_SHARE * float(space.left @ space.left)
+        found.append(sharpened(make, space, best, 2.0) if worth else make(best))
+        keys = np.column_stack([circles.setup, circles.radius_mm, circles.run, circles.direction])[own]
+        _, number = np.unique(keys, axis=0, return_inverse=True)
+        passes = int(number.max()) + 1
+        feed = circles.covariates.get("feed_mm_min")
+        if LEAST_PASSES <= passes <= MOST_PASSES and (feed is None or np.ptp(feed[own]) == 0):
+            levels = np.zeros((len(circles), passes - 1))
+            levels[own] = np.eye(passes)[number.ravel()][:, 1:]
+            names = tuple((f"c{j + 1}_um", MM_PER_UM) for j in range(1, passes))
+            found.append(CircleCandidate(f"radius_level_{plane}", plane, levels, names))
+    return found
+
+
+def price(circles: Circles, item: CircleCandidate) -> float:
+    """Chi-square that every parameter beyond the first has to bring: four columns always fit better than one."""
+    return (item.columns.shape[1] - 1) * math.log(len(circles))
 
 
 def chosen_of(
@@ -525,11 +784,11 @@ def chosen_of(
     def worth(item: CircleCandidate, space: CircleSpace) -> float:
         """Chi-square of an effect beside ``space``; 0 if that is too little for a name."""
         gain = space.gain(item.columns)
-        least = variance * (NAMED_CHI2 + 2.0 * math.log(item.trials))
+        least = variance * (NAMED_CHI2 + 2.0 * math.log(item.trials) + price(circles, item))
         least = max(least, NAMED_MM**2 * np.count_nonzero(item.columns.any(axis=1)))
         if item.settings:  # of many settings one always imitates a part of what has no name
             least = max(least, SEARCHED_SHARE * (float(space.left @ space.left) - len(value) * floor_mm**2))
-        return gain / variance if gain > least else 0.0
+        return gain / variance - price(circles, item) if gain > least else 0.0
 
     def beside(items: Sequence[CircleCandidate]) -> CircleSpace:
         return CircleSpace.of(np.hstack([base, *(item.columns for item in items)]), value)
@@ -538,13 +797,28 @@ def chosen_of(
         space = beside(named)
         others = [item for item in allowed if item not in named]
         gains = [worth(item, space) for item in others]
-        if max(gains, default=0.0) == 0.0:
+        if max(gains, default=0.0) <= 0.0:
             break
         # of two that explain the same, the first
         named.append(next(item for item, gain in zip(others, gains, strict=True) if gain > max(gains) * (1 - 1e-9)))
+    # what was taken first may have stood for two of the others
+    for _ in range(MOST_SWAPS if any(item.columns.shape[1] > 1 for item in named) else 0):
+        before = [item.name for item in named]
+        for item in [one for one in named if one not in forced]:
+            rest = [one for one in named if one is not item]
+            space, others = beside(rest), [one for one in allowed if one not in rest]
+            own = worth(item, space)
+            best = max(others, key=lambda one, space=space: worth(one, space))
+            named = [*rest, best if worth(best, space) > own + ALIKE_CHI2 else item]
+        space, others = beside(named), [one for one in allowed if one not in named]
+        best = max(others, key=lambda one, space=space: worth(one, space), default=None)
+        if best is not None and worth(best, space) > 0.0 and len(named) < most + len(forced):
+            named.append(best)
+        if [item.name for item in named] == before:
+            break
     for item in [one for one in reversed(named) if one not in forced]:
         rest = [one for one in named if one is not item]
-        if worth(item, beside(rest)) == 0.0:
+        if worth(item, beside(rest)) <= 0.0:
             named = rest
     # the settings were found before the other effects were known: once more beside these
     for _ in range(2):
@@ -592,10 +866,59 @@ def solved(
             values = {"tau_ms": (math.sqrt(square), u_square / (2.0 * math.sqrt(square)))}
         others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
         own = others.without(item.columns)
-        alias = [one.name for one in every if one.name not in names and others.are_alike(item.columns, one.columns)]
+        alike = [one for one in every if one.name not in names and others.are_alike(item.columns, one.columns)]
+        criteria = {one.name: others.gain(one.columns) / variance - price(circles, one) for one in (item, *alike)}
+        weights = {name: math.exp(min(0.5 * (value - criteria[item.name]), 50.0)) for name, value in criteria.items()}
+        total = sum(weights.values())
+        alias = [
+            (name, weight / total)
+            for name, weight in weights.items()
+            if weight / total >= LEAST_WEIGHT or name == item.name
+        ]
         visible = float(np.linalg.norm(own) / np.linalg.norm(item.columns))
-        effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible))
+        shape = item.columns @ found[at : at + item.columns.shape[1]]
+        reasons = [*_implausible(item, values), *_uneven(circles, item, wide, after, shape, variance)]
+        effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible, tuple(reasons)))
     return effects, after
+
+
+def _implausible(item: CircleCandidate, values: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Why the amount speaks against an effect: smaller than its uncertainty allows, or no drive does that."""
+    reasons = []
+    if max(abs(value) / u if u else math.inf for value, u in values.values()) < LEAST_SIZE:
+        reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+    square = values.get("tau_squared_ms2", (0.0, 0.0))[0]
+    if square < -MOST_LEAD_MS2:
+        reasons.append(f"its size, tau_squared_ms2 = {square:.3g}, is not plausible: no drive leads by so much")
+    return reasons
+
+
+def _uneven(
+    circles: Circles, item: CircleCandidate, columns: FloatArray, left: FloatArray, shape: FloatArray, variance: float
+) -> list[str]:
+    """Whether the size of an effect differs by direction and by half of the circle: then it imitates something else.
+
+    Not for reversals, which may differ at the two ends of a circle.
+    """
+    if item.name.startswith(("backlash", "reversal_spike", "radius")):
+        return []
+    ways = [np.sign(np.cos(circles.angle_rad)), np.sign(np.sin(circles.angle_rad))]
+    if len(np.unique(circles.direction)) == 2:
+        ways.append(circles.direction.astype(np.float64))
+    ways.append(ways[0] * ways[1])
+    space = CircleSpace.of(columns, left)
+    extra = np.column_stack([shape * way for way in ways])
+    own = space.without(extra)
+    kept = np.linalg.norm(own, axis=0) > LEAST_VISIBLE * np.linalg.norm(extra, axis=0)
+    if not kept.any():
+        return []
+    value = np.linalg.lstsq(own[:, kept], space.left, rcond=1e-6)[0]
+    moved = own[:, kept] @ value
+    p = float(chdtrc(int(kept.sum()), float(moved @ moved) / variance))
+    varies = extra[:, kept] @ value
+    if p < UNEVEN_P and float(varies @ varies) > UNEVEN_SHARE * float(shape @ shape):
+        return [f"it is not alike in all quadrants and both directions (p = {p:.1e})"]
+    return []
 
 
 def invisible_of(circles: Circles, start: CircleSpace, every: Sequence[CircleCandidate]) -> tuple[str, ...]:

@@ -347,7 +347,8 @@ def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis) -> dict[
     data = found.to_dict()
     files = {"diagnosis.json": json_text(data), "diagnosis.md": summary(found.machine.name, data, markdown=True)}
     if isinstance(found, CircleDiagnosis):
-        return {**files, "index.html": circle_page(found, data)}
+        extended = found.extended()
+        return {**files, "index.html": circle_page(found, data), **({"extended.toml": extended} if extended else {})}
     if isinstance(found, AxisDiagnosis):
         files["index.html"] = axis_page(found, data)
         files["removed.csv"] = found.removed_csv()
