@@ -20,7 +20,7 @@ from compgen.cli.shared_options import open_machine
 from compgen.cli.terminal import answer, say, stdout
 from compgen.controls import CONTROLLERS
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.deviations import Deviations
+from compgen.data.deviations import Artefact, Deviations, Part
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, read_text
 from compgen.data.lengths import Lengths
@@ -275,7 +275,10 @@ def outside_travel(machine: Machine, data: object) -> list[str]:
 def _positions(data: object) -> dict[int, np.ndarray]:
     if isinstance(data, AxisRuns):
         return {axis: data.position_mm[data.axis == axis] for axis in data.axes}
-    if isinstance(data, Lengths | Deviations):
+    if isinstance(data, Artefact):
+        found = np.where(np.isnan(data.measured_mm), data.nominal_mm, data.measured_mm)
+        return {axis: found[:, axis] for axis in range(3)}
+    if isinstance(data, Lengths | Deviations | Part):
         return {axis: data.position_mm[:, axis] for axis in range(3)}
     if isinstance(data, ErrorTable):
         ends = [(error_named(name).axis, curve.position_mm) for name, curve in data.curves.items()]

@@ -36,11 +36,13 @@ __all__ = [
     "Artefact",
     "DEVIATION_COLUMNS",
     "PART",
+    "Part",
     "Deviations",
     "RoughPose",
     "aligned",
     "format_artefact",
     "format_deviations",
+    "format_part",
     "join_artefacts",
     "read_artefacts",
     "read_deviations",
@@ -274,6 +276,69 @@ def _origin(table: CsvTable) -> FloatArray | None:
     if values.shape != (3,) or not np.isfinite(values).all():
         raise InputError(f"the comment origin_mm = {text!r} is not three numbers X, Y, Z in mm", file=table.path)
     return values
+
+
+@dataclass(frozen=True, repr=False)
+class Part(Displayed):
+    """Features of a part as another machine measured them, n rows: what ``*.part.csv`` contains.
+
+    Parameters
+    ----------
+    feature : name of the feature of each row.
+    nominal_mm : its nominal place, from a zero of the part, (n, 3).
+    measured_mm : its measured place in any frame, (n, 3); nan for a component that was not measured.
+    setup : number of the clamping in which it was made, (n,).
+    origin_mm : machine coordinates of the zero of the nominal places, (3,).
+    metadata, origin : comments ``key = value``; file and line of each row.
+    """
+
+    feature: Sequence[str]
+    nominal_mm: FloatArray
+    measured_mm: FloatArray
+    setup: NDArray[np.int64]
+    origin_mm: FloatArray
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.feature)
+
+    @property
+    def position_mm(self) -> FloatArray:
+        """Nominal places in machine coordinates, (n, 3)."""
+        return self.nominal_mm + self.origin_mm
+
+    def deviations(self) -> Deviations:
+        """Return what :func:`read_parts` returns of the file: aligned deviations at the places in the machine."""
+        found = Deviations(
+            self.position_mm,
+            self.measured_mm - self.nominal_mm,
+            labels={"setup": self.setup},
+            metadata={**self.metadata, "measured": PART},
+            origin=self.origin,
+        )
+        return aligned(found)
+
+    def overview(self) -> Overview:
+        """Numbers of features and set-ups, and the box of the machine that they cover."""
+        title = f"{len(self)} features of a part in {len(np.unique(self.setup))} set-ups"
+        return Overview(title, ("axis", "from (mm)", "to (mm)"), ranges_of(self.position_mm))
+
+
+def format_part(part: Part) -> str:
+    """Return the text of a ``*.part.csv`` file: coordinates in mm with 6 decimals (1 nm)."""
+    columns = SimpleNamespace(
+        **vars(part),
+        xy_mm=part.nominal_mm[:, :2],
+        z_mm=part.nominal_mm[:, 2:],
+        u_mm=np.full(part.nominal_mm.shape, np.nan),
+        tool_mm=None,
+        labels={"setup": part.setup},
+        covariates={},
+    )
+    origin = ", ".join(f"{value:.6g}" for value in part.origin_mm)
+    return _PARTS.format(columns, {**part.metadata, "origin_mm": origin})
 
 
 # An artefact (plate, ring, step gauge) measured by the machine's own probe: ``*.artefact.csv``.

@@ -549,7 +549,7 @@ def check_field(key: str, option: str) -> None:
     if (
         key not in FIELDS
         and key not in ERROR_NAMES
-        and key != "temperature"
+        and key not in ("temperature", "feature")
         and not CHANNEL.fullmatch(key)
         and not RUN_FIELD.fullmatch(key)
     ):

@@ -21,6 +21,7 @@ from compgen.data.csv_files import CsvTable, read_csv
 from compgen.data.deviations import (
     Artefact,
     Deviations,
+    Part,
     join_artefacts,
     join_deviations,
     read_artefacts,
@@ -181,7 +182,8 @@ def _measured(path: Path, kind: str | None, answers: ImportOptions) -> Sequence[
     item = _settled(path, answers)
     if isinstance(item.data, Capture):
         raise InputError("contains a capture over time, from which no errors are identified", file=path)
-    return [item.data] if item.other_errors is None else [item.data, item.other_errors]
+    data = item.data.deviations() if isinstance(item.data, Part) else item.data
+    return [data] if item.other_errors is None else [data, item.other_errors]
 
 
 def _settled(path: Path, answers: ImportOptions | None = None) -> Imported:

@@ -23,6 +23,7 @@ from compgen.errors import CompgenError, InputError
 from compgen.foreign.answers import TABLE_SIGNS, ImportOptions
 from compgen.foreign.cells import CellGrid, chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
+from compgen.foreign.coordinate_reports import imported_features, is_dmis, is_qif, read_dmis, read_qif, read_report
 from compgen.foreign.covariates import surroundings_of
 from compgen.foreign.error_tables import squareness_in
 from compgen.foreign.findings import (
@@ -326,6 +327,8 @@ _TAKES: dict[str, tuple[str, ...]] = {
     "ecmc-iso230": _ONE_AXIS[:-1],
     "etalon-exchange": ("sign", "units"),
     "probe-log": (),
+    "dmis": ("units", "ignore"),
+    "qif": ("units", "ignore"),
     "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
     "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
 }
@@ -348,6 +351,10 @@ def form_of(path: Path) -> str:
         return "etalon-exchange"
     if is_probe_log(text):
         return "probe-log"
+    if is_qif(text):
+        return "qif"
+    if is_dmis(text):
+        return "dmis"
     check_size(path, MOST_BYTES)
     return "table"
 
@@ -431,6 +438,9 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
 
 def _of_grid(grid: CellGrid, options: ImportOptions, form: str) -> Imported:
     """Import one table, or a list of squareness errors."""
+    report = read_report(grid, options)
+    if report is not None:
+        return imported_features(report, form, options)
     plain = options if options.sign in TABLE_SIGNS else replace(options, sign=None)
     try:
         return import_table(grid, plain, form)
@@ -599,11 +609,21 @@ def _centre(points_mm: FloatArray, dimensions: int) -> tuple[FloatArray, float, 
     return centre, float(unknowns[-1]), float(np.abs(residual).max())
 
 
+def _import_dmis(path: Path, options: ImportOptions) -> Imported:
+    return imported_features(read_dmis(read_source(path), options), "dmis", options)
+
+
+def _import_qif(path: Path, options: ImportOptions) -> Imported:
+    return imported_features(read_qif(path, options), "qif", options)
+
+
 READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
     "renishaw": import_renishaw,
     "renishaw-capture": import_capture,
     "ecmc-iso230": import_ecmc,
     "etalon-exchange": import_exchange,
     "probe-log": import_probe_log,
+    "dmis": _import_dmis,
+    "qif": _import_qif,
     "xlsx": _import_workbook,
 }

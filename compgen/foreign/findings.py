@@ -18,7 +18,7 @@ import numpy as np
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.circles import Circles, format_circles
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Artefact, Deviations, format_artefact, format_deviations
+from compgen.data.deviations import Artefact, Deviations, Part, format_artefact, format_deviations, format_part
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.errors import InputError
@@ -47,7 +47,7 @@ SUFFIXES = {
     "artefact": ".artefact.csv",
     "part": ".part.csv",
 }
-Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact
+Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact | Part
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
     Lengths: format_lengths,
@@ -56,6 +56,7 @@ _WRITERS: dict[type, Callable[[Any], str]] = {
     Capture: format_capture,
     Circles: format_circles,
     Artefact: format_artefact,
+    Part: format_part,
 }
 
 
