@@ -35,7 +35,7 @@ from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessi
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Effect, active_effects, catalogue, section_text
-from compgen.effects.catalogue import what_to_do
+from compgen.effects.catalogue import belongs_to, what_to_do
 from compgen.errors import InputError
 from compgen.kinematics.kernel_switch import one_thread
 
@@ -1251,6 +1251,7 @@ def _effect_dict(part: AxisFindings, item: AxisEffect) -> dict[str, Any]:
     return {
         "name": item.name,
         "axis": part.session.letter,
+        "belongs_to": belongs_to(item.name),
         "text": item.text,
         "what_to_do": what_to_do(item.effect.card),
         "alias_set": [{"name": name, "weight": round(weight, 4)} for name, weight in item.alias],

@@ -393,7 +393,8 @@ def _linearise(
     changes = [_columns(effect, readings) for effect in effects]
     counts[:] = [change.shape[1] for change in changes]
     jacobian = np.empty((len(observed), size + len(placement) + sum(counts)))
-    jacobian[:, :size] = along(direction, poses) @ moved.reshape(-1, size)
+    if size:  # a list of errors may contain none that this measurement moves
+        jacobian[:, :size] = along(direction, poses) @ moved.reshape(-1, size)
     jacobian[:, size:] = np.hstack([placing, *changes])
     if changes and len(unknowns) == jacobian.shape[1]:
         model = model + np.hstack(changes) @ unknowns[-sum(counts) :]

@@ -35,6 +35,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Readings, active_effects, catalogue, section_text
+from compgen.effects.catalogue import belongs_to
 from compgen.errors import InputError, nearest
 from compgen.identify.axis_tests import SQUARENESS_OF, circle_positions, correlated
 from compgen.kinematics.first_order import c_matrix
@@ -531,6 +532,7 @@ class CircleDiagnosis(DisplayedDiagnosis):
             amount = "; here it grows: the feed-forward is too strong"
         return {
             "name": item.candidate.name,
+            "belongs_to": belongs_to(item.candidate.name),
             "alias_set": [{"name": name, "weight": round(weight, 4)} for name, weight in item.alias],
             "parameters": {key: {"value": value, "u": u} for key, (value, u) in item.values.items()},
             "settings": dict(item.candidate.settings),

@@ -22,7 +22,7 @@ from compgen.diagnose.search import Design
 from compgen.diagnose.verdict import DisplayedDiagnosis, Named, Unknown, Verdict
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.active import section_text
-from compgen.effects.catalogue import what_to_do
+from compgen.effects.catalogue import belongs_to, what_to_do
 from compgen.errors import one_line
 
 # The full nonlinear model including the effects: their parameters with uncertainty, and the extended machine file.
@@ -401,12 +401,11 @@ class Diagnosis(DisplayedDiagnosis):
         parameters: dict[str, dict[str, float | None]] = {
             p.name: {"value": p.value, "u": p.u} for p in self.refit.parameters.get(item.group, ())
         }
-        if item.name != group.name:
-            parameters = {}
         for key, value in settings_of(self.analysis, group).items():
             parameters[key] = {"value": value, "u": None}
         return {
             "name": item.name,
+            "belongs_to": belongs_to(item.name),
             "what_to_do": what_to_do(self._cards[item.name]),
             "alias_set": [{"name": other.name, "weight": round(other.weight, 4)} for other in item.alternatives],
             "parameters": parameters,
@@ -437,11 +436,25 @@ class Diagnosis(DisplayedDiagnosis):
         }
 
     def extended(self) -> str:
-        """The machine file with the effects found; empty without a named effect or without a file."""
-        if not self.verdict.named or self.machine.source is None:
+        """The machine file with the effects of the machine; empty without any or without a file.
+
+        Tentative ones are never written, nor what belongs to the instrument or to this session: in the next measurement it
+        would be an error.
+        """
+        return self._written({"machine"})
+
+    def session(self) -> str:
+        """The same with everything that is in these readings, if anything of it belongs to instrument or session."""
+        own = {belongs_to(item.name) for item in self.verdict.named if item.grade != "tentative"}
+        return self._written({"machine", "setup", "session"}) if own & {"setup", "session"} else ""
+
+    def _written(self, classes: set[str]) -> str:
+        if self.machine.source is None:
             return ""
-        groups = [i.group for i in self.verdict.named if i.name == self.analysis.design.groups[i.group].name]
-        return extended_toml(self.machine, self.analysis, self.refit, groups)
+        groups = [
+            item.group for item in self.verdict.named if item.grade != "tentative" and belongs_to(item.name) in classes
+        ]
+        return extended_toml(self.machine, self.analysis, self.refit, groups) if groups else ""
 
 
 def _unknown(item: Unknown) -> dict[str, Any]:

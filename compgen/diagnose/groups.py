@@ -138,6 +138,12 @@ class Group:
         return self.source.columns()[:, self.place or slice(None)]
 
 
+#: An axis that moves by less than this is at rest, and positions closer than this are one level, mm.
+SAME_MM = 1e-3
+#: Least levels of an axis that show a periodic error: twice the coefficients of the curves.
+LEAST_LEVELS = 2 * (DEGREE + 1)
+#: Columns of unit length with a singular value below this are not independent.
+DEPENDENT = 1e-6
 #: Maximum number of scan positions of an effect.
 MOST_SCANS = 400
 #: Scan positions whose columns are stored together; share of changed readings below which only the changes are stored.
@@ -151,6 +157,9 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
     for name, effect in catalogue(readings.stations).items():
         if (only and name not in only) or readings.kind not in effect.card.kinds:
             continue
+        if not _can_show(effect, readings):
+            missing.append(name)
+            continue
         positions = list(effect.positions(readings))
         before = len(groups)
         if len(positions) > MOST_SCANS:
@@ -161,7 +170,7 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
             for position in choices[first : first + TOGETHER]:
                 fixed = (effect if position is None else effect.at(position)).shown(readings)
                 columns = None if fixed is None else fixed.columns(readings)
-                if fixed is not None and columns is not None and np.isfinite(columns).all() and np.any(columns):
+                if fixed is not None and columns is not None and _independent(fixed, columns):
                     found.append((position, fixed, columns))
             if not found:
                 continue
@@ -185,6 +194,29 @@ def named_groups(readings: Readings, only: Sequence[str] = ()) -> tuple[list[Gro
         if len(groups) == before:
             missing.append(name)
     return groups, missing
+
+
+def _can_show(effect: Effect, readings: Readings) -> bool:
+    """Whether the axis of an effect moves, and its positions are close enough to show a wave."""
+    axis = getattr(effect, "axis", None)
+    if axis is None or effect.card.name.startswith(("spindle_growth", "settling")):
+        return True
+    position = readings.position_mm[:, axis]
+    if np.ptp(position) < SAME_MM:
+        return False
+    # what a few levels leave over of a curve of the machine alternates from level to level, as waves of any pitch may
+    levels = len(np.unique(np.round(position / SAME_MM)))
+    return not effect.card.name.startswith("periodic") or levels >= LEAST_LEVELS
+
+
+def _independent(effect: Effect, columns: FloatArray) -> bool:
+    """Whether columns (n, k) are finite, and none is a sum of others: products with an axis at rest are."""
+    if not np.isfinite(columns).all() or not np.any(columns):
+        return False
+    if columns.shape[1] == 1 or effect.card.name.startswith("periodic"):
+        return True
+    size = np.linalg.norm(columns, axis=0)
+    return bool(size.min() > 0) and int(np.linalg.matrix_rank(columns / size, tol=DEPENDENT)) == columns.shape[1]
 
 
 def source_of(every: Sequence[FloatArray]) -> Placed | Scanned:
@@ -250,9 +282,10 @@ class Covariates:
 
     @property
     def quadratic(self) -> FloatArray:
-        """1, x, y, z and their products of second order, (n, 10)."""
+        """1, x, y, z and their products of second order, (n, 10); without those of an axis at rest."""
         x, y, z = self.s.T
-        return np.column_stack([np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z])
+        columns = [np.ones(len(x)), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
+        return np.column_stack([column for column in columns if np.any(column)])
 
 
 def covariates_of(readings: Readings, layout: MeasurementLayout) -> Covariates:
@@ -281,14 +314,20 @@ Term = tuple[str, tuple[str, ...], FloatArray, bool, bool]
 
 
 def _static_terms(c: Covariates) -> Iterator[Term]:
-    s = c.s
+    s, moves = c.s, np.any(c.s, axis=0)
     for a, letter in enumerate("xyz"):
+        if not moves[a]:
+            continue
         yield f"fine structure in {letter}", (letter,), legendre(s[:, a], DEGREE + 6)[:, DEGREE + 1 :], False, True
         centres = np.linspace(-1, 1, BUMPS)
         yield f"bumps in {letter}", (letter,), np.exp(-(((s[:, [a]] - centres) * BUMPS / 2) ** 2)), False, True
     powers = [legendre(s[:, a], 3)[:, 1:] for a in range(3)]
     for a, b in ((0, 1), (0, 2), (1, 2)):
+        if not (moves[a] and moves[b]):
+            continue
         yield f"{'xyz'[a]} with {'xyz'[b]}", ("xyz"[a], "xyz"[b]), _times(powers[a], powers[b]), False, True
+    if not moves.all():
+        return
     triple = _times(_times(powers[0][:, :2], powers[1][:, :2]), powers[2][:, :2])
     yield "x with y with z", ("x", "y", "z"), triple, False, True
 
@@ -301,8 +340,11 @@ def _condition_terms(c: Covariates) -> Iterator[Term]:
             continue
         name = f"approach_{letter}"
         yield f"direction of {letter}", (name,), sign, False, True
-        position = np.hstack([legendre(c.s[:, b], 3)[:, 1:] for b in range(3)])
-        yield f"direction of {letter} with position", (name, "x", "y", "z"), sign * position, False, True
+        moving = [b for b in range(3) if np.any(c.s[:, b])]
+        if moving:
+            position = np.hstack([legendre(c.s[:, b], 3)[:, 1:] for b in moving])
+            along = (name, *("xyz"[b] for b in moving))
+            yield f"direction of {letter} with position", along, sign * position, False, True
         if c.temperature:
             warm = np.column_stack(list(c.temperature.values()))
             yield f"direction of {letter} with temperature", (name, "temperature"), sign * warm, True, True
@@ -318,7 +360,7 @@ def _condition_terms(c: Covariates) -> Iterator[Term]:
         if values is None:
             continue
         x, y, z = c.s.T
-        shape = np.column_stack([c.quadratic, x * y * z])
+        shape = np.column_stack([c.quadratic, *([x * y * z] if np.any(x * y * z) else [])])
         yield f"{what} with position", (what, "x", "y", "z"), values[:, None] * shape, False, True
         yield f"{what} squared", (what,), np.column_stack([values**2, values**3]), False, True
         yield f"{what} with time", (what, "time"), values[:, None] * legendre(c.time, 2)[:, 1:], True, True
@@ -330,6 +372,8 @@ def _condition_terms(c: Covariates) -> Iterator[Term]:
 def _slow_terms(c: Covariates) -> Iterator[Term]:
     yield "time", ("time",), legendre(c.time, 4)[:, 1:], True, True
     for a, letter in enumerate("xyz"):
+        if not np.any(c.s[:, a]):
+            continue
         columns = _times(legendre(c.time, 2)[:, 1:], legendre(c.s[:, a], 2)[:, 1:])
         yield f"time with {letter}", ("time", letter), columns, True, True
     for name, values in c.temperature.items():
@@ -500,6 +544,8 @@ def wider_of(fit: BaseFit) -> tuple[Wider, ...]:
             for before, after in zip(old, basis.parts(poses.position_mm), strict=True):
                 more = after.basis[:, before.basis.shape[1] :]
                 added.append(Part(after.name, slice(size_of(added), size_of(added) + more.shape[1]), more))
+            if not size_of(added):  # no error of the model depends on this axis
+                continue
             columns = np.asarray(readings @ tip_columns(added, by_errors).reshape(-1, size_of(added)))
             gain, count = _gain(fit, base, columns)
             log_ratio = gain - count * (1.0 + np.log(max(gain / max(count, 1), 1.0)))

@@ -357,11 +357,18 @@ def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis) -> dict[
     extended = found.extended()
     if extended:
         files["extended.toml"] = extended
+    if isinstance(found, Diagnosis) and (session := found.session()):
+        files["session.toml"] = session
     return files
 
 
 def next_steps(files: Container[str], machine: str, measurement: str, out: str) -> str:
     """Tell which command uses ``extended.toml``; empty without that file."""
+    if "session.toml" in files and "extended.toml" not in files:
+        return (
+            f"{out}/session.toml removes what belongs to instrument and session from these readings only:\n"
+            f"  volcomp run {out}/session.toml {measurement} --controller NAME --out tables/"
+        )
     if "extended.toml" not in files:
         return ""
     return (

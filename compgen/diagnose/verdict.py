@@ -69,6 +69,8 @@ class DisplayedDiagnosis(Drawable):
         return [Panel("residuals of the readings used and left out", "rms (um)", bars=(before, after))]
 
 
+#: Standard uncertainties below which an amount is not confirmed.
+LEAST_SIZE = 2.0
 #: Names with less than this left after projecting out the base model are never confirmed.
 LEAST_VISIBLE = 0.05
 #: A name is not confirmed if its chi-square is below this share of the total of all members without a (firm) name.
@@ -231,6 +233,8 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
         )
     if (effect := design.groups[group].effect) is not None:
         values, covariance, _ = contribution(design, analysis.chosen, group)
+        if float(values @ np.linalg.pinv(covariance, hermitian=True) @ values) < LEAST_SIZE**2 * len(values):
+            reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
         for parameter, value, u in zip(effect.card.parameters, values, np.sqrt(np.diag(covariance)), strict=False):
             size = (abs(value) - 2 * u) / parameter.si_per_unit
             if parameter.plausible > 0 and size > 3 * parameter.plausible:
@@ -240,9 +244,8 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
         reasons.append("the noise is assumed, not measured")
     others = tuple(alternatives(design, analysis.rules, analysis.chosen, group))
     weight = next((item.weight for item in others if item.name == name), 0.0)
-    first = others[0].name if others else name
-    return Named(
-        first, group, "tentative" if reasons else "confirmed", others[0].weight if others else weight, others, visible,
+    return Named(  # the name of what was fitted and is added, whatever else explains the readings as well
+        name, group, "tentative" if reasons else "confirmed", weight, others, visible,
         chi2, p, tuple(reasons), not inexact,
     )  # fmt: skip
 

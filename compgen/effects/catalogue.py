@@ -288,6 +288,27 @@ WHAT_TO_DO = {
 }
 
 
+#: Effects of the instrument as it was set up, and events of one session; all others belong to the machine.
+OF_SETUP = (
+    "refractive_index", "dead_path", "laser_scale", "tracer_runout", "target_angle", "tool_offset_error", "sign",
+    "crosstalk", "detector_gain", "nonparallel_beams", "distance_offset",
+)  # fmt: skip
+OF_SESSION = (
+    "station_drift", "length_step", "machine_jump", "warmup_drift", "linear_drift", "step_between_runs", "bad_run",
+    "disturbed_readings", "radius_drift", "radius_level", "outliers", "variance_trend", "autocorrelated_noise", "quantisation",
+    "axis_mapping", "beam_drift",
+)  # fmt: skip
+
+
+def belongs_to(name: str) -> str:
+    """What an effect belongs to: "machine" (kept), "setup" (of the instrument), or "session" (these readings only).
+
+    >>> belongs_to("backlash_X"), belongs_to("tool_offset_error"), belongs_to("length_step_T1")
+    ('machine', 'setup', 'session')
+    """
+    return "setup" if name.startswith(OF_SETUP) else "session" if name.startswith(OF_SESSION) else "machine"
+
+
 def what_to_do(card: Card) -> str:
     """Return what to do about an effect; for a plug-in's effect without such a sentence, what to measure next."""
     name = card.name

@@ -185,7 +185,7 @@ def run_of(readings: Readings) -> NDArray[np.int64] | None:
 
 
 def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> list[float]:
-    """Times between runs at which something may have changed, at most 200; between stops if there is only one run.
+    """Times at which something may have changed: between runs, and between stops as far as there are no more than 200.
 
     ``rows`` (n,) selects readings.
     """
@@ -198,12 +198,17 @@ def step_times_s(readings: Readings, rows: NDArray[np.bool_] | None = None) -> l
     order = np.argsort(time_s[rows], kind="stable")
     ordered = time_s[rows][order]
     run = run_of(readings)
+    gap, middle = np.diff(ordered) > 0, 0.5 * (ordered[1:] + ordered[:-1])
     several = run is not None and np.any(run[rows] != run[rows][0])
-    changed = np.diff(run[rows][order]) != 0 if several and run is not None else np.diff(ordered) > 0
-    between = 0.5 * (ordered[1:] + ordered[:-1])[changed & (np.diff(ordered) > 0)]
+    changed = gap & (np.diff(run[rows][order]) != 0) if several and run is not None else gap
+    between, inside = middle[changed], middle[gap & ~changed]
     if len(between) > MOST_TIMES:
         between = between[np.linspace(0, len(between) - 1, MOST_TIMES).astype(int)]
-    return [float(time) for time in between]
+    room = MOST_TIMES - len(between)
+    if len(inside) > room:  # of many runs their ends are enough; within a few long ones, stops close to any event
+        few = len(between) < MOST_TIMES // 4
+        inside = inside[np.linspace(0, len(inside) - 1, room).astype(int)] if few else inside[:0]
+    return [float(time) for time in np.sort(np.concatenate([between, inside]))]
 
 
 def velocity_mm_s(readings: Readings) -> FloatArray | None:

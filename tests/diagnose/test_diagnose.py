@@ -29,6 +29,7 @@ from compgen.diagnose.noise_model import (
     rotation,
     whitener,
 )
+from compgen.diagnose.observed import read_diagnosed
 from compgen.errors import InputError
 from compgen.kinematics.kernel_switch import one_thread
 
@@ -458,3 +459,57 @@ def test_at_steps_of_the_pitch_no_periodic_error_is_named_and_the_diagnosis_says
     found = diagnose(machine, measured, DiagnoseOptions(effects=("periodic_X",))).to_dict()
     assert not found["effects"] and "periodic_X" in found["invisible"]
     assert any(text.startswith("steps that are not a multiple of the pitch") for text in found["advice"])
+
+
+def plane_of(errors, folder, *, still, seed=3, backlash_um=0.0):
+    """Deviations of three runs there and back along X at one or three places of Y; only ``errors`` are in the model."""
+    path = folder / "restricted.toml"
+    axes = "".join(f"[axes.{a}]\nrange_mm = [-100.0, 900.0]\nnodes = 9\n" for a in "XYZ")
+    path.write_text(f'name = "r"\nchain = "WFYXZT"\nerrors = {json.dumps(errors)}\n{axes}')
+    rng, rows = np.random.default_rng(seed), []
+    for run in range(3):
+        for way in (1.0, -1.0):
+            for y in [300.0] if still else [0.0, 300.0, 600.0]:
+                for x in np.linspace(0, 800, 9)[:: int(way)]:
+                    moved = [0.01 * x + backlash_um * way, 2 * (x / 800) ** 2, 1.5 * (x / 800) ** 2]
+                    rows.append([x, y, 250.0, *(moved + rng.normal(0, 0.4, 3)), way, 5.0 * len(rows), run])
+    text = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,approach_x,time_s,run\n"
+    text += "".join(",".join(f"{v:.4f}" for v in row[:-1]) + f",{row[-1]:.0f}\n" for row in rows)
+    file = folder / "plane.deviations.csv"
+    file.write_text(text)
+    return diagnose(read_machine(path), read_diagnosed([file]))
+
+
+@pytest.mark.parametrize("still", [True, False])
+@pytest.mark.parametrize("errors", [["EXX"], ["EYX"], ["EC0Y"], ["EZY", "EXZ"], ["EAX"], ["EXX", "EYY", "EZZ"]])
+def test_any_list_of_errors_can_be_diagnosed(errors, still, tmp_path):
+    found = plane_of(errors, tmp_path, still=still).to_dict()
+    assert found["verdict"] in ("none", "named", "unknown")
+    # nothing depends on an axis that stood still, and no amount is beyond what a machine does
+    if still:
+        assert not [u for u in found["unknown"] if {"y", "z"} & set(u["covariates"]) - {"x"}]
+    assert all(abs(p["value"]) < 1e4 for e in found["effects"] for p in e["parameters"].values())
+
+
+def test_backlash_is_named_with_a_list_of_errors_that_holds_the_curve(tmp_path):
+    found = plane_of(["EXX", "EYX", "EZX"], tmp_path, still=False, backlash_um=1.5).to_dict()
+    firm = [e["name"] for e in found["effects"] if e["grade"] != "tentative"]
+    assert firm == ["backlash_X"] and found["effects"][0]["belongs_to"] == "machine"
+    assert found["effects"][0]["parameters"]["c_um"]["value"] == pytest.approx(1.5, abs=0.15)
+
+
+def test_what_happened_in_one_session_is_not_kept_as_the_machine(gantry, tmp_path, capsys):
+    def slipped(q, approach, time):
+        return backlash(q, approach, time) + 8e-3 * (time > np.median(time))[:, None] * [1.0, -1.0, 0.5]
+
+    path = tmp_path / "m.lengths.csv"
+    path.write_text(format_lengths(session(21, displaced=slipped)))
+    run_command(cli, ["diagnose", "zha-gantry", str(path), "--out", str(tmp_path / "out"), "--json"])
+    data = json.loads(capsys.readouterr().out)
+    belongs = {e["name"]: e["belongs_to"] for e in data["effects"] if e["grade"] != "tentative"}
+    assert belongs == {"backlash_Y": "machine", "machine_jump": "session"}
+    assert list(read_machine(tmp_path / "out/extended.toml").effects) == ["backlash_Y"]
+    assert set(read_machine(tmp_path / "out/session.toml").effects) == {"backlash_Y", "machine_jump"}
+    # a clean measurement after it fits the machine that was kept
+    clean = diagnose(read_machine(tmp_path / "out/extended.toml"), session(22, displaced=backlash)).to_dict()
+    assert clean["verdict"] == "none"

@@ -268,3 +268,13 @@ def test_the_names_of_the_report_are_all_there():
 
 def test_families_are_registered_under_their_own_names():
     assert all(name == family.name for name, family in FAMILIES.items())
+
+
+def test_within_a_few_runs_every_stop_may_be_a_step(machine):
+    stops = session_stops(machine)
+    lengths, _ = lengths_of(stops)
+    readings = readings_of_lengths(machine, lengths, PLACES_MM[lengths.station], lengths.position_mm)
+    end = stops.time_s[np.isin(stops.run, np.unique(stops.run)[:2])].max()
+    few = readings.part(np.flatnonzero(readings.covariates["time_s"] <= end))
+    times = np.unique(few.covariates["time_s"])
+    np.testing.assert_allclose(step_times_s(few), 0.5 * (times[1:] + times[:-1]))
