@@ -24,7 +24,7 @@ from compgen.cli.shared_options import (
 from compgen.cli.terminal import answer, complain, progress, table_of
 from compgen.data.error_table import read_reversal
 from compgen.data.files import OutputFolder, json_text, sha256_of_file
-from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
+from compgen.data.machine import INTEGERS, MM_PER_UNIT, Machine, ProgramNumbers, Vector3
 from compgen.effects import effects_reversal
 from compgen.errors import InputError, number_text
 from compgen.foreign import open_errors
@@ -61,6 +61,19 @@ def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
     return found
 
 
+def _integers(
+    stated: ProgramNumbers, integers: str | None, increment_mm: float | None
+) -> tuple[str | None, float | None]:
+    """What numbers without a decimal point are: as the command line says, else the machine file."""
+    integers, increment_mm = integers or stated.integers, increment_mm or stated.increment_mm
+    if integers == "increments" and increment_mm is None:
+        raise InputError(
+            "increments of what? add --increment-mm 0.001, or increment_mm of [programs] in the machine file",
+            field="--integers",
+        )
+    return integers, increment_mm
+
+
 def program_options(command: Command) -> Command:
     """Add what a program needs to be read; the command receives ``setup`` (of a machine), ``errors`` and ``reversal``."""
 
@@ -72,17 +85,27 @@ def program_options(command: Command) -> Command:
         block_delete: bool,
         keep_unknown: tuple[str, ...],
         gauge: str,
+        integers: str | None,
+        increment_mm: float | None,
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
 
         def setup(machine: Machine) -> Setup:
             lengths = read_tools(tools, MM_PER_UNIT[machine.units]) if tools else {}
-            return Setup(_wcs(wcs), lengths, block_delete, codes, tool_offset("--gauge", gauge))
+            numbers = _integers(machine.programs, integers, increment_mm)
+            return Setup(_wcs(wcs), lengths, block_delete, codes, tool_offset("--gauge", gauge), *numbers)
 
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
+    text = "Least input increment of the control, mm, e.g. 0.001 (0.0001 inch): for --integers increments."
+    decorated = click.option("--increment-mm", type=click.FloatRange(1e-6, 1.0), help=text)(decorated)
+    text = (
+        "What a number without a decimal point is, FANUC: X500 is 500 mm, or 500 increments (default: integers of [programs] "
+        "of the machine file; without either it is asked)."
+    )
+    decorated = click.option("--integers", type=click.Choice(INTEGERS), help=text)(decorated)
     text = "M code that moves and calls nothing and stays as it is, e.g. M100 or M88 (may be given several times)."
     decorated = click.option("--keep-unknown", multiple=True, metavar="CODE", help=text)(decorated)
     text = "Blocks with / are skipped at the control; they stay as they are. Default: they are executed."

@@ -42,6 +42,9 @@ _weight = toml_files.bounded(
     f"a number from 1 (no zone) to {MOST_ZONE_WEIGHT:g} (almost only the zone)", minimum=1.0, maximum=MOST_ZONE_WEIGHT
 )
 
+#: What numbers without a decimal point may be in NC programs.
+INTEGERS = ("mm", "increments")
+
 
 @dataclass(frozen=True)
 class Emphasis:
@@ -251,6 +254,22 @@ def _name(value: Any) -> str:
 
 @toml_files.accepts({"enum": list(CHAINS), "examples": ["WFYXZT"]})
 @dataclass(frozen=True)
+class ProgramNumbers:
+    """What NC programs of a machine mean by a number without a decimal point; ``integers`` None: that is asked."""
+
+    integers: str | None = toml_files.setting(
+        toml_files.choice(*INTEGERS),
+        None,
+        meaning="what a number without a decimal point is in NC programs: X500 is 500 mm (mm), or 500 increments",
+    )
+    increment_mm: float | None = toml_files.setting(
+        toml_files.bounded("an increment from 0.000001 to 1 mm", minimum=1e-6, maximum=1.0),
+        None,
+        meaning="least input increment of the control, mm: 0.001 (0.0001 inch, 0.001 deg); needed for increments",
+    )
+
+
+@dataclass(frozen=True)
 class Chain:
     """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
 
@@ -425,6 +444,7 @@ class Machine(Displayed):
     repeatability: Repeatability = toml_files.table_setting(
         Repeatability, meaning="how well the machine repeats from one calibration to the next"
     )
+    programs: ProgramNumbers = toml_files.table_setting(ProgramNumbers, meaning="how numbers of NC programs are read")
     travel_margin_mm: float = toml_files.setting(
         _margin,
         0.0,
@@ -581,6 +601,10 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
         )
         section.finish()
         tool_range_mm = x, y, z
+    programs = stated.get("programs", ProgramNumbers())
+    if programs.integers == "increments" and programs.increment_mm is None:
+        message = "is missing; integers = 'increments' needs the least input increment of the control, e.g. 0.001"
+        raise root.section("programs").fail("increment_mm", message, kind="missing", instead=[0.001])
     emphasis = take_emphasis(root, [axis.range_mm for axis in axes])
     prior = read_prior(root.section("prior", required=False))
     root.finish()

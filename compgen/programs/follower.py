@@ -63,6 +63,8 @@ class _Words:
     number: dict[str, float] = field(default_factory=dict)
     mode: dict[str, str] = field(default_factory=dict)
     name: str = ""
+    #: Addresses whose number has no decimal point.
+    whole: list[str] = field(default_factory=list)
     call: tuple[str, str] | None = None
 
     @staticmethod
@@ -102,6 +104,8 @@ class _Words:
             self.codes.append(name + (text if text in _SHORT else f"{value:g}"))
         elif name not in self.number:
             self.number[name] = value
+            if "." not in text:
+                self.whole.append(name)
 
     def axes(self) -> list[float | None]:
         """Numbers of X, Y and Z."""
@@ -117,10 +121,13 @@ _COMMENTS = {"fanuc": r"\([^()\n]*+\)", "siemens": r";[^\n]*+", "heidenhain-iso"
 _OTHER_COMMENTS = r"\([^()\n]*+\)|;[^\n]*+"
 
 
-def _runs(dialect: str) -> re.Pattern[str]:
-    """The pattern of such blocks; of HEIDENHAIN without arcs, whose centre is a pole."""
+def _runs(dialect: str, *, pointed: bool = False) -> re.Pattern[str]:
+    """The pattern of such blocks; of HEIDENHAIN without arcs, whose centre is a pole. ``pointed``: without increments."""
     straight = dialect == "heidenhain-iso"
-    place = rf"(?:[XYZ{'' if straight else 'IJKR'}FS][+-]?(?:\d++\.?\d*+|\.\d++)|M0?[345789](?![\d.]))[ ]*+"
+    number = r"(?:\d++\.\d*+|\.\d++|0++(?![\d.]))" if pointed else r"(?:\d++\.?\d*+|\.\d++)"
+    place = (
+        rf"(?:[XYZ{'' if straight else 'IJKR'}][+-]?{number}|[FS][+-]?(?:\d++\.?\d*+|\.\d++)|M0?[345789](?![\d.]))[ ]*+"
+    )
     head = rf"(?:N\d++[ ]*+)?(?:G0?[0-{1 if straight else 3}](?![\d.])[ ]*+)?"
     tail = rf"(?:[*;][ ]*+)?(?:(?:{_COMMENTS.get(dialect, _OTHER_COMMENTS)})[ ]*+)*+"
     return re.compile(rf"(?:^{head}(?:{place})*+{tail}\r?\n)+", re.MULTILINE | re.IGNORECASE)
@@ -309,7 +316,10 @@ class Follower:
         self.modally = False
         self.done = self.moved = self.percent = False
         self.number = 0
-        self.runs, self.comments = _runs(dialect), re.compile(_COMMENTS.get(dialect, _OTHER_COMMENTS))
+        counted = dialect == "fanuc" and setup.integers == "increments" and setup.increment_mm is not None
+        #: Length of an increment in mm, where numbers without a decimal point are increments.
+        self.increment_mm = float(setup.increment_mm or 0.0) if counted else 0.0
+        self.runs, self.comments = _runs(dialect, pointed=counted), re.compile(_COMMENTS.get(dialect, _OTHER_COMMENTS))
         #: Moves, and the zeros and tools in force, of which each move has the number.
         self.rows: list[tuple[float, ...]] = []
         self.zeros: list[tuple[float, ...]] = []
@@ -411,7 +421,20 @@ class Follower:
             return self._definition(words)
         if words.codes or "T" in words.number or "D" in words.number or "H" in words.number or words.name:
             return self._act(words)
+        self._count(words, frozenset())
         return self._execute(words, frozenset())
+
+    def _count(self, words: _Words, kinds: frozenset[str]) -> None:
+        """Turn increments into lengths and angles, once the unit is known: 0.001 mm, 0.0001 inch and 0.001 deg are one."""
+        if not self.increment_mm or kinds & {"quiet", "dwell"}:
+            return
+        drilling = "cycle" in kinds or (self.series is not None and not kinds & {"go", "end"})
+        repeats = drilling and not words.number.keys() & {"I", "J"}
+        for name in words.whole:
+            if name in "ABC":
+                words.number[name] *= self.increment_mm
+            elif name in "XYZUVWIJQR" or (name == "K" and not repeats):
+                words.number[name] *= self.increment_mm if self.unit == 1.0 else self.increment_mm / 10.0
 
     def _percent(self, body: str) -> None:
         if self.heidenhain:
@@ -437,6 +460,7 @@ class Follower:
                 self.unit = number
             elif kind == "relative":
                 self.relative = number > 0
+        self._count(words, plan.kinds)
         if not plan.only_goes or "T" in words.number or "D" in words.number or "H" in words.number or words.name:
             self.zero_changed = True
             self._change_tool(words)

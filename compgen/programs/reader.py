@@ -36,7 +36,7 @@ from compgen.programs.runs import (
     carried,
     centres_and_sweeps,
 )
-from compgen.programs.subprograms import written_out
+from compgen.programs.subprograms import Pointed, written_out
 
 MM_PER_INCH = 25.4
 #: Bytes that are read at a time, and the fewest blocks in a row that are read together.
@@ -60,6 +60,8 @@ class Setup:
     """What a program needs beside its text: work offsets and tools (mm), blocks with ``/``, codes that move nothing.
 
     ``work_offsets_mm`` by name (``G54``), ``tools_mm`` the offsets that the control adds for a tool, by its number or name.
+    ``integers`` says what a number without a decimal point is where controls differ (FANUC): mm, or increments of
+    ``increment_mm``.
     ``gauge_mm`` is the tool offset of the model for a tool of length 0: from the origin of the tool carriage to the gauge point.
     """
 
@@ -68,6 +70,8 @@ class Setup:
     skip_deleted: bool = False
     keep_unknown: frozenset[str] = frozenset()
     gauge_mm: Vector3 = (0.0, 0.0, 0.0)
+    integers: str | None = None
+    increment_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -172,23 +176,36 @@ class Reader:
         self.closed_by_percent = False
         self._line, self._text = 0, ""
         self.line_in_file: IntArray | None = None
+        self._integers: tuple[Pointed, str] | None = None
         self._rows: list[tuple[float, ...]] = []
 
     # Streams of blocks.
 
-    def opened(self) -> BinaryIO:
+    def opened(self) -> BinaryIO | Pointed:
         """Open the program; calls of subprograms that are in its file are written out."""
         path = Path(self.source)
         found = None
         if self.dialect.name in ("fanuc", "linuxcnc"):
             found = written_out(path, self.dialect.name, skip_deleted=self.setup.skip_deleted)
         if found is None:
-            return path.open("rb")
+            return self._pointed(path.open("rb"))
         self.line_in_file = found.line
         self.assumed[f"calls are written out where they are, so that each is corrected: {', '.join(found.called)}"] = (
             None
         )
-        return BytesIO(found.content)
+        return self._pointed(BytesIO(found.content))
+
+    def _pointed(self, stream: BinaryIO) -> BinaryIO | Pointed:
+        """Give numbers their decimal point as the setup says what they are without."""
+        setup, dialect = self.setup, self.dialect
+        if not dialect.point_needed or setup.integers is None:
+            return stream
+        said = "mm (G20: inch)" if setup.integers == "mm" else f"increments of {setup.increment_mm:g} mm"
+        plain = {code for code, meaning in dialect.codes.items() if meaning.startswith(("setting", "dwell"))}
+        increment_mm = setup.increment_mm if setup.integers == "increments" else None
+        found = Pointed(stream, increment_mm, plain, inch=self.scale == MM_PER_INCH)
+        self._integers = found, f"numbers without a decimal point are {said}; the corrected program has them with it"
+        return found
 
     def numbered_as_in_file(self, moves: Moves) -> Moves:
         """Return moves with the lines of the file in which their blocks are."""
@@ -198,7 +215,7 @@ class Reader:
         """Return the line of the file that a line of the program as it was opened is from."""
         return line if self.line_in_file is None or not line else int(self.line_in_file[line - 1])
 
-    def batches(self, stream: BinaryIO) -> Iterator[Batch]:
+    def batches(self, stream: BinaryIO | Pointed) -> Iterator[Batch]:
         """Yield the batches of a program; the last one is followed by the check that the program was whole."""
         number, rest = 1, b""
         while chunk := stream.read(BATCH_BYTES):
@@ -259,6 +276,8 @@ class Reader:
 
     def finish(self, last_line: int) -> None:
         """Refuse a program that ends in the middle, or has M codes that are not known."""
+        if self._integers and self._integers[0].used:
+            self.assumed[self._integers[1]] = None
         if self.unknown:
             first = min(map(self.in_file, next(iter(self.unknown.values()))))
             raise InputError(self._said_unknown(), file=self.source, line=first)
@@ -740,10 +759,9 @@ class Reader:
                 continue
             if letter in values:
                 self._fail(f"{letter} is given twice in a block")
-            if letter in lengths and dialect.point_needed and not setting and "." not in text and value != 0.0:
-                self._fail(
-                    f"{letter}{text} has no decimal point: mm or increments; post it with a decimal point", letter
-                )
+            plain = setting or "G4" in codes
+            if letter in lengths and dialect.point_needed and not plain and "." not in text and value != 0.0:
+                self._ask_integers(letter, text)
             values[letter] = value
         if self.closed_by_percent and dialect.name in ("fanuc", "linuxcnc"):
             self._fail("blocks after the closing %, which the control does not read; give one program, within % and %")
@@ -797,6 +815,18 @@ class Reader:
         if "R" in values and dialect.name == "siemens":
             self._fail("R is a variable; write a radius as CR=")
         return self._execute(actions, [values.get(letter) for letter in "XYZ"], values)
+
+    def _ask_integers(self, letter: str, text: str) -> NoReturn:
+        unit = "inch" if self.scale == MM_PER_INCH else "mm"
+        least = 1e-4 if unit == "inch" else 1e-3
+        value = number_of(text)
+        self._fail(
+            f"{letter}{text} has no decimal point: {value:g} {unit}, or {value * least:g} {unit} "
+            f"({text} increments of {least:g} {unit})? "
+            'State [programs] integers = "mm" or "increments" (with increment_mm = 0.001) in the machine file, or --integers mm '
+            "or --integers increments --increment-mm 0.001; or post it with a decimal point",
+            letter,
+        )
 
     def _is_setting(self, code: str) -> bool:
         """Whether the words of a block with ``code`` belong to it and move nothing."""

@@ -1,4 +1,6 @@
-"""Subprograms in the file of their program: every call is written out, since each place needs its own correction.
+"""Programs as their control executes them: calls are written out, and numbers without a decimal point get it.
+
+Subprograms are those in the file of their program: each place that they lead to needs its own correction.
 
 ``M98 P1001 L3`` calls the blocks from ``O1001`` to ``M99`` three times, as does ``M98 P31001`` of FANUC; ``M97 P100`` of
 Haas those from ``N100``. What stands in comments, or in blocks that the control skips, calls nothing and ends nothing.
@@ -7,11 +9,12 @@ Haas those from ``N100``. What stands in comments, or in blocks that the control
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
-from typing import NoReturn
+from typing import BinaryIO, NoReturn
 
 import numpy as np
 
@@ -27,6 +30,13 @@ _LATER = {
     "fanuc": re.compile(rb"\([^()\n]*\)|<[^<>\n]*>|;[^\n]*"),
     "linuxcnc": re.compile(rb"\([^()\n]*\)|;[^\n]*"),
 }
+#: Words with a number without a decimal point that may be a length or an angle, and codes that matter to it.
+_INTEGER = re.compile(rb"([XYZUVWABCIJKQR])[ \t]*+((?:[+-][ \t]*+)?\d++)(?![\d.])", re.IGNORECASE)
+_G_CODE = re.compile(rb"G[ \t]*+(\d++(?:\.\d*+)?)", re.IGNORECASE)
+_DRILLS = frozenset(f"G{k}" for k in (73, 74, 76, *range(81, 90)))
+_ENDS_DRILLING = frozenset(("G0", "G1", "G2", "G3", "G80"))
+#: A line is read no further, bytes.
+_LONGEST_LINE = 1 << 16
 _SKIPPED = re.compile(rb"\s*/")
 
 
@@ -77,6 +87,57 @@ class _Block:
                 start = len(text[: word.start()].rstrip(b" \t"))
                 text = text[:start] + text[word.end() :]
         return text
+
+
+class Pointed:
+    """A program of FANUC whose numbers without a decimal point are given it: read in parts, as a stream.
+
+    ``X500`` is ``X500.`` where integers are mm (inch in G20). Where they are increments it is ``X0.5`` with increments of 0.001
+    mm, which are 0.0001 inch and 0.001 deg. Lengths, angles, radii and pecks are such numbers; G, M, T, H, D, N, O, P, S, F, L,
+    repeats (K of a drilling cycle), and the words of dwells and of settings (``plain`` codes) are not. Zero stays as it is.
+    """
+
+    def __init__(self, stream: BinaryIO, increment_mm: float | None, plain: Collection[str], *, inch: bool) -> None:
+        self._stream, self._plain, self._inch, self._drills = stream, plain, inch, False
+        self._increment = None if increment_mm is None else Decimal(repr(increment_mm))
+        #: Whether a number has been given its point.
+        self.used = False
+
+    def __enter__(self) -> Pointed:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
+    def read(self, size: int) -> bytes:
+        """Return the next lines, at least ``size`` bytes of the program if there are so many."""
+        text = self._stream.read(size)
+        text += self._stream.readline(_LONGEST_LINE) if text and not text.endswith(b"\n") else b""
+        return b"".join(map(self._line, text.splitlines(keepends=True)))
+
+    def _line(self, line: bytes) -> bytes:
+        code = _LATER["fanuc"].sub(lambda part: b" " * len(part[0]), line)
+        codes = [f"G{float(found[1]):g}" for found in _G_CODE.finditer(code)]
+        for name in codes:
+            self._inch = name == "G20" or (self._inch and name != "G21")
+            self._drills = name in _DRILLS or (self._drills and name not in _ENDS_DRILLING)
+        if not self._plain.isdisjoint(codes):
+            return line
+        counts = self._drills and not re.search(rb"[IJ]\s*[-+.\d]", code, re.IGNORECASE)
+        for word in reversed(list(_INTEGER.finditer(code))):
+            letter, number = word[1].upper(), re.sub(rb"\s", b"", word[2])
+            if int(number) and not (counts and letter == b"K"):
+                self.used = True
+                line = line[: word.start(2)] + self._pointed(letter, number.decode()) + line[word.end(2) :]
+        return line
+
+    def _pointed(self, letter: bytes, number: str) -> bytes:
+        if self._increment is None:
+            return f"{number}.".encode()
+        tenth = self._inch and letter not in b"ABC"
+        text = f"{Decimal(number) * self._increment * (Decimal('0.1') if tenth else 1):f}"
+        text = text.rstrip("0") if "." in text else f"{text}."
+        return (f"+{text}" if number[0] == "+" else text).encode()
 
 
 def written_out(source: Path, dialect: str, *, skip_deleted: bool = False) -> WrittenOut | None:
