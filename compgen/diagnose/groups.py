@@ -144,6 +144,8 @@ SAME_MM = 1e-3
 LEAST_LEVELS = 2 * (DEGREE + 1)
 #: Columns of unit length with a singular value below this are not independent.
 DEPENDENT = 1e-6
+#: A column below this (mm per unit of its parameter) is rounding: the effect of an axis that stands at its zero.
+ROUNDING = 1e-9
 #: Maximum number of scan positions of an effect.
 MOST_SCANS = 400
 #: Scan positions whose columns are stored together; share of changed readings below which only the changes are stored.
@@ -211,12 +213,12 @@ def _can_show(effect: Effect, readings: Readings) -> bool:
 
 def _independent(effect: Effect, columns: FloatArray) -> bool:
     """Whether columns (n, k) are finite, and none is a sum of others: products with an axis at rest are."""
-    if not np.isfinite(columns).all() or not np.any(columns):
+    if not np.isfinite(columns).all() or np.abs(columns).max() < ROUNDING:
         return False
     if columns.shape[1] == 1 or effect.card.name.startswith("periodic"):
         return True
     size = np.linalg.norm(columns, axis=0)
-    return bool(size.min() > 0) and int(np.linalg.matrix_rank(columns / size, tol=DEPENDENT)) == columns.shape[1]
+    return bool(size.min() > ROUNDING) and int(np.linalg.matrix_rank(columns / size, tol=DEPENDENT)) == columns.shape[1]
 
 
 def source_of(every: Sequence[FloatArray]) -> Placed | Scanned:

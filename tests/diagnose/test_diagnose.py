@@ -471,7 +471,8 @@ def plane_of(errors, folder, *, still, seed=3, backlash_um=0.0):
         for way in (1.0, -1.0):
             for y in [300.0] if still else [0.0, 300.0, 600.0]:
                 for x in np.linspace(0, 800, 9)[:: int(way)]:
-                    moved = [0.01 * x + backlash_um * way, 2 * (x / 800) ** 2, 1.5 * (x / 800) ** 2]
+                    bow = (x / 800) * (1 - x / 800)
+                    moved = [0.01 * x + backlash_um * way, 8 * bow, -6 * bow]
                     rows.append([x, y, 250.0, *(moved + rng.normal(0, 0.4, 3)), way, 5.0 * len(rows), run])
     text = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,approach_x,time_s,run\n"
     text += "".join(",".join(f"{v:.4f}" for v in row[:-1]) + f",{row[-1]:.0f}\n" for row in rows)
