@@ -244,10 +244,14 @@ def _of_stops(result: Identification) -> ReversalCurves | None:
     return ReversalCurves(curves, {"machine": result.errors.metadata.get("machine", "")}) if curves else None
 
 
-def fit_files(result: FitResult) -> dict[str, str]:
-    """Return the texts of ``fitted.errors.csv`` and ``fit.json``."""
+def fit_files(result: FitResult, covariance_file: tuple[str, bytes] | None = None) -> dict[str, str]:
+    """Return the texts of ``fitted.errors.csv`` and ``fit.json``.
+
+    ``covariance_file`` is the one of the errors that were fitted, with its name beside the new files.
+    """
+    known = {} if covariance_file is None else covariance.uncertainty_of_fitted(*covariance_file)
     return {
-        "fitted.errors.csv": format_errors(result.errors),
+        "fitted.errors.csv": format_errors(result.errors, known),
         "fit.json": json.dumps(result.to_dict(), indent=2) + "\n",
     }
 
@@ -290,6 +294,7 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
         reversal=reversal,
     )
     read, verification = verified_export(machine, exported, identified, reversal, limits)
+    exported = tables.with_known(exported, verification.known_lines)
     extra_files = tables.check_files(machine, exported, identified, templates, reversal, read=read)
     return _write_results(OutputFolder(folder), {"": (exported, read, verification, extra_files)})[0][0]
 
@@ -610,11 +615,16 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         )
         if any(item.code in tables.MISFIT_CODES for item in verification.objections):
             verification = replace(verification, next_command=diagnosis)
-        extra_files = tables.check_files(machine, exported, identification.errors, templates, reversal, language, read)
+        extra_files = tables.check_files(
+            machine, exported, identification.errors, templates, reversal, language, read, known
+        )
+        exported = tables.with_known(exported, verification.known_lines, language)
         checked[sub_folder] = exported, read, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
     identified = identification_files(identification, provenance, proposed=proposed)
-    add_identification(output, {**identified, **fit_files(fitted), **evidence})
+    covered = identified.get(covariance.FILE_NAME)
+    own = (covariance.FILE_NAME, covered) if isinstance(covered, bytes) else None
+    add_identification(output, {**identified, **fit_files(fitted, own), **evidence})
     results, earlier_report = _write_results(output, checked)
     return RunResult(identification, fitted, tuple(results), earlier_report, proposed)

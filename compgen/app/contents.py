@@ -46,6 +46,7 @@ from compgen.report.html.pictures import (
     draw_slices,
     draw_space,
     grid_of,
+    uncertainty_um,
 )
 from compgen.report.html.write import assumptions_of, judged, proposed_rows
 from compgen.tables import load_format
@@ -548,14 +549,17 @@ def volume_pictures(step: Step, folder: Path) -> Sequence[Picture]:
             return ()
         stats = [path.stat() for path in paths]
         return _volume_drawn(tuple(paths), tuple((stat.st_mtime_ns, stat.st_size) for stat in stats), step.number)
-    except (OSError, CompgenError):
+    except (OSError, ValueError, CompgenError):
         return ()
 
 
 @lru_cache(maxsize=16)
 def _volume_drawn(paths: Sequence[Path], _stamps: tuple[tuple[int, int], ...], number: int) -> Sequence[Picture]:
     if paths[0].name == "volume.csv":
-        grid = grid_of(read_volume(paths[0]))
+        stated = paths[0].parent / "result.json"
+        grid = grid_of(
+            read_volume(paths[0]), uncertainty_um(json.loads(stated.read_text())) if stated.is_file() else None
+        )
     else:
         machine = read_machine(paths[0])
         levels_mm = [np.linspace(*axis.range_mm, VOLUME_LEVELS) for axis in machine.axes]

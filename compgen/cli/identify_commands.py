@@ -22,7 +22,7 @@ from compgen.cli.shared_options import (
 )
 from compgen.cli.terminal import progress, stdout
 from compgen.data.error_table import SQUARENESS_APART
-from compgen.data.files import OutputFolder
+from compgen.data.files import OutputFolder, read_bytes
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
@@ -30,6 +30,7 @@ from compgen.foreign.answers import ImportOptions
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
+from compgen.identify.covariance import covariance_file_of
 from compgen.identify.options import StatedNumbers
 from compgen.pipeline import (
     add_identification,
@@ -174,7 +175,8 @@ def fit_command(
 
     ERRORS is an *.errors.csv file (um, urad), or the exchange file of a laser tracer's software (Etalon, variant
     Vendor; mm, rad). Writes fitted.errors.csv and fit.json to DIR. If the covariance that volcomp identify wrote is in
-    the folder of ERRORS, its correlations are used; otherwise nodes are independent.
+    the folder of ERRORS, its correlations are used, and fitted.covariance.npz is a copy of it; otherwise nodes are
+    independent.
 
     \b
     Example:
@@ -189,6 +191,9 @@ def fit_command(
         text = f"{', '.join(gained)} comes from the lines of straightness curves and the zeros of angles; if these are those of "
         text += f"instruments, write the comment # squareness = {SQUARENESS_APART} into {errors}"
         warnings.warn(text, CompgenWarning, stacklevel=2)
-    write_all(out, fit_files(result))
+    files: dict[str, str | bytes] = {}
+    if known is not None:
+        files["fitted.covariance.npz"] = read_bytes(covariance or covariance_file_of(errors, table))
+    write_all(out, {**files, **fit_files(result, next(iter(files.items()), None))})
     answer(as_json, result.to_dict(), fit_table(result))
     return 0

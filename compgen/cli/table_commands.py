@@ -38,6 +38,7 @@ from compgen.data.machine import Machine, zone_of
 from compgen.effects import effects_reversal
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
+from compgen.identify.covariance import joint_covariance
 from compgen.pipeline import (
     RunResult,
     export_and_verify,
@@ -48,7 +49,7 @@ from compgen.pipeline import (
 )
 from compgen.report.options_text import explanation_markdown, options_markdown, options_tables
 from compgen.report.terminal import crash_table, difference_table, merge_text, verification_table
-from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify
+from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify, with_known
 from compgen.tables.active import (
     ActiveTables,
     bare_errors,
@@ -77,11 +78,15 @@ OPTIONS_REVERSAL_HELP = "*.reversal.csv (um): the reversal value of each axis al
 
 def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path | None, language: str) -> None:
     """Write explain.md next to the tables of every control of a run."""
-    reversal = identified_reversal(result.identification)
+    reversal, known = identified_reversal(result.identification), None
+    if result.identification.has_covariance:
+        known = joint_covariance(result.identification)
     several = len(result.results) > 1
     files: dict[str, str | bytes] = {}
     for item in result.results:
-        found = explained(machine, result.fitted.errors, item.export, reversal=reversal, templates=templates)
+        found = explained(
+            machine, result.fitted.errors, item.export, reversal=reversal, templates=templates, covariance=known
+        )
         folder = f"{item.export.controller}/" if several else ""
         files[f"{folder}explain.md"] = explanation_markdown(found)
     write_all(out, for_readers(files, language))
@@ -89,6 +94,7 @@ def explain_run(machine: Machine, result: RunResult, out: Path, templates: Path 
 
 @click.command("options")
 @machine_argument
+@prior_option
 @errors_argument
 @click.option("--tool", "tools", multiple=True, metavar="X,Y,Z", help=TOOL_HELP)
 @click.option("--zone", metavar="RANGES", help=ZONE_HELP)
@@ -123,13 +129,15 @@ def options_command(
         OutputFolder(out)
     with progress(quiet=as_json) as show:
         show("fitting every level, exporting for every control and reading back")
+        table = open_errors(errors)
         result = capability(
             machine,
-            open_errors(errors),
+            table,
             tools_mm=[tool_offset("--tool", text) for text in tools],
             zone_mm=zone_of(zone, [axis.range_mm for axis in machine.axes]) if zone else None,
             reversal=read_reversal(reversal) if reversal else effects_reversal(machine),
             templates=templates,
+            covariance=covariance_of(errors, table, None, independent=False),
         )
     if out is not None:
         text = json.dumps(result.as_dict(), indent=2) + "\n"
@@ -143,6 +151,7 @@ def options_command(
 
 @click.command("export")
 @machine_argument
+@prior_option
 @emphasis_options
 @errors_argument
 @controller_option()
@@ -185,6 +194,7 @@ def export_command(
     OutputFolder(out)
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
+    known = None if active is not None else covariance_of(errors, table, None, independent=False)
     if active is not None:
         table, lost_um = bare_errors(machine, table, active)
         extra_files["bare.errors.csv"] = format_errors(
@@ -200,17 +210,20 @@ def export_command(
         reversal=both,
         language=language,
     )
-    extra_files |= check_files(machine, exported, table, templates, both, language)
-    explanation = explained(machine, table, exported, reversal=both, templates=templates) if explain else None
+    extra_files |= check_files(machine, exported, table, templates, both, language, covariance=known)
+    explanation = None
+    if explain:
+        explanation = explained(machine, table, exported, reversal=both, templates=templates, covariance=known)
     if explanation is not None:
         extra_files |= for_readers({"explain.md": explanation_markdown(explanation)}, language)
     reasons: tuple[str, ...] = tuple(exported.violations)
     if not no_verify:
-        _, verification = verified_export(machine, exported, table, both)
+        _, verification = verified_export(machine, exported, table, both, known=known)
         reasons = verification.reasons
         prefix = REJECTED_PREFIX if reasons else ""
         named = tuple((prefix + name, digest) for name, digest in verification.files)
         extra_files |= verification_files(replace(verification, files=named))
+        exported = with_known(exported, verification.known_lines, language)
     paths = exported.write(out, accepted=not reasons, beside=extra_files)
     for text in exported.warnings:
         complain(f"warning: {text}")
@@ -386,6 +399,7 @@ def diff_command(
 
 @click.command("merge")
 @machine_argument
+@prior_option
 @click.argument("old", nargs=-1, required=True, metavar="OLD...", type=PATH)
 @controller_option()
 @sample_options

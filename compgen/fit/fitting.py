@@ -687,7 +687,9 @@ def _fit(
         item.name: finish(item, how, solution) for item, how, solution in zip(prepared, weighted, solved, strict=True)
     }
     reference = ", ".join(f"{value:g}" for value in machine.reference_point_mm)
-    kept = {key: value for key, value in errors.metadata.items() if key != "covariance"}  # from the unfitted values
+    kept = {
+        key: text for key, text in errors.metadata.items() if not key.startswith("covariance")
+    }  # of unfitted values
     table = ErrorTable(
         curves={name: curve for name, (curve, _) in fitted.items()},
         squareness=zeroed.squareness,

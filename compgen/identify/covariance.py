@@ -38,8 +38,12 @@ if TYPE_CHECKING:
 
 FILE_NAME = "identified.covariance.npz"
 FORMAT = "compgen covariance 1"
+#: Comment of a file of fitted errors: the covariance file of the errors that were fitted; another one has its SHA-256.
+OF_FITTED = "covariance_before_fit"
 #: Least standard uncertainty of a stated value, um and urad.
 FINEST = 1e-3
+#: Positions closer than this are one, mm.
+SAME_MM = 1e-4
 #: Points whose rows of C B are computed together.
 CHUNK = 1024
 _MEMBERS = ("format", "machine", "errors_sha256", "error", "position_mm", "unit", "station", "setup", "factor")
@@ -426,15 +430,36 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
     return covariance
 
 
+def uncertainty_of_fitted(name: str, content: bytes) -> dict[str, str]:
+    """Return the comments with which a file of fitted errors names the covariance file of the errors that were fitted."""
+    return {OF_FITTED: name, f"{OF_FITTED}_sha256": sha256_of(content)}
+
+
+def covariance_file_of(path: Path, errors: ErrorTable) -> Path | None:
+    """Return the covariance file that an errors file refers to, if it exists."""
+    name = errors.metadata.get("covariance") or errors.metadata.get(OF_FITTED)
+    return path.parent / name if name and (path.parent / name).is_file() else None
+
+
 def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
-    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match."""
-    name = errors.metadata.get("covariance")
-    covariance_file = path.parent / name if name else None
-    if covariance_file is None or not covariance_file.is_file():
+    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match.
+
+    Fitted errors have that of the errors that were fitted: smoothing adds no knowledge, and taken as independent from node
+    to node, what was hardly measured would be counted as many readings.
+    """
+    covariance_file = covariance_file_of(path, errors)
+    if covariance_file is None:
         return None
     found = read_covariance(covariance_file)
-    if found.errors_sha256 == sha256_of(read_bytes(path)):
-        return found
+    if "covariance" in errors.metadata:
+        if found.errors_sha256 == sha256_of(read_bytes(path)):
+            return found
+    elif errors.metadata.get(f"{OF_FITTED}_sha256") == sha256_of(read_bytes(covariance_file)):
+        names, at_mm = errors.labels()
+        if names == found.error and np.allclose(at_mm, found.position_mm, atol=SAME_MM, equal_nan=True):
+            return found
+        own = covariance_or_independent(errors, None, found.machine)  # fitting added a squareness
+        return None if own is None else replace(own, posterior=found.posterior)
     message = f"{covariance_file} belongs to another version of {path.name}; u_value is used instead"
     warnings.warn(f"{message}, independent from node to node", CompgenWarning, stacklevel=2)
     return None

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from compgen.data.comparison import Residuals
 from compgen.errors import um_text
-from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation, LevelResult
+from compgen.tables.options import CORRECTED_UM, LABELS, Capability, Explanation, Left, LevelResult
 
 # What the options of a control would gain: tables for the terminal, and ``options.md``.
 
@@ -24,19 +24,49 @@ SQUARENESS_ALONE = "squareness alone"
 LISTED_FROM_UM = 0.1
 #: A level that reduces the rms by less than this share, or by less than this much, gains nothing.
 LEAST_GAIN, LEAST_GAIN_UM = 0.005, 0.05
+#: Heading of the rms that has in it what the measurement does not know.
+UNKNOWN = "with what is not known*"
+#: What is written where the uncertainty is not determined.
+NOT_DETERMINED = "not determined"
 LEGEND = (
-    "left: what the best table of that level leaves, largest / rms / 95 % in um; left*: the best-fit rigid motion of the "
-    "workpiece removed; gain: reduction of rms* compared with the level above, with the tool of the machine file: full "
-    "volumetric compensation pays off with other tools. A level may contain a constant shift of "
-    "an axis, which a workpiece offset can do as well; controls whose tables are zero at the reference point do not. "
-    "A program corrected by `volcomp correct` leaves the last decimal of its coordinates and the uncertainty of the errors; "
-    "with program*: the control adds its table, and a program made with `--active` corrects what that leaves (rigid motion "
-    "removed, in the decimals of the control's programs)."
+    "left: what the best table of that level leaves of the errors found, largest / rms / 95 % in um, with no more digits than "
+    "the uncertainty leaves; left*: the best-fit rigid motion of the workpiece removed; with what is not known*: rms* of both, "
+    "what is left and what the measurement does not know; gain: reduction of that (where the uncertainty is not determined, of "
+    "rms*) compared with the level above, with the tool of the machine file: full volumetric compensation pays off with other "
+    "tools. A level may contain a constant shift of an axis, which a workpiece offset can do as well; controls whose tables are "
+    "zero at the reference point do not. A program corrected by `volcomp correct` leaves the last decimal of its coordinates and "
+    "what is not known; with program*: the control adds its table, and a program made with `--active` corrects what that leaves "
+    "(rigid motion removed, in the decimals of the control's programs)."
 )
 
 
-def _three(figures: Residuals) -> str:
-    return f"{um_text(figures.max_um)} / {um_text(figures.rms_um)} / {um_text(figures.p95_um)}"
+def _three(result: Capability, figures: Residuals) -> str:
+    """Largest, rms and 95 % of what a table leaves of the errors found, with as many digits as mean something."""
+    known = result.uncertainty
+    u_max, u_rms = (None, None) if known is None else (known.max_um, known.rms_um)
+    largest, most = um_text(figures.max_um, u_um=u_max), um_text(figures.p95_um, u_um=u_max)
+    return f"{largest} / {um_text(figures.rms_um, u_um=u_rms)} / {most}"
+
+
+def _with_unknown(result: Capability, left: Left | None) -> str:
+    """The rms of what is left and of what is not known, the rigid motion removed."""
+    found = None if left is None else result.with_unknown_um(left)
+    if found is None:
+        return "-" if left is None else NOT_DETERMINED
+    return um_text(found[1])
+
+
+def uncertainty_lines(result: Capability) -> list[str]:
+    """Return the uncertainty of every figure, and what was assumed of what was not measured."""
+    known = result.uncertainty
+    text = f"uncertainty of every figure after compensation: {NOT_DETERMINED}"
+    if known is not None:
+        text = (
+            "uncertainty of every figure after compensation, whatever the tables contain: U = "
+            f"{um_text(known.rms_um)} um rms over the volume, {um_text(known.max_um)} um where it is largest (k = 2); "
+            f"rigid motion removed {um_text(known.rms_rigid_removed_um)} and {um_text(known.max_rigid_removed_um)} um"
+        )
+    return [text, *result.assumed]
 
 
 def tool_name(tool_mm: Sequence[float]) -> str:
@@ -46,16 +76,18 @@ def tool_name(tool_mm: Sequence[float]) -> str:
 
 
 def level_rows(result: Capability) -> list[list[str]]:
-    """Return rows of level, left, left*, gain."""
+    """Return rows of level, left, left*, with what is not known*, gain."""
     rows, before = [], None
     for item in result.levels:
-        rms = item.left.rigid_removed.rms_um
-        rows.append([item.label, _three(item.left.after), _three(item.left.rigid_removed), _gain(before, rms)])
+        found = result.with_unknown_um(item.left)
+        rms = item.left.rigid_removed.rms_um if found is None else found[1]
+        left = _three(result, item.left.after), _three(result, item.left.rigid_removed)
+        rows.append([item.label, *left, _with_unknown(result, item.left), _gain(before, rms)])
         before = rms
     if result.program is not None:
         left = result.program.left
-        uncertainty = "" if result.program.u_um is None else f", U {um_text(2.0 * result.program.u_um)} um (k = 2)"
-        rows.append([PROGRAM, _three(left.after), _three(left.rigid_removed), f"rounding of the program{uncertainty}"])
+        figures = _three(result, left.after), _three(result, left.rigid_removed)
+        rows.append([PROGRAM, *figures, _with_unknown(result, left), "rounding of the program"])
     return rows
 
 
@@ -74,8 +106,11 @@ def control_rows(result: Capability) -> list[list[str]]:
     for item in result.controls:
         directional = f", {LABELS['directional'].lstrip('+ ')}" if item.directional else ""
         level = "-" if item.level is None else LABELS.get(item.level, SQUARENESS_ALONE) + directional
-        left = ["-", "-"] if item.left is None else [_three(item.left.after), _three(item.left.rigid_removed)]
-        left.append("-" if item.both is None else _three(item.both.left.rigid_removed))
+        left = ["-", "-"]
+        if item.left is not None:
+            left = [_three(result, item.left.after), _three(result, item.left.rigid_removed)]
+        left += [_with_unknown(result, item.left)]
+        left.append("-" if item.both is None else _three(result, item.both.left.rigid_removed))
         broken = [f"{len(item.broken)} limits exceeded, first: {item.broken[0]}"] if item.broken else []
         other = [] if item.own else ["not as in the machine file"]
         remark = f"cannot be exported: {item.problem}" if item.problem else "; ".join([*broken, *other, *item.notes])
@@ -93,14 +128,22 @@ def error_rows(result: Capability, tool: int) -> list[list[str]]:
     for name in result.levels[0].by_tool[tool][1]:
         values = [result.level(key).by_tool[tool][1][name] for key in _shown_levels(result)]
         if max(values) >= LISTED_FROM_UM:
-            rows.append([name, *map(um_text, values)])
+            rows.append([name, *(_of_largest(result, value) for value in values)])
     return rows
+
+
+def _of_largest(result: Capability, value_um: float) -> str:
+    """A largest displacement, with as many digits as the uncertainty leaves."""
+    return um_text(value_um, u_um=None if result.uncertainty is None else result.uncertainty.max_um)
 
 
 def tool_rows(result: Capability) -> list[list[str]]:
     """Return rows of tool offset and, by level, largest / rms of all errors together, with the reference point fixed."""
     return [
-        [tool_name(tool), *(um_text(result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result))]
+        [
+            tool_name(tool),
+            *(_of_largest(result, result.level(key).by_tool[k][0].after.max_um) for key in _shown_levels(result)),
+        ]
         for k, tool in enumerate(result.tools_mm)
     ]
 
@@ -121,8 +164,8 @@ def _table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -
 def options_tables(result: Capability) -> Group:
     """Return the tables for the terminal: levels, controls, errors that remain with the machine's tool, other tools."""
     own = tool_name(result.tools_mm[0])
-    levels = ["tables contain", "left", "left*", "gain"]
-    controls = ["control", "level", "left", "left*", "with program*", "remark"]
+    levels = ["tables contain", "left", "left*", UNKNOWN, "gain"]
+    controls = ["control", "level", "left", "left*", UNKNOWN, "with program*", "remark"]
     return Group(
         _table(f"{result.machine}: what each level of option leaves (max / rms / p95, um)", levels, level_rows(result)),
         _table("what the file of each control leaves, read back (max / rms / p95, um)", controls, control_rows(result)),
@@ -136,6 +179,7 @@ def options_tables(result: Capability) -> Group:
             ["tool offset", *_level_headings(result)],
             tool_rows(result),
         ),
+        *(Text(text) for text in uncertainty_lines(result)),
         Text(LEGEND),
         *(Text(note, "yellow") for note in result.notes),
     )
@@ -154,11 +198,22 @@ def options_markdown(result: Capability) -> str:
     parts = [
         f"# Options for {result.machine}\n\nEvaluated at {result.points} points over {zone or 'the whole travel'}.\n",
         "## What each level of option leaves\n\n"
-        + markdown_table(["tables contain", "left, um (max / rms / p95)", "left*, um", "gain"], level_rows(result)),
+        + markdown_table(
+            ["tables contain", "left, um (max / rms / p95)", "left*, um", f"{UNKNOWN}, um", "gain"], level_rows(result)
+        ),
+        "".join(f"- {text}\n" for text in uncertainty_lines(result)),
         LEGEND + "\n",
         "## What the file of each control leaves\n\n"
         + markdown_table(
-            ["control", "level", "left, um (max / rms / p95)", "left*, um", "with program*, um", "remark"],
+            [
+                "control",
+                "level",
+                "left, um (max / rms / p95)",
+                "left*, um",
+                f"{UNKNOWN}, um",
+                "with program*, um",
+                "remark",
+            ],
             control_rows(result),
         ),
         "## Largest error with other tool offsets, um\n\n"
@@ -193,25 +248,32 @@ def explanation_markdown(item: Explanation) -> str:
     text = f"# Control {item.controller}, machine {item.machine}\n\nThis control corrects {CORRECTS[item.level]}."
     if item.own is not None and item.own.left is not None:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
+        known = item.options.uncertainty
+        largest = [um_text(part.max_um, u_um=known and known.max_rigid_removed_um) for part in (before, after)]
+        rms = [um_text(part.rms_um, u_um=known and known.rms_rigid_removed_um) for part in (before, after)]
         text += (
-            f" Its file changes the error over the volume from {um_text(before.max_um)} to {um_text(after.max_um)} um (largest) "
-            f"and from {um_text(before.rms_um)} to {um_text(after.rms_um)} um (rms), the best-fit rigid motion removed, "
-            "as read back from the file."
+            f" Its file changes the effect of the errors found from {largest[0]} to {largest[1]} um (largest) "
+            f"and from {rms[0]} to {rms[1]} um (rms over the volume), the best-fit rigid motion removed, "
+            f"as read back from the file. {_known_after(item.options, item.own.left)}"
         )
-    parts = [text + "\n"]
+    parts = [text + "\n", "".join(f"- {line}\n" for line in uncertainty_lines(item.options))]
     helped = [fate for fate in item.fates if fate.after_um < LEAST_HELP * fate.before_um]
-    rows = [[fate.name, um_text(fate.before_um), um_text(fate.after_um)] for fate in helped]
+    rows = [[fate.name, *(_of_largest(item.options, x) for x in (fate.before_um, fate.after_um))] for fate in helped]
     if rows:
         table = markdown_table(["error", "displacement before, um", "left, um"], rows)
         parts.append("## What it corrects\n\n" + table)
-    rows = [[fate.name, um_text(fate.after_um), fate.why] for fate in item.fates if fate.after_um > CORRECTED_UM]
+    rows = [
+        [fate.name, _of_largest(item.options, fate.after_um), fate.why]
+        for fate in item.fates
+        if fate.after_um > CORRECTED_UM
+    ]
     table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
     notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
     other = ""
     if item.level not in ("volumetric", "skew"):
         results = zip(item.options.tools_mm, _level(item).by_tool, strict=True)
         tools = [
-            f"{um_text(left.after.max_um)} um at {tool_name(tool) if any(tool) else 'no offset'}"
+            f"{_of_largest(item.options, left.after.max_um)} um at {tool_name(tool) if any(tool) else 'no offset'}"
             for tool, (left, _) in results
         ]
         other = (
@@ -220,6 +282,14 @@ def explanation_markdown(item: Explanation) -> str:
         )
     parts.append("## What remains, and why\n\n" + table + other + notes)
     return "\n".join([*parts, _next(item), _nodes(item), _limits(item)])
+
+
+def _known_after(options: Capability, left: Left) -> str:
+    """What the error of the machine will be, with what the measurement does not know."""
+    found = options.with_unknown_um(left)
+    if found is None:
+        return "What the machine will do with it is not determined: nothing is said of what was not measured."
+    return f"With what the measurement does not know, {um_text(found[1])} um rms is to be expected."
 
 
 def _level(item: Explanation) -> LevelResult:
@@ -237,11 +307,12 @@ def _next(item: Explanation) -> str:
     if not following:
         return "## What the next option would gain\n\nNothing: this is the highest level for these errors.\n"
     rows = [
-        [level.label, um_text(level.left.rigid_removed.max_um), um_text(level.left.rigid_removed.rms_um)]
+        [level.label, *(part for part in _three(item.options, level.left.rigid_removed).split(" / ")[:2]),
+         _with_unknown(item.options, level.left)]
         for level in (current, *following)
-    ]
+    ]  # fmt: skip
     return "## What the next option would gain\n\n" + markdown_table(
-        ["tables contain", "largest left, um", "rms left, um"], rows
+        ["tables contain", "largest left, um", "rms left, um", f"{UNKNOWN[:-1]}, um rms"], rows
     )
 
 

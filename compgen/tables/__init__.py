@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from compgen.data.comparison import Residuals, residuals, without_rigid_motion
     from compgen.data.files import REJECTED_PREFIX, Provenance
     from compgen.resources import program_version
-    from compgen.tables.export import REPORT_FILES, Export, export, set_aside_superseded, usable_format
+    from compgen.tables.export import REPORT_FILES, Export, export, set_aside_superseded, usable_format, with_known
     from compgen.tables.judge import SafetyLimits
     from compgen.tables.render import Format, load_format
     from compgen.tables.signs import check_files
@@ -55,6 +55,7 @@ __all__ = [
     "verification_files",
     "verify",
     "wanted_correction",
+    "with_known",
     "without_rigid_motion",
 ]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -312,6 +312,19 @@ def export(
     if companions:
         manifest["companions"] = _described(companions)
     return Export(controller, files, manifest, preflight, violations, own["warnings"], companions)
+
+
+def with_known(exported: Export, lines: Sequence[str], language: str = LANGUAGES[0]) -> Export:
+    """Return the export whose preflight list says what is known of the machine, before its first step."""
+    heading = "What is known of the machine"
+    if language != LANGUAGES[0]:
+        from compgen.data.language import texts_of
+
+        heading, *lines = [texts_of(language).text(line) for line in (heading, *lines)]
+    section = f"## {heading}\n\n" + "".join(f"- {line}\n" for line in lines) + "\n"
+    before, step, after = exported.preflight.partition("\n## 1.")
+    text = f"{before}\n{section}{step.lstrip()}{after}" if step else f"{before.rstrip()}\n\n{section}"
+    return replace(exported, preflight=text)
 
 
 def table_values(

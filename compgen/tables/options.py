@@ -19,20 +19,21 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Emphasis, Interval, Machine
-from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.identify.covariance import Covariance
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid, volume_grid, volumetric_error
 from compgen.tables import Export, export
 from compgen.tables.judge import (
     LargestStep,
-    displacement_uncertainty,
     in_both_directions,
     left_by_reversal,
     safety_of,
 )
 from compgen.tables.synthesis import Projector, basis_field, placed_terms, projector, wanted_correction
+from compgen.tables.verification import FigureUncertainty, assumed_lines, volume_uncertainty
 
 # Levels of compensation that controls offer, as bases of terms, and the best that each could do for given errors.
 #
@@ -279,8 +280,8 @@ class LevelResult:
 class ProgramResult:
     """What a corrected NC program leaves (``volcomp correct``), without tables or with those of a control active.
 
-    ``left`` comes from the rounding of its coordinates to ``step_mm``, ``u_um`` is the largest standard uncertainty that the
-    errors give the tool tip, None if it is not known.
+    ``left`` comes from the rounding of its coordinates to ``step_mm``, ``u_um`` is the largest standard uncertainty of the tool
+    tip, with what was not measured; None if it is not determined.
     """
 
     left: Left
@@ -320,7 +321,11 @@ class ControlResult:
 
 @dataclass(frozen=True)
 class Capability:
-    """Result of :func:`capability`; ``tools_mm`` are the evaluated tool offsets, that of the machine file first."""
+    """Result of :func:`capability`; ``tools_mm`` are the evaluated tool offsets, that of the machine file first.
+
+    ``uncertainty`` is that of every figure, whatever the tables contain: no table knows more than the measurement. It is
+    None if it is not determined; ``assumed`` are the sentences about what was not measured.
+    """
 
     machine: str
     errors: tuple[str, ...]
@@ -331,6 +336,17 @@ class Capability:
     controls: tuple[ControlResult, ...]
     notes: tuple[str, ...] = field(default_factory=tuple)
     program: ProgramResult | None = None
+    uncertainty: FigureUncertainty | None = None
+    assumed: tuple[str, ...] = ()
+
+    def with_unknown_um(self, left: Left) -> tuple[float, float] | None:
+        """Return rms of what is left together with what is not known, um: as it stands, rigid motion removed."""
+        if self.uncertainty is None:
+            return None
+        u = self.uncertainty.rms_um / COVERAGE, self.uncertainty.rms_rigid_removed_um / COVERAGE
+        parts = zip((left.after, left.rigid_removed), u, strict=True)
+        as_it_stands, rigid = (float(np.hypot(part.rms_um, own)) for part, own in parts)
+        return as_it_stands, rigid
 
     def level(self, key: str) -> LevelResult:
         """Return one level."""
@@ -378,6 +394,8 @@ class Capability:
                 for item in self.controls
             ],
             "program": None if self.program is None else self.program.as_dict(),
+            "after_uncertainty": None if self.uncertainty is None else self.uncertainty.as_dict(),
+            "assumed": list(self.assumed),
             "notes": list(self.notes),
         }
 
@@ -397,6 +415,7 @@ def capability(
     reversal: ReversalCurves | None = None,
     templates: Path | None = None,
     controllers: Sequence[str] | None = None,
+    covariance: Covariance | None = None,
 ) -> Capability:
     """Return what every level of option and every control leaves of the errors.
 
@@ -408,7 +427,9 @@ def capability(
     reversal : difference between the directions of travel; all points are then evaluated from both sides.
     templates : the user's templates, searched first.
     controllers : names of the controls, default all.
+    covariance : of the errors, with what is known of those that were not measured; by default from their u.
     """
+    whole = machine
     zone = in_zone(machine, zone_mm)
     if zone_mm is not None:
         machine = replace(machine, emphasis=replace(machine.emphasis, zone_mm=zone_mm))
@@ -428,7 +449,8 @@ def capability(
             left = _left(zone, errors, points, correction, reversal, tool)
             by_tool.append((left, {**alone, **dict.fromkeys(reversed_um, 0.0), **left_um}))
         levels.append(LevelResult(level.key, by_tool[0][0], tuple(by_tool)))
-    u_um = float(np.linalg.norm(displacement_uncertainty(zone, errors, points.position_mm))) / MM_PER_UM or None
+    unknown = volume_uncertainty(whole, errors, points.position_mm, covariance)
+    u_um = None if unknown is None else unknown.max_um / COVERAGE
     program = _left_by_program(zone, errors, points, reversal, PROGRAM_STEP_MM)
     controls = [
         _control_result(variant, changed, errors, points, reversal, templates, u_um)
@@ -443,8 +465,10 @@ def capability(
         points=len(points),
         levels=tuple(levels),
         controls=tuple(controls),
-        notes=tuple(_notes(errors, reversal)),
+        notes=tuple(_notes(machine, errors, reversal)),
         program=ProgramResult(program, PROGRAM_STEP_MM, u_um),
+        uncertainty=unknown,
+        assumed=assumed_lines(whole, errors, covariance),
     )
 
 
@@ -559,22 +583,24 @@ def _control_result(
     return replace(variant, level=level, directional=directional, left=left, both=program, broken=broken)
 
 
-def missing_notes(errors: ErrorTable) -> list[str]:
+def missing_notes(machine: Machine, errors: ErrorTable) -> list[str]:
     """Return which of the 21 errors are unknown, and when that matters."""
     missing = [name for name in ERROR_NAMES if name not in errors.names]
     if not missing:
         return []
+    if machine.prior.is_none:
+        return [f"not measured, so no table corrects them: {', '.join(missing)}; what they do is not determined"]
     return [
         f"not measured, so no table corrects them: {', '.join(missing)}; what they may do is in the uncertainty of run and "
         "verify, also with other tool offsets than the one used in the measurement"
     ]
 
 
-def _notes(errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
+def _notes(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | None) -> list[str]:
     if reversal is None:
-        return [*missing_notes(errors), "no reversal was given: both directions of travel are assumed equal"]
+        return [*missing_notes(machine, errors), "no reversal was given: both directions of travel are assumed equal"]
     return [
-        *missing_notes(errors),
+        *missing_notes(machine, errors),
         "controls without direction-dependent tables are shown with the full reversal; their backlash parameter "
         "corrects the part along the axis",
     ]
@@ -641,8 +667,12 @@ def explain(
     *,
     reversal: ReversalCurves | None = None,
     templates: Path | None = None,
+    covariance: Covariance | None = None,
 ) -> Explanation:
-    """Explain exported files from their text; ``errors``, ``reversal`` and ``templates`` are those of the export."""
+    """Explain exported files from their text; ``errors``, ``reversal`` and ``templates`` are those of the export.
+
+    ``covariance`` is that of the errors, as for :func:`capability`.
+    """
     control = controller_named(exported.controller)(machine)
     tables = control.parse([SourceFile(Path(name), text) for name, text in exported.files.items()])
     solver = projector(machine, control.basis(errors), anchored=control.anchored)
@@ -653,7 +683,9 @@ def explain(
     if reversal is not None:
         rest = reversal.without(control.reversal_in_tables(reversal))
     known = rest if rest is not None and rest.curves else None
-    options = capability(machine, errors, reversal=known, templates=templates, controllers=(control.name,))
+    options = capability(
+        machine, errors, reversal=known, templates=templates, controllers=(control.name,), covariance=covariance
+    )
     usage = sorted(control.usage(tables), key=lambda item: -item.share)
     before, after = (
         item.left_alone_um(machine, errors, [tool_of(machine, None)], anchored=control.anchored)[0]
@@ -680,7 +712,7 @@ def explain(
         violations=tuple(exported.violations),
         options=options,
         own=next((item for item in options.controls if item.own), None),
-        notes=tuple(missing_notes(errors)),
+        notes=tuple(missing_notes(machine, errors)),
     )
 
 

@@ -17,8 +17,10 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.data.names import AXES, COVERAGE, MM_PER_UM, error_named
 from compgen.errors import CompgenError
+from compgen.identify.covariance import Covariance
+from compgen.identify.posterior import Posterior
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import full_grid
 from compgen.resources import LANGUAGES
@@ -26,7 +28,7 @@ from compgen.tables import Export, export
 from compgen.tables.entries import entry_check, numbers_of, with_number
 from compgen.tables.judge import COMPONENT_FLOOR_MM, Judge, judge_of
 from compgen.tables.render import load_format, render, template_folders
-from compgen.tables.verification import ReadTables, reasons_against
+from compgen.tables.verification import ReadTables, assumed_lines, known_errors, reasons_against
 
 # The sign crash test: every way to get signs, axes and units wrong, and whether the verification detects it. Variants
 # at the level of the **emulated correction** c(p), after the text of the tables was parsed:
@@ -430,6 +432,7 @@ def check_files(
     reversal: ReversalCurves | None = None,
     language: str = LANGUAGES[0],
     read: ReadTables | None = None,
+    covariance: Covariance | None = None,
 ) -> dict[str, str]:
     """Return ``check/check-program.md`` and, for controls with a documented motion in machine coordinates, the program.
 
@@ -441,6 +444,7 @@ def check_files(
     reversal : as in :func:`check_program`.
     language : of the page; the program stays in English.
     read : the files as read back, if they have been.
+    covariance : of the errors, with what is known of those that were not measured; by default from their u.
     """
     if read is None:
         control = controller_named(exported.controller)(machine)
@@ -451,14 +455,33 @@ def check_files(
     # If the control's folder has no program, only the page is written.
     folders = template_folders(card.name, templates)
     has_program = any((folder / card.name / "check-program.nc.j2").is_file() for folder in folders)
-    context = {**_context(machine, exported, program), "has_program": has_program}
+    known = known_errors(machine, errors, covariance)
+    context = {**_context(machine, exported, program, known), "has_program": has_program}
+    context["assumed"] = assumed_lines(machine, errors, covariance)[0]
     files = {PAGE_NAME: render(replace(card, name="_common"), "check-program.md.j2", context, templates, language)}
     if has_program:
         files[PROGRAM_NAME] = render(card, "check-program.nc.j2", context, templates)
     return files
 
 
-def _context(machine: Machine, exported: Export, program: CheckProgram) -> Mapping[str, Any]:
+def _reading_u_um(known: Posterior | None, position_mm: FloatArray) -> list[list[float]] | None:
+    """Expanded uncertainty of each reading, um: of the difference of E to the first position; None if nothing is known."""
+    if known is None:
+        return None
+    spread, found = known.field(position_mm), list[list[float]]()
+    for k in range(len(position_mm)):
+        row = []
+        for axis in range(3):
+            weight = np.zeros_like(position_mm)
+            weight[k, axis] += 1.0
+            weight[0, axis] -= 1.0
+            row.append(COVERAGE * spread.u_of(weight) / MM_PER_UM)
+        found.append(row)
+    return found
+
+
+def _context(machine: Machine, exported: Export, program: CheckProgram, known: Posterior | None) -> Mapping[str, Any]:
+    u_um = _reading_u_um(known, program.position_mm)
     rows = [
         {
             "number": k + 1,
@@ -467,6 +490,7 @@ def _context(machine: Machine, exported: Export, program: CheckProgram) -> Mappi
             "off": (program.off_mm[k] / MM_PER_UM).tolist(),
             "on": (program.on_mm[k] / MM_PER_UM).tolist(),
             "added": (program.added_mm[k] / MM_PER_UM).tolist(),
+            "u": None if u_um is None else u_um[k],
         }
         for k in range(len(program.position_mm))
     ]

@@ -386,6 +386,33 @@ def figure_uncertainty(
     return FigureUncertainty(*found)
 
 
+def known_errors(machine: Machine, errors: ErrorTable, covariance: Covariance | None = None) -> Posterior | None:
+    """:func:`posterior_with`, kept for all controls of a run."""
+    return _known(machine, errors, _NO_POINTS, covariance)
+
+
+#: What is said where nothing is assumed of what was not measured.
+WITHOUT_PRIOR = "no prior: what was not measured is not determined, and no uncertainty has it in"
+
+
+def volume_uncertainty(
+    machine: Machine, errors: ErrorTable, position_mm: FloatArray, covariance: Covariance | None = None
+) -> FigureUncertainty | None:
+    """:func:`figure_uncertainty` of the whole error of the machine: None without a prior if errors were not measured."""
+    if machine.prior.is_none and coverage_of(machine, errors).missing:
+        return None
+    return figure_uncertainty(machine, errors, position_mm, covariance)
+
+
+def assumed_lines(machine: Machine, errors: ErrorTable, covariance: Covariance | None = None) -> tuple[str, ...]:
+    """Return what is assumed of what was not measured, what is not known, and whether the machine is worse than its class."""
+    posterior = known_errors(machine, errors, covariance)
+    if posterior is None:
+        return (WITHOUT_PRIOR,) if machine.prior.is_none else ("the uncertainty of the errors is not known",)
+    said = assumed_text(posterior), open_text(not_determined_um(posterior)), worse_text(posterior)
+    return tuple(text for text in said if text)
+
+
 def _posterior_uncertainty(machine: Machine, posterior: Posterior, position_mm: FloatArray) -> FigureUncertainty:
     """Expanded uncertainty of the figures from the posterior; a rigid motion takes nothing from what is between levels."""
     chosen = position_mm[_some(position_mm, DRAWN_POINTS)]
@@ -966,6 +993,20 @@ class Verification(Drawable):
                 "by a rigid motion of the workpiece"
             )
         return (*notes, *self.remarks)
+
+    @property
+    def known_lines(self) -> list[str]:
+        """What a person should know before loading the tables: verdict, uncertainty, what was assumed."""
+        found = self.uncertainty
+        text = "what the machine will do with the tables is not determined"
+        if found is not None and self.gain is None and self.measured.missing:
+            text = f"{text}; what was measured has U = {um_text(found.rms_um)} um rms over the volume (k = 2)"
+        elif found is not None:
+            text = (
+                f"whatever the files say, the machine may be U = {um_text(found.rms_um)} um rms over the volume from it, "
+                f"{um_text(found.max_um)} um where it is largest (k = 2)"
+            )
+        return [self.headline, text, *(self.assumptions or [WITHOUT_PRIOR])]
 
     @property
     def assumptions(self) -> list[str]:

@@ -21,7 +21,18 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.pipeline import write_all
 from compgen.report.html import FILES, build_report, write_report
 from compgen.report.html.folder import read_folder, table_curves
-from compgen.report.html.pictures import describe_error, draw_slices, grid_of, histogram, nice, projected, resampled
+from compgen.report.html.pictures import (
+    VolumeOnGrid,
+    describe_error,
+    draw_slices,
+    draw_space,
+    grid_of,
+    histogram,
+    nice,
+    projected,
+    resampled,
+    uncertainty_um,
+)
 from compgen.report.html.write import markdown, script_data
 from compgen.tables import read_tables, residuals
 from compgen.tables.verification import verification_files
@@ -495,3 +506,18 @@ def test_a_date_that_nobody_filled_in_is_not_a_date(small_machine, small_errors,
     assert "# date = \n" in text
     write_all(tmp_path, {"identified.errors.csv": text, "identify.json": "{}"})
     assert build_report(tmp_path).data["provenance"]["date"] is None
+
+
+def test_no_picture_of_the_volume_is_enlarged_beyond_what_is_known():
+    """After compensation 0.002 um is left of what was measured, and U = 6 um of what was not: nothing finer is drawn."""
+    levels = tuple(np.linspace(0.0, 100.0, 3) for _ in range(3))
+    before, after = np.full((3, 3, 3, 3), 0.02), np.full((3, 3, 3, 3), 2e-6)
+    plain, known = (VolumeOnGrid(levels, before, after, u_um) for u_um in (None, 6.0))
+    spaces = [draw_space(grid, 0).data for grid in (plain, known)]
+    assert spaces[0]["before_scale"] == spaces[1]["before_scale"]
+    assert spaces[0]["after_scale"] > 1e5
+    assert spaces[1]["after_scale"] == pytest.approx(nice(0.1 * 100.0 / 6e-3))
+    drawn = [item for item in draw_slices(known, 0, {}) if item.title == "After"]
+    assert all("U 6.00 µm" in item.note and "<0.1 µm" in item.note and "0.002" not in str(item.data) for item in drawn)
+    assert uncertainty_um({"after_uncertainty": {"U_max_um": 6.0}}) == 6.0
+    assert uncertainty_um({"after_uncertainty": None}) is None

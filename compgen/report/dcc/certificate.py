@@ -360,6 +360,8 @@ class Results:
 
     def _error(self, item: Mapping[str, Any]) -> Element:
         name, symbol = f"{item['name']}: {item['meaning']}", str(item["name"])
+        if item.get("known_in_part"):
+            name = f"{name}, known in part only (see limitations)"
         values = dcc("quantity", said("name", name), self._values(item), refType=f"basic_measuredValue iso230_{symbol}")
         if not item["positions"]["valueXMLList"]:
             return dcc("result", said("name", name), dcc("data", values))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -174,12 +175,14 @@ WIDE = (420.0, 250.0)
 class VolumeOnGrid:
     """A volume whose points fill a grid: levels of X, Y, Z in mm, and errors (nx, ny, nz, 3) before and after, mm.
 
-    ``after_mm`` is None as long as there is no correction.
+    ``after_mm`` is None as long as there is no correction. ``u_um`` is the expanded uncertainty of what is left where it is
+    largest: no picture is enlarged beyond it.
     """
 
     levels_mm: tuple[FloatArray, FloatArray, FloatArray]
     before_mm: FloatArray
     after_mm: FloatArray | None = None
+    u_um: float | None = None
 
     @property
     def sides(self) -> tuple[FloatArray, ...]:
@@ -187,8 +190,15 @@ class VolumeOnGrid:
         return (self.before_mm,) if self.after_mm is None else (self.before_mm, self.after_mm)
 
 
-def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
-    """Return the grid that the points of a volume fill; None if they do not.
+def uncertainty_um(result: Mapping[str, Any]) -> float | None:
+    """Return the largest expanded uncertainty after compensation that ``result.json`` states, um."""
+    stated = result.get("after_uncertainty")
+    value = stated.get("U_max_um") if isinstance(stated, Mapping) else None
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def grid_of(volume: Volume | None, u_um: float | None = None) -> VolumeOnGrid | None:
+    """Return the grid that the points of a volume fill; None if they do not. ``u_um`` is its expanded uncertainty.
 
     If a point occurs several times (both directions of travel), the mean is used.
     """
@@ -210,7 +220,7 @@ def grid_of(volume: Volume | None) -> VolumeOnGrid | None:
         np.stack([np.bincount(flat, part[:, k], len(count)) / count for k in range(3)], axis=-1).reshape(*shape, 3)
         for part in (volume.before_mm, volume.after_mm)
     )
-    return VolumeOnGrid((levels[0], levels[1], levels[2]), before, after)
+    return VolumeOnGrid((levels[0], levels[1], levels[2]), before, after, u_um)
 
 
 def resampled(grid: VolumeOnGrid, places_mm: Sequence[FloatArray]) -> list[FloatArray]:
@@ -254,9 +264,10 @@ def thousands(value: float) -> str:
 def draw_space(grid: VolumeOnGrid, number: int) -> Picture:
     """Return the volume as a grid of lines, enlarged: before, after at the same scale, after at its own scale."""
     longest = max(float(np.ptp(level)) for level in grid.levels_mm)
+    known_mm = (grid.u_um or 0.0) * 1e-3
     scales = [
-        min(nice(DRAWN_SHARE * longest / max(float(np.linalg.norm(part, axis=-1).max()), 1e-9)), MOST_ENLARGED)
-        for part in grid.sides
+        min(nice(DRAWN_SHARE * longest / max(float(np.linalg.norm(part, axis=-1).max()), floor)), MOST_ENLARGED)
+        for part, floor in zip(grid.sides, (1e-9, max(1e-9, known_mm)), strict=False)
     ]
     before_scale, after_scale = scales[0], scales[-1]
     drawn = [list[FloatArray]() for _ in (None, *grid.sides)]
@@ -322,6 +333,9 @@ def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> lis
     for side, when in zip(range(len(grid.sides)), ("before", "after"), strict=False):
         planes = [(axis, edges, both_um[side]) for axis, edges, both_um in cut]
         top_um = max(float(np.linalg.norm(errors_um, axis=-1).max()) for *_, errors_um in planes) or 1.0
+        u_um = grid.u_um if when == "after" else None
+        top_um = max(top_um, u_um or 0.0)  # what is smaller than U is not known to be there
+        digits = 3 if not u_um else min(3, max(0, 1 - math.floor(math.log10(u_um))))
         for axis, edges, errors_um in planes:
             across, up = (k for k in range(3) if k != axis)
             middle = 0.5 * (grid.levels_mm[axis][0] + grid.levels_mm[axis][-1])
@@ -334,13 +348,14 @@ def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> lis
             name = name.replace("-", "−")
             title = f"Length of the error vector in µm, {when}, {name}"
             drawn = svg(key, title, [plot], more=colour_bar(210.0, BOX[1], BOX[3], (0.0, top_um), "µm", HEAT))
-            first = known.setdefault(errors_um.tobytes(), key)
+            first = known.setdefault(errors_um.tobytes() + bytes([digits]), key)
             cells = {
                 "axes": [AXES[across], AXES[up]],
                 "cells": [len(edges[across]) - 1, len(edges[up]) - 1],
-                "values": rounded(errors_um.reshape(-1, 3), 3) if first == key else first,
+                "values": rounded(errors_um.reshape(-1, 3), digits) if first == key else first,
             }
-            note = f"{name}, at most {um_text(float(length_um.max()), whole_from=100.0)} µm"
+            note = f"{name}, at most {um_text(float(length_um.max()), whole_from=100.0, u_um=u_um)} µm"
+            note += f", U {um_text(u_um)} µm" if u_um else ""
             pictures.append(Picture(key, when.capitalize(), drawn, {**plot.data, **cells}, note))
     return pictures
 

@@ -26,6 +26,7 @@ from compgen.data.files import OutputFolder, json_text, json_values
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError, number_text, one_line, um_text
+from compgen.identify.covariance import covariance_named_by
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
 from compgen.report.html.pictures import (
@@ -40,11 +41,12 @@ from compgen.report.html.pictures import (
     draw_tables,
     grid_of,
     thousands,
+    uncertainty_um,
 )
 from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
-from compgen.tables.verification import coverage_of, open_text, rounded_limits
+from compgen.tables.verification import coverage_of, known_errors, open_text, rounded_limits
 
 if TYPE_CHECKING:
     from markdown_it import MarkdownIt
@@ -90,12 +92,14 @@ def accuracy_groups(source: ResultFolder) -> dict[str, Any]:
 
 
 def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> dict[str, Any]:
-    given = error_source(machine, errors)
+    covariance = covariance_named_by(source.folder / "identified.errors.csv", errors)
+    given = error_source(machine, errors, covariance)
     ((full, pairs),) = volume_fields(machine, (given,), "axes")
     found: dict[str, Mapping[str, Figure]] = {"volume": volume_figures(full, pairs), **groups_of_errors(given, LINE)}
     found.pop("errors")  # they are shown with their curves
-    coverage = coverage_of(machine, errors)
-    for name in VOLUMETRIC if coverage.missing else ():
+    coverage = coverage_of(machine, errors, known_errors(machine, errors, covariance))
+    listed = coverage_of(machine, errors)
+    for name in VOLUMETRIC if listed.missing else ():
         found.pop(name, None)
     partial = f"{coverage.text}: no figures of the volume and its diagonals, because the other errors are unknown"
     groups = [
@@ -103,6 +107,8 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
         for name, group in found.items()
     ]
     independent = "uncertainties from those of the single values, taken as independent"
+    if covariance is not None:
+        independent = "uncertainties from what is known of all errors together"
     with_tables = []
     for control in source.controls:
         if control.tables is not None:
@@ -115,7 +121,7 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
             *statements_of(machine, full, LINE),
             independent,
             "the machine as identified, without tables",
-            *([partial] if coverage.missing else []),
+            *([partial] if listed.missing else []),
         ],
         "with_tables": with_tables,
     }
@@ -166,15 +172,28 @@ ALWAYS = (
     "Quasi-static geometric errors of three linear axes only: no thermal drift, load, dynamics, spindle or rotary axes.",
     "The figures follow published formulas of ISO 230-1 and ISO 230-2; the program is not certified against the "
     "standards.",
-    "Uncertainties are expanded with k = 2. They include the noise of the readings, and those systematic inputs that were "
-    "stated.",
+    "Uncertainties are expanded with k = 2. They include the noise of the readings, those systematic inputs that were "
+    "stated, and what is assumed of errors that were not measured, as far as it is named below.",
 )
+
+
+def in_part_of(identify: Mapping[str, Any]) -> list[str]:
+    """Return the errors that are listed in ``identify.json`` although the readings do not determine them."""
+    if "determined" not in identify:
+        return []
+    return [str(name) for name in identify.get("identified") or [] if name not in identify["determined"]]
 
 
 def limitations(source: ResultFolder) -> list[str]:
     """Return the limitations of this report."""
     found = list(ALWAYS) if source.controls else list(ALWAYS[1:])
     identify = source.identify
+    in_part = in_part_of(identify)
+    if in_part:
+        found.append(
+            f"Known in part only: {', '.join(in_part)}. Of these the readings leave more than a third of what is assumed of "
+            "errors that were not measured; their values are drawn towards zero by it, and their uncertainties have it in."
+        )
     if identify.get("unobservable"):
         found.append(
             f"Not in the errors found, so no table corrects it: {'; '.join(map(str, identify['unobservable']))}."
@@ -250,7 +269,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "title": title,
         "verdict": _verdict(source, controls),
         "controls": controls,
-        "errors": _errors(source.identified),
+        "errors": _errors(source.identified, in_part_of(identify)),
         "assumed": assumptions_of(identify) if identify and identify.get("identified") is not False else [],
         "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
         "next": _proposed(source),
@@ -491,13 +510,17 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     return text
 
 
-def _errors(table: ErrorTable | None) -> list[dict[str, Any]]:
-    """Return a row for each error: largest value and uncertainty, and all values, in the unit of the files."""
+def _errors(table: ErrorTable | None, in_part: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Return a row for each error: largest value and uncertainty, and all values, in the unit of the files.
+
+    ``in_part`` are errors that the readings do not determine.
+    """
     rows: list[dict[str, Any]] = []
     for name in table.names if table is not None else ():
         assert table is not None
         unit = error_named(name)
         row: dict[str, Any] = {"error": name, "meaning": describe_error(name), "unit": unit.unit}
+        row["in_part"] = name in in_part
         if name in table.squareness:
             value, u = (part / unit.si_per_unit for part in table.squareness[name])
             row |= {"largest": value, "at_mm": None, "U": COVERAGE * u, "position_mm": [], "value": [value], "u": [u]}
@@ -807,6 +830,7 @@ def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
         {
             "name": item["error"],
             "meaning": item["meaning"],
+            "known_in_part": item["in_part"],
             "positions": _list(item["position_mm"], "mm"),
             "values": _list(item["value"], item["unit"], item["u"]),
         }
@@ -952,7 +976,7 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
     found["next"] = draw_proposed(data["next"]["measurements"])
     known: dict[bytes, str] = {}
     for k, item in enumerate(source.controls):
-        grid = grid_of(item.volume)
+        grid = grid_of(item.volume, uncertainty_um(item.result))
         found[f"space-{k}"] = [draw_space(grid, k)] if grid is not None else []
         found[f"slices-{k}"] = draw_slices(grid, k, known) if grid is not None else []
         found[f"tables-{k}"] = draw_tables(item.name, k, tables[item.name])
