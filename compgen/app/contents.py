@@ -568,7 +568,7 @@ def _volume_drawn(paths: Sequence[Path], _stamps: tuple[tuple[int, int], ...], n
             exact_error(machine, read_errors(path), points_mm.reshape(-1, 3)).reshape(points_mm.shape)
             for path in paths[1::2]
         ]
-        grid = VolumeOnGrid((levels_mm[0], levels_mm[1], levels_mm[2]), *sides)
+        grid = VolumeOnGrid((levels_mm[0], levels_mm[1], levels_mm[2]), sides[0], sides[1] if len(sides) > 1 else None)
     return () if grid is None else (draw_space(grid, number), *draw_slices(grid, number, {}))
 
 

@@ -191,9 +191,11 @@ def fit_command(
         text = f"{', '.join(gained)} comes from the lines of straightness curves and the zeros of angles; if these are those of "
         text += f"instruments, write the comment # squareness = {SQUARENESS_APART} into {errors}"
         warnings.warn(text, CompgenWarning, stacklevel=2)
-    files: dict[str, str | bytes] = {}
-    if known is not None:
-        files["fitted.covariance.npz"] = read_bytes(covariance or covariance_file_of(errors, table))
-    write_all(out, {**files, **fit_files(result, next(iter(files.items()), None))})
+    source = covariance or covariance_file_of(errors, table)
+    if known is None or source is None:
+        write_all(out, fit_files(result))
+    else:
+        copied = "fitted.covariance.npz", read_bytes(source)
+        write_all(out, {**fit_files(result, copied), copied[0]: copied[1]})
     answer(as_json, result.to_dict(), fit_table(result))
     return 0

@@ -81,8 +81,8 @@ def level_rows(result: Capability) -> list[list[str]]:
     for item in result.levels:
         found = result.with_unknown_um(item.left)
         rms = item.left.rigid_removed.rms_um if found is None else found[1]
-        left = _three(result, item.left.after), _three(result, item.left.rigid_removed)
-        rows.append([item.label, *left, _with_unknown(result, item.left), _gain(before, rms)])
+        shown = _three(result, item.left.after), _three(result, item.left.rigid_removed)
+        rows.append([item.label, *shown, _with_unknown(result, item.left), _gain(before, rms)])
         before = rms
     if result.program is not None:
         left = result.program.left
@@ -248,9 +248,7 @@ def explanation_markdown(item: Explanation) -> str:
     text = f"# Control {item.controller}, machine {item.machine}\n\nThis control corrects {CORRECTS[item.level]}."
     if item.own is not None and item.own.left is not None:
         before, after = item.options.level("nothing").left.rigid_removed, item.own.left.rigid_removed
-        known = item.options.uncertainty
-        largest = [um_text(part.max_um, u_um=known and known.max_rigid_removed_um) for part in (before, after)]
-        rms = [um_text(part.rms_um, u_um=known and known.rms_rigid_removed_um) for part in (before, after)]
+        largest, rms = zip(*(_three(item.options, part).split(" / ")[:2] for part in (before, after)), strict=True)
         text += (
             f" Its file changes the effect of the errors found from {largest[0]} to {largest[1]} um (largest) "
             f"and from {rms[0]} to {rms[1]} um (rms over the volume), the best-fit rigid motion removed, "

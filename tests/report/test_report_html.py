@@ -416,7 +416,8 @@ def test_cells_that_controls_share_are_on_the_page_once_and_are_those_of_each(ra
     items = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[1])
     shared = {key: item["values"] for key, item in items.items() if isinstance(item.get("values"), str)}
     assert shared == {f"slice-1-before-{axis}": f"slice-0-before-{axis}" for axis in range(3)}
-    own = draw_slices(grid_of(read_folder(ran).controls[1].volume), 1, {})
+    control = read_folder(ran).controls[1]
+    own = draw_slices(grid_of(control.volume, uncertainty_um(control.result)), 1, {})
     for picture in own:
         assert picture.data["values"] == items[shared.get(picture.key, picture.key)]["values"]
 

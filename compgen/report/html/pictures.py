@@ -352,7 +352,7 @@ def draw_slices(grid: VolumeOnGrid, number: int, known: dict[bytes, str]) -> lis
             cells = {
                 "axes": [AXES[across], AXES[up]],
                 "cells": [len(edges[across]) - 1, len(edges[up]) - 1],
-                "values": rounded(errors_um.reshape(-1, 3), digits) if first == key else first,
+                "values": rounded(np.round(errors_um.reshape(-1, 3), digits), 3) if first == key else first,
             }
             note = f"{name}, at most {um_text(float(length_um.max()), whole_from=100.0, u_um=u_um)} µm"
             note += f", U {um_text(u_um)} µm" if u_um else ""
