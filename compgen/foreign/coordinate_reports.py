@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Artefact, Part
+from compgen.data.deviations import Artefact, Part, join_artefacts
 from compgen.data.files import read_bytes
 from compgen.data.names import AXES
 from compgen.errors import InputError
@@ -926,3 +926,49 @@ def _metadata(report: Report) -> dict[str, str]:
     }
     taken = ("rows", "origin_mm", "calibrated", "u_probe_um", "expansion_um_per_m_k", "measured")
     return {"source": report.path.name, **{key: value for key, value in clean.items() if key and key not in taken}}
+
+
+def merged_features(parts: Sequence[tuple[str, Imported]], options: ImportOptions) -> Imported:
+    """Return the features on several sheets of a workbook as one part or artefact; which sheets are one set-up is asked."""
+    first, setups, begin = parts[0][1], [], 1
+    for _, item in parts:
+        assert isinstance(item.data, Part | Artefact)  # the caller looked
+        _, own = np.unique(item.data.setup, return_inverse=True)
+        setups.append(own.ravel() + (1 if options.clamping == "one" else begin))
+        begin += int(own.max()) + 1
+    doubts = [f"sheet {shown(name)}: {text}" for name, item in parts for text in item.doubts]
+    if options.clamping is None:
+        doubts.append(
+            f"there are features on {len(parts)} sheets: give --clamping one (all in one set-up) or --clamping each (each sheet)"
+        )
+    setup = np.concatenate(setups).astype(np.int64)
+    found = [item.data for _, item in parts]
+    data: Part | Artefact
+    if all(isinstance(item, Part) for item in found):
+        data = _joined_parts([item for item in found if isinstance(item, Part)], setup)
+    else:
+        plates = [item for item in found if isinstance(item, Artefact)]
+        if len(plates) < len(found):
+            raise InputError("has parts and artefacts on its sheets; choose one with --sheet", file=first.path)
+        data = replace(join_artefacts(plates), setup=setup)
+    return replace(
+        first,
+        data=data,
+        understood={f"sheet {name}": dict(item.understood) for name, item in parts},
+        doubts=tuple(doubts),
+        notes=tuple(dict.fromkeys(text for _, item in parts for text in item.notes)),
+    )
+
+
+def _joined_parts(parts: Sequence[Part], setup: Any) -> Part:
+    """Return parts in the frame of the first one."""
+    origin = parts[0].origin_mm
+    shift = [part.origin_mm - origin for part in parts]
+    return replace(
+        parts[0],
+        feature=[name for part in parts for name in part.feature],
+        nominal_mm=np.concatenate([part.nominal_mm + by for part, by in zip(parts, shift, strict=True)]),
+        measured_mm=np.concatenate([part.measured_mm + by for part, by in zip(parts, shift, strict=True)]),
+        setup=setup,
+        origin=[place for part in parts for place in part.origin],
+    )

@@ -23,7 +23,15 @@ from compgen.errors import CompgenError, InputError
 from compgen.foreign.answers import TABLE_SIGNS, ImportOptions
 from compgen.foreign.cells import CellGrid, chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
-from compgen.foreign.coordinate_reports import imported_features, is_dmis, is_qif, read_dmis, read_qif, read_report
+from compgen.foreign.coordinate_reports import (
+    imported_features,
+    is_dmis,
+    is_qif,
+    merged_features,
+    read_dmis,
+    read_qif,
+    read_report,
+)
 from compgen.foreign.covariates import surroundings_of
 from compgen.foreign.error_tables import squareness_in
 from compgen.foreign.findings import (
@@ -432,7 +440,10 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
         raise InputError(
             f"no sheet contains a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
         )
-    item = merged_sheets(read)
+    features = [item for item in read if item[1].kind in ("part", "artefact")]
+    if features and len(features) < len(read):
+        raise InputError("has features of a part and other measurements; choose one sheet with --sheet", file=path)
+    item = merged_features(read, options) if len(features) > 1 else merged_sheets(read)
     return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))
 
 

@@ -296,3 +296,20 @@ def test_an_origin_that_contradicts_the_report_is_refused(tmp_path):
     path.write_text(PRINTS["blanks"], encoding="utf-8")
     with pytest.raises(InputError, match="--origin"):
         import_file(path, ImportOptions(kind="part", origin="0,0,0"))
+
+
+def test_set_ups_on_the_sheets_of_a_workbook(tmp_path):
+    from openpyxl import Workbook
+
+    book = Workbook()
+    for k, sheet in enumerate((book.active, book.create_sheet("Lage 2"))):
+        sheet.append(["Bohrung", "X Soll", "Y Soll", "X Ist", "Y Ist"])
+        for name, n, a in zip(NAMES, GRID, printed(shift=(0.01 * k, 0.0, 0.0)), strict=True):
+            sheet.append([name, n[0], n[1], round(a[0], 4), round(a[1], 4)])
+    path = tmp_path / "cmm.xlsx"
+    book.save(path)
+    assert "--clamping" in " ".join(import_file(path, PART).doubts)
+    item = import_file(path, ImportOptions(kind="part", origin="-700,-900,-250", clamping="each"))
+    assert (item.doubts, sorted(set(item.data.setup))) == ((), [1, 2])
+    both = item.data.deviations().deviation_mm[:, :2].reshape(2, len(GRID), 2)
+    assert np.allclose(both[0], both[1], atol=1e-4)  # each set-up has its own pose
