@@ -7,7 +7,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,12 +65,16 @@ class ControllerResult:
     read: ReadTables | None = None
 
 
+#: State of a control without tables, and the file in its folder that says why.
+NO_TABLES, NOT_MADE = "no_tables", "NO-TABLES.txt"
+
+
 @dataclass(frozen=True, repr=False)
 class RunResult(Drawable):
     """Outcome of :func:`run`; ``accepted`` is True if every control's tables are.
 
     ``earlier_report`` is the path to which the report of the earlier tables in the folder was moved, ``next_best`` what to
-    measure next; None where the readings determine every error.
+    measure next; None where the readings determine every error. ``failed`` says, by name, why a control has no tables.
 
     Examples
     --------
@@ -90,11 +94,12 @@ class RunResult(Drawable):
     results: tuple[ControllerResult, ...]
     earlier_report: tuple[Path, ...] = ()
     next_best: NextBest | None = None
+    failed: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
         """Whether all tables may be loaded."""
-        return all(result.verification.accepted for result in self.results)
+        return not self.failed and all(result.verification.accepted for result in self.results)
 
     def summary(self) -> dict[str, Any]:
         """Return the object that ``volcomp run --json`` prints; with one control its ``result.json`` plus the rest."""
@@ -104,9 +109,13 @@ class RunResult(Drawable):
             "identify": {**self.identification.summary(), **proposed_keys(self.next_best)},
             "paths": [str(path) for item in self.results for path in item.paths],
         }
-        if len(summaries) == 1:
+        if len(summaries) == 1 and not self.failed:
             return {**summaries[0], **common}
-        return {**common, "controllers": {item["controller"]: item for item in summaries}}
+        without = {
+            name: {"controller": name, "accepted": False, "state": NO_TABLES, "reasons": [why]}
+            for name, why in self.failed.items()
+        }
+        return {**common, "controllers": {**{item["controller"]: item for item in summaries}, **without}}
 
     def overview(self) -> Overview:
         """The verdict on the tables of each control."""
@@ -470,6 +479,27 @@ def _write_results(
 
 
 @contextmanager
+def _apart(name: str, failed: dict[str, str], of: int) -> Iterator[None]:
+    """Note why a control gets no tables, so that the others get theirs; the error of the last one that is left goes on."""
+    try:
+        yield
+    except CompgenError as error:
+        failed[name] = str(error)
+        if len(failed) == of:
+            raise
+        warnings.warn(f"{name}: no tables: {error}", CompgenWarning, stacklevel=3)
+
+
+def _add_failed(output: OutputFolder, failed: Mapping[str, str]) -> None:
+    """Add a file with the reason to the folder of every control without tables; those of an earlier run are set aside."""
+    for path in output.folder.glob(f"*/{NOT_MADE}") if output.folder.is_dir() else ():
+        if path.parent.name not in failed:
+            output.set_aside(f"{path.parent.name}/{NOT_MADE}")
+    for name, why in failed.items():
+        output.add(f"{name}/{NOT_MADE}", f"{why}\n")
+
+
+@contextmanager
 def failure_reported(folder: str | Path) -> Iterator[None]:
     """Write ``identify.json`` where the data do not determine the errors, or no optimum is found, and pass the error on.
 
@@ -558,10 +588,14 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
         raise InputError("no controller was given; give at least one")
-    for name, sub_folder in sub_folders.items():  # wrong settings are found before the work begins
+    for name, sub_folder in sub_folders.items():
         OutputFolder(Path(folder) / sub_folder)
-        controller_named(name).read_settings(machine)
-        tables.usable_format(name, templates, allow_unverified=allow_unverified)
+        controller_named(name)
+    failed: dict[str, str] = {}
+    for name in sub_folders:  # wrong settings are found before the work begins
+        with _apart(name, failed, len(sub_folders)):
+            controller_named(name).read_settings(machine)
+            tables.usable_format(name, templates, allow_unverified=allow_unverified)
     progress("reading the measurement")
     numbers = stated or StatedNumbers()
     numbers.reversal()  # wrong numbers are found before the work begins
@@ -587,44 +621,48 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     diagnosis = shlex.join(["volcomp", *words])
     checked: dict[str, tuple[Export, ReadTables, Verification, Mapping[str, str]]] = {}
     for name, sub_folder in sub_folders.items():
-        progress(f"exporting, reading back and verifying: {name}")
-        exported = tables.export(
-            machine,
-            fitted.errors,
-            name,
-            templates=templates,
-            allow_unverified=allow_unverified,
-            provenance=provenance,
-            reversal=reversal,
-            language=language,
-        )
-        read, verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
-        # findings on the measurement; those that block are also reasons against the tables
-        before, after = verification.before_rigid_removed, verification.after_rigid_removed
-        taken = (
-            tables.taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None
-        )  # else they are wrong
-        found = tables.measurement_objections(identification, taken, allow_misfit=allow_misfit)
-        reasons = dict.fromkeys([*verification.reasons, *tables.blocking_reasons(found)])
-        verification = replace(
-            verification,
-            objections=(*verification.objections, *found),
-            reasons=tuple(reasons),
-            remarks=identification.notes,
-            proposed=proposed_keys(proposed),
-        )
-        if any(item.code in tables.MISFIT_CODES for item in verification.objections):
-            verification = replace(verification, next_command=diagnosis)
-        extra_files = tables.check_files(
-            machine, exported, identification.errors, templates, reversal, language, read, known
-        )
-        exported = tables.with_known(exported, verification.known_lines, language)
-        checked[sub_folder] = exported, read, verification, extra_files
+        if name in failed:
+            continue
+        with _apart(name, failed, len(sub_folders)):
+            progress(f"exporting, reading back and verifying: {name}")
+            exported = tables.export(
+                machine,
+                fitted.errors,
+                name,
+                templates=templates,
+                allow_unverified=allow_unverified,
+                provenance=provenance,
+                reversal=reversal,
+                language=language,
+            )
+            read, verification = verified_export(machine, exported, identification.errors, reversal, limits, known)
+            # findings on the measurement; those that block are also reasons against the tables
+            before, after = verification.before_rigid_removed, verification.after_rigid_removed
+            taken = (
+                tables.taken_away_um(before.rms_um, after.rms_um) if verification.accepted else None
+            )  # else they are wrong
+            found = tables.measurement_objections(identification, taken, allow_misfit=allow_misfit)
+            reasons = dict.fromkeys([*verification.reasons, *tables.blocking_reasons(found)])
+            verification = replace(
+                verification,
+                objections=(*verification.objections, *found),
+                reasons=tuple(reasons),
+                remarks=identification.notes,
+                proposed=proposed_keys(proposed),
+            )
+            if any(item.code in tables.MISFIT_CODES for item in verification.objections):
+                verification = replace(verification, next_command=diagnosis)
+            extra_files = tables.check_files(
+                machine, exported, identification.errors, templates, reversal, language, read, known
+            )
+            exported = tables.with_known(exported, verification.known_lines, language)
+            checked[sub_folder] = exported, read, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
     identified = identification_files(identification, provenance, proposed=proposed)
     covered = identified.get(covariance.FILE_NAME)
     own = (covariance.FILE_NAME, covered) if isinstance(covered, bytes) else None
     add_identification(output, {**identified, **fit_files(fitted, own), **evidence})
+    _add_failed(output, failed)
     results, earlier_report = _write_results(output, checked)
-    return RunResult(identification, fitted, tuple(results), earlier_report, proposed)
+    return RunResult(identification, fitted, tuple(results), earlier_report, proposed, failed)

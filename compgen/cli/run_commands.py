@@ -218,7 +218,7 @@ def run_command(
         print_json({**result.summary(), "report": None if report is None else str(report)})
     else:
         stdout.print(identification_table(result.identification, assumed=False))
-        stdout.print(verification_table([item.verification for item in result.results]))
+        stdout.print(verification_table([item.verification for item in result.results], result.failed))
         stdout.print(advice_text(result.identification, result.next_best))
         for item in result.results:
             say_paths(item.paths)

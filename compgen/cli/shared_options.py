@@ -50,8 +50,11 @@ def open_machine(
             if whole or not shipped or controller not in CONTROLLERS:
                 check_settings(machine, controller)
         except InputError as error:
-            if whole or controller in in_use or (in_use and controller not in CONTROLLERS):
+            misspelt = bool(in_use) and controller not in CONTROLLERS
+            if whole or misspelt or (controller in in_use and len(in_use) == 1):
                 raise
+            if controller in in_use:  # of several controls the others get their tables; this one says why it gets none
+                continue
             warnings.warn(f"{error}. This command does not use these settings", CompgenWarning, stacklevel=2)
     if machine.effects:
         effects.active_effects(machine)

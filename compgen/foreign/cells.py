@@ -675,7 +675,8 @@ def _check_archive(path: Path) -> None:
             members = archive.infolist()
             names = {member.filename for member in members}
             if "[Content_Types].xml" not in names or not any(name.startswith("xl/") for name in names):
-                raise InputError("is a zip archive but not an .xlsx workbook", file=path)
+                text = "is a zip archive but not an .xlsx workbook; if it is the backup of a control, unpack it and give its "
+                raise InputError(f"{text}files to 'volcomp read', or to run with --active", file=path)
             declared = sum(member.file_size for member in members)
             if len(members) > MOST_MEMBERS or declared > MOST_UNPACKED:
                 text = f"unpacks to {declared / MEGABYTE:.0f} MB in {len(members)} parts; at most "

@@ -47,12 +47,22 @@ _MARKS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff",
 _BINARY = (
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook (.xls) or one with a password; save it as .xlsx without a password"),
     (b"%PDF", "a PDF; export the numbers as text or .xlsx"),
-    (b"\x1f\x8b", "compressed (gzip); unpack it first"),
+    (b"\x1f\x8b", "compressed (gzip); unpack it first (the archive of a control: then volcomp read, or --active)"),
     (b"7z\xbc\xaf", "compressed (7z); unpack it first"),
     (b"Rar!", "compressed (rar); unpack it first"),
     (b"\x89PNG", "a picture; give the numbers as text or .xlsx"),
     (b"\xff\xd8\xff", "a picture; give the numbers as text or .xlsx"),
 )
+#: Files of controls by what a line begins with, the control, and the name of a reader of their tables.
+_BACKUPS = (
+    (re.compile(rb"(?m)^\s*(?:N\d+\s+)?\$(?:AN|AA|MA|MN|MC|MM|SN|SC|SA)_\w+|^\s*CHANDATA\s*\(|\0_N_\w+_INI"), "SINUMERIK",
+     "siemens-cec"),
+    (re.compile(rb"(?m)^\s*PARA1\d\d\(\)|^\s*N4\d{3}P-?\d"), "Mitsubishi", "mitsubishi"),
+    (re.compile(rb"(?m)^\s*N\d{4,5}\s?[QALTSP]\d{1,4}\s?[APLM]-?\d"), "FANUC", "fanuc-pitch"),
+    (re.compile(rb"(?im)^\s*BEGIN\s+\S+\.(?:COM|CMA)\b"), "HEIDENHAIN", "heidenhain-com"),
+    (re.compile(rb"(?m)^\s*kw\.ssfk"), "TwinCAT or ISG", "twincat-lists"),
+    (re.compile(rb"(?im)^[^;\n]*\bDEFINE\s+COMP\b"), "PMAC", "pmac"),
+)  # fmt: skip
 _MARKUP = ("<?xml", "<!doctype", "<html", "<svg")
 
 
@@ -101,6 +111,14 @@ def read_head(path: Path) -> bytes:
     for mark, what in _BINARY:
         if head.startswith(mark):
             raise InputError(f"is {what}", file=path)
+    for pattern, control, reader in _BACKUPS:
+        if pattern.search(head):
+            text = (
+                f"is a backup or a table of a {control} control, not a measurement: 'volcomp read MACHINE FILE --controller "
+                f"{reader} --points POINTS --out OUT' shows what it does, and run and identify take it with --active FILE as the "
+                "compensation that was on while the machine was measured"
+            )
+            raise InputError(text, file=path)
     return head
 
 
@@ -123,7 +141,8 @@ def read_source(path: Path, encodings: Sequence[str] = ENCODINGS, most: int = MO
         raise InputError("is XML or HTML; export the numbers as text (CSV) or .xlsx", file=path)
     if "\0" in text:
         line = text[: text.index("\0")].count("\n") + 1
-        raise InputError("contains NUL bytes: it is not text, or was not written completely", file=path, line=line)
+        why = "contains NUL bytes: it is not text, or was not written completely; the backup of a control goes to 'volcomp read'"
+        raise InputError(f"{why}, or to run with --active", file=path, line=line)
     check_lines(text, path)
     return Text(path, text, encoding)
 

@@ -208,14 +208,17 @@ def _uncertainty(results: Sequence[Verification]) -> str:
     )
 
 
-def verification_table(results: Sequence[Verification]) -> Group:
+def verification_table(results: Sequence[Verification], failed: Mapping[str, str] | None = None) -> Group:
     """Return before and after for every control, read from its files, and why tables were not accepted.
 
-    What is assumed of errors that were not measured is the same for all of them, and is said once.
+    What is assumed of errors that were not measured is the same for all of them, and is said once. ``failed`` says, by name,
+    why a control has no tables.
     """
-    table = _probable_table(results) if all(item.gain is not None for item in results) else _file_table(results)
+    lacking = tuple(failed or ())
+    probable = all(item.gain is not None for item in results)
+    table = _probable_table(results, lacking) if probable else _file_table(results, lacking)
     common = list(dict.fromkeys(text for item in results for text in item.assumptions))
-    notes: list[Text] = []
+    notes = [Text(f"{name}: no tables: {one_line(why)}", "red") for name, why in (failed or {}).items()]
     for item in results:
         notes += _notes(item, common)
         if item.next_command:
@@ -259,7 +262,7 @@ def _table_of_controls(title: str, *headings: str) -> Table:
     return table
 
 
-def _probable_table(results: Sequence[Verification]) -> Group:
+def _probable_table(results: Sequence[Verification], lacking: Sequence[str] = ()) -> Group:
     """Return before and after with the limits that measurement and prior leave."""
     title = "tool tip error over the volume, um rms, with what was not measured (97.5 % limits)"
     table = _table_of_controls(title, "before", "after", "at most", "after*", "at most*", "by the files", "at best")
@@ -277,6 +280,8 @@ def _probable_table(results: Sequence[Verification]) -> Group:
             um_text(item.unrepresentable_um, u_um=None if known is None else known.max_um),
             Text(*VERDICTS[item.state]),
         )
+    for name in lacking:
+        table.add_row(name, *["–"] * 7, Text("NO TABLES", "red"))
     legend = (
         "before, after: with the reference point fixed; after*: with the best-fit rigid motion of the workpiece removed; by the "
         "files: largest / rms that the tables, read back, leave of the errors found; at best: the largest with the best "
@@ -285,7 +290,7 @@ def _probable_table(results: Sequence[Verification]) -> Group:
     return Group(table, Text(legend))
 
 
-def _file_table(results: Sequence[Verification]) -> Group:
+def _file_table(results: Sequence[Verification], lacking: Sequence[str] = ()) -> Group:
     """Return before and after of the errors found, as read back from the files: nothing is known of other errors."""
     volumetric = all(item.volumetric for item in results)
     what = "tool tip error over the volume" if volumetric else "effect of the measured errors alone on the tool tip"
@@ -302,6 +307,8 @@ def _file_table(results: Sequence[Verification]) -> Group:
             um_text(item.unrepresentable_um),
             Text(*VERDICTS[item.state]),
         )
+    for name in lacking:
+        table.add_row(name, *["–"] * 5, Text("NO TABLES", "red"))
     legend = (
         "before, after: with the reference point fixed; before*, after*: with the best-fit rigid motion of the "
         "workpiece removed; at best: the largest error with the best possible table of this control"

@@ -445,10 +445,15 @@ def test_siemens_cec_without_the_mode_of_its_products_asks_for_it(
 ):
     machine = bad_machine(tmp_path, small_machine_file, 'mult_mode = "S1"', "products = true")
     before = listing(tmp_path)
-    words = ("--controller", "isg-csv", "--controller", "siemens-cec", "--out", tmp_path / "out")
-    code, stdout, stderr = call("run", machine, small_lengths_file, *words)
-    check_refused(code, stdout, stderr, 'set e.g. mult_mode = "S1", or set products = false')
+    wanted = 'set e.g. mult_mode = "S1", or set products = false'
+    words = ("--controller", "siemens-cec", "--out", tmp_path / "out")
+    check_refused(*call("run", machine, small_lengths_file, *words), wanted)
     assert listing(tmp_path) == before
+    # beside another control, that one gets its tables
+    code, _, stderr = call("run", machine, small_lengths_file, "--controller", "isg-csv", *words, "--no-report")
+    assert code == 1
+    assert f"siemens-cec: no tables: {machine}" in stderr and wanted in stderr
+    assert (tmp_path / "out" / "isg-csv" / "result.json").is_file()
 
 
 def test_two_machines_with_one_name_are_refused_where_that_name_is_used(call, small_machine_file, tmp_path):

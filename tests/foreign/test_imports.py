@@ -552,3 +552,32 @@ def test_no_damage_to_a_file_ends_in_anything_but_an_answer(tmp_path, name):
         except InputError:
             continue
         assert item.files()
+
+
+BACKUPS = {
+    "siemens-cec": [
+        b"%_N_NC_CEC_INI\n$AN_CEC[0,0]=0.001\n$AN_CEC[0,1]=0.002\n",
+        b"\0\0\x03_N_NC_CEC_INI\0\0\r\nCHANDATA(1)\r\n$MA_CEC_ENABLE[AX1]=1\r\n",
+        b"; axis data\nN38000 $MA_MM_ENC_COMP_MAX_POINTS[0,AX1]=100\n",
+    ],
+    "fanuc-pitch": [b"%\nN03620Q1A1P40A2P140\n", b"%\nN05711Q1L1P0L2P0\n"],
+    "mitsubishi": [b"%\n; M80\nPARA101()\nN4001PX\nN4007P12.000\n"],
+    "heidenhain-com": [b"BEGIN AXIS_X.COM MM\n0 0.000 0.001\nEND AXIS_X.COM MM\n"],
+    "pmac": [b"#4 DEFINE COMP 24 #20,#20,60000000\n0,1,2,3\n"],
+}
+
+
+@pytest.mark.parametrize(("control", "content"), [(name, text) for name, texts in BACKUPS.items() for text in texts])
+def test_the_backup_of_a_control_is_named_and_where_it_belongs(tmp_path, control, content):
+    path = tmp_path / "backup.txt"
+    path.write_bytes(content)
+    for reading in (import_file, lambda file: open_measurement([file]), open_errors):
+        with pytest.raises(InputError, match=rf"backup.*volcomp read .*--controller {control} .*--active"):
+            reading(path)
+
+
+def test_a_zip_archive_that_is_no_workbook_may_be_a_backup(tmp_path):
+    with zipfile.ZipFile(tmp_path / "backup.zip", "w") as archive:
+        archive.writestr("a.ini", "$AN_CEC[0,0]=0.001\n")
+    with pytest.raises(InputError, match="--active"):
+        import_file(tmp_path / "backup.zip")

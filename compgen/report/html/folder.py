@@ -22,6 +22,7 @@ from compgen.data.machine import Machine, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError, one_line
 from compgen.identify.any_measurement import MEASURED_WITH
+from compgen.pipeline import NOT_MADE
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector
 from compgen.tables.verification import ERROR_DECIMALS, POSITION_DECIMALS, Verification
@@ -150,6 +151,8 @@ def read_folder(folder: str | Path, known: KnownTables | None = None) -> ResultF
     kind = _kind(base, control_folders)
     notes: list[str] = []
     machine = _machine(base, notes)
+    for path in sorted(base.glob(f"*/{NOT_MADE}")):  # a control whose tables could not be made beside those of others
+        notes.append(f"{path.parent.name}: no tables: {read_text(path).strip()}")
     # Accepted tables first, partial ones after those, rejected ones last.
     return ResultFolder(
         base,
