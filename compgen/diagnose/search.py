@@ -216,6 +216,7 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
         chunks[-1].append(own)
         widths[-1] += source.width
     reduced: dict[int, tuple[FloatArray, FloatArray, float]] = {}
+    of_white = float(residual @ residual) / max(float(fit.residual_mm @ fit.residual_mm), 1e-300)
     space = np.empty((2, len(residual) * max(widths, default=0)))
     for chunk, width in zip(chunks, widths, strict=True):
         # less the mean on each channel, which a dead length would absorb
@@ -228,7 +229,11 @@ def design_of(fit: BaseFit, groups: Sequence[Group], whiten: Whitener) -> Design
             source = groups[of[0]].source
             source.columns(columns[:, at : at + source.width])
             at += source.width
+        size_raw = np.einsum("nk,nk->k", columns, columns)
         whiten(columns, less=mean, out=tall)
+        # a column that is constant on each channel (an axis that stood still) leaves its rounding behind
+        nothing = np.einsum("nk,nk->k", tall, tall) < ROUNDING**2 * size_raw * of_white
+        tall[:, nothing], seen[:, nothing] = 0.0, 0.0
         whole = np.einsum("nk,nk->k", tall, tall)
         left = np.maximum(whole - np.einsum("pk,pk->k", seen, seen), 0.0)
         shares, at = np.sqrt(left / np.where(whole > 0.0, whole, np.inf)), 0
