@@ -25,6 +25,7 @@ from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine
 from compgen.diagnose import AxisDiagnosis, CircleDiagnosis, DiagnoseOptions, Diagnosis, diagnose
 from compgen.diagnose.diagnose import SixDofDiagnosis, diagnose_sixdof, sixdof_text
+from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
 from compgen.diagnose.observed import read_diagnosed
 from compgen.diagnose.page import diagnosis_files, next_steps, summary
 from compgen.errors import CompgenError, InputError
@@ -66,7 +67,7 @@ class DiagnosedMeasurement:
 
 def diagnosed(
     request: DiagnoseRequest, measurements: Sequence[Path], show: Show
-) -> tuple[Diagnosis | AxisDiagnosis | CircleDiagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
+) -> tuple[Diagnosis | AxisDiagnosis | CircleDiagnosis | FeatureDiagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
     """Diagnose files as one measurement; return the diagnosis and its files by name."""
     if request.instrument is None:
         found = diagnose(request.machine, read_diagnosed(measurements), request.options, show=show)
@@ -143,10 +144,11 @@ def diagnose_command(
 ) -> int:
     """Find where model and measurement disagree, name the missing effect, add it, and check that the misfit shrinks.
 
-    MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv, *.axis.csv or *.circle.csv files (um), or *.sixdof.csv files
-    (mm) with --instrument, which are checked for errors of the instrument itself. Writes diagnosis.json, diagnosis.md, pages with
-    pictures (index.html), and extended.toml: the machine with the effects that were found, to be used as MACHINE in the
-    next command. For axis runs (ISO 230-2) also removed.csv: what was subtracted from each reading.
+    MEASUREMENTS are *.lengths.csv (mm), *.deviations.csv, *.axis.csv or *.circle.csv files (um), *.part.csv or
+    *.artefact.csv files (mm), or *.sixdof.csv files (mm) with --instrument, which are checked for errors of the
+    instrument itself. Writes diagnosis.json, diagnosis.md, pages with pictures (index.html), and extended.toml: the
+    machine with the effects that were found, to be used as MACHINE in the next command. For axis runs (ISO 230-2) also
+    removed.csv: what was subtracted from each reading.
 
     --each diagnoses every file separately; --workers and --cluster distribute them.
 

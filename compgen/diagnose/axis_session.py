@@ -91,7 +91,7 @@ class AxisSession:
     @property
     def least_mm(self) -> float:
         """Least standard deviation of a reading, mm: that of rounding to the step of the readings."""
-        return max(LEAST_MM, self.step_mm / 12.0**0.5)
+        return max(LEAST_MM, self.step_mm / float(np.sqrt(12.0)))
 
     @property
     def targets_mm(self) -> FloatArray:

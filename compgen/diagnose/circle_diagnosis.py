@@ -300,18 +300,22 @@ def sharpened(make: Callable[[float], CircleCandidate], space: CircleSpace, at: 
     return replace(make(math.exp(0.5 * (low + high))), make=make)
 
 
+def _explained(make: Callable[[float], CircleCandidate], space: CircleSpace, setting: float) -> float:
+    return space.gain(make(setting).columns)
+
+
 def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space: CircleSpace) -> list[CircleCandidate]:
     """Spikes and periodic errors of every axis, with the settings that explain most beside ``space``."""
     found: list[CircleCandidate] = []
     axes = [axis for axis in range(3) if np.any(circles.radial()[:, axis])]
     speed = angular_speed(circles)
-    grid = SPIKE_DEG if speed is None else SPIKE_MS
+    grid: tuple[float, ...] = SPIKE_DEG if speed is None else SPIKE_MS
     if speed is not None:  # the slower the circle, the longer a spike of the same angle
         longer = [SPIKE_MS[-1] * 2.0**k for k in range(1, 9)]
         grid = (*SPIKE_MS, *(ms for ms in longer if float(speed.min()) * ms * 1e-3 < MOST_SPIKE_RAD))
     for axis in axes:
         make = partial(spike, circles, axis, len(grid))
-        best = max(grid, key=lambda decay, make=make: space.gain(make(decay).columns))
+        best = max(grid, key=partial(_explained, make, space))
         found.append(sharpened(make, space, best, 2.0))
     # with the spikes that matter, so that a short period does not take their place
     strong = [item.columns for item in found if space.gain(item.columns) > 0.1 * float(space.left @ space.left)]
@@ -747,7 +751,7 @@ def changing(circles: Circles, space: CircleSpace) -> list[CircleCandidate]:
             continue
         share = (time - time[own].min()) / max(float(np.ptp(time[own])), 1e-9)
         make = partial(drift, plane, own, share)
-        best = max(DRIFT_SHARES, key=lambda tau, make=make: space.gain(make(tau).columns))
+        best = max(DRIFT_SHARES, key=partial(_explained, make, space))
         worth = space.gain(make(best).columns) > SEARCHED_SHARE * float(space.left @ space.left)
         found.append(sharpened(make, space, best, 2.0) if worth else make(best))
         keys = np.column_stack([circles.setup, circles.radius_mm, circles.run, circles.direction])[own]
@@ -764,7 +768,7 @@ def changing(circles: Circles, space: CircleSpace) -> list[CircleCandidate]:
 
 def price(circles: Circles, item: CircleCandidate) -> float:
     """Chi-square that every parameter beyond the first has to bring: four columns always fit better than one."""
-    return (item.columns.shape[1] - 1) * math.log(len(circles))
+    return float((item.columns.shape[1] - 1) * math.log(len(circles)))
 
 
 def chosen_of(
@@ -810,12 +814,12 @@ def chosen_of(
             rest = [one for one in named if one is not item]
             space, others = beside(rest), [one for one in allowed if one not in rest]
             own = worth(item, space)
-            best = max(others, key=lambda one, space=space: worth(one, space))
+            best = max(others, key=partial(worth, space=space))
             named = [*rest, best if worth(best, space) > own + ALIKE_CHI2 else item]
         space, others = beside(named), [one for one in allowed if one not in named]
-        best = max(others, key=lambda one, space=space: worth(one, space), default=None)
-        if best is not None and worth(best, space) > 0.0 and len(named) < most + len(forced):
-            named.append(best)
+        more = max(others, key=partial(worth, space=space), default=None)
+        if more is not None and worth(more, space) > 0.0 and len(named) < most + len(forced):
+            named.append(more)
         if [item.name for item in named] == before:
             break
     for item in [one for one in reversed(named) if one not in forced]:

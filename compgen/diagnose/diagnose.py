@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import Circles
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations
+from compgen.data.deviations import PART, Artefact, Deviations
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
@@ -26,6 +26,7 @@ from compgen.diagnose.axis_session import Order
 from compgen.diagnose.base_fit import BaseFit, CurveBasis, base_errors, fit_base, least_norm
 from compgen.diagnose.circle_diagnosis import CircleDiagnosis, diagnose_circles
 from compgen.diagnose.diagnosis import Classed, Diagnosis, misfit_before_after, refit
+from compgen.diagnose.feature_diagnosis import FeatureDiagnosis, diagnose_features
 from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.layout import IntArray, MeasurementLayout
 from compgen.diagnose.noise_model import difference_matrix
@@ -434,13 +435,13 @@ def diagnose(
     options: DiagnoseOptions | None = None,
     *,
     show: Show = lambda _: None,
-) -> Diagnosis | AxisDiagnosis | CircleDiagnosis:
+) -> Diagnosis | AxisDiagnosis | CircleDiagnosis | FeatureDiagnosis:
     """Diagnose a measurement.
 
     Parameters
     ----------
     machine : kinematic chain, travel, and the errors that its model contains.
-    measurement : tracer lengths, measured deviations, axis runs, or circles.
+    measurement : tracer lengths, measured deviations, axis runs, circles, features of a part, or an artefact.
     options : options of the diagnosis.
     show : called with a description of each step.
 
@@ -464,6 +465,12 @@ def diagnose(
             u_um=chosen.u_um,
             show=show,
         )
+    if isinstance(measurement, Artefact) or (
+        isinstance(measurement, Deviations) and measurement.metadata.get("measured") == PART
+    ):
+        if chosen.against is not None or chosen.effects or chosen.add:
+            raise InputError("--against, --effects and --add cannot be used with features of parts and artefacts")
+        return diagnose_features(machine, measurement, most=chosen.max_effects, u_um=chosen.u_um, show=show)
     known = catalogue(measurement.stations if isinstance(measurement, Lengths) else ())
     for name in chosen.effects:
         if name not in known:

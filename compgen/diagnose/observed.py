@@ -14,7 +14,7 @@ from compgen.data.axis_runs import AxisRuns, read_axis_runs
 from compgen.data.circles import Circles, read_circles
 from compgen.data.comparison import rigid_fields
 from compgen.data.csv_files import FloatArray
-from compgen.data.deviations import Deviations, read_deviations
+from compgen.data.deviations import Artefact, Deviations, read_artefacts, read_deviations, read_parts
 from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.records import detect_format
@@ -222,11 +222,11 @@ class ObservedDeviations(Observed):
 # Measurements that can be diagnosed, distinguished by the columns of their files.
 
 
-Measurement = Lengths | Deviations | AxisRuns | Circles
+Measurement = Lengths | Deviations | AxisRuns | Circles | Artefact
 
 
 def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
-    """Read measurement files of one kind: tracer lengths, measured deviations, axis runs or circles."""
+    """Read measurement files of one kind: tracer lengths, deviations, axis runs, circles, parts or artefacts."""
     kinds = {path: _kind(path) for path in paths}
     if len(set(kinds.values())) > 1:
         odd = next(path for path, kind in kinds.items() if kind != kinds[paths[0]])
@@ -237,6 +237,10 @@ def read_diagnosed(paths: Sequence[str | Path]) -> Measurement:
         return read_axis_runs(files)
     if kind == "circles":
         return read_circles(files)
+    if kind == "features of a part":
+        return read_parts(files)
+    if kind == "an artefact":
+        return read_artefacts(files)
     return read_deviations(files) if kind == "deviations" else read_lengths(files)
 
 
@@ -247,9 +251,8 @@ def _kind(path: str | Path) -> str:
             "contains six-DOF readings, which need the constants of their instrument; give --instrument FILE (TOML)"
         )
         raise InputError(message, file=path)
-    others = {"part": "features of a part", "artefact": "an artefact", "errors": "errors"}
-    if kind in others:
-        known = "lengths, deviations, axis runs and circles"
-        message = f"contains {others[kind]}, which only identify can read; diagnose reads {known}"
-        raise InputError(message, file=path)
-    return {"axis": "axis runs", "circle": "circles", "deviations": "deviations"}.get(str(kind), "lengths")
+    if kind == "errors":
+        known = "lengths, deviations, axis runs, circles, parts and artefacts"
+        raise InputError(f"contains errors, which only identify can read; diagnose reads {known}", file=path)
+    words = {"axis": "axis runs", "circle": "circles", "part": "features of a part", "artefact": "an artefact"}
+    return {**words, "deviations": "deviations"}.get(str(kind), "lengths")

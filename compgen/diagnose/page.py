@@ -25,6 +25,7 @@ from compgen.data.names import MM_PER_UM
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
 from compgen.diagnose.circle_diagnosis import CircleDiagnosis
 from compgen.diagnose.diagnosis import Diagnosis
+from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
 from compgen.diagnose.search import gains, remainder_of
 
 # Figures of a diagnosis: residuals before and after over all quantities they may depend on, and the suspects.
@@ -342,10 +343,13 @@ def _list(title: str, items: list[str]) -> str:
 # The files of a diagnosis: JSON, text, extended machine.
 
 
-def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis) -> dict[str, str]:
+def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis | FeatureDiagnosis) -> dict[str, str]:
     """Return the content of each file, keyed by file name."""
     data = found.to_dict()
     files = {"diagnosis.json": json_text(data), "diagnosis.md": summary(found.machine.name, data, markdown=True)}
+    if isinstance(found, FeatureDiagnosis):
+        title = f"Diagnosis of {found.machine.name}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
+        return {**files, "index.html": _page(title, [_effects(data), _misfit(data)], data)}
     if isinstance(found, CircleDiagnosis):
         extended = found.extended()
         return {**files, "index.html": circle_page(found, data), **({"extended.toml": extended} if extended else {})}
