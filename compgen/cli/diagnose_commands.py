@@ -27,7 +27,7 @@ from compgen.diagnose import AxisDiagnosis, CircleDiagnosis, DiagnoseOptions, Di
 from compgen.diagnose.diagnose import SixDofDiagnosis, diagnose_sixdof, sixdof_text
 from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
 from compgen.diagnose.observed import read_diagnosed
-from compgen.diagnose.page import diagnosis_files, next_steps, summary
+from compgen.diagnose.page import diagnosis_files, next_steps, summary, told
 from compgen.errors import CompgenError, InputError
 from compgen.instruments.sixdof_instrument import read_instrument, read_sixdof
 from compgen.kinematics.kernel_switch import one_thread
@@ -172,9 +172,9 @@ def diagnose_command(
         files.add(name, content)
     files.commit()
     if as_json:
-        print_json(found.to_dict())
+        print_json(told(found.to_dict()))
     else:
-        data = found.to_dict()
+        data = told(found.to_dict())
         say(str(contents["diagnosis.md"]) if instrument is not None else summary(machine.name, data, markdown=False))
         steps = next_steps(contents, str(machine.source or machine.name), " ".join(map(str, measurements)), str(out))
         if steps:

@@ -34,7 +34,7 @@ from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.errors import InputError
 
 #: Degrees of freedom beside pose and machine that a diagnosis needs.
-LEAST_FREEDOM = 6
+LEAST_FREEDOM = 8
 #: Gain beyond the price that a name needs; criteria closer than this are alternatives (99 %).
 LEAST_GAIN, ALIAS = 9.0, 9.2
 #: What every name beyond the first must gain in addition.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container, Mapping, Sequence
 from html import escape
 from typing import Any
@@ -206,9 +207,15 @@ def page_of(found: Diagnosis, data: dict[str, Any]) -> str:
         picture_grid(residual_pictures(found)),
         "<h2>Over the volume</h2>",
         picture_grid(volume_pictures(found)),
-        "<h2>Suspects</h2>",
-        picture_grid([suspects_picture(ranked, {item.name for item in found.verdict.named})], "wide") if ranked else "",
-        f"<table><tr><th>candidate effect</th><th>chi-square alone</th><th>visible</th></tr>{rows}</table>",
+        _folded(
+            "Statistics: what each candidate explains by itself",
+            [
+                picture_grid([suspects_picture(ranked, {item.name for item in found.verdict.named})], "wide")
+                if ranked
+                else "",
+                f"<table><tr><th>candidate effect</th><th>chi-square alone</th><th>visible</th></tr>{rows}</table>",
+            ],
+        ),
     ]
     return _page(title, parts, data)
 
@@ -262,10 +269,17 @@ def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
     """The page with its parts and the common end of all pages."""
     parts = [
         f"<h1>{escape(title)}</h1>",
+        f"<p><b>{escape(data['headline'])}</b></p><p>{escape(data['left_over'])}</p>",
+        _list("What to do next", data["next_steps"]),
         *parts,
-        _list("What to measure next", data["advice"]),
-        _list("What this measurement cannot show", data["invisible"]),
         _list("Notes", [*data["reasons"], *data["notes"]]),
+        _folded(
+            "Further measurements, and what this one cannot show",
+            [
+                _list("Further measurements", [text for text in data["advice"] if text not in data["next_steps"]]),
+                _list("What this measurement cannot show", data["invisible"]),
+            ],
+        ),
     ]
     style, script, policy = page_assets("charts.js")
     head = f'<meta charset="utf-8"><meta http-equiv="Content-Security-Policy" content="{policy}">'
@@ -275,6 +289,11 @@ def _page(title: str, parts: list[str], data: dict[str, Any]) -> str:
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head><body>\n{body}\n<script>{script}</script></body></html>\n'
     )
+
+
+def _folded(title: str, parts: list[str]) -> str:
+    text = "".join(parts)
+    return f"<details><summary>{escape(title)}</summary>{text}</details>" if text else ""
 
 
 def _effects(data: dict[str, Any]) -> str:
@@ -340,12 +359,105 @@ def _list(title: str, items: list[str]) -> str:
     return f"<h2>{escape(title)}</h2><ul>" + "".join(f"<li>{escape(item)}</li>" for item in items) + "</ul>"
 
 
+# What comes first: one sentence, what is left over against the noise, and at most three steps, the most useful first.
+
+
+#: Names that a terminal lists.
+MOST_HIDDEN = 6
+#: Number of next steps.
+MOST_STEPS = 3
+#: Residuals within this factor of the noise are noise.
+LIKE_NOISE = 1.15
+SURE = {"confirmed": "sure", "beside_unknown": "sure, beside something without a name", "tentative": "not certain"}
+SECONDS_PER_MIN = 60.0
+
+
+def told(data: dict[str, Any]) -> dict[str, Any]:
+    """The content of ``diagnosis.json`` with the sentence and the steps that a page begins with."""
+    steps = [text for item in _ranked(data) if item["grade"] != "tentative" and (text := _action(item))]
+    steps = list(dict.fromkeys([*steps[: MOST_STEPS - 1], *data["advice"], *steps]))[:MOST_STEPS]
+    return {**data, "headline": _headline(data), "left_over": _left_over(data["gap"]), "next_steps": steps}
+
+
+def _ranked(data: dict[str, Any]) -> list[dict[str, Any]]:
+    """The effects, sure ones first, in the order in which they were found."""
+    return sorted(data["effects"], key=lambda item: list(SURE).index(item["grade"]))
+
+
+def _headline(data: dict[str, Any]) -> str:
+    if data["verdict"] == "not_decidable":
+        return f"Not decidable: {'; '.join(data['reasons']) or 'see the notes'}."
+    effects = _ranked(data)
+    firm = [item for item in effects if item["grade"] != "tentative"]
+    if firm:
+        rest = f", and {len(firm) - 1} more" if len(firm) > 1 else ""
+        return f"{_what(firm[0])} ({SURE[firm[0]['grade']]}){rest}: {_briefly(_action(firm[0]))}."
+    if data["unknown"]:
+        step = data["advice"][0] if data["advice"] else "measure again, everything twice"
+        return f"Something that no known effect explains: {data['unknown'][0]['text']}. Next: {step}."
+    if effects:
+        return f"Perhaps {_what(effects[0])} (not certain: {'; '.join(effects[0].get('reasons', [])) or 'no repeats'})."
+    return "Nothing is wrong that these readings show beyond their noise."
+
+
+def _what(item: Mapping[str, Any]) -> str:
+    """Name and amount of an effect in words."""
+    if item.get("text"):
+        return f"{item['name']}: {item['text']}"
+    values = [
+        f"{key} = {entry['value']:.3g} +- {entry['u']:.1g}" for key, entry in item["parameters"].items() if entry["u"]
+    ]
+    return f"{item['name']}, {', '.join(values[:2])}" if values else str(item["name"])
+
+
+def _action(item: Mapping[str, Any]) -> str:
+    """What to do about an effect, with the number for the control or the clock where there is one."""
+    name, values = item["name"], {key: entry["value"] for key, entry in item["parameters"].items()}
+    todo = str(item.get("what_to_do") or "")
+    if name.startswith("backlash_") and "c_um" in values:
+        number = -2.0 * values["c_um"]
+        sense = "stops short of its target" if number > 0 else "goes beyond its target"
+        return (
+            f"{name[-1]} {sense} by {abs(number):.3g} um after each reversal: enter {number:+.3g} um as its backlash where the "
+            "control counts play as positive (SINUMERIK MD32450, Fanuc 1851 in detection units), in addition to what is there; "
+            f"or export it (volcomp run);{todo.partition(';')[2] or ' check screw, nut and bearings'}"
+        )
+    if name == "warmup_drift" and in_seconds(item):
+        return f"warm up for {3 * values['tau'] / SECONDS_PER_MIN:.0f} minutes (three time constants); {todo}"
+    return todo
+
+
+def _briefly(action: str) -> str:
+    """The first part of what to do; all of it is in the steps."""
+    return re.split(r"; | where the control| \(", action)[0]
+
+
+def in_seconds(item: Mapping[str, Any]) -> bool:
+    """Whether the time constant of a warm-up is in seconds: its text says so where times were logged."""
+    return "tau" in item["parameters"] and re.search(r"time constant [0-9.e+]+ s\b", item.get("text", "")) is not None
+
+
+def _left_over(gap: Mapping[str, Any]) -> str:
+    """Whether what is left equals the noise, and where that is from."""
+    floor, after = gap["noise_floor_um"], gap["train"]["after_rms_um"]
+    if not floor or after is None:
+        return ""
+    source = {"repeats": "from the repeats", "stated": "as stated", "residuals": "from what is left itself"}.get(
+        gap["noise_floor_source"], f"{gap['noise_floor_source']}"
+    )
+    held = gap.get("heldout_lines") or gap.get("heldout_times")
+    out = f", {held['after_rms_um']:.3g} um on readings left out" if held else ""
+    if after <= LIKE_NOISE * floor:
+        return f"What is left ({after:.3g} um rms{out}) is the noise of the instrument ({floor:.3g} um, {source})."
+    return f"What is left ({after:.3g} um rms{out}) is {after / floor:.1f} times the noise ({floor:.3g} um, {source})."
+
+
 # The files of a diagnosis: JSON, text, extended machine.
 
 
 def diagnosis_files(found: Diagnosis | AxisDiagnosis | CircleDiagnosis | FeatureDiagnosis) -> dict[str, str]:
     """Return the content of each file, keyed by file name."""
-    data = found.to_dict()
+    data = told(found.to_dict())
     files = {"diagnosis.json": json_text(data), "diagnosis.md": summary(found.machine.name, data, markdown=True)}
     if isinstance(found, FeatureDiagnosis):
         title = f"Diagnosis of {found.machine.name}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
@@ -385,7 +497,7 @@ def next_steps(files: Container[str], machine: str, measurement: str, out: str) 
 def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
     """Return the report of a diagnosis (the content of ``diagnosis.json``), as Markdown or as plain text."""
     title = f"Diagnosis of {machine}: {IN_WORDS.get(data['verdict'], data['verdict'])}"
-    lines = [f"# {title}" if markdown else title, ""]
+    lines = [f"# {title}" if markdown else title, "", data["headline"], data["left_over"], ""]
     several = len(data.get("iso_230_2", {})) > 1
     for item in data["effects"]:
         lines += _effect_lines(item, markdown=markdown, several=several)
@@ -426,10 +538,16 @@ def summary(machine: str, data: Mapping[str, Any], *, markdown: bool) -> str:
             lines += [f"{key:20s} {pair['before']:10.2f} {pair['after']:10.2f}" for key, pair in figures.items()]
     lines += ["", f"Noise floor {data['gap']['noise_floor_um']:.3f} um ({data['gap']['noise_floor_source']})."]
     lines += [f"Note: {text}." for text in (*data["reasons"], *data["notes"])]
-    if data["advice"]:
-        lines += ["", "What to measure next:", *[f"* {text}" for text in data["advice"]]]
-    if data["invisible"]:
-        lines += ["", f"This measurement cannot show: {', '.join(data['invisible'])}."]
+    if data["next_steps"]:
+        lines += ["", "What to do next:", *[f"* {text}" for text in data["next_steps"]]]
+    further = [text for text in data["advice"] if text not in data["next_steps"]]
+    if further and markdown:
+        lines += ["", "Further measurements:", *[f"* {text}" for text in further]]
+    hidden = data["invisible"]
+    if hidden and (markdown or len(hidden) <= MOST_HIDDEN):
+        lines += ["", f"This measurement cannot show: {', '.join(hidden)}."]
+    elif hidden:
+        lines += ["", f"This measurement cannot show {len(hidden)} of the effects; diagnosis.md lists them."]
     text = "\n".join(lines) + "\n"
     return text if markdown else text.replace("  * ", "    ").replace("\n* ", "\n- ")
 

@@ -10,6 +10,7 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.deviations import Artefact, Part
 from compgen.diagnose import diagnose
+from compgen.diagnose.page import told
 
 SIGMA_UM = 1.0
 
@@ -125,7 +126,7 @@ def test_what_has_no_name_is_unknown_and_rows_hide_a_drift(mill):
 
 
 def test_too_few_features_say_what_is_missing(mill):
-    for columns, rows in ((2, 2), (3, 3)):
+    for columns, rows in ((2, 2), (3, 2)):
         few, um = plate(1, columns=columns, rows=rows)
         found = diagnose(mill, part_of(few, um).deviations())
         assert found.to_dict()["verdict"] == "not_decidable" and not found.acceptable
@@ -143,3 +144,31 @@ def test_the_command_reads_parts_and_artefacts(mill, tmp_path, capsys):
     assert (
         run_command(cli, ["diagnose", machine, str(path), "--out", str(tmp_path / "o"), "--effects", "clamp_slip"]) == 2
     )
+
+
+def test_a_page_begins_with_a_sentence_a_number_for_the_control_and_three_steps():
+    item = {
+        "name": "backlash_X", "grade": "confirmed", "what_to_do": "enter it; look at the nut", "text": "reversal of -8 um",
+        "parameters": {"c_um": {"value": -4.0, "u": 0.1}},
+    }  # fmt: skip
+    gap = {
+        "train": {"after_rms_um": 0.5},
+        "noise_floor_um": 0.5,
+        "noise_floor_source": "repeats",
+        "heldout_lines": None,
+    }
+    data = {"verdict": "named", "effects": [item], "unknown": [], "advice": list("abcd"), "reasons": [], "gap": gap}
+    found = told(data)
+    # up minus down is -8 um: the axis stops short, MD32450 and 1851 are positive (as in controls/siemens_eec.py)
+    assert "(sure)" in found["headline"] and "enter +8 um as its backlash" in found["headline"]
+    assert len(found["next_steps"]) == 3 and "stops short of its target by 8 um" in found["next_steps"][0]
+    assert "is the noise of the instrument (0.5 um, from the repeats)" in found["left_over"]
+    more = {**data, "gap": {**gap, "train": {"after_rms_um": 1.5}}}
+    assert "is 3.0 times the noise" in told(more)["left_over"]
+    doubtful = {**data, "effects": [{**item, "grade": "tentative", "reasons": ["it is small"]}]}
+    assert told(doubtful)["headline"].startswith("Perhaps backlash_X") and "it is small" in told(doubtful)["headline"]
+    warm = {
+        **item, "name": "warmup_drift", "text": "level off: +9 um at the end, time constant 600 s", "what_to_do": "repeat",
+        "parameters": {"c_um": {"value": 9.0, "u": 0.1}, "tau": {"value": 600.0, "u": None}},
+    }  # fmt: skip
+    assert "warm up for 30 minutes" in told({**data, "effects": [warm]})["headline"]
