@@ -42,6 +42,7 @@ class ImportOptions:
     base_length_mm : straightness consists of differences over this length, step by step, which are summed.
     origin : machine coordinates, mm, of the zero from which the coordinates of a part or artefact count ("X,Y,Z").
     calibrated : whether the nominal places of an artefact are those of a calibration ("yes") or of a drawing ("no").
+    mounted : body on which a level was.
     clamping : several tables of one report are features of "one" set-up, or "each" has its own.
     """
 
@@ -113,6 +114,10 @@ class ImportOptions:
     )
     clamping: Literal["one", "each"] | None = option(
         None, "Several tables of one report: features of one set-up, or each table a set-up of its own."
+    )
+
+    mounted: Literal["spindle", "table"] | None = option(
+        None, "Body on which a level was: on the spindle side, or on the table; the signs are opposite."
     )
 
     def origin_mm(self) -> tuple[float, float, float] | None:

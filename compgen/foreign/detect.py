@@ -33,6 +33,7 @@ from compgen.foreign.coordinate_reports import (
     read_report,
 )
 from compgen.foreign.covariates import surroundings_of
+from compgen.foreign.dial_readings import dial_readings
 from compgen.foreign.error_tables import squareness_in
 from compgen.foreign.findings import (
     ABSURD_DECADES,
@@ -452,6 +453,9 @@ def _of_grid(grid: CellGrid, options: ImportOptions, form: str) -> Imported:
     report = read_report(grid, options)
     if report is not None:
         return imported_features(report, form, options)
+    dials = dial_readings(grid, options, form)
+    if dials is not None:
+        return dials
     plain = options if options.sign in TABLE_SIGNS else replace(options, sign=None)
     try:
         return import_table(grid, plain, form)
