@@ -14,6 +14,7 @@ ORDER = (
     ("effects",),
     ("instruments",),
     ("simulate",),
+    ("heat",),
     ("identify",),
     ("plan",),
     ("fit",),

@@ -70,6 +70,9 @@ _COMMANDS = {
         "instruments": "List the instruments that compgen simulates.",
         "import": "Show what a file of another program contains, and convert it to the native format.",
     },
+    "heat_commands": {
+        "heat": "Learn how heat moves the tool, from days of drift; judged on days left out.",
+    },
     "app_commands": {
         "app": "Open the workbench in the browser: from files to checked tables without a command line.",
     },

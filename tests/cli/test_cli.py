@@ -527,7 +527,10 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
     )
     program = small_lengths_file.parent / "part.ngc"
     program.write_text("G21 G90 G17 G54\nG0 X0 Y0 Z-100\nG1 X50 F100\nM2\n")
+    drift = points_file.with_name("a.drift.csv")
+    drift.write_text("time_s,temp_a_c,dx_um\n0,20,0\n60,21,1\n")
     return {
+        "heat": (small_machine_file, drift, "--out", out),
         "correct": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
         "part": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
         "init": ("new", "--chain", "WFYXZT", "--travel", "X=0..500,Y=0..500,Z=0..500", "--out", out),
@@ -580,6 +583,7 @@ WRITING = [
     "accuracy",
     "compare",
     "diagnose",
+    "heat",
 ]
 
 
