@@ -215,7 +215,7 @@ def base_of(f: Features) -> FloatArray:
         for j in range(3):
             if i == j or np.ptp(p[:, j]) < 1e-6:
                 continue
-            for power in range(1, min(2, len(np.unique(np.round(p[:, j], 3))) - 2) + 1):
+            for power in range(1, min(2, len(np.unique(np.round(p[:, j], 3))) - 1) + 1):
                 columns.append(f.field(_vector(i, s[:, j] ** power))[:, None])
     axes = [i for i in range(3) if np.ptp(p[:, i]) > 1e-6 and (f.component == i).any()]
     columns += [f.field(_vector(i, s[:, i] ** 2))[:, None] for i in axes if len(np.unique(np.round(p[:, i], 3))) > 3]
