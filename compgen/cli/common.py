@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import click
 
@@ -194,6 +194,32 @@ _PAGES = (
     "Language of messages, pages and lists for the reader (default en); files for a control and JSON stay in English."
 )
 language_option = click.option("--language", is_eager=True, help=_PAGES, **_LANGUAGE)
+
+
+class GroupedCommand(click.Command):
+    """A command with many options: its help lists them under headings.
+
+    ``groups`` gives, by heading, what the names of the parameters begin with; the first that fits counts, others come last.
+    """
+
+    groups: ClassVar[Mapping[str, Sequence[str]]] = {}
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, each group under its heading."""
+        found: dict[str, list[tuple[str, str]]] = {heading: [] for heading in [*self.groups, "Other options"]}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            if record is None:
+                continue
+            name = str(parameter.name)
+            heading = next(
+                (key for key, begin in self.groups.items() if name.startswith(tuple(begin))), "Other options"
+            )
+            found[heading].append(record)
+        for heading, records in found.items():
+            if records:
+                with formatter.section(heading):
+                    formatter.write_dl(records)
 
 
 def with_language(command: click.Command) -> click.Command:

@@ -241,7 +241,7 @@ def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:
     "--travel",
     multiple=True,
     metavar="AXIS=LOW..HIGH",
-    help="Travel of an axis in mm, e.g. X=-800..0; once for each of X, Y, Z.",
+    help="Travel of an axis in mm, e.g. X=-800..0, or in another unit, X=0..24in; once for each of X, Y, Z.",
 )
 @click.option(
     "--nodes",
@@ -375,15 +375,49 @@ def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
         else _asked(f"Travel of {letter} in mm, lower and upper end (e.g. -800..0)", "--travel", asks)
     )
     try:
-        low, high = (float(end) for end in re.split(r"\.\.+|:|\bto\b|\bbis\b", text))
+        low, high = _ends_mm(text)
     except ValueError:
         raise InputError(
-            f"{letter}={text!r} is not of the form AXIS=LOW..HIGH, e.g. X=-800..0", field="--travel"
+            f"{letter}={text!r} is not of the form AXIS=LOW..HIGH in mm, e.g. X=-800..0, or with a unit X=0..24in, X=24in",
+            field="--travel",
         ) from None
     try:
         return toml_files.interval([low, high])
     except ValueError as error:
         raise InputError(f"{letter}={text!r}: {error}", field="--travel") from None
+
+
+_END = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:[eE][-+]?\d+)?)\s*([a-zA-Z\"\u2033]*)\s*")
+_MM = {
+    "": 1.0,
+    "mm": 1.0,
+    "cm": 10.0,
+    "m": 1e3,
+    "in": 25.4,
+    "inch": 25.4,
+    "inches": 25.4,
+    '"': 25.4,
+    "\u2033": 25.4,
+    "ft": 304.8,
+}
+
+
+def _ends_mm(text: str) -> tuple[float, float]:
+    """Return both ends of a travel in mm; one length alone counts from 0, and a unit behind the last end is that of both.
+
+    >>> _ends_mm("-800..0"), _ends_mm("24in"), _ends_mm("-30..0 in"), _ends_mm("0mm..0.6m")
+    ((-800.0, 0.0), (0.0, 609.6), (-762.0, 0.0), (0.0, 600.0))
+    """
+    found = [_END.fullmatch(part) for part in re.split(r"\.\.+|:|\bto\b|\bbis\b", text)]
+    if not 1 <= len(found) <= 2 or None in found or (len(found) == 1 and not (found[0] and found[0][2])):
+        raise ValueError(text)
+    parts = [(float(match[1].replace(",", ".")), match[2].lower()) for match in found if match]
+    unit = parts[-1][1]
+    if any(name not in _MM for _, name in parts):
+        raise ValueError(text)
+    # rounded: 24 * 25.4 is 609.5999999999999
+    ends = [round(value * _MM[name or unit], 9) for value, name in parts]
+    return (ends[0], ends[1]) if len(ends) == 2 else (min(0.0, ends[0]), max(0.0, ends[0]))
 
 
 def _nodes(given: Sequence[str], ranges: Mapping[str, Interval]) -> dict[str, int]:

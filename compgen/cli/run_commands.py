@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from compgen.cli.common import PATH, json_option, language_option, out_option, print_json
+from compgen.cli.common import PATH, GroupedCommand, json_option, language_option, out_option, print_json
 from compgen.cli.shared_options import (
     active_options,
     answer_options,
@@ -127,7 +128,21 @@ def report_written(folder: Path, language: str, known: KnownTables | None = None
 # ``volcomp run``: the whole chain.
 
 
-@click.command("run")
+class _Run(GroupedCommand):
+    """``run`` with its options under headings."""
+
+    groups: ClassVar[Mapping[str, Sequence[str]]] = {
+        "Needed": ("controller", "out"),
+        "Numbers known without a file": ("stated__",),
+        "What files of other programs leave open (volcomp import shows it)": ("answers__", "instrument"),
+        "Identification": ("options__", "prior"),
+        "Smoothing and bounds of the tables": ("fitting__", "zone", "tools", "limits__"),
+        "Tables on the control": ("active", "template_from", "style_from", "templates", "allow_unverified", "sample"),
+        "Verdict and output": ("allow_misfit", "explain", "no_report", "language", "as_json"),
+    }
+
+
+@click.command("run", cls=_Run)
 @machine_argument
 @prior_option
 @emphasis_options
@@ -176,9 +191,21 @@ def run_command(
 ) -> int:
     """Identify, fit, export, read back, verify: tracer lengths in, checked controller tables out.
 
-    MACHINE is a name in machines/ or the path of a machine TOML; MEASUREMENTS are *.lengths.csv (mm) or
-    *.deviations.csv files, or *.sixdof.csv with --instrument FILE. With several --controller each gets its own
-    sub-folder of DIR. report.html in DIR shows everything; --no-report omits it.
+    MACHINE is a name in machines/ or the path of a machine TOML. MEASUREMENTS are files of any kinds, alone or together:
+
+    \b
+      tracer lengths            *.lengths.csv, a table of points and lengths
+      positioning (ISO 230-2)   *.axis.csv, Renishaw .rtl, ecmc .dat, CSV, Excel
+      straightness, angles      *.errors.csv, .rta, .rts, CSV, Excel, records of levels and straightedges
+      squares, tramming         records with travel and plunger, lists of squareness; or --squareness
+      ballbar (ISO 230-4)       *.circle.csv, text with angle and deviation
+      artefact by the probe     *.artefact.csv, log of a probe program, nominal and measured coordinates
+      part on a CMM             *.part.csv, prints of measuring machines, DMIS, QIF
+      positions, six-DOF laser  *.deviations.csv; *.sixdof.csv with --instrument FILE
+      errors of other programs  Etalon exchange, *.errors.csv
+
+    With several --controller each gets its own sub-folder of DIR. report.html in DIR shows everything; --no-report
+    omits it.
 
     \b
     Example:

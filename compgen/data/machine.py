@@ -173,7 +173,7 @@ MM_PER_UNIT = {"mm": 1.0, "inch": 25.4}
 #: Longest travel and offset of a machine, mm.
 MOST_MM = 1e6
 #: A travel below this is asked about, mm.
-FEW_MM = 5.0
+FEW_MM = 60.0
 _NODES = toml_files.whole(2, 10001)
 _ONE_NODES = {"oneOf": [{"required": ["nodes"]}, {"required": ["nodes_mm"]}]}
 #: A length of a machine, mm.
@@ -534,7 +534,8 @@ class Machine(Displayed):
             (letter, axis.length_mm) for letter, axis in zip(AXES, self.axes, strict=True) if axis.length_mm < FEW_MM
         ]
         return [
-            f"[axes.{letter}] range_mm: is the travel really {length:g} mm? The unit is mm, not m"
+            f"[axes.{letter}] range_mm: is the travel really {length:g} mm? The unit is mm, not m or inch ({length:g} in are "
+            f"{25.4 * length:.5g} mm)"
             for letter, length in short
         ]
 

@@ -454,3 +454,51 @@ def test_on_a_terminal_what_no_option_says_is_asked(tmp_path):
     machine = read_machine(tmp_path / "mill.toml")
     assert (machine.chain.name, list(machine.controllers)) == ("WYXFZT", ["isg-csv"])
     assert b"is the travel really 0.5 mm?" in stderr
+
+
+@pytest.mark.parametrize(
+    ("text", "ends"),
+    [
+        ("-800..0", [-800.0, 0.0]),
+        ("24in", [0.0, 609.6]),
+        ("0..24in", [0.0, 609.6]),
+        ('-20..0"', [-508.0, 0.0]),
+        ("0mm..0.6m", [0.0, 600.0]),
+        ("-2ft", [-609.6, 0.0]),
+        ("0 to 23,6 in", [0.0, 599.44]),
+    ],
+)
+def test_travel_may_be_given_in_inches_and_is_written_in_mm(call, tmp_path, text, ends):
+    travel = ("--travel", f"X={text}", "--travel", "Y=0..400", "--travel", "Z=0..500")
+    if "," in text:  # commas separate axes: the machine would get another travel
+        assert call("init", "mill", "--chain", "WXYFZT", *travel, "--out", tmp_path)[0] == 2
+        return
+    code, _, stderr = call("init", "mill", "--chain", "WXYFZT", *travel, "--out", tmp_path)
+    assert (code, stderr) == (0, "")
+    assert tomllib.loads((tmp_path / "mill.toml").read_text())["axes"]["X"]["range_mm"] == pytest.approx(ends, abs=1e-9)
+
+
+@pytest.mark.parametrize("text", ["24", "0..24furlong", "1..2..3in", "in", "0in..x"])
+def test_a_travel_that_is_not_understood_is_refused(call, tmp_path, text):
+    travel = ("--travel", f"X={text}", "--travel", "Y=0..400", "--travel", "Z=0..500")
+    code, _, stderr = call("init", "mill", "--chain", "WXYFZT", *travel, "--out", tmp_path)
+    assert code == 2 and "LOW..HIGH" in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_travel_that_may_be_in_inches_is_asked_about(call, tmp_path):
+    travel = ("--travel", "X=0..23.6", "--travel", "Y=0..400", "--travel", "Z=0..500")
+    code, _, stderr = call("init", "mill", "--chain", "WXYFZT", *travel, "--out", tmp_path)
+    assert code == 0
+    assert "[axes.X]" in stderr and "23.6 in are 599.44 mm" in stderr and "[axes.Y]" not in stderr
+
+
+def test_the_help_of_run_groups_its_options_and_names_every_kind_of_file(call):
+    text = call("run", "--help")[1]
+    headings = ["Needed:", "Identification:", "Tables on the control:", "Verdict and output:", "Other options:"]
+    assert all(f"\n{heading}" in text for heading in headings)
+    assert "\nOptions:" not in text
+    for kind in ("lengths", "axis", "errors", "circle", "artefact", "part", "deviations", "sixdof"):
+        assert f"*.{kind}.csv" in text
+    other = text.partition("\nOther options:")[2]
+    assert other.count("  --") <= 4  # new options belong to a group
