@@ -37,7 +37,7 @@ from compgen.effects.active import active_effects
 from compgen.errors import CompgenError, InputError, nearest
 from compgen.identify.adjust.starts import robust_state
 from compgen.identify.adjust.unknowns import State, dead_lengths_of
-from compgen.instruments.sixdof_health import Suspicion, sixdof_health
+from compgen.instruments.sixdof_health import Suspicion, sixdof_health, turning_beams
 from compgen.instruments.sixdof_instrument import SixDof, SixDofInstrument
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.kernel_switch import one_thread
@@ -661,7 +661,8 @@ def _effect(item: Suspicion) -> dict[str, Any]:
         "alias_set": [{"name": item.name, "weight": 1.0}],
         "parameters": {key: {"value": value, "u": None} for key, value in item.evidence.items()},
         "confidence": 0.5,
-        "grade": "tentative",
+        # what the drift monitor reads is measured; everything else is a hint
+        "grade": "confirmed" if "range_arcsec" in item.evidence else "tentative",
         "visible_fraction": None,
         "axis": item.axis,
         "reasons": [item.text],
@@ -670,7 +671,10 @@ def _effect(item: Suspicion) -> dict[str, Any]:
 
 def diagnose_sixdof(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> SixDofDiagnosis:
     """Return what the readings show about the instrument."""
-    return SixDofDiagnosis(machine, tuple(sixdof_health(machine, readings, instrument)))
+    found = sixdof_health(machine, readings, instrument)
+    known = {(item.name, item.axis) for item in found}  # a wrong monitor explains the beam, too
+    turning = [item for item in turning_beams(machine, readings, instrument) if (item.name, item.axis) not in known]
+    return SixDofDiagnosis(machine, (*found, *turning))
 
 
 def sixdof_text(found: SixDofDiagnosis) -> str:

@@ -37,6 +37,8 @@ NOISY = 0.2
 LEAST = 8
 #: Smaller curvature of Y_QD2 - Y_QD1 is not reported, mm.
 STRAIGHT_MM = 0.2 * MM_PER_UM
+#: A beam that turns by less within a run is steady, rad.
+STEADY_RAD = 1.5 * RAD_PER_ARCSEC
 #: Spots that move by less tell nothing about their channel, mm; a difference below this share is small.
 SPREAD_MM, SWAPPED = 3.0 * MM_PER_UM, 0.3
 #: Share of one PSD2 step that counts as "the same zero".
@@ -92,6 +94,13 @@ def sixdof_health(machine: Machine, readings: SixDof, instrument: SixDofInstrume
             )
             found.append(Suspicion("drift_zero", "", text, {"range_um": float(np.ptp(monitor)) / MM_PER_UM}))
     return found
+
+
+def turning_beams(machine: Machine, readings: SixDof, instrument: SixDofInstrument) -> list[Suspicion]:
+    """Axes during which the beam turned more than one that has warmed up, although the drift monitor takes it off."""
+    reduced = reduce_runs(readings, instrument, expected_away(machine, instrument))
+    axes = sorted({run.axis for run in reduced})
+    return [item for axis in axes for item in _turning(readings, instrument, [r for r in reduced if r.axis == axis])]
 
 
 def _letter(runs: Sequence[RelativeRun]) -> str:
@@ -166,6 +175,24 @@ def _swapped(readings: SixDof, runs: Sequence[RelativeRun]) -> Iterator[Suspicio
         names = [name.removesuffix("_mm").upper() for name in (wrong, own, by)]
         text = f"{names[0]}, not {names[1]}, follows {names[2]}: the channels of the first detector are swapped"
         yield Suspicion("detector_swap", _letter(runs), text, {"own_um": same * 1e3, "other_um": other * 1e3})
+
+
+def _turning(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
+    """Find a beam that turns more within a run than one that has warmed up."""
+    axis, focal_mm = runs[0].axis, instrument.optics.focal_length_mm
+    fixed = SetUp(axis, 1, instrument.axes[axis].set_up.beam_direction)
+    drift = [drift_of(readings, run.rows, focal_mm) for run in runs]
+    largest = float(max(np.ptp(own, axis=0).max() for own in drift))
+    if largest <= STEADY_RAD:
+        return
+    paths = [path_mm(instrument.optics, fixed, run.distance_mm) for run in runs]
+    moved_mm = float(max(np.ptp(own * path[:, None], axis=0).max() for own, path in zip(drift, paths, strict=True)))
+    text = (
+        f"the beam turns by up to {largest / RAD_PER_ARCSEC:.2g} arcsec within a run, {moved_mm / MM_PER_UM:.2g} um at the "
+        "target; the drift monitor takes it off, as far as its gain is right: let the laser warm up and shield the beam"
+    )
+    evidence = {"range_arcsec": largest / RAD_PER_ARCSEC, "at_target_um": moved_mm / MM_PER_UM}
+    yield Suspicion("beam_drift", AXES[axis], text, evidence)
 
 
 def _drift(readings: SixDof, instrument: SixDofInstrument, runs: Sequence[RelativeRun]) -> Iterator[Suspicion]:
