@@ -607,6 +607,8 @@ MOST_OF_RUNS, CURVE = 60, 4
 MOST_WINDOWS = 800
 #: Scan positions charged at most for the setting of an effect of a logged column: neighbours are nearly alike.
 MOST_LOGGED_SCANS = 6
+#: Readings before and after a step within a run, at least.
+LEAST_OF_STEP = 5
 #: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
@@ -654,6 +656,8 @@ def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]
     found = []
     for k in range(1, len(session)):
         end, between = int(np.flatnonzero(session.leg == session.leg[k])[-1]), session.leg[k] != session.leg[k - 1]
+        if not between and min(k, len(session) - k) < LEAST_OF_STEP:
+            continue  # a few readings at an end that are off are disturbed, not a step
         where = session.window(k, end) if between else session.place(k)
         scans = _runs(session) if between else float(len(session))
         found.append(_candidate(session, step.at(float(k)), scans, f"step before {where}"))
