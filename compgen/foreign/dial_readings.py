@@ -153,6 +153,10 @@ def _edges(table: Table, names: Sequence[str], options: ImportOptions, form: str
         known = np.isfinite(values)
         if known.sum() < 2:
             raise table.grid.fail("has fewer than two readings", table.header_line, f"column {name}")
+        if len(np.unique(position_mm[known])) < known.sum():
+            raise table.grid.fail(
+                "has a position twice; give the mean of repeats", table.header_line, f"column {place}"
+            )
         arm = arms.setdefault(error, _Arm(position_mm[known]))
         if not np.array_equal(arm.position_mm, position_mm[known]):
             text = f"the columns of {error} have readings at different positions; measure both set-ups at the same ones"
@@ -421,6 +425,9 @@ def _levels(table: Table, names: Sequence[str], options: ImportOptions, form: st
             "(the signs are opposite)"
         )
     position_mm = np.array(table.numbers(place)) * MM_PER_LENGTH.get(split_name(place).unit or "mm", 1.0)
+    if len(np.unique(position_mm)) < max(2, len(position_mm)):
+        text = "needs two positions or more, each once; give the mean of repeats"
+        raise table.grid.fail(text, table.header_line, f"column {place}")
     order = np.argsort(position_mm)
     curves, understood = {}, {}
     for name in names:

@@ -150,3 +150,12 @@ def test_one_arm_over_a_span_is_no_squareness(tmp_path):
         import_file(path)
     aligned = written(tmp_path, "Travel;Plunger;Span [mm];Reading [um]\nZ;+X;200;6\nX;+Z;300;0\n")
     assert import_file(aligned).data.squareness["EB0Z"][0] == pytest.approx(30e-6)
+
+
+@pytest.mark.parametrize(
+    "head", ["X arm (plunger +Y) [um];Y arm (plunger +X) [um]", "Level along X [um/m];Level along Y [um/m]"]
+)
+def test_a_position_that_occurs_twice_is_refused(tmp_path, head):
+    path = written(tmp_path, f"Level on: table\nX position [mm];{head}\n100;1;1\n100;2;2\n")
+    with pytest.raises(InputError, match="mean of repeats"):
+        import_file(path)
