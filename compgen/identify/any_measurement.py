@@ -19,7 +19,7 @@ from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format, may_be_large
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, UndeterminedError, um_text
 from compgen.identify.adjust.propagation import SystematicInputs
 from compgen.identify.identification import Identification, at_nodes, determines_all
 from compgen.identify.options import IdentifyOptions
@@ -336,8 +336,10 @@ def unseen(machine: Machine, parts: Sequence[OneKind | ErrorTable]) -> tuple[str
         others = [*parts[:k], *parts[k + 1 :]]
         if isinstance(part, Artefact) and part.calibrated.all():
             found += _unseen_in_plate(part, others)
-        elif isinstance(part, AxisRuns) and not any(name.startswith("temp_") for name in part.covariates):
-            found.append(_unseen_in_runs(machine, part))
+        elif isinstance(part, AxisRuns):
+            if not any(name.startswith("temp_") for name in part.covariates):
+                found.append(_unseen_in_runs(machine, part))
+            found += _assumed_of_lines(machine, part)
     return tuple(dict.fromkeys(found))
 
 
@@ -352,6 +354,25 @@ def _unseen_in_runs(machine: Machine, runs: AxisRuns) -> str:
         f"and a wrong scale ({max(stated):.3g} um/m for each K); their file has no temperatures, so u allows for "
         f"{U_NOT_READ_K:g} K. Read the temperatures of axis and instrument (columns temp_x_c ...), or measure a length standard "
         "at the other end of the travel"
+    )
+
+
+def _assumed_of_lines(machine: Machine, runs: AxisRuns) -> Iterator[str]:
+    """Where in the volume the laser was, if nobody said it: what is assumed, what it costs, and how to state it."""
+    from compgen.identify.axis_tests import unstated_lines
+
+    if machine.prior.is_none:
+        return
+    costs = unstated_lines(machine, runs)
+    if not costs:
+        return
+    parts = ", ".join(f"{um_text(cost)} um in {AXES[axis]}" for axis, (cost, _) in costs.items())
+    letters = dict.fromkeys(letter for _, others in costs.values() for letter in others)
+    keys = " and ".join(f"# line_{letter.lower()}_mm = ..." for letter in sorted(letters))
+    yield (
+        f"where in the volume the runs of {', '.join(AXES[axis] for axis in costs)} were measured is not stated: it is assumed "
+        f"to be anywhere in the travel, where angles move the tool, which adds to u (rms along the axis) {parts}. Where was the "
+        f"laser? State the positions of the axes that did not move in the file, {keys} (or columns of these names)"
     )
 
 

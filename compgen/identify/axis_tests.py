@@ -167,6 +167,38 @@ def u_scale_of(machine: Machine, runs: AxisRuns) -> float:
     return float(np.hypot(U_LASER, expansion * (U_READ_K if read else U_NOT_READ_K)))
 
 
+def _unstated_lever(machine: Machine, name: str, axis: int, unknown: Sequence[int]) -> float:
+    """Mean square, mm^2, of the levers of an angle on a run of an axis along a line of which positions are unknown."""
+    terms = coefficients(machine.chain, machine.squareness_reference)
+    levers = {term.lever for term in terms if term.error == name and term.output == axis}
+    travels = (machine.axes[lever].range_mm for lever in levers if lever in unknown)
+    return sum(float(np.mean(np.square(np.linspace(*travel, 101)))) for travel in travels)
+
+
+def unstated_lines(machine: Machine, runs: AxisRuns) -> dict[int, tuple[float, tuple[str, ...]]]:
+    """Return by axis what it costs that nobody said where its line was: u of the run, um, rms about its mean, and the axes.
+
+    Empty for lines that are stated, or whose position does not matter on this chain.
+    """
+    found: dict[int, tuple[float, tuple[str, ...]]] = {}
+    line_mm = runs.line_mm()
+    for axis in runs.axes:
+        rows = runs.axis == axis
+        unknown = [k for k in range(3) if k != axis and np.isnan(line_mm[rows, k]).any()]
+        at_mm = np.unique(runs.position_mm[rows])
+        total, matter = 0.0, set[str]()
+        angles = [f"E{about}{AXES[axis]}" for about in "ABC"]
+        for name, process in processes_of(machine, machine.prior, angles).items():
+            for lever in unknown:
+                square = _unstated_lever(machine, name, axis, [lever])
+                spread = process.covariance(at_mm, at_mm)
+                total += square * float(np.trace(spread) / len(at_mm) - spread.mean())
+                matter |= {AXES[lever]} if square else set()
+        if total > 0.0:
+            found[axis] = float(np.sqrt(total)) / MM_PER_UM, tuple(sorted(matter))
+    return found
+
+
 def axis_observations(machine: Machine, layout: ErrorParameters, runs: AxisRuns, prior: PriorSettings) -> Observations:
     """Return the means of axis runs as readings of the errors of a layout, at the lines where they were measured.
 
@@ -197,12 +229,9 @@ def axis_observations(machine: Machine, layout: ErrorParameters, runs: AxisRuns,
         own[[ERROR_INDEX[name] for name in SQUARENESS_NAMES]] = False  # constant, or along the line: not in its mean
         design = layout.design(columns * own, layout.bases(everywhere))[:, axis]
         offset = [np.ones(count)]
-        angles = [f"E{about}{letter}" for about in AXES]
+        angles = [f"E{about}{letter}" for about in "ABC"]
         for name, process in processes_of(machine, prior, angles).items():
-            terms = coefficients(machine.chain, machine.squareness_reference)
-            levers = {term.lever for term in terms if term.error == name and term.output == axis}
-            square = sum(float(np.mean(np.square(np.linspace(*machine.axes[lever].range_mm, 101))))
-                         for lever in levers if lever in unknown)  # fmt: skip
+            square = _unstated_lever(machine, name, axis, unknown)
             if square:
                 offset += list(np.sqrt(square) * root_of(process.covariance(curve.position_mm, curve.position_mm)).T)
         designs.append(design)

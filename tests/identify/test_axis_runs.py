@@ -1,11 +1,14 @@
 """Axis runs: the contract file `*.axis.csv`."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from compgen.data.axis_runs import format_axis_runs, read_axis_runs
 from compgen.data.records import detect_format
 from compgen.errors import InputError
+from compgen.pipeline import identify_bare
 
 HEADER = "axis,position_mm,direction,run,deviation_um\n"
 GOOD = HEADER + "X,0,1,1,2.5\nX,100,1,1,-4\nY,100,-1,2,1e1\n"
@@ -61,3 +64,30 @@ def test_two_files_are_one_measurement_unless_they_are_the_same(tmp_path):
     assert read_axis_runs([a, b]).axes == (0, 1, 2)
     with pytest.raises(InputError, match="same rows"):
         read_axis_runs([a, written(tmp_path, GOOD, "c.axis.csv")])
+
+
+def test_a_run_along_a_line_that_nobody_stated_costs_what_the_angles_do_at_an_unknown_lever():
+    """The prior of the angles at the root mean square lever of the travel; a line that is stated costs nothing of it."""
+    from virtual_shop import case
+
+    from compgen.identify.any_measurement import unseen
+    from compgen.identify.axis_tests import unstated_lines
+
+    shop = case(2, seed=3)
+    unknown, stated = shop.runs(stated=False), shop.runs()
+    costs = unstated_lines(shop.machine, unknown)
+    assert costs and not unstated_lines(shop.machine, stated)
+    loose, tight = (known_alone_quietly(shop.machine, runs) for runs in (unknown, stated))
+    for axis, (cost_um, _) in costs.items():
+        name, at = "E" + 2 * "XYZ"[axis], np.unique(unknown.position_mm[unknown.axis == axis])
+        wide, narrow = (1e3 * found.posterior.curve(name, at).u for found in (loose, tight))
+        added_um = np.sqrt(np.mean(wide**2) - np.mean(narrow**2))
+        assert 0.3 * cost_um < added_um < 3.0 * cost_um
+    text = " ".join(unseen(shop.machine, [unknown]))
+    assert "Where was the laser?" in text and "Where was the laser?" not in " ".join(unseen(shop.machine, [stated]))
+
+
+def known_alone_quietly(machine, runs):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return identify_bare(machine, runs)
