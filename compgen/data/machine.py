@@ -1,4 +1,4 @@
-"""A machine as described by its TOML file: chain, axes, error model, work zone and tools.
+"""A machine as described by its TOML file: chain, linear and rotary axes, error model, work zone and tools.
 
 :func:`read_machine` reads one file strictly, :func:`load_machine` finds it by name. A machine keeps the raw
 sections of its controls and effects, which read their settings when they are used.
@@ -6,6 +6,7 @@ sections of its controls and effects, which read their settings when they are us
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -252,7 +253,12 @@ def _name(value: Any) -> str:
     return name
 
 
-@toml_files.accepts({"enum": list(CHAINS), "examples": ["WFYXZT"]})
+#: Rotary axes about X, Y, Z (ISO 841).
+ROTARY = ("A", "B", "C")
+_CHAIN_PATTERN = r"^W(?!.*([A-CFXYZ]).*\1)(?=.*F)(?=.*X)(?=.*Y)(?=.*Z)[A-CFXYZ]+T$"
+
+
+@toml_files.accepts({"type": "string", "pattern": _CHAIN_PATTERN, "examples": ["WFYXZT", "WCAYFXZT"]})
 @dataclass(frozen=True)
 class ProgramNumbers:
     """What NC programs of a machine mean by a number without a decimal point; ``integers`` None: that is asked."""
@@ -271,10 +277,11 @@ class ProgramNumbers:
 
 @dataclass(frozen=True)
 class Chain:
-    """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``; axes count 0, 1, 2 for X, Y, Z.
+    """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``, with rotary axes ``WCAYFXZT``; 0, 1, 2 are X, Y, Z.
 
-    ``workpiece_side`` lists the axes left of F in order from the foundation outwards (the first is next to F),
-    ``tool_side`` those right of F, also from the foundation outwards (the last carries the tool).
+    ``workpiece_side`` lists the linear axes left of F in order from the foundation outwards (the first is next to F),
+    ``tool_side`` those right of F, also from the foundation outwards (the last carries the tool). With its rotary axes at
+    zero a machine is that of its linear axes.
 
     Examples
     --------
@@ -289,13 +296,30 @@ class Chain:
     tool_side: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or self.name not in CHAINS:
+        if not isinstance(self.name, str) or not re.fullmatch(_CHAIN_PATTERN, self.name):
             raise InputError(
-                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. the name 'WFYXZT'"
+                f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. the name "
+                "'WFYXZT'; rotary axes A, B, C at most once each between them, e.g. 'WCAYFXZT'"
             )
-        left, _, right = self.name[1:-1].partition("F")
+        left, _, right = self.linear[1:-1].partition("F")
         object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
         object.__setattr__(self, "tool_side", tuple(AXES.index(axis) for axis in right))
+
+    @property
+    def linear(self) -> str:
+        """The chain without its rotary axes."""
+        return "".join(letter for letter in self.name if letter not in ROTARY)
+
+    @property
+    def rotary(self) -> tuple[str, ...]:
+        """Rotary axes from workpiece to tool."""
+        return tuple(letter for letter in self.name if letter in ROTARY)
+
+    @property
+    def passed(self) -> tuple[tuple[str, bool], ...]:
+        """Axes in the order in which a point passes them from tool to workpiece, with True for the tool side."""
+        left, _, right = self.name[1:-1].partition("F")
+        return (*((letter, True) for letter in reversed(right)), *((letter, False) for letter in reversed(left)))
 
     def lever_axes(self, axis: int) -> tuple[int, ...]:
         """Axes whose travel is part of the lever arm of an angular error of ``axis`` (``docs/conventions.md``)."""
@@ -366,9 +390,81 @@ class Axis(Displayed):
         return Overview(f"{self.range_mm[0]:g} to {self.range_mm[1]:g} mm, {len(self.nodes_mm)} nodes")
 
 
+_angle = toml_files.bounded("an angle from -36000 to 36000 degrees", minimum=-36000.0, maximum=36000.0)
+
+
+@dataclass(frozen=True, repr=False)
+class RotaryAxis(Displayed):
+    """One rotary axis: nominal direction, a point of its axis line (mm), range and nodes in degrees.
+
+    The tool turns by +angle about ``direction`` relative to the workpiece (ISO 841), whichever side carries the axis.
+    An axis that turns without end has ``modulo_deg``, the others ``range_deg``; errors are zero at ``reference_deg``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import compgen
+    >>> compgen.RotaryAxis((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), np.linspace(0.0, 360.0, 13), modulo_deg=360.0)
+    <RotaryAxis: 0 to 360 deg without end, 13 nodes>
+    """
+
+    direction: Vector3
+    point_mm: Vector3 = toml_files.setting(
+        _offset, meaning="a point of the axis line with all axes at zero, machine coordinates, mm"
+    )
+    nodes_deg: FloatArray = toml_files.part_setting(
+        {
+            "nodes": {"anyOf": [toml_files.accepted(check) for check in (_NODES, toml_files.ascending)]},
+            "direction": toml_files.accepted(toml_files.vector3),
+        },
+        required=True,
+    )
+    range_deg: tuple[float, float] | None = toml_files.setting(
+        toml_files.interval, None, meaning="lower and upper end of the travel, degrees"
+    )
+    modulo_deg: float | None = toml_files.setting(
+        toml_files.positive, None, meaning="an axis that turns without end: after how many degrees it repeats, 360"
+    )
+    reference_deg: float = toml_files.setting(_angle, 0.0, meaning="where the errors of the axis are zero, degrees")
+
+    def __post_init__(self) -> None:
+        direction = numbers("direction", self.direction, 3)
+        length = float(np.linalg.norm(direction))
+        if not length > 1e-9:
+            raise InputError("is (0, 0, 0); expected a direction such as [0.0, 0.0, 1.0]", field="direction")
+        object.__setattr__(self, "direction", tuple((direction / length).tolist()))
+        if (self.range_deg is None) == (self.modulo_deg is None):
+            raise InputError(
+                "expected either range_deg, or modulo_deg for an axis that turns without end", field="range_deg"
+            )
+        low, high = self.ends_deg
+        if not low < high:
+            raise InputError(f"goes from {low:g} to {high:g} degrees; expected the lower end first", field="range_deg")
+        if not low <= self.reference_deg <= high:
+            raise InputError(
+                f"{self.reference_deg:g} degrees is outside {low:g} ... {high:g}; the errors are zero there",
+                field="reference_deg",
+            )
+        nodes = numbers("nodes_deg", self.nodes_deg, None)
+        if len(nodes) < 2 or (np.diff(nodes) <= 0.0).any():
+            raise InputError("expected at least two angles in ascending order, degrees", field="nodes_deg")
+        object.__setattr__(self, "nodes_deg", nodes)
+
+    @property
+    def ends_deg(self) -> tuple[float, float]:
+        """Ends of the travel, or of one turn from zero, degrees."""
+        return self.range_deg or (0.0, float(self.modulo_deg or 360.0))
+
+    def overview(self) -> Overview:
+        """Travel and number of nodes."""
+        low, high = self.ends_deg
+        endless = " without end" if self.modulo_deg is not None else ""
+        return Overview(f"{low:g} to {high:g} deg{endless}, {len(self.nodes_deg)} nodes")
+
+
 @dataclass(frozen=True, repr=False)
 class Machine(Displayed):
-    """A three-axis machine; ``axes`` are X, Y, Z in that order, ``errors`` the contents of its model.
+    """A machine of three linear axes, X, Y, Z in that order; ``errors`` the contents of its model, ``rotary`` further axes.
 
     ``errors`` is ``"observable"``, 17, 21 or a tuple of names (resolved by :func:`compgen.kinematics.modelled_errors`).
     ``controllers`` keeps the raw settings of each control; the control itself checks them. ``emphasis`` says where
@@ -394,7 +490,11 @@ class Machine(Displayed):
         meaning="order of the bodies from workpiece W over foundation F to tool T: axes left of F carry the workpiece",
     )
     axes: tuple[Axis, Axis, Axis] = toml_files.part_setting(
-        lambda: toml_files.table_schema(dict.fromkeys(AXES, {**toml_files.section_schema(Axis), **_ONE_NODES}), AXES),
+        lambda: toml_files.table_schema(
+            dict.fromkeys(AXES, {**toml_files.section_schema(Axis), **_ONE_NODES})
+            | dict.fromkeys(ROTARY, toml_files.section_schema(RotaryAxis)),
+            AXES,
+        ),
         required=True,
     )
     squareness_reference: Reference = toml_files.setting(
@@ -450,6 +550,7 @@ class Machine(Displayed):
         0.0,
         meaning="how far beyond the travel NC programs may go, mm: the software limits are as far from range_mm, or farther",
     )
+    rotary: Mapping[str, RotaryAxis] = toml_files.part_setting(factory=dict, meaning="rotary axes of the chain by letter")
 
     def __post_init__(self) -> None:
         text_of("name", self.name)
@@ -459,6 +560,13 @@ class Machine(Displayed):
             raise InputError(f"has {len(self.axes)} axes; expected those of X, Y and Z", field="axes")
         for letter, axis in zip(AXES, self.axes, strict=True):
             of_kind(f"axes[{letter}]", axis, Axis)
+        of_kind("rotary", self.rotary, Mapping)
+        if set(self.rotary) != set(self.chain.rotary):
+            raise InputError(
+                f"has the rotary axes {', '.join(self.rotary) or '-'}, the chain {self.chain.name} "
+                f"{', '.join(self.chain.rotary) or '-'}; give each of them",
+                field="rotary",
+            )
         for name in ("tool_offset_mm", "reference_point_mm"):
             numbers(name, getattr(self, name), 3)
         for name, allowed in (("squareness_reference", ("X", "Y")), ("curves", ("linear", "cubic"))):
@@ -554,7 +662,8 @@ class Machine(Displayed):
 
     def overview(self) -> Overview:
         """Chain, travel and nodes."""
-        rows = tuple((letter, axis.overview().title) for letter, axis in zip("XYZ", self.axes, strict=True))
+        axes: dict[str, Axis | RotaryAxis] = {**dict(zip(AXES, self.axes, strict=True)), **self.rotary}
+        rows = tuple((letter, axis.overview().title) for letter, axis in axes.items())
         return Overview(f"{self.name}, chain {self.chain.name}", ("axis", "travel"), rows)
 
 
@@ -573,6 +682,7 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
     stated = toml_files.stated_settings(Machine, root)
     axes_section = root.section("axes")
     axes = [_read_axis(axes_section.section(axis), stated.get("curves", Machine.curves)) for axis in AXES]
+    rotary = _read_rotary(axes_section, stated["chain"])
     axes_section.finish()
     controllers_section = root.section("controllers", required=False)
     controllers = {key: controllers_section.section(key) for key in controllers_section.data}
@@ -618,7 +728,32 @@ def machine_of(root: toml_files.Section, source: Path) -> Machine:
         effects=effects,
         tool_range_mm=tool_range_mm,
         prior=prior,
+        rotary=rotary,
     )
+
+
+def _read_rotary(section: toml_files.Section, chain: Chain) -> dict[str, RotaryAxis]:
+    """Read the rotary axes of the chain; one that the chain does not name is refused."""
+    for letter in ROTARY:
+        if letter in section and letter not in chain.rotary:
+            raise section.fail(letter, f"the chain {chain.name} has no axis {letter}; put the letter into it, or omit [axes.{letter}]")
+    found = {}
+    for letter in sorted(chain.rotary):
+        own = section.section(letter)
+        unit = tuple(float(k == ROTARY.index(letter)) for k in range(3))
+        direction = own.take("direction", toml_files.vector3, unit)
+        stated = toml_files.stated_settings(RotaryAxis, own)
+        low, high = stated.get("range_deg") or (0.0, stated.get("modulo_deg", 360.0))
+        if isinstance(own.data.get("nodes"), list):
+            nodes = np.array(own.take("nodes", toml_files.ascending))
+        else:
+            nodes = np.linspace(low, high, own.take("nodes", _NODES))
+        own.finish()
+        try:
+            found[letter] = RotaryAxis(direction, nodes_deg=nodes, **stated)
+        except InputError as error:
+            raise own.fail(error.field or "nodes", error.message) from None
+    return found
 
 
 def _read_axis(section: toml_files.Section, curves: str) -> Axis:

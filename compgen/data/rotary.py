@@ -1,0 +1,434 @@
+"""Errors of rotary axes (ISO 230-1, ISO 230-7), and sphere centres found at poses of a machine with rotary axes.
+
+A rotary axis has six error motions over its angle (``EXC`` ... ``ECC``), and constants of its position: for C the offsets
+``EX0C``, ``EY0C``, the tilts ``EA0C``, ``EB0C`` and the zero ``EC0C``. Files are in um, urad and degrees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compgen.data.arguments import numbers
+from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, names_in_header, read_csv
+from compgen.data.display import Displayed, Overview
+from compgen.data.error_table import ErrorTable, parse_errors
+from compgen.data.files import read_text
+from compgen.data.machine import ROTARY, Machine
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD
+from compgen.data.records import (
+    DEVIATION_COLUMNS,
+    POSITION_COLUMNS,
+    TEMPERATURES,
+    TOOL_COLUMNS,
+    ReadColumn,
+    deviations_um,
+    uncertainties,
+    within,
+)
+from compgen.errors import InputError, nearest
+
+# Names and units.
+
+
+def motion_names(letter: str) -> tuple[str, ...]:
+    """Error motions of a rotary axis: three translations, three rotations, e.g. EXC ... ECC."""
+    return tuple(f"E{part}{letter}" for part in "XYZABC")
+
+
+def position_names(letter: str) -> tuple[str, ...]:
+    """Constants of the position of its axis line: two offsets, two tilts across it, then its zero, e.g. EX0C ... EC0C."""
+    along = ROTARY.index(letter)
+    across = [k for k in range(3) if k != along]
+    return (*(f"E{AXES[k]}0{letter}" for k in across), *(f"E{ROTARY[k]}0{letter}" for k in across), f"E{letter}0{letter}")
+
+
+ROTARY_NAMES: tuple[str, ...] = tuple(
+    name for letter in ROTARY for name in (*motion_names(letter), *position_names(letter))
+)
+#: By name: letter of the axis, component of its small motion (0 to 5: X, Y, Z, A, B, C), whether it is a constant.
+_PLACES: dict[str, tuple[str, int, bool]] = {
+    name: (name[-1], "XYZABC".index(name[1]), name[2] == "0") for name in ROTARY_NAMES
+}
+
+
+def si_per_unit(name: str) -> float:
+    """Factor from the unit of files (um or urad) to mm or rad."""
+    return MM_PER_UM if name[1] in AXES else RAD_PER_URAD
+
+
+def unit_of(name: str) -> str:
+    """Unit in files."""
+    return "um" if name[1] in AXES else "urad"
+
+
+# Errors.
+
+
+@dataclass(frozen=True)
+class RotaryCurve:
+    """One error motion over the angle: ``angle_deg`` ascending, ``value`` and ``u`` in mm or rad, shape (n,)."""
+
+    angle_deg: FloatArray
+    value: FloatArray
+    u: FloatArray
+
+    def __post_init__(self) -> None:
+        for name, how in (("angle_deg", {}), ("value", {}), ("u", {"unknown": True, "least": 0.0})):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), None, **how))
+        if not len(self.angle_deg) == len(self.value) == len(self.u) > 0 or (np.diff(self.angle_deg) <= 0).any():
+            raise InputError("expected one value and one u for each angle, angles ascending", field="angle_deg")
+
+    def at(self, angle_deg: FloatArray, modulo_deg: float | None) -> FloatArray:
+        """Value at angles, same shape: linear between nodes, periodic with ``modulo_deg``, else constant outside."""
+        return np.interp(angle_deg, self.angle_deg, self.value, period=modulo_deg)
+
+
+@dataclass(frozen=True, repr=False)
+class RotaryErrors(Displayed):
+    """Errors of rotary axes, mm and rad; one that is absent is zero. ``constants`` by name as (value, uncertainty)."""
+
+    curves: Mapping[str, RotaryCurve] = field(default_factory=dict)
+    constants: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for names, constant in ((self.curves, False), (self.constants, True)):
+            for name in names:
+                if name not in _PLACES or _PLACES[name][2] != constant:
+                    what = "a constant of a rotary axis" if constant else "an error motion of a rotary axis"
+                    raise InputError(f"{name!r} is not {what}; {nearest(name, ROTARY_NAMES)}", field="errors")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the errors that are present."""
+        return tuple(name for name in ROTARY_NAMES if name in self.curves or name in self.constants)
+
+    def motions(self, machine: Machine, angle_deg: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Small motions D (n, 6) of each rotary axis at angles (n,): mm and rad, zero at its reference."""
+        found = {letter: np.zeros((len(angle), 6)) for letter, angle in angle_deg.items()}
+        for name, curve in self.curves.items():
+            letter, part, _ = _PLACES[name]
+            if letter not in machine.rotary:
+                continue
+            axis = machine.rotary[letter]
+            zero = curve.at(np.array([axis.reference_deg]), axis.modulo_deg)
+            found[letter][:, part] = curve.at(angle_deg[letter], axis.modulo_deg) - zero
+        return found
+
+    def position(self, letter: str) -> FloatArray:
+        """Position errors L (6,) of one rotary axis, mm and rad."""
+        found = np.zeros(6)
+        for name, (value, _) in self.constants.items():
+            if _PLACES[name][0] == letter:
+                found[_PLACES[name][1]] = value
+        return found
+
+    def overview(self) -> Overview:
+        """Constants with their uncertainty, and the largest value of each motion."""
+        rows = []
+        for name in self.names:
+            value, u = (
+                self.constants[name]
+                if name in self.constants
+                else (self.curves[name].value[np.argmax(np.abs(self.curves[name].value))], np.max(self.curves[name].u))
+            )
+            unit = si_per_unit(name)
+            rows.append((name, f"{value / unit:+.2f}", "" if np.isnan(u) else f"{u / unit:.2f}", unit_of(name)))
+        return Overview(f"{len(rows)} errors of rotary axes", ("error", "value", "u (k = 1)", "unit"), tuple(rows))
+
+
+def read_machine_errors(path: str | Path) -> tuple[ErrorTable, RotaryErrors]:
+    """Read an ``*.errors.csv`` file with errors of linear (``position_mm``) and rotary axes (``position_deg``).
+
+    Raises
+    ------
+    InputError
+        for a name that is neither, an angle missing or given twice, with file, line and column.
+    """
+    text, source = read_text(path), Path(path)
+    lines = text.splitlines()
+    rotary = [line.split(",")[0].strip().lstrip("'") in _PLACES for line in lines]
+    linear = "\n".join("" if own else line for line, own in zip(lines, rotary, strict=True)) + "\n"
+    rest = [line for line in linear.splitlines() if line.strip() and not line.startswith("#")]
+    if not any(rotary):
+        return parse_errors(text, source), RotaryErrors()
+    linear = "\n".join(line for line in linear.split("\n") if not line.startswith("# rows"))
+    table = parse_errors(linear, source) if len(rest) > 1 else ErrorTable(metadata={})
+    columns = csv_table(
+        source, text, required=("error", "value"), optional=("position_mm", "position_deg", "u_value")
+    )
+    return table, _rotary_of(columns)
+
+
+def _rotary_of(table: CsvTable) -> RotaryErrors:
+    names, values = table.text("error"), table.numbers("value")
+    u = table.numbers("u_value", empty=np.nan) if "u_value" in table.columns else np.full(len(table), np.nan)
+    if "position_deg" in table.columns:
+        angle = table.numbers("position_deg", empty=np.nan)
+    else:
+        angle = np.full(len(table), np.nan)
+    rows: dict[str, list[int]] = {}
+    for row, name in enumerate(names):
+        if name in _PLACES:
+            rows.setdefault(name, []).append(row)
+        elif name not in ERROR_NAMES:
+            raise table.fail(row, "error", f"{name!r} is not an error; {nearest(name, (*ERROR_NAMES, *ROTARY_NAMES))}")
+    curves, constants = {}, {}
+    for name, own in rows.items():
+        unit = si_per_unit(name)
+        if _PLACES[name][2]:
+            if len(own) > 1:
+                raise table.fail(own[1], "error", f"{name} appears a second time (first in line {table.lines[own[0]]})")
+            constants[name] = (float(values[own[0]]) * unit, float(u[own[0]]) * unit)
+            continue
+        for row in own:
+            if np.isnan(angle[row]):
+                raise table.fail(row, "position_deg", f"is missing; {name} is a function of the angle in degrees")
+        own = sorted(own, key=lambda row: float(angle[row]))
+        for first, second in zip(own, own[1:], strict=False):
+            if angle[first] == angle[second]:
+                raise table.fail(second, "position_deg", f"{name} has two values at {angle[second]:g} degrees")
+        curves[name] = RotaryCurve(angle[own], values[own] * unit, u[own] * unit)
+    return RotaryErrors(curves, constants)
+
+
+def format_machine_errors(table: ErrorTable, rotary: RotaryErrors, metadata: Mapping[str, object]) -> str:
+    """Return the text of an ``*.errors.csv`` file with both kinds of axes; what has no position has an empty cell."""
+    rows: list[tuple[str, str, str, float, float]] = []
+    for name in table.names:
+        if name in table.squareness:
+            value, u = table.squareness[name]
+            rows.append((name, "", "", value / RAD_PER_URAD, u / RAD_PER_URAD))
+        else:
+            curve, unit = table.curves[name], MM_PER_UM if name[1] in AXES else RAD_PER_URAD
+            rows += [
+                (name, f"{at:.6f}", "", value / unit, u / unit)
+                for at, value, u in zip(curve.position_mm, curve.value, curve.u, strict=True)
+            ]
+    for name in rotary.names:
+        unit = si_per_unit(name)
+        if name in rotary.constants:
+            value, u = rotary.constants[name]
+            rows.append((name, "", "", value / unit, u / unit))
+        else:
+            own = rotary.curves[name]
+            rows += [
+                (name, "", f"{at:.6f}", value / unit, u / unit)
+                for at, value, u in zip(own.angle_deg, own.value, own.u, strict=True)
+            ]
+    columns: dict[str, Any] = {
+        "error": [row[0] for row in rows],
+        "position_mm": [row[1] for row in rows],
+        "position_deg": [row[2] for row in rows],
+        "value": [f"{row[3]:.6f}" for row in rows],
+        "u_value": ["" if np.isnan(row[4]) else f"{row[4]:.6f}" for row in rows],
+    }
+    return format_csv(columns, metadata)
+
+
+# Centres of spheres found at poses: ``*.sphere.csv``.
+
+
+ANGLE_COLUMNS = tuple(f"{letter.lower()}_deg" for letter in ROTARY)
+CENTRE_COLUMNS = ("cx_mm", "cy_mm", "cz_mm")
+#: What the coordinates of a centre are: positions of the axes, or of the tip under active kinematics.
+JOINTS, TIP = "joints", "tip"
+_length = within(2000.0, "mm", "more than 2 m; is the unit mm?")
+
+
+@dataclass(frozen=True, repr=False)
+class SphereCentres(Displayed):
+    """Centres of spheres found with a touch probe, or by an R-test, at n poses.
+
+    Parameters
+    ----------
+    found_mm : the centre found, or for an R-test the commanded position, (n, 3).
+    deviation_mm : for an R-test: tip minus the centre, in the frame of the table, (n, 3); nan for a touch probe.
+    coordinates : what ``found_mm`` is: positions of the axes (``joints``), or of the tip in the workpiece frame of the
+        nominal machine (``tip``).
+    angle_deg : commanded angles by rotary axis, each (n,).
+    tool_mm : offset of the tip, (n, 3).
+    sphere, setup : which sphere, and which set-up of it, (n,); each pair has a place of its own on the table.
+    u_mm : standard uncertainty of a coordinate, (n,); nan where unknown.
+    diameter_mm, time_s : nan where not stated, (n,).
+    """
+
+    found_mm: FloatArray
+    deviation_mm: FloatArray
+    coordinates: str
+    angle_deg: Mapping[str, FloatArray]
+    tool_mm: FloatArray
+    sphere: Sequence[str]
+    setup: NDArray[np.int64]
+    u_mm: FloatArray
+    diameter_mm: FloatArray
+    time_s: FloatArray
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    origin: Sequence[tuple[str, int]] = ()
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.found_mm)
+
+    @property
+    def places(self) -> tuple[NDArray[np.int64], list[str]]:
+        """Number of the place of each reading (n,), and the names of the places."""
+        keys = [f"{ball}, set-up {setup}" for ball, setup in zip(self.sphere, self.setup.tolist(), strict=True)]
+        names = list(dict.fromkeys(keys))
+        return np.array([names.index(key) for key in keys], dtype=np.int64), names
+
+    def part(self, rows: NDArray[np.intp]) -> SphereCentres:
+        """Return some of the readings."""
+        arrays = {name: getattr(self, name)[rows] for name in _ARRAYS}
+        return replace(
+            self,
+            **arrays,
+            angle_deg={letter: angle[rows] for letter, angle in self.angle_deg.items()},
+            sphere=[self.sphere[k] for k in rows],
+            origin=[self.origin[k] for k in rows] if self.origin else (),
+        )
+
+    def overview(self) -> Overview:
+        """Number of poses, spheres and lengths of the probe."""
+        spheres, tools = len(self.places[1]), len(np.unique(self.tool_mm, axis=0))
+        return Overview(f"{len(self)} poses, {spheres} places of spheres, {tools} lengths of the probe")
+
+
+_ARRAYS = ("found_mm", "deviation_mm", "tool_mm", "setup", "u_mm", "diameter_mm", "time_s")
+
+
+def read_spheres(machine: Machine, paths: Sequence[str | Path]) -> SphereCentres:
+    """Read ``*.sphere.csv`` files (mm and degrees) of a machine with rotary axes.
+
+    Raises
+    ------
+    InputError
+        without the comment ``# coordinates = joints`` or ``tip``, for an angle outside the travel of its axis, an axis
+        that the machine lacks, a missing column; with file, line and column.
+    """
+    if not machine.rotary:
+        raise InputError(
+            f"contains poses of rotary axes, and the machine {machine.name} has none; name them in its chain, e.g. "
+            "WCAYFXZT, and describe them in [axes.A] and [axes.C]",
+            file=paths[0],
+        )
+    parts = [_spheres_of(machine, Path(path)) for path in paths]
+    if len({part.coordinates for part in parts}) > 1:
+        raise InputError("some files have coordinates = joints, others tip; identify them separately", file=paths[-1])
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    return replace(
+        first,
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS},
+        angle_deg={letter: np.concatenate([part.angle_deg[letter] for part in parts]) for letter in machine.rotary},
+        sphere=[name for part in parts for name in part.sphere],
+        origin=[entry for part in parts for entry in part.origin],
+    )
+
+
+def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
+    found = CENTRE_COLUMNS[0] in names_in_header(read_text(path))
+    places = CENTRE_COLUMNS if found else (*POSITION_COLUMNS, *DEVIATION_COLUMNS)
+    angles = tuple(f"{letter.lower()}_deg" for letter in machine.rotary)
+    table = read_csv(
+        path,
+        (*places, *angles),
+        (*POSITION_COLUMNS, *ANGLE_COLUMNS, "probe_length_mm", "tool", *TOOL_COLUMNS, "sphere", "setup", "u_um",
+         "diameter_mm", "time_s", "run"),
+        (TEMPERATURES,),
+    )  # fmt: skip
+    coordinates = table.metadata.get("coordinates", "").strip().lower()
+    if coordinates not in (JOINTS, TIP):
+        stated = f"is {coordinates!r}" if coordinates else "is not stated"
+        raise InputError(
+            f"{stated}; write '# coordinates = joints' if the numbers are positions of the axes, '# coordinates = tip' "
+            "if they are positions of the tip under active kinematics (TCPC, RTCP)",
+            file=path,
+            field="coordinates",
+        )
+    count, nan = len(table), np.full(len(table), np.nan)
+    angle_deg = {letter: _angles(machine, table, letter) for letter in machine.rotary}
+    for column in ANGLE_COLUMNS:
+        letter = column[0].upper()
+        if column in table.columns and letter not in machine.rotary and np.any(table.numbers(column, empty=0.0)):
+            row = int(np.flatnonzero(table.numbers(column, empty=0.0))[0])
+            raise table.fail(row, column, f"the machine {machine.name} (chain {machine.chain.name}) has no axis {letter}")
+
+    def column(name: str, read: ReadColumn = CsvTable.numbers) -> FloatArray:
+        return np.asarray(read(table, name)) if name in table.columns else nan
+
+    return SphereCentres(
+        found_mm=np.column_stack([table.numbers(name) for name in (CENTRE_COLUMNS if found else POSITION_COLUMNS)]),
+        deviation_mm=np.column_stack(
+            [nan if found else deviations_um(table, name) * MM_PER_UM for name in DEVIATION_COLUMNS]
+        ),
+        coordinates=coordinates,
+        angle_deg=angle_deg,
+        tool_mm=_tools(machine, table),
+        sphere=table.text("sphere") if "sphere" in table.columns else ["sphere"] * count,
+        setup=table.labels("setup") if "setup" in table.columns else np.ones(count, dtype=np.int64),
+        u_mm=column("u_um", uncertainties) * MM_PER_UM,
+        diameter_mm=column("diameter_mm", _length),
+        time_s=column("time_s"),
+        metadata={key: value for key, value in table.metadata.items() if key != "rows"},
+        origin=[(str(path), line) for line in table.lines],
+    )
+
+
+def _angles(machine: Machine, table: CsvTable, letter: str) -> FloatArray:
+    """Commanded angles of one axis, within its travel."""
+    column = f"{letter.lower()}_deg"
+    angle = table.numbers(column)
+    axis = machine.rotary[letter]
+    if axis.range_deg is not None:
+        low, high = axis.range_deg
+        for row in np.flatnonzero((angle < low - 1e-6) | (angle > high + 1e-6))[:1].tolist():
+            raise table.fail(
+                row, column, f"{angle[row]:g} degrees is outside the travel {low:g} ... {high:g} of {letter}"
+            )
+    return angle
+
+
+def _tools(machine: Machine, table: CsvTable) -> FloatArray:
+    """Offsets of the tip (n, 3): stated as a vector, or the machine's own offset and the probe along -Z."""
+    own = np.tile(np.array(machine.tool_offset_mm), (len(table), 1))
+    if "probe_length_mm" in table.columns:
+        length = _length(table, "probe_length_mm")
+        for row in np.flatnonzero(length < 0)[:1].tolist():
+            raise table.fail(row, "probe_length_mm", f"{length[row]:g} mm is no length; expected a positive number")
+        return own + length[:, None] * np.array([0.0, 0.0, -1.0])
+    if TOOL_COLUMNS[0] in table.columns:
+        return np.column_stack([table.numbers(name) for name in TOOL_COLUMNS])
+    if "tool" in table.columns and len(set(table.text("tool"))) > 1:
+        raise InputError(
+            "names several tools; give their lengths in a column probe_length_mm", file=table.path, field="column tool"
+        )
+    return own
+
+
+def format_spheres(spheres: SphereCentres) -> str:
+    """Return the text of a ``*.sphere.csv`` file."""
+    columns: dict[str, Any] = {}
+    touched = np.isnan(spheres.deviation_mm).all()
+    for k, name in enumerate(CENTRE_COLUMNS if touched else POSITION_COLUMNS):
+        columns[name] = spheres.found_mm[:, k]
+    for letter, angle in spheres.angle_deg.items():
+        columns[f"{letter.lower()}_deg"] = angle
+    if not touched:
+        columns |= {name: spheres.deviation_mm[:, k] / MM_PER_UM for k, name in enumerate(DEVIATION_COLUMNS)}
+    columns |= {name: spheres.tool_mm[:, k] for k, name in enumerate(TOOL_COLUMNS)}
+    columns |= {"sphere": list(spheres.sphere), "setup": [str(k) for k in spheres.setup]}
+    for name, values, unit in (
+        ("u_um", spheres.u_mm, MM_PER_UM),
+        ("diameter_mm", spheres.diameter_mm, 1.0),
+        ("time_s", spheres.time_s, 1.0),
+    ):
+        if not np.isnan(values).any():
+            columns[name] = values / unit
+    return format_csv(columns, {**spheres.metadata, "coordinates": spheres.coordinates})
