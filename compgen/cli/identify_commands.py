@@ -21,10 +21,11 @@ from compgen.cli.shared_options import (
     stated_options,
 )
 from compgen.cli.terminal import progress, stdout
-from compgen.data.error_table import SQUARENESS_APART
+from compgen.data.error_table import SQUARENESS_APART, ErrorTable
 from compgen.data.files import OutputFolder, read_bytes
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
+from compgen.data.records import detect_format
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.source import open_measurement
@@ -109,6 +110,9 @@ def identify_command(
     averaged; exit code 1 and a warning list the errors that disagree. --workers and --cluster distribute the replicates
     of --self-check.
 
+    *.sphere.csv files contain centres of spheres at poses of a machine with rotary axes (chain such as WCAYFXZT): they give
+    the position errors of the rotary axes, and which of them the poses cannot tell apart.
+
     \b
     Example:
       volcomp identify zha-gantry examples/zha-gantry.lengths.csv --out identified/
@@ -116,6 +120,8 @@ def identify_command(
     if replicates is None and (workers > 1 or cluster is not None):
         raise InputError("--workers and --cluster need --self-check: they distribute its replicates")
     OutputFolder(out)
+    if any(detect_format(path) == "sphere" for path in measurements if path.suffix.lower() == ".csv"):
+        return _identify_spheres(machine, measurements, out, options, as_json)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
         measurement = open_measurement(measurements, instrument, stated=stated.errors(machine), answers=answers)
@@ -153,6 +159,40 @@ def identify_command(
             text += f"{checked.ratio_median:.2f} ({checked.ratio_min:.2f} ... {checked.ratio_max:.2f}): "
             stdout.print(text + ("agrees" if checked.agrees else "DOES NOT AGREE"))
     return 1 if result.details.get("disagree") else 0
+
+
+def _identify_spheres(
+    machine: Machine, measurements: tuple[Path, ...], out: Path, options: IdentifyOptions, as_json: bool
+) -> int:
+    """Identify the position errors of rotary axes, and write them with what the poses leave open."""
+    import json
+
+    from compgen.data.rotary import format_machine_errors, read_spheres
+    from compgen.identify.spheres import identify_spheres
+    from compgen.report.terminal import sphere_table
+
+    others = [path for path in measurements if detect_format(path) != "sphere"]
+    if others:
+        raise InputError(
+            "contains no centres of spheres; identify the linear axes and the rotary axes separately", file=others[0]
+        )
+    result = identify_spheres(machine, read_spheres(machine, measurements), u_um=options.u_deviation_um)
+    output = OutputFolder(out)
+    provenance = provenance_of(machine.source, *measurements)
+    output.add(
+        "identified.errors.csv",
+        format_machine_errors(ErrorTable(), result.errors, {"machine": machine.name, "source": "sphere centres"}),
+    )
+    output.add(
+        "identify.json", json.dumps({**result.summary(), "provenance": dict(provenance.inputs)}, indent=2) + "\n"
+    )
+    output.commit()
+    if as_json:
+        print_json(result.summary())
+    else:
+        stdout.print(sphere_table(result))
+        stdout.print(f"{out / 'identified.errors.csv'}, {out / 'identify.json'}")
+    return 0 if result.rank else 1
 
 
 @click.command("fit")

@@ -64,9 +64,6 @@ from compgen.report.terminal import (
     visibility_table,
 )
 from compgen.simulate import (
-    AxisLaser,
-    Ballbar,
-    DiagonalLaser,
     LaserTracer,
     MovingSimulation,
     SimulatedReadings,
@@ -81,6 +78,7 @@ from compgen.simulate import (
     write_simulation,
 )
 from compgen.simulate.gauges import circle_from_text, pose_from_text, read_gauge
+from compgen.simulate.run import OwnPath
 from compgen.tables import residuals
 from compgen.tables.probe_program import PROGRAM_NAME, probe_program, read_probing
 
@@ -395,7 +393,7 @@ def simulate_command(machine: Machine, scenario: Path, out: Path, seed: int | No
         simulation: Simulation | SimulatedReadings | MovingSimulation
         if isinstance(planned.instrument, LaserTracer) and planned.instrument.rate_hz is not None:
             simulation = simulate_moving(machine, planned, seed)
-        elif isinstance(planned.instrument, AxisLaser | DiagonalLaser | Ballbar | TouchProbe):
+        elif isinstance(planned.instrument, OwnPath):
             simulation = simulate_axis_runs(machine, planned, seed)
         elif isinstance(planned.instrument, SimulatedSixDof):
             simulation = simulate_sixdof(machine, planned, seed)
@@ -441,10 +439,15 @@ def predict_command(
     ex_um, ey_um, ez_um, and with --uncertainty u_x_um, u_y_um, u_z_um: standard uncertainties from the covariance that
     volcomp identify wrote, or from u_value of ERRORS, and from the prior of the machine.
 
+    Of a machine with rotary axes the points may have a_deg, b_deg, c_deg, and FILE also gets ea_urad, eb_urad, ec_urad:
+    position of the tip and orientation of the tool in the workpiece frame, which turns with the table; always exact.
+
     \b
     Example:
       volcomp predict zha-gantry fitted/fitted.errors.csv --points p.points.csv --out predicted.csv
     """
+    if machine.rotary:
+        return _predict_poses(machine, errors, points, out, uncertainty is not None, as_json)
     where = read_points(points)
     table = open_errors(errors)
     covariance, assumed = None, ""
@@ -484,6 +487,33 @@ def predict_command(
         if extra:
             stdout.print(f"largest standard uncertainty: x, y, z {', '.join(f'{u:.3f}' for u in extra.values())} um")
             stdout.print(assumed or "no prior: what was not measured is not in this uncertainty")
+    return 0
+
+
+def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with_u: bool, as_json: bool) -> int:
+    """Predict position and orientation at poses of a machine with rotary axes."""
+    import numpy as np
+
+    from compgen.data.rotary import format_poses, read_machine_errors, read_poses
+    from compgen.kinematics.rotary_chain import pose_error
+
+    if with_u:
+        raise InputError("--uncertainty does not work with rotary axes yet; identify.json contains the covariance")
+    poses = read_poses(machine, points)
+    table, rotary = read_machine_errors(errors)
+    error_mm, error_rad = pose_error(machine, table, rotary, poses.position_mm, poses.angle_deg, poses.tool_mm)
+    columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+    columns |= {f"e{axis}_urad": error_rad[:, k] * 1e6 for k, axis in enumerate("abc")}
+    write_file(out, format_poses(poses, columns, {"machine": machine.name, "model": "exact"}))
+    figures, turned = residuals(error_mm), float(np.linalg.norm(error_rad, axis=1).max() * 1e6)
+    if as_json:
+        angular = {"max_urad": turned}
+        print_json({"points": len(error_mm), "model": "exact", **figures.as_dict(), **angular, "file": str(out)})
+    else:
+        say(
+            f"{len(error_mm)} points, exact: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um, orientation max "
+            f"{turned:.1f} urad -> {out}"
+        )
     return 0
 
 

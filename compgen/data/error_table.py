@@ -308,7 +308,7 @@ def read_errors(path: str | Path) -> ErrorTable:
 
 def parse_errors(text: str, source: Path) -> ErrorTable:
     """Read the text of an ``*.errors.csv`` file like :func:`read_errors`; ``source`` is the name in messages."""
-    return errors_of_table(csv_table(source, text, required=ERROR_COLUMNS, optional=("u_value",)))
+    return errors_of_table(csv_table(source, text, required=ERROR_COLUMNS, optional=("u_value", "position_deg")))
 
 
 def errors_of_table(table: CsvTable) -> ErrorTable:

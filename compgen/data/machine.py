@@ -550,7 +550,9 @@ class Machine(Displayed):
         0.0,
         meaning="how far beyond the travel NC programs may go, mm: the software limits are as far from range_mm, or farther",
     )
-    rotary: Mapping[str, RotaryAxis] = toml_files.part_setting(factory=dict, meaning="rotary axes of the chain by letter")
+    rotary: Mapping[str, RotaryAxis] = toml_files.part_setting(
+        factory=dict, meaning="rotary axes of the chain by letter"
+    )
 
     def __post_init__(self) -> None:
         text_of("name", self.name)
@@ -736,12 +738,14 @@ def _read_rotary(section: toml_files.Section, chain: Chain) -> dict[str, RotaryA
     """Read the rotary axes of the chain; one that the chain does not name is refused."""
     for letter in ROTARY:
         if letter in section and letter not in chain.rotary:
-            raise section.fail(letter, f"the chain {chain.name} has no axis {letter}; put the letter into it, or omit [axes.{letter}]")
+            raise section.fail(
+                letter, f"the chain {chain.name} has no axis {letter}; put the letter into it, or omit [axes.{letter}]"
+            )
     found = {}
     for letter in sorted(chain.rotary):
         own = section.section(letter)
-        unit = tuple(float(k == ROTARY.index(letter)) for k in range(3))
-        direction = own.take("direction", toml_files.vector3, unit)
+        x, y, z = (float(k == ROTARY.index(letter)) for k in range(3))
+        direction = own.take("direction", _offset, (x, y, z))
         stated = toml_files.stated_settings(RotaryAxis, own)
         low, high = stated.get("range_deg") or (0.0, stated.get("modulo_deg", 360.0))
         if isinstance(own.data.get("nodes"), list):

@@ -383,6 +383,8 @@ def _any_of(names: Iterable[str]) -> tuple[frozenset[str], ...]:
 _PLACE = frozenset(POSITION_COLUMNS)
 _SIGNATURES = (
     _Signature("sixdof", _any_of(("y_qd1_mm", "y_psd1_mm"))),
+    _Signature("sphere", (frozenset({"cx_mm", "cy_mm", "cz_mm"}),)),
+    _Signature("sphere", tuple(frozenset({angle, "dx_um"}) for angle in ("a_deg", "b_deg", "c_deg")), _PLACE),
     _Signature("part", _any_of(MEASURED_COLUMNS), frozenset(POSITION_COLUMNS[:2])),
     _Signature("lengths", _any_of(("length_mm",)), _PLACE | {"station", "point"}),
     _Signature("axis", (frozenset({"axis", "position_mm", "deviation_um"}),), frozenset({"direction", "run"})),
@@ -411,7 +413,8 @@ def format_of_columns(names: set[str], *, complete: bool = False) -> str | None:
 def detect_format(source: str | Path) -> str | None:
     """Return the kind of a measurement file from its columns.
 
-    ``lengths``, ``deviations``, ``part``, ``artefact``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``errors``, or None.
+    ``lengths``, ``deviations``, ``part``, ``artefact``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``sphere``,
+    ``errors``, or None.
     """
     if str(source).lower().endswith((ARCHIVE, PARQUET)):
         return "lengths"

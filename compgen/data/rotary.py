@@ -45,7 +45,11 @@ def position_names(letter: str) -> tuple[str, ...]:
     """Constants of the position of its axis line: two offsets, two tilts across it, then its zero, e.g. EX0C ... EC0C."""
     along = ROTARY.index(letter)
     across = [k for k in range(3) if k != along]
-    return (*(f"E{AXES[k]}0{letter}" for k in across), *(f"E{ROTARY[k]}0{letter}" for k in across), f"E{letter}0{letter}")
+    return (
+        *(f"E{AXES[k]}0{letter}" for k in across),
+        *(f"E{ROTARY[k]}0{letter}" for k in across),
+        f"E{letter}0{letter}",
+    )
 
 
 ROTARY_NAMES: tuple[str, ...] = tuple(
@@ -79,8 +83,9 @@ class RotaryCurve:
     u: FloatArray
 
     def __post_init__(self) -> None:
-        for name, how in (("angle_deg", {}), ("value", {}), ("u", {"unknown": True, "least": 0.0})):
-            object.__setattr__(self, name, numbers(name, getattr(self, name), None, **how))
+        for name in ("angle_deg", "value"):
+            object.__setattr__(self, name, numbers(name, getattr(self, name), None))
+        object.__setattr__(self, "u", numbers("u", self.u, None, unknown=True, least=0.0))
         if not len(self.angle_deg) == len(self.value) == len(self.u) > 0 or (np.diff(self.angle_deg) <= 0).any():
             raise InputError("expected one value and one u for each angle, angles ascending", field="angle_deg")
 
@@ -159,19 +164,15 @@ def read_machine_errors(path: str | Path) -> tuple[ErrorTable, RotaryErrors]:
         return parse_errors(text, source), RotaryErrors()
     linear = "\n".join(line for line in linear.split("\n") if not line.startswith("# rows"))
     table = parse_errors(linear, source) if len(rest) > 1 else ErrorTable(metadata={})
-    columns = csv_table(
-        source, text, required=("error", "value"), optional=("position_mm", "position_deg", "u_value")
-    )
+    columns = csv_table(source, text, required=("error", "value"), optional=("position_mm", "position_deg", "u_value"))
     return table, _rotary_of(columns)
 
 
 def _rotary_of(table: CsvTable) -> RotaryErrors:
     names, values = table.text("error"), table.numbers("value")
     u = table.numbers("u_value", empty=np.nan) if "u_value" in table.columns else np.full(len(table), np.nan)
-    if "position_deg" in table.columns:
-        angle = table.numbers("position_deg", empty=np.nan)
-    else:
-        angle = np.full(len(table), np.nan)
+    unknown = np.full(len(table), np.nan)
+    angle = table.numbers("position_deg", empty=np.nan) if "position_deg" in table.columns else unknown
     rows: dict[str, list[int]] = {}
     for row, name in enumerate(names):
         if name in _PLACES:
@@ -323,9 +324,10 @@ def read_spheres(machine: Machine, paths: Sequence[str | Path]) -> SphereCentres
     first = parts[0]
     if len(parts) == 1:
         return first
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     return replace(
         first,
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS},
+        **arrays,
         angle_deg={letter: np.concatenate([part.angle_deg[letter] for part in parts]) for letter in machine.rotary},
         sphere=[name for part in parts for name in part.sphere],
         origin=[entry for part in parts for entry in part.origin],
@@ -358,9 +360,11 @@ def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
         letter = column[0].upper()
         if column in table.columns and letter not in machine.rotary and np.any(table.numbers(column, empty=0.0)):
             row = int(np.flatnonzero(table.numbers(column, empty=0.0))[0])
-            raise table.fail(row, column, f"the machine {machine.name} (chain {machine.chain.name}) has no axis {letter}")
+            raise table.fail(
+                row, column, f"the machine {machine.name} (chain {machine.chain.name}) has no axis {letter}"
+            )
 
-    def column(name: str, read: ReadColumn = CsvTable.numbers) -> FloatArray:
+    def optional(name: str, read: ReadColumn = CsvTable.numbers) -> FloatArray:
         return np.asarray(read(table, name)) if name in table.columns else nan
 
     return SphereCentres(
@@ -373,9 +377,9 @@ def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
         tool_mm=_tools(machine, table),
         sphere=table.text("sphere") if "sphere" in table.columns else ["sphere"] * count,
         setup=table.labels("setup") if "setup" in table.columns else np.ones(count, dtype=np.int64),
-        u_mm=column("u_um", uncertainties) * MM_PER_UM,
-        diameter_mm=column("diameter_mm", _length),
-        time_s=column("time_s"),
+        u_mm=optional("u_um", uncertainties) * MM_PER_UM,
+        diameter_mm=optional("diameter_mm", _length),
+        time_s=optional("time_s"),
         metadata={key: value for key, value in table.metadata.items() if key != "rows"},
         origin=[(str(path), line) for line in table.lines],
     )
@@ -402,7 +406,7 @@ def _tools(machine: Machine, table: CsvTable) -> FloatArray:
         length = _length(table, "probe_length_mm")
         for row in np.flatnonzero(length < 0)[:1].tolist():
             raise table.fail(row, "probe_length_mm", f"{length[row]:g} mm is no length; expected a positive number")
-        return own + length[:, None] * np.array([0.0, 0.0, -1.0])
+        return np.asarray(own + length[:, None] * np.array([0.0, 0.0, -1.0]))
     if TOOL_COLUMNS[0] in table.columns:
         return np.column_stack([table.numbers(name) for name in TOOL_COLUMNS])
     if "tool" in table.columns and len(set(table.text("tool"))) > 1:
@@ -432,3 +436,43 @@ def format_spheres(spheres: SphereCentres) -> str:
         if not np.isnan(values).any():
             columns[name] = values / unit
     return format_csv(columns, {**spheres.metadata, "coordinates": spheres.coordinates})
+
+
+# Points at poses, where errors are predicted.
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Commanded positions (n, 3) with angles by rotary axis, each (n,), and tool offsets (n, 3) or None."""
+
+    position_mm: FloatArray
+    angle_deg: Mapping[str, FloatArray]
+    tool_mm: FloatArray | None
+
+
+def read_poses(machine: Machine, path: str | Path) -> Poses:
+    """Read a ``*.points.csv`` file with ``a_deg``, ``b_deg``, ``c_deg``; an axis without a column is at its reference."""
+    table = read_csv(path, POSITION_COLUMNS, (*ANGLE_COLUMNS, *TOOL_COLUMNS))
+    for column in ANGLE_COLUMNS:
+        if column in table.columns and column[0].upper() not in machine.rotary:
+            raise table.fail(0, column, f"the machine {machine.name} has no axis {column[0].upper()}; omit the column")
+    angle = {
+        letter: _angles(machine, table, letter)
+        if f"{letter.lower()}_deg" in table.columns
+        else np.full(len(table), axis.reference_deg)
+        for letter, axis in machine.rotary.items()
+    }
+    known = [name for name in TOOL_COLUMNS if name in table.columns]
+    if known and len(known) < len(TOOL_COLUMNS):
+        raise InputError(f"has {known[0]} but not all of {', '.join(TOOL_COLUMNS)}", file=path)
+    tool = np.column_stack([table.numbers(name) for name in TOOL_COLUMNS]) if known else None
+    return Poses(np.column_stack([table.numbers(name) for name in POSITION_COLUMNS]), angle, tool)
+
+
+def format_poses(poses: Poses, results: Mapping[str, FloatArray], metadata: Mapping[str, object]) -> str:
+    """Return CSV text of the poses with result columns (n,) after them."""
+    columns = {name: poses.position_mm[:, k] for k, name in enumerate(POSITION_COLUMNS)}
+    columns |= {f"{letter.lower()}_deg": angle for letter, angle in poses.angle_deg.items()}
+    if poses.tool_mm is not None:
+        columns |= {name: poses.tool_mm[:, k] for k, name in enumerate(TOOL_COLUMNS)}
+    return format_csv({**columns, **results}, metadata)

@@ -16,12 +16,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, COVERAGE, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
+from compgen.data.names import AXES, COVERAGE, MM_PER_UM, SQUARENESS_NAMES
 from compgen.data.prior import CLASSES, USUAL_CLASS
 from compgen.data.rotary import JOINTS, TIP, RotaryErrors, SphereCentres, position_names, si_per_unit, unit_of
 from compgen.errors import ConvergenceError, InputError
@@ -38,12 +39,14 @@ _NAMED = 0.25
 _NO_PRIOR = 1e3
 #: Errors of this many times their size say that the machine is worse than its class; the sizes grow until they are not.
 _WORSE = 2.0
-_STEPS, _SETTLED = 30, 1e-6
+_STEPS, _SETTLED = 30, 1e-4
 #: Steps of the difference quotients: mm, rad, relative.
 _STEP_MM, _STEP_RAD = 1e-3, 1e-6
 #: Times the uncertainty of the readings, and the sizes of the errors, follow the residuals.
 _ROUNDS = 8
 WITHOUT_EFFECT = "nothing needs to: it moves or turns the workpiece as a whole, and setting up the part removes it"
+#: A diameter changes with an angle if chance explains it with a smaller probability only (F test over sectors of 30 degrees).
+_UNLIKELY = 1e-4
 #: Groups of poses that are left out in turn.
 _FOLDS = 5
 
@@ -87,7 +90,7 @@ class SphereIdentification(Displayed):
     @property
     def u(self) -> FloatArray:
         """Standard uncertainties of the errors, mm and rad."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def summary(self) -> dict[str, object]:
         """Plain values for ``identify.json``; um and urad."""
@@ -104,8 +107,13 @@ class SphereIdentification(Displayed):
                     "determined": known,
                 }
                 for name, unit, value, u, size, known in zip(
-                    self.names, units.tolist(), self.values.tolist(), self.u.tolist(), self.sizes.tolist(),
-                    self.determined, strict=True,
+                    self.names,
+                    units.tolist(),
+                    self.values.tolist(),
+                    self.u.tolist(),
+                    self.sizes.tolist(),
+                    self.determined,
+                    strict=True,
                 )
             },
             "covariance": (self.covariance / np.outer(units, units)).tolist(),
@@ -185,13 +193,15 @@ class _Model:
         """Derivatives (3 n, 3 m) of the residuals by the places of the spheres."""
         place, names = self.spheres.places
         pick = np.eye(len(names))[place]
-        return -np.einsum("nm,ij->nimj", pick, np.eye(3)).reshape(3 * len(place), 3 * len(names))
+        return np.asarray(-np.einsum("nm,ij->nimj", pick, np.eye(3)).reshape(3 * len(place), 3 * len(names)))
 
 
 def _constants(names: Sequence[str], values: FloatArray, u: FloatArray) -> dict[str, tuple[float, float]]:
     """Constants of the rotary axes by name, without the offsets of the spindle."""
     return {
-        name: (float(value), float(own)) for name, value, own in zip(names, values, u, strict=True) if name not in SPINDLE
+        name: (float(value), float(own))
+        for name, value, own in zip(names, values, u, strict=True)
+        if name not in SPINDLE
     }
 
 
@@ -260,7 +270,9 @@ def identify_spheres(
         *_look(machine, spheres),
     ]
     if raised > 1.0:
-        notes.append(f"The rotary axes are {raised:.1f} times as far off as the class of the machine says; its sizes were raised.")
+        notes.append(
+            f"The rotary axes are {raised:.1f} times as far off as the class of the machine says; its sizes were raised."
+        )
     if not estimated and scale > 1.3:
         notes.append(
             f"The readings scatter {scale:.1f} times as much as they state; their uncertainty is widened. Something that no "
@@ -278,7 +290,7 @@ def identify_spheres(
         ),
         rank=int((~open_).sum()),
         residual_um=_figures(before, residual),
-        left_out_um=_left_out(machine, spheres, u, raised),
+        left_out_um=_left_out(model, x, u),
         u_um=float(np.sqrt(np.mean(u**2)) / MM_PER_UM),
         u_from_residuals=estimated or scale > 1.0,
         poses=len(spheres),
@@ -303,10 +315,12 @@ def _solve(model: _Model, u_mm: FloatArray) -> tuple[FloatArray, FloatArray, Flo
         normal = jacobian.T @ jacobian + np.diag(precision)
         step = np.linalg.solve(normal, -(jacobian.T @ residual) - precision * full / size)
         x = full + step * size
-        if np.abs(step[:m]).max() < _SETTLED:
+        if np.abs(jacobian @ (x / size - full / size)).max() < _SETTLED:
             break
     else:
-        raise ConvergenceError("the position errors of the rotary axes were not found; are the angles and the chain right?")
+        raise ConvergenceError(
+            "the position errors of the rotary axes were not found; are the angles and the chain right?"
+        )
     inverse = np.linalg.inv(normal)
     residual = (model.tip(x[:m]).ravel() + places @ x[m:]).reshape(-1, 3)
     freedom = residual.size - float(np.trace(inverse @ (jacobian.T @ jacobian)))
@@ -383,10 +397,11 @@ def _split(model: _Model, open_: FloatArray) -> list[tuple[FloatArray, bool]]:
     effect = _effects(model)
     _, strength, across = np.linalg.svd(effect @ open_, full_matrices=True)
     turned = open_ @ across.T
-    none = np.append(strength, np.zeros(turned.shape[1] - len(strength))) <= _NO_EFFECT * np.linalg.norm(effect, axis=0).max()
-    return [
-        (column, bool(acts)) for acts in (True, False) for column in _sparse(turned[:, none != acts]).T
-    ]
+    none = (
+        np.append(strength, np.zeros(turned.shape[1] - len(strength)))
+        <= _NO_EFFECT * np.linalg.norm(effect, axis=0).max()
+    )
+    return [(column, bool(acts)) for acts in (True, False) for column in _sparse(turned[:, none != acts]).T]
 
 
 def _sparse(basis: FloatArray) -> FloatArray:
@@ -433,7 +448,7 @@ def _poses(joint_mm: FloatArray, angle_deg: Mapping[str, FloatArray], tool_mm: F
     )  # fmt: skip
 
 
-def _centred(points: FloatArray, place: FloatArray) -> FloatArray:
+def _centred(points: FloatArray, place: NDArray[np.int64]) -> FloatArray:
     out = points.copy()
     for k in np.unique(place):
         out[place == k] -= out[place == k].mean(axis=0)
@@ -450,50 +465,57 @@ def _figures(before: FloatArray, after: FloatArray) -> dict[str, float]:
     }
 
 
-def _left_out(machine: Machine, spheres: SphereCentres, u_mm: FloatArray, raised: float) -> tuple[float, float]:
-    """Rms over poses that were left out of the fit in turn, um: with the sphere from the fitted poses, no errors and fitted."""
-    place, names = spheres.places
+def _left_out(model: _Model, x: FloatArray, u_mm: FloatArray) -> tuple[float, float]:
+    """Rms over poses that were left out of the fit in turn, um: with the sphere from the fitted poses, no errors and fitted.
+
+    Each fit is one linear step from the fit of all poses.
+    """
+    place, names = model.spheres.places
     if min((place == k).sum() for k in range(len(names))) < 3 * _FOLDS:
         return np.nan, np.nan
-    fold = np.random.default_rng(0).permutation(len(spheres)) % _FOLDS
+    m, places = len(model.size), model.places()
+    columns = np.hstack([model.columns(x[:m]), places])
+    residual = model.tip(x[:m]).ravel() + places @ x[m:]
+    zero = model.tip(np.zeros(m))
+    prior = np.concatenate([model.size**-2.0, np.zeros(places.shape[1])])
+    fold = np.random.default_rng(0).permutation(len(place)) % _FOLDS
     before, after = [], []
     for k in range(_FOLDS):
-        inside, outside = np.flatnonzero(fold != k), np.flatnonzero(fold == k)
-        model = _model(machine, spheres.part(inside), raised)
-        x = _solve(model, u_mm[inside])[0]
-        other = _model(machine, spheres.part(outside), raised)
-        m = len(model.size)
-        order = [model.spheres.places[1].index(other.spheres.places[1][j]) for j in other.spheres.places[0]]
-        centre = x[m:].reshape(-1, 3)[order]
-        after.append(other.tip(x[:m]) - centre)
-        zero = model.tip(np.zeros(m))
-        means = np.stack([zero[model.spheres.places[0] == j].mean(axis=0) for j in range(len(names))])
-        before.append(other.tip(np.zeros(m)) - means[order])
-    return (
-        float(np.sqrt(np.mean(np.sum(np.concatenate(before) ** 2, axis=1))) / MM_PER_UM),
-        float(np.sqrt(np.mean(np.sum(np.concatenate(after) ** 2, axis=1))) / MM_PER_UM),
-    )
+        inside = np.repeat(fold != k, 3)
+        weighted = columns[inside] * np.repeat(u_mm, 3)[inside, None] ** -2.0
+        normal = weighted.T @ columns[inside] + np.diag(prior)
+        step = np.linalg.solve(normal, -(weighted.T @ residual[inside]) - prior * x)
+        after.append((residual + columns @ step)[~inside])
+        means = np.stack([zero[(place == j) & (fold != k)].mean(axis=0) for j in range(len(names))])
+        before.append((zero - means[place])[fold == k].ravel())
+    first, second = (float(np.sqrt(3.0 * np.mean(np.concatenate(rows) ** 2)) / MM_PER_UM) for rows in (before, after))
+    return first, second
 
 
 def _look(machine: Machine, spheres: SphereCentres) -> list[str]:
     """What the sphere itself betrays: a probed diameter that changes with an angle; repeats of a pose that do not close."""
+    from scipy.special import fdtrc  # imported here: slow to load
+
     notes = []
     diameter = spheres.diameter_mm
     known = ~np.isnan(diameter)
     if known.sum() >= 8:
         spread = float(np.std(diameter[known], ddof=1))
         for letter, angle in spheres.angle_deg.items():
-            turns = np.round(np.mod(angle[known], 360.0) / 5.0).astype(int) % 72
+            turns = np.round(np.mod(angle[known], 360.0) / 30.0).astype(int) % 12
             groups = [diameter[known][turns == k] for k in np.unique(turns) if (turns == k).sum() >= 2]
             if len(groups) < 2:
                 continue
             within = np.concatenate([group - group.mean() for group in groups])
-            inner = float(np.sqrt(np.sum(within**2) / max(len(within) - len(groups), 1)))
+            freedom = len(within) - len(groups)
+            inner = float(np.sqrt(np.sum(within**2) / max(freedom, 1)))
             means = np.array([group.mean() for group in groups])
-            if np.ptp(means) > 3.0 * max(inner, 1e-3) * np.sqrt(2.0 / min(map(len, groups))):
+            across = sum(len(group) * (group.mean() - np.mean(np.concatenate(groups))) ** 2 for group in groups)
+            ratio = across / (len(groups) - 1) / max(inner, 1e-4) ** 2
+            if freedom >= 3 and fdtrc(len(groups) - 1, freedom, ratio) < _UNLIKELY:
                 notes.append(
                     f"The probed diameter of the sphere changes with {letter}: {means.min():.3f} to {means.max():.3f} mm "
-                    f"({1e3 * inner:.0f} um at the same angle). No position error does that: look at the probe (pre-travel and "
+                    f"({1e3 * inner:.0f} um within a sector). No position error does that: look at the probe (pre-travel and "
                     f"lobing against its direction), its calibration at this angle, or a spindle that turns with {letter}."
                 )
         if not notes and spread > 5e-3:

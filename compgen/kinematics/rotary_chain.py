@@ -33,9 +33,11 @@ def _own_axes(letter: str, direction: tuple[float, float, float]) -> FloatArray:
     along, u = np.eye(3)[ROTARY.index(letter)], np.array(direction)
     cross, cosine = np.cross(along, u), float(along @ u)
     if cosine < -1.0 + 1e-12:
-        raise InputError(f"direction of {letter} is opposite to its axis; reverse the sign of its angles", field="direction")
+        raise InputError(
+            f"direction of {letter} is opposite to its axis; reverse the sign of its angles", field="direction"
+        )
     matrix = np.array([[0.0, -cross[2], cross[1]], [cross[2], 0.0, -cross[0]], [-cross[1], cross[0], 0.0]])
-    return np.eye(3) + matrix + matrix @ matrix / (1.0 + cosine)
+    return np.asarray(np.eye(3) + matrix + matrix @ matrix / (1.0 + cosine))
 
 
 def tip_pose(
@@ -86,7 +88,7 @@ def tip_pose(
 def _large(rotation: FloatArray, vectors: FloatArray) -> FloatArray:
     """Turn vectors (n, 3), or columns (n, 3, k), by rotation vectors (n, 3) of any size."""
     matrices = level_rotations(rotation)[0]
-    return np.einsum("nij,nj...->ni...", matrices, vectors)
+    return np.asarray(np.einsum("nij,nj...->ni...", matrices, vectors))
 
 
 def pose_error(

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from compgen.accuracy.field import ComparedFigure, Figure
     from compgen.fit import FitResult
     from compgen.identify import Identification
+    from compgen.identify.spheres import SphereIdentification
     from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate, VolumeUncertainty
     from compgen.plan.gauges import GaugePlan
     from compgen.plan.next_best import NextBest
@@ -127,6 +128,33 @@ def advice_text(result: Identification, proposed: NextBest | None) -> Group:
     if proposed is not None and proposed.text:
         lines.append(f"next measurement: {proposed.text}")
     return Group(*(Text(line) for line in lines))
+
+
+def sphere_table(result: SphereIdentification) -> Group:
+    """Return the position errors of rotary axes, the fit, and what the poses cannot tell apart."""
+    figures, (without, left_out) = result.residual_um, result.left_out_um
+    overview = result.overview()
+    table = Table(
+        title=f"{overview.title}; {result.rank} combinations determined", box=box.SIMPLE_HEAD, title_justify="left"
+    )
+    for name, justify in zip(overview.header, ("left", "right", "right", "left", "left"), strict=True):
+        table.add_column(name, justify=justify)  # type: ignore[arg-type]
+    for row in overview.rows:
+        table.add_row(*row)
+    lines = [
+        f"distance from the spheres {um_text(figures['before_rms'])} um rms (largest {um_text(figures['before_max'])}) -> "
+        f"{um_text(figures['after_rms'])} um (largest {um_text(figures['after_max'])} um)"
+        + (
+            ""
+            if math.isnan(left_out)
+            else f"; poses left out of the fit: {um_text(without)} -> {um_text(left_out)} um rms"
+        ),
+        f"standard uncertainty of a coordinate: {um_text(result.u_um)} um"
+        + (", from the residuals" if result.u_from_residuals else ", as stated"),
+        *(f"cannot be told apart: {words}; {cure}" for words, cure in result.inseparable),
+        *(f"note: {text}" for text in result.notes),
+    ]
+    return Group(table, *(Text(line) for line in lines))
 
 
 def _errors_table(result: Identification) -> Table:

@@ -32,6 +32,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import SECONDS_PER_MIN
 from compgen.data.records import ARCHIVE
 from compgen.data.registry import call_problem
+from compgen.data.rotary import RotaryErrors, SphereCentres, format_machine_errors, format_spheres
 from compgen.data.toml_files import part_setting, setting
 from compgen.errors import InputError
 from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
@@ -56,6 +57,7 @@ from compgen.simulate.lasers import (
     read_laser_tracer,
 )
 from compgen.simulate.sixdof import SimulatedSixDof, read_sixdof_measurement
+from compgen.simulate.spheres import SphereProbe, read_sphere_probe
 from compgen.simulate.trajectory import (
     Session,
     Stops,
@@ -139,7 +141,7 @@ class Instrument(Protocol):
 
 
 #: Instruments that bring the path of the machine with them, and need no trajectory.
-OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe
+OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe | SphereProbe
 AnyInstrument = Instrument | SimulatedSixDof | OwnPath
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
 INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
@@ -149,6 +151,7 @@ INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
     "diagonal-laser": read_diagonal_laser,
     "ballbar": read_ballbar,
     "touch-probe": read_touch_probe,
+    "sphere-probe": read_sphere_probe,
 }
 
 
@@ -264,8 +267,8 @@ def scenario_of(root: toml_files.Section, source: Path) -> Scenario:
 # Run a scenario on a virtual machine: true errors -> tips -> readings -> files.
 
 
-#: Children of the seed: one for the errors, one for the noise, one for the order of a session.
-ERROR_STREAM, NOISE_STREAM, ORDER_STREAM = 0, 1, 2
+#: Children of the seed: for the errors, the noise, the order of a session, and the errors of rotary axes.
+ERROR_STREAM, NOISE_STREAM, ORDER_STREAM, ROTARY_STREAM = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, repr=False)
@@ -299,8 +302,9 @@ class SimulatedReadings:
     """
 
     name: str
-    readings: AxisRuns | Diagonals | Circles | Artefact | SixDof
+    readings: AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres
     truth: ErrorTable
+    rotary: RotaryErrors | None = None
 
 
 def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequence[Displacement] = ()) -> FloatArray:
@@ -495,6 +499,8 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
             file=scenario.source,
             field="[instrument] type",
         )
+    if isinstance(instrument, SphereProbe):
+        return _found_spheres(machine, scenario, instrument, seed)
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
 
     def measure(truth: ErrorTable, rng: np.random.Generator) -> AxisRuns | Diagonals | Circles | Artefact:
@@ -506,11 +512,30 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
     return _measured(machine, scenario, seed, measure)
 
 
+def _found_spheres(
+    machine: Machine, scenario: Scenario, instrument: SphereProbe, seed: int | None
+) -> SimulatedReadings:
+    """Find the spheres; the errors of the rotary axes come from the stream of errors, after those of the linear axes."""
+    if scenario.effects or scenario.temperatures:
+        raise InputError("a sphere-probe takes no effects and no temperatures; omit them", file=scenario.source)
+    drawn: list[RotaryErrors] = []
+    used_seed = scenario.seed if seed is None else seed
+    own = random_stream(np.random.SeedSequence(used_seed), ROTARY_STREAM)
+
+    def measure(truth: ErrorTable, rng: np.random.Generator) -> SphereCentres:
+        drawn.append(instrument.truth(machine, own))
+        return instrument.measure(machine, truth, drawn[0], rng)
+
+    return replace(_measured(machine, scenario, seed, measure), rotary=drawn[0])
+
+
 def _measured(
     machine: Machine,
     scenario: Scenario,
     seed: int | None,
-    measure: Callable[[ErrorTable, np.random.Generator], AxisRuns | Diagonals | Circles | Artefact | SixDof],
+    measure: Callable[
+        [ErrorTable, np.random.Generator], AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres
+    ],
 ) -> SimulatedReadings:
     used_seed = scenario.seed if seed is None else seed
     seeds = np.random.SeedSequence(used_seed)
@@ -537,6 +562,7 @@ _FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
     Circles: (".circle.csv", format_circles),
     Artefact: (".artefact.csv", format_artefact),
     SixDof: (".sixdof.csv", format_sixdof),
+    SphereCentres: (".sphere.csv", format_spheres),
     Lengths: (".lengths.csv", format_lengths),
 }
 
@@ -570,5 +596,8 @@ def write_simulation(
     readings = simulation.lengths if isinstance(simulation, Simulation) else simulation.readings
     suffix, text_of = _FORMATS[type(readings)]
     output.add(f"{simulation.name}{suffix}", text_of(readings))
-    output.add("truth.errors.csv", format_errors(simulation.truth))
+    rotary = simulation.rotary if isinstance(simulation, SimulatedReadings) else None
+    truth = simulation.truth
+    text = format_errors(truth) if rotary is None else format_machine_errors(truth, rotary, truth.metadata)
+    output.add("truth.errors.csv", text)
     return output.commit()

@@ -168,7 +168,7 @@ def test_a_missing_axis_is_named(saved):
 
 def test_an_unknown_axis_is_refused(saved):
     message = refusal(saved(GOOD + "[axes.A]\nrange_mm = [0, 1]\nnodes = 2\n"))
-    assert ":22: [axes] A: is not a known key; " in message
+    assert ":22: [axes] A: the chain WYFXZT has no axis A; put the letter into it" in message
 
 
 def test_a_range_without_machine_zero_needs_a_reference_point(saved):

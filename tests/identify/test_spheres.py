@@ -1,0 +1,241 @@
+"""Position errors of rotary axes from sphere centres: hidden truth, what cannot be told apart, the files."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Axis, Chain, Machine, RotaryAxis
+from compgen.data.prior import PriorSettings
+from compgen.data.rotary import RotaryErrors, format_spheres, position_names, read_machine_errors, read_spheres, unit_of
+from compgen.errors import InputError
+from compgen.identify.spheres import WITHOUT_EFFECT, identify_spheres
+from compgen.simulate.spheres import SphereProbe
+
+KINDS = {"table-table": "WCAYFXZT", "head-table": "WCYFXZBT", "head-head": "WXYFZCBT"}
+
+
+def machine_of(chain):
+    axes = tuple(Axis((-600.0, 600.0), np.linspace(-600.0, 600.0, 5)) for _ in range(3))
+    rotary = {}
+    for letter in Chain(chain).rotary:
+        table = chain.index(letter) < chain.index("F")
+        place = (0.0, 0.0, -50.0 if letter != "C" else 0.0) if table else (0.0, 0.0, 200.0)
+        ends = {"modulo_deg": 360.0} if letter == "C" else {"range_deg": (-110.0, 110.0)}
+        rotary[letter] = RotaryAxis(tuple(np.eye(3)["ABC".index(letter)]), place, np.linspace(-110, 110, 5), **ends)
+    return Machine("five", Chain(chain), axes, rotary=rotary)
+
+
+def measured(machine, rng, lengths, *, poses=40, noise_um=2.0, truth=None, spheres=((60.0, 40.0, 20.0),)):
+    probe = SphereProbe(spheres, lengths, poses, noise_um, offset_um=100.0, tilt_urad=300.0)
+    truth = truth or probe.truth(machine, rng)
+    return probe.measure(machine, ErrorTable(), truth, rng), truth
+
+
+@pytest.mark.parametrize(
+    ("kind", "lengths", "combinations", "apart"),
+    [
+        ("table-table", (120.0,), 8, []),
+        ("table-table", (120.0, 220.0), 8, []),
+        ("head-table", (120.0,), 8, [{"EB0B", "TX"}]),
+        ("head-table", (120.0, 220.0), 9, []),
+        ("head-head", (120.0,), 8, [{"EB0B", "TX"}]),
+        ("head-head", (120.0, 220.0), 9, []),
+    ],
+)
+def test_poses_of_one_sphere_determine_what_a_table_of_the_model_says(kind, lengths, combinations, apart):
+    """8 of 10 with one probe, with a second length 9 where a head turns; a zero of B and a tool beside B look alike."""
+    machine = machine_of(KINDS[kind])
+    spheres, _ = measured(machine, np.random.default_rng(1), lengths)
+    found = identify_spheres(machine, spheres)
+    assert found.rank == combinations
+    acting = [(set(words.split(" with ")), cure) for words, cure in found.inseparable if cure != WITHOUT_EFFECT]
+    assert [names for names, _ in acting] == apart
+    assert all(cure == "the same poses with a probe 100 mm longer" for _, cure in acting)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_stated_uncertainties_cover_the_truth(kind):
+    machine, rng, off = machine_of(KINDS[kind]), np.random.default_rng(2), []
+    for _ in range(5):
+        spheres, truth = measured(machine, rng, (120.0, 220.0))
+        found = identify_spheres(machine, spheres, separate=False)
+        true = np.array([truth.constants.get(name, (0.0, 0.0))[0] for name in found.names])
+        off.append((found.values - true) / found.u)
+        # combinations, too: the joint covariance is one
+        assert (found.values - true) @ np.linalg.solve(found.covariance, found.values - true) < 40.0
+        assert found.residual_um["after_rms"] < 4.5 < found.residual_um["before_rms"]
+    inside = np.mean(np.abs(off) < 2.0)
+    assert inside > 0.9
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) < 1.2
+
+
+def test_what_is_not_determined_is_not_claimed():
+    machine = machine_of(KINDS["table-table"])
+    truth = RotaryErrors(
+        {}, {name: (0.0, 0.0) for letter in "CA" for name in position_names(letter)} | {"EA0C": (4e-4, 0.0)}
+    )
+    spheres, _ = measured(machine, np.random.default_rng(3), (120.0,), truth=truth, noise_um=1.0)
+    found = identify_spheres(machine, spheres)
+    known = dict(zip(found.names, found.determined, strict=True))
+    assert not known["EA0C"] and not known["EA0A"] and not known["EC0C"] and known["EX0C"]
+    k, j = found.names.index("EA0C"), found.names.index("EA0A")
+    pair = found.values[k] + found.values[j]
+    u = np.sqrt(found.covariance[[k, j]][:, [k, j]].sum())
+    assert abs(pair - 4e-4) < 3.0 * u < 3e-5  # their sum is determined
+    assert min(found.u[[k, j]]) > 1e-4
+
+
+def test_a_machine_much_worse_than_its_class_is_said_and_found():
+    machine = machine_of(KINDS["table-table"])
+    truth = RotaryErrors({}, {"EX0C": (2.5, 0.0), "EY0A": (-1.0, 0.0), "EB0C": (4e-3, 0.0)})
+    spheres, _ = measured(machine, np.random.default_rng(4), (120.0,), truth=truth)
+    found = identify_spheres(machine, spheres, separate=False)
+    assert any("times as far off as the class" in note for note in found.notes)
+    for name in truth.constants:
+        k = found.names.index(name)
+        assert abs(found.values[k] - truth.constants[name][0]) < 3.5 * found.u[k]
+        assert found.determined[k]
+
+
+def test_noise_that_is_not_stated_comes_from_the_residuals():
+    machine = machine_of(KINDS["head-head"])
+    spheres, _ = measured(machine, np.random.default_rng(5), (120.0, 220.0), noise_um=5.0)
+    from dataclasses import replace
+
+    unknown = replace(spheres, u_mm=np.full(len(spheres), np.nan))
+    found = identify_spheres(machine, unknown, separate=False)
+    assert found.u_from_residuals and found.u_um == pytest.approx(5.0, rel=0.15)
+    optimistic = replace(spheres, u_mm=np.full(len(spheres), 1e-3))
+    assert identify_spheres(machine, optimistic, separate=False).u_um == pytest.approx(5.0, rel=0.15)
+
+
+def test_without_a_prior_the_determined_errors_are_the_same():
+    from dataclasses import replace
+
+    machine = machine_of(KINDS["table-table"])
+    spheres, _ = measured(machine, np.random.default_rng(6), (120.0,))
+    usual = identify_spheres(machine, spheres, separate=False)
+    free = identify_spheres(replace(machine, prior=PriorSettings("none")), spheres, separate=False)
+    for k, known in enumerate(usual.determined):
+        if known:
+            assert abs(usual.values[k] - free.values[k]) < 0.3 * usual.u[k]
+        else:
+            assert free.u[k] > 50.0 * usual.u[k]
+
+
+def test_a_diameter_that_changes_with_an_angle_is_named():
+    from dataclasses import replace
+
+    machine, rng = machine_of(KINDS["head-head"]), np.random.default_rng(7)
+    spheres, _ = measured(machine, rng, (120.0,), poses=150)
+    turned = spheres.angle_deg["C"]
+    lobed = 30.13 + 0.15 * (np.abs(turned - 270.0) < 45.0) + 0.005 * rng.normal(size=150)
+    notes = identify_spheres(machine, replace(spheres, diameter_mm=lobed), separate=False).notes
+    assert any("changes with C" in note and "No position error does that" in note for note in notes)
+    even = 30.13 + 0.002 * rng.normal(size=150)
+    notes = identify_spheres(machine, replace(spheres, diameter_mm=even), separate=False).notes
+    assert not any("diameter" in note for note in notes)
+
+
+MACHINE = """name = "trunnion"
+chain = "WCAYFXZT"
+axes.X = { range_mm = [-400.0, 400.0], nodes = 7 }
+axes.Y = { range_mm = [-400.0, 400.0], nodes = 7 }
+axes.Z = { range_mm = [-300.0, 400.0], nodes = 7 }
+axes.A = { point_mm = [0.0, 0.0, -50.0], range_deg = [-110.0, 30.0], nodes = 8 }
+axes.C = { point_mm = [0.0, 0.0, 0.0], modulo_deg = 360.0, nodes = 13 }
+"""
+SCENARIO = """name = "trunnion"
+seed = 5
+[errors]
+file = "zero.errors.csv"
+[instrument]
+type = "sphere-probe"
+spheres_mm = [[60.0, 20.0, 10.0]]
+probe_lengths_mm = [100.0]
+poses = 40
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("five.toml").write_text(MACHINE)
+    Path("s.toml").write_text(SCENARIO)
+    Path("zero.errors.csv").write_text("error,position_mm,value\nEC0Y,,0.0\n")
+    return tmp_path
+
+
+def test_simulate_identify_predict(folder, call):
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    code, out, err = call("identify", "five.toml", "sim/trunnion.sphere.csv", "--out", "found", "--json")
+    assert code == 0, err
+    summary = json.loads(out)
+    assert summary["determined_combinations"] == 8 and len(summary["inseparable"]) == 2
+    _, truth = read_machine_errors("sim/truth.errors.csv")
+    _, found = read_machine_errors("found/identified.errors.csv")
+    for name, entry in summary["errors"].items():
+        unit = 1e-3 if unit_of(name) == "um" else 1e-6
+        assert found.constants[name][0] == pytest.approx(entry["value"] * unit, abs=1e-9)
+        if entry["determined"]:
+            assert abs(truth.constants[name][0] / unit - entry["value"]) < 4.0 * entry["u"]
+    Path("p.points.csv").write_text("x_mm,y_mm,z_mm,a_deg,c_deg\n10,20,130,-45,90\n0,0,200,0,0\n")
+    code, out, err = call(
+        "predict", "five.toml", "found/identified.errors.csv", "--points", "p.points.csv", "--out", "p.csv"
+    )
+    assert code == 0, err
+    assert "ea_urad,eb_urad,ec_urad" in Path("p.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("# coordinates = joints\n", "", "is not stated; write '# coordinates = joints'"),
+        ("# coordinates = joints\n", "# coordinates = machine\n", "is 'machine'; write"),
+        ("a_deg", "b_deg", "a_deg"),
+    ],
+)
+def test_a_file_that_does_not_say_what_it_is_is_refused(folder, call, old, new, said):
+    call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")
+    text = Path("sim/trunnion.sphere.csv").read_text()
+    Path("x.sphere.csv").write_text(text.replace(old, new, 1))
+    code, out, err = call("identify", "five.toml", "x.sphere.csv", "--out", "found")
+    assert code == 2 and said in " ".join(err.split())
+    assert not Path("found").exists()
+
+
+def test_an_angle_beyond_the_travel_a_machine_of_three_axes_and_other_commands_are_refused(folder, call):
+    call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")
+    lines = Path("sim/trunnion.sphere.csv").read_text().splitlines()
+    cells = lines[-1].split(",")
+    cells[3] = "-130.0"
+    Path("x.sphere.csv").write_text("\n".join([*lines[:-1], ",".join(cells)]) + "\n")
+    code, out, err = call("identify", "five.toml", "x.sphere.csv", "--out", "found")
+    assert code == 2 and "-130 degrees is outside the travel -110 ... 30 of A" in err.replace("\n", " ")
+    code, out, err = call("identify", "zha-gantry", "sim/trunnion.sphere.csv", "--out", "found")
+    assert code == 2 and "the machine zha-gantry has none" in " ".join(err.split())
+    code, out, err = call("run", "five.toml", "sim/trunnion.sphere.csv", "--controller", "isg-csv", "--out", "found")
+    assert code == 2 and "centres of spheres" in err
+
+
+def test_positions_of_the_tip_give_the_same_as_positions_of_the_axes(tmp_path):
+    from dataclasses import replace
+
+    from compgen.data.rotary import TIP
+    from compgen.kinematics.rotary_chain import tip_pose
+
+    machine = machine_of(KINDS["table-table"])
+    spheres, _ = measured(machine, np.random.default_rng(8), (120.0,))
+    tip = tip_pose(machine, ErrorTable(), RotaryErrors(), spheres.found_mm, spheres.angle_deg, spheres.tool_mm)[0]
+    file = tmp_path / "t.sphere.csv"
+    file.write_text(format_spheres(replace(spheres, found_mm=tip, coordinates=TIP)))
+    one = identify_spheres(machine, spheres, separate=False)
+    other = identify_spheres(machine, read_spheres(machine, [file]), separate=False)
+    assert other.values == pytest.approx(one.values, rel=0, abs=2e-6)
+    with pytest.raises(InputError, match="some files have coordinates = joints, others tip"):
+        joints = tmp_path / "j.sphere.csv"
+        joints.write_text(format_spheres(spheres))
+        read_spheres(machine, [file, joints])
