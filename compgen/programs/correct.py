@@ -23,6 +23,7 @@ from compgen.errors import InputError
 from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.follower import Follower, difference, read_twice
+from compgen.programs.klartext import CALCULATED, arc_text
 from compgen.programs.path import (
     PLANE_AXES,
     RAPID,
@@ -53,6 +54,8 @@ SAME_MM = 1e-6
 MOST_LISTED, MOST_IN_PREFLIGHT = 100, 20
 #: A program that has grown by more than this many times, and by more than so many blocks, is said to have.
 GROWTH, FEW_BLOCKS = 2, 200
+#: Decimals of angles of Klartext, degrees.
+_ANGLE_DIGITS = 4
 #: Characters of a comment in the first lines of a corrected program.
 LONGEST_COMMENT = 90
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
@@ -63,7 +66,9 @@ class CorrectOptions:
     """How a program is corrected."""
 
     dialect: str = option(
-        "linuxcnc", "Dialect of the program.", choices=("fanuc", "siemens", "heidenhain-iso", "linuxcnc", "grbl")
+        "linuxcnc",
+        "Dialect of the program.",
+        choices=("fanuc", "siemens", "heidenhain-iso", "heidenhain-klartext", "linuxcnc", "grbl"),
     )
     tolerance_um: float = option(1.0, "Largest deviation of a corrected move from the correction within it, um.")
     shortest_mm: float = option(0.1, "Shortest move that the division of a move makes, mm.")
@@ -209,6 +214,9 @@ class ProgramWriter:
         text = f"{value + 0.0:.{digits}f}"
         if text.startswith("-") and not text.strip("-0."):
             text = text[1:]
+        if self.dialect.klartext and len(like.partition(".")[2]) not in range(digits, CALCULATED):
+            text = text.rstrip("0").rstrip(".") if "." in text else text
+            return text if text[0] == "-" else f"+{text}"
         if len(like.partition(".")[2]) < digits:
             text = text.rstrip("0")
         if (like.lstrip()[:1] == "+" or (self.dialect.pole and not like)) and text[0] != "-":
@@ -250,6 +258,8 @@ class ProgramWriter:
         if block.kind not in ("line", "arc", "cycle", "hole"):
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
+                if self.dialect.klartext:
+                    return [self._rounded(block)]
             if block.count:
                 # axes that a move in machine coordinates does not name stay where they were written to go
                 letters = {word[0][0] for word in block.words if word[0] in (*AXES, *(f"{axis}1" for axis in AXES))}
@@ -272,7 +282,10 @@ class ProgramWriter:
             sweep = float(move.sweep_rad[0]) * part
             texts.append(self._piece(block, move, command, centre, sweep, offset, (piece, count), part))
             self.target_mm = np.array(command)
-        if count > 1:
+        if block.kind == "arc" and self.dialect.klartext:
+            texts = [line for text in texts for line in text.splitlines(keepends=True)]
+            count = len(texts)
+        elif count > 1:
             moved = " ".join(
                 letter + text
                 for letter, text, *_ in block.words
@@ -281,7 +294,7 @@ class ProgramWriter:
             if moved:
                 end = self.line_end(block.text)
                 texts[-1] = f"{texts[-1].removesuffix(end)} {moved}{end}"
-            self.added += count - 1
+        self.added += max(count - 1, 0)
         self.changed += texts[0] != block.text
         return texts
 
@@ -297,6 +310,8 @@ class ProgramWriter:
         part: float,
     ) -> str:
         """Text of one piece of a move: the block with other numbers, or a new one with what differs."""
+        if block.kind == "arc" and self.dialect.klartext:
+            return self._arc_sentence(block, move, command, centre, sweep, offset, number)
         piece, count = number
         scale, digits = block.scale, self.digits(block.scale)
         unit = 10.0**-digits
@@ -311,8 +326,10 @@ class ProgramWriter:
             """Replace or add a word if its value differs; returns the value that the control then reads."""
             if letter in words:
                 text, first, last = words[letter]
-                given, own = float(text.replace(" ", "")), max(digits, len(text.partition(".")[2].strip()))
-                if count == 1 and abs(value - given) <= _HALF * 10.0**-own:
+                places = len(text.partition(".")[2].strip())
+                calculated = self.dialect.klartext and places >= CALCULATED
+                given, own = float(text.replace(" ", "")), digits if calculated else max(digits, places)
+                if count == 1 and abs(value - given) <= _HALF * 10.0**-own and not calculated:
                     return given
                 changes.append((first, last, self._number(value, own, text)))
                 return round(value, own)
@@ -365,7 +382,8 @@ class ProgramWriter:
                 more.append(f"F{faster}")
         if piece > 0:
             skip = re.match(r"\s*(/\d?)", block.text)
-            return (skip[1] if skip else "") + " ".join(more) + self.line_end(block.text)
+            head = "L " if self.dialect.klartext else skip[1] if skip else ""
+            return head + " ".join(more) + self.line_end(block.text)
         if count > 1:
             for letter, text, first, last in block.words:
                 if text and letter in "GM" and f"{letter}{float(text):g}" in AT_THE_END:
@@ -375,6 +393,112 @@ class ProgramWriter:
         end = end or max(stop for _, _, _, stop in block.words)
         text = _spliced(block.text, changes, end, more)
         return text if count == 1 or text.endswith("\n") else text + "\n"
+
+    def _rounded(self, block: SingleBlock) -> str:
+        """Write numbers that were calculated with the decimals of the dialect."""
+        digits = self.digits(block.scale)
+        changes = [
+            (first, last, self._number(float(text), digits, text))
+            for _, text, first, last in block.words
+            if len(text.partition(".")[2]) >= CALCULATED
+        ]
+        return _spliced(block.text, changes, 0, ()) if changes else block.text
+
+    def _arc_sentence(
+        self,
+        block: SingleBlock,
+        move: Moves,
+        command: FloatArray,
+        centre: FloatArray,
+        sweep: float,
+        offset: FloatArray,
+        number: tuple[int, int],
+    ) -> str:
+        """Text of one piece of an arc of Klartext: CC where the pole is another one, then C, CR or CP."""
+        piece, count = number
+        scale, digits, plane = block.scale, self.digits(block.scale), int(move.plane[0])
+        a, b = PLANE_AXES[plane]
+        kind = next(letter for letter, *_ in block.words if letter in ("C", "CR", "CP"))
+        start = np.array(self.written_mm)
+        closed = bool(is_closed(sweep)) and kind != "CP"
+        # the other axis moves as well: only CP can do that
+        kind = "CP" if abs(command[plane] - start[plane]) > _HALF * 10.0**-digits * scale else kind
+        words: list[str] = []
+        lines: list[str] = []
+        least_mm = _HALF * 10.0**-digits * scale
+        if count == 1 and self._arc_stays(block, move, command, centre, start, least_mm):
+            self.written_mm = np.where(np.isnan(move.end_mm[0]), start, move.end_mm[0] + self.shift_mm)
+            return block.text
+
+        def word(letter: str, value: float) -> float:
+            words.append(f"{letter}{self._number(value, digits)}")
+            return round(value, digits)
+
+        if kind != "CR":
+            known = [move.centre_mm[0, k] if np.isnan(self.pole_mm[k]) else self.pole_mm[k] for k in (a, b)]
+            if (
+                max(abs(centre[k] - place) for k, place in zip((a, b), known, strict=True))
+                > _HALF * 10.0**-digits * scale
+            ):
+                for k in sorted((a, b)):
+                    self.pole_mm[k] = word(AXES[k], (centre[k] - offset[k]) / scale) * scale + offset[k]
+                lines.append(f"CC {' '.join(words)}")
+                words.clear()
+            else:
+                for k, place in zip((a, b), known, strict=True):
+                    self.pole_mm[k] = place
+        if kind == "CP":
+            self._helix_end(words, command, start, sweep, (a, b))
+        else:
+            for k in sorted((a, b)):
+                value = start[k] if closed and not np.isnan(start[k]) else command[k]
+                self.written_mm[k] = word(AXES[k], (value - offset[k]) / scale) * scale + offset[k]
+        if not np.isnan(command[plane]) and (
+            move.corrected[0, plane] and abs(command[plane] - start[plane]) > _HALF * 10.0**-digits * scale
+        ):
+            self.written_mm[plane] = word(AXES[plane], (command[plane] - offset[plane]) / scale) * scale + offset[plane]
+        if kind == "CR":
+            chord = float(np.hypot(self.written_mm[a] - start[a], self.written_mm[b] - start[b]))
+            if chord == 0.0:
+                raise InputError(
+                    "the arc is shorter than the last decimal; give more with --decimals", line=block.number
+                )
+            radius = max(float(np.hypot(centre[a] - start[a], centre[b] - start[b])), 0.5 * chord) / scale
+            word("R", radius if abs(sweep) <= np.pi else -radius)
+        sense = "DR+" if sweep > 0 else "DR-"
+        return arc_text(block.text, lines, [kind, *words, sense], piece, count, AT_THE_END)
+
+    def _arc_stays(
+        self,
+        block: SingleBlock,
+        move: Moves,
+        command: FloatArray,
+        centre: FloatArray,
+        start: FloatArray,
+        least_mm: float,
+    ) -> bool:
+        """Whether the text of an arc of Klartext leads where it should as it is."""
+        if any(len(text.partition(".")[2]) >= CALCULATED for _, text, *_ in block.words):
+            return False
+        axes = list(PLANE_AXES[int(move.plane[0])])
+        same = [np.abs(command - move.end_mm[0]), np.abs(start - move.start_mm[0])]
+        same += [np.abs(np.where(np.isnan(self.pole_mm), 0.0, np.array(self.pole_mm) - move.centre_mm[0]))[axes]]
+        same += [np.abs(centre - move.centre_mm[0])[axes]]
+        return all(bool((one[~np.isnan(one)] <= least_mm).all()) for one in same)
+
+    def _helix_end(
+        self, words: list[str], command: FloatArray, start: FloatArray, sweep: float, axes: tuple[int, int]
+    ) -> None:
+        """Write the angle of CP, and keep where it leads: about the pole as written, as far as the tool is from it."""
+        a, b = axes
+        pole = np.array([self.pole_mm[a], self.pole_mm[b]])
+        here, there = start[[a, b]] - pole, command[[a, b]] - pole
+        exact = float(np.arctan2(there[1], there[0]) - np.arctan2(here[1], here[0]))
+        exact += 2.0 * np.pi * np.rint((sweep - exact) / (2.0 * np.pi))
+        degrees = round(float(np.degrees(exact)), _ANGLE_DIGITS)
+        words.append(f"IPA{self._number(degrees, _ANGLE_DIGITS)}")
+        turned = np.radians(degrees) + float(np.arctan2(here[1], here[0]))
+        self.written_mm[[a, b]] = pole + np.hypot(*here) * np.array([np.cos(turned), np.sin(turned)])
 
     def _arc_words(
         self,
@@ -519,12 +643,14 @@ class ProgramWriter:
             self.changed += 1
             return lines
         codes = {f"{letter}{float(value):g}" for letter, value, *_ in block.words if value and letter in "GM"}
-        if lines and self.dialect.pole and not codes & {"M89", "M99", "G79"}:
+        codes |= {letter for letter, value, *_ in block.words if not value}
+        if lines and self.dialect.pole and not codes & {"M89", "M99", "G79", "CYCL CALL"}:
             body = text.partition(";")[0].rstrip("* \t\r\n")
             text = f"{body} M89{text[len(body) :]}"  # a definition ends the calls by all positions
         self.changed += text != block.text
         self.added += len(lines)
-        return [*(re.sub(r"^(\s*)N\d+\s*", r"\1", line, flags=re.IGNORECASE) for line in lines), text]
+        numbered = r"^(\s*)\d+\s+" if self.dialect.klartext else r"^(\s*)N\d+\s*"
+        return [*(re.sub(numbered, r"\1", line, flags=re.IGNORECASE) for line in lines), text]
 
     def _note_peck(self, block: SingleBlock) -> None:
         """Remember whether the cycle pecks, and its Q."""

@@ -36,7 +36,10 @@ _HEIDENHAIN = {
     "G203": False,
     "G205": False,
 }
-_HEIDENHAIN |= {"G206": True, "G207": True, "G209": True, "G240": False}
+_HEIDENHAIN |= {"G206": True, "G207": True, "G209": True, "G240": False, "G241": False}
+#: Of Klartext also bore milling: the control mills about the place of the hole.
+_KLARTEXT = frozenset(name for name in _HEIDENHAIN if name[1:].isdigit() and len(name) == 4) | {"G208"}
+_HEIDENHAIN |= {"G208": False}
 
 
 @dataclass(frozen=True)
@@ -114,6 +117,8 @@ class DrillingCycle:
             return f"{self.name} without {missing[0]}; expected {', '.join(needed)}"
         if self["Q343"]:
             return f"{self.name} with the depth from a diameter (Q343) is not followed; give Q201 with Q343=0"
+        if self["Q395"]:
+            return f"{self.name} with its depth to the cylinder of the tool (Q395=1) is not followed; give Q201 with Q395=0"
         level, depth, left = self.heights(0.0)
         if not (depth < level and (left >= level or self.name in _SINUMERIK and left >= self["RFP"])):
             return f"{self.name} goes up to its depth, or leaves the tool below where it begins; check its heights"
@@ -157,6 +162,6 @@ class DrillingCycle:
         return lines
 
 
-def defines_hole(name: str) -> bool:
+def defines_hole(name: str, *, klartext: bool = False) -> bool:
     """Whether a name is that of a drilling cycle that is defined in one block and executed at others."""
-    return name in _SINUMERIK or name in _HEIDENHAIN
+    return name in (_KLARTEXT if klartext else _SINUMERIK.keys() | _HEIDENHAIN.keys() - {"G208", "G241"})

@@ -88,6 +88,13 @@ _HEIDENHAIN = {
     # G62 is the tolerance (cycle 32), G36 turns the spindle, G38 stops, G51 names the next tool
     **{"G62": "setting", "G36": "setting", "G38": "nothing", "G51": "setting"},
 }
+#: Words of Klartext: the letters that begin a move, its sense, and the M codes that change it.
+_KLARTEXT = {
+    **{"L": "motion 1", "DR-": "motion 2", "DR+": "motion 3", "FMAX": "rapid once"},
+    **dict.fromkeys(("C", "CR", "CC"), "nothing"),
+    **{"CC here": "pole here", "CP": "helix", "CYCL CALL": "drill here", "M99": "drill here", "M89": "calls"},
+    **{"M91": "machine coordinates", "M92": "unknown position", "M140": "lost height"},
+}
 for _code in ("G20", "G21", "G94", "G95", "G61", "G64", "G97", "G9", *(f"G{k}" for k in range(55, 60))):
     del _HEIDENHAIN[_code]
 
@@ -223,6 +230,11 @@ class Dialect:
     #: What else may shift the coordinates at the control, and is not checked.
     beside: str = ""
 
+    @property
+    def klartext(self) -> bool:
+        """Whether blocks are those of HEIDENHAIN in plain language: L X+10 R0 FMAX."""
+        return self.name == "heidenhain-klartext"
+
     def word_pattern(self) -> re.Pattern[str]:
         """Return the pattern of one word: its address and value, or a comment."""
         comments = [
@@ -341,6 +353,23 @@ DIALECTS = {
             work_offset="PRESET",
             starts_in_its_units=False,
             beside="the datum has no basic rotation",
+            pole=True,
+            tool_by_number=True,
+        ),
+        Dialect(
+            "heidenhain-klartext",
+            _KLARTEXT,
+            r";[^\n]*",
+            "; {}",
+            decimals=(4, 5),
+            refused={**REFUSED, **_HEIDENHAIN_REFUSED},
+            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 94, 97, 98, 101, 102, 103, 107, 108, 109, 110, 111,
+                                                116, 117, 118, 120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
+            end=frozenset(("M2", "M30", "END PGM")),
+            work_offset="PRESET",
+            starts_in_its_units=False,
+            beside="the preset has no basic rotation",
+            first=r"\d*\s*+BEGIN\s",
             pole=True,
             tool_by_number=True,
         ),

@@ -30,7 +30,7 @@ _NOWHERE = (math.nan,) * 3
 #: Heights that differ by less are one, mm: sums of the same numbers in another order.
 _ROUNDED_MM = 1e-7
 #: Dialects that begin a program in mm, whatever the unit of the machine is.
-_STARTS_IN_MM = ("heidenhain-iso", "grbl")
+_STARTS_IN_MM = ("heidenhain-iso", "heidenhain-klartext", "grbl")
 _NUMBER = r"(?:[-+]\s*+)?(?:\d++\.?\d*+|\.\d++)"
 
 # Words: name and value. What is no word (comments, texts) is left out. Blanks and digits are taken once and for all (possessive).
@@ -180,6 +180,7 @@ _CYCLES: _Does = {
 #: How a shift counts: in place of that of the named axes, of all axes, further, or not at all.
 _NAMED, _ANEW, _MORE, _OFF = range(4)
 _TABLES: dict[str, _Does] = {
+    "heidenhain-klartext": {},
     "grbl": _GRBL,
     "linuxcnc": {
         **_GRBL,
@@ -294,10 +295,14 @@ class Follower:
     Of the machine it takes where G28 leads, and the tool while no tool length is active.
     """
 
+    def __new__(cls, dialect: str, *_: object) -> Follower:
+        """Klartext has a follower of its own."""
+        return super().__new__(KlartextFollower if dialect == "heidenhain-klartext" else cls)
+
     def __init__(self, dialect: str, setup: Setup, machine: Machine) -> None:
         self.dialect, self.setup, self.bare_tool_mm = dialect, setup, machine.tool_offset_mm
         self.table = _TABLES[dialect]
-        self.linuxcnc, self.heidenhain = dialect == "linuxcnc", dialect == "heidenhain-iso"
+        self.linuxcnc, self.heidenhain = dialect == "linuxcnc", dialect.startswith("heidenhain")
         self.at: Place = [math.nan] * 3
         self.homes = {"G28": list(machine.reference_place_mm), "G30": [math.nan] * 3}
         self.fixture: Sequence[float] = setup.work_offsets_mm.get("PRESET" if self.heidenhain else "G54", _NOWHERE)
@@ -850,6 +855,415 @@ class Follower:
             self._to(RAPID, [*place, clear])
 
 
+# Klartext: sentences, not words with a letter.
+
+_MOST_STEPS = 5_000_000
+_SYMBOL = re.compile(r"\s*(\d++\.?\d*+|\.\d++|Q[LR]?\d+|[A-Z]+|\*\*|[-+*/^()])")
+
+
+def _worth(text: str, known: dict[str, float]) -> float:
+    """The value of an expression, from left to right by precedence; nan if something in it is not known."""
+    symbols = _SYMBOL.findall(text.upper())
+    if not symbols or re.sub(r"\s", "", "".join(symbols)) != re.sub(r"\s", "", text.upper()):
+        return math.nan
+    place = 0
+
+    def next_is(*those: str) -> str:
+        nonlocal place
+        if place < len(symbols) and symbols[place] in those:
+            place += 1
+            return str(symbols[place - 1])
+        return ""
+
+    def total() -> float:
+        found = product()
+        while sign := next_is("+", "-"):
+            found += product() * (1.0 if sign == "+" else -1.0)
+        return found
+
+    def product() -> float:
+        found = power()
+        while sign := next_is("*", "/", "DIV"):
+            other = power()
+            found = found * other if sign == "*" else found / other if other else math.nan
+        return found
+
+    def power() -> float:
+        if sign := next_is("+", "-"):
+            return power() * (1.0 if sign == "+" else -1.0)
+        found = atom()
+        return float(found ** power()) if next_is("^") else found
+
+    def atom() -> float:
+        nonlocal place
+        if next_is("("):
+            found = total()
+            next_is(")")
+            return found
+        if name := next_is("SIN", "COS", "TAN", "SQRT", "SQ", "ABS", "INT", "NEG"):
+            value = atom() if not (sign := next_is("+", "-")) else atom() * (1.0 if sign == "+" else -1.0)
+            turn = math.radians(value)
+            if name in ("SIN", "COS", "TAN"):
+                return {"SIN": math.sin, "COS": math.cos, "TAN": math.tan}[name](turn)
+            return {
+                "SQRT": math.sqrt(abs(value)), "SQ": value**2, "ABS": abs(value), "INT": float(int(value)), "NEG": -value
+            }[name]  # fmt: skip
+        place += 1
+        symbol = symbols[place - 1] if place <= len(symbols) else ""
+        if symbol == "PI":
+            return math.pi
+        return known.get(symbol, math.nan) if symbol[:1] == "Q" else float(symbol)
+
+    try:
+        return total()
+    except (ValueError, ArithmeticError):
+        return math.nan
+
+
+@dataclass
+class _Line:
+    """A sentence: the number of its line, its text without comment and number, and whether it has a slash."""
+
+    number: int
+    text: str
+    slash: bool
+
+
+def _sentences_of(text: str, numbers: Sequence[int]) -> list[_Line]:
+    found: list[_Line] = []
+    goes_on = remark = False
+    for number, raw in zip(numbers, text.split("\n"), strict=False):
+        line = raw.strip()
+        said = line.rstrip("~").split(";")[0].strip().upper()
+        if goes_on:
+            if not remark and said:
+                found[-1].text += f" {said}"
+        else:
+            head = re.match(r"(?:\d+(?=[\s/*;]|$)\s*)?(/\d?\s*)?", said)
+            bare = said[head.end() :] if head else said
+            found.append(_Line(number, bare, bool(head and head[1])))
+            remark = not bare and ";" in line
+        goes_on = line.endswith("~")
+    return found
+
+
+class KlartextFollower(Follower):
+    """Follows Klartext: it executes labels, repeats, patterns and roundings itself, from the text as it is."""
+
+    def __init__(self, dialect: str, setup: Setup, machine: Machine) -> None:
+        super().__init__(dialect, setup, machine)
+        self.known: dict[str, float] = {}
+        self.cycle: dict[str, float] = {}
+        self.cycle_name = ""
+        self.way = complex(math.nan)
+        self.spots: list[tuple[complex, float]] = []
+        self.arm = math.nan
+        self.corner: tuple[str, float, int] | None = None
+        self.around = (0, 1)
+
+    def follow(self, text: str, numbers: Sequence[int]) -> Moves:
+        """Follow blocks, each with its number; calls lead to labels among them."""
+        every = _sentences_of(text, numbers)
+        places: dict[str, int] = {}
+        for k, line in enumerate(every):
+            if label := re.match(r"LBL\s*(\"[^\"]+\"|\d+)", line.text):
+                places.setdefault(label[1], k)
+        back: list[int] = []
+        again: dict[int, int] = {}
+        k = steps = 0
+        while k < len(every) and not self.done and steps < _MOST_STEPS:
+            line, k, steps = every[k], k + 1, steps + 1
+            if not line.text or (line.slash and self.setup.skip_deleted):
+                continue
+            self.number = line.number
+            call = re.match(r"CALL\s*LBL\s*(\"[^\"]+\"|\d+)\s*(?:REP\s*([^\s/]+))?", line.text)
+            if call and call[2]:
+                again.setdefault(k, round(_worth(call[2], self.known)))
+                again[k] -= 1
+                if again[k] < 0:
+                    del again[k]
+                else:
+                    k = places[call[1]]
+            elif call:
+                back.append(k)
+                k = places.get(call[1], len(every))
+            elif re.match(r"LBL\s*0\b", line.text):
+                k = back.pop() if back else k
+            else:
+                try:
+                    self._say(line.text)
+                except (ArithmeticError, ValueError, KeyError):  # the reader says why it refuses it
+                    self.done = True
+        return self._taken()
+
+    def _say(self, text: str) -> None:
+        text = re.sub(r"\s+", " ", text)
+        if set_to := re.match(r"(?:FN ?(\d+) ?: ?)?(Q[LR]?\d+) ?= ?(.*)", text):
+            if set_to[1] is None and self.cycle_name and set_to[2] in self.cycle:
+                self.cycle[set_to[2]] = _worth(
+                    set_to[3], self.known
+                )  # a definition that was cut between two parts of the text
+            value = _worth(set_to[3], self.known) if not set_to[1] or int(set_to[1]) < 9 else math.nan
+            self.known[set_to[2]] = value
+        elif text.startswith("BEGIN PGM"):
+            self.unit = 25.4 if text.endswith("INCH") else 1.0
+        elif text.startswith("END PGM"):
+            self.done = True
+        elif define := re.match(r"CYCL ?DEF ?(\d+)(?:[ .]*\. ?(\d+))?", text):
+            self._take(int(define[1]), define[2], text[define.end() :])
+        elif text.startswith("TOOL"):
+            self._take_tool(text)
+        elif text.startswith("TRANS DATUM"):
+            self._take(7, "1", text[17:] if "AXIS" in text else " X0 Y0 Z0")
+        elif text.startswith("PATTERN"):
+            self.spots = [
+                spot
+                for kind, inside in re.findall(r"([A-Z]+)\d+ ?\(([^)]*)\)", text)
+                for spot in self._spots(kind, inside)
+            ]
+        elif text.startswith("CYCL CALL PAT"):
+            self._drill_spots(self.spots, "F MAX" in text or "FMAX" in text or not re.search(r"F ?\d", text))
+        elif text.startswith("CYCL CALL POS"):
+            n = self._numbers(text[13:])
+            self._drill_spots(
+                [(complex(n["X"], n["Y"]), n.get("Z", 0.0))],
+                "F MAX" in text or "FMAX" in text or not re.search(r"F ?\d", text),
+            )
+        elif text.startswith("CYCL CALL"):
+            self._hole_here()
+        elif found := re.match(r"(LP|L|CTP|CT|CP|CR|CC|C|RND|CHF)(?![A-Z])", text):
+            self._step(found[1], text[found.end() :])
+        if re.search(r"(?<![A-Z])M0?(?:2|30)(?!\d)", text):
+            self.done = True
+
+    def _numbers(self, text: str) -> dict[str, float]:
+        """Numbers of a sentence by their names; Q parameters are looked up."""
+        found: dict[str, float] = {}
+        for name, sign, value in re.findall(
+            r"(?<![A-Z])(I?P[AR]|I?[XYZ]|NUM[XY]?|ROT|D[XY]?|START|STEP|R) ?([-+]?) ?(Q[LR]?\d+|\d*\.?\d+)(?![\d.])",
+            text,
+        ):
+            if name != "R" or value != "0" or sign:
+                number = self.known.get(value, math.nan) if value[0] == "Q" else float(value)
+                found.setdefault(name, -number if sign == "-" else number)
+        return found
+
+    def _take(self, number: int, part: str | None, text: str) -> None:
+        """Definitions of cycles."""
+        given = {name: _worth(value, self.known) for name, value in re.findall(r"(Q\d+) ?= ?([-+]? ?[\w.]+)", text)}
+        self.known |= {name: value for name, value in given.items() if not math.isnan(value)}
+        self.zero_changed = True
+        if number == 7 and part not in (None, "0"):
+            n = self._numbers(text)
+            for k, letter in enumerate("XYZ"):
+                self.frame[k] = (
+                    n[letter] * self.unit if letter in n else self.frame[k] + n.get("I" + letter, 0.0) * self.unit
+                )
+        elif number == 247:
+            name = f"PRESET{given.get('Q339', math.nan):g}"
+            offsets = self.setup.work_offsets_mm
+            self.fixture, self.frame = offsets.get(name, offsets.get("PRESET", _NOWHERE)), [0.0] * 3
+        elif number in (220, 221):
+            self._take_pattern(number, given)
+        elif number >= 200:
+            self.cycle, self.cycle_name, self.modally = given, f"G{number}", False
+
+    def _take_pattern(self, number: int, q: dict[str, float]) -> None:
+        self.cycle |= {name: q[name] for name in ("Q200", "Q203", "Q204") if name in q}
+        if number == 221:
+            turn = cmath.exp(1j * math.radians(q.get("Q224", 0.0)))
+            columns, rows = int(q["Q242"]), int(q["Q243"])
+            self._drill_spots(
+                [
+                    (complex(q["Q225"], q["Q226"]) + turn * complex(x * q["Q237"], y * q["Q238"]), 0.0)
+                    for y in range(rows)
+                    for x in (range(columns) if y % 2 == 0 else range(columns - 1, -1, -1))
+                ]
+            )
+            return
+        count, step = int(q["Q241"]), q.get("Q247", 0.0)
+        if not step:
+            whole = math.isclose(abs(q["Q246"] - q["Q245"]), 360.0)
+            step = (q["Q246"] - q["Q245"]) / max(count if whole else count - 1, 1) if count > 1 else 0.0
+        self._drill_spots(
+            [
+                (
+                    complex(q["Q216"], q["Q217"]) + q["Q244"] / 2 * cmath.exp(1j * math.radians(q["Q245"] + step * k)),
+                    0.0,
+                )
+                for k in range(count)
+            ]
+        )
+
+    def _spots(self, kind: str, inside: str) -> list[tuple[complex, float]]:
+        n = self._numbers(inside)
+        first, turn, z = complex(n["X"], n["Y"]), cmath.exp(1j * math.radians(n.get("ROT", 0.0))), n.get("Z", 0.0)
+        count, wide, high = (int(n.get(name, 1)) for name in ("NUM", "NUMX", "NUMY"))
+        if kind in ("CIRC", "PITCHCIRC"):
+            step = n.get("STEP", 0.0) if kind[0] == "P" else 360.0 / count
+            start = n.get("START", 0.0)
+            return [
+                (first + n.get("D", 0.0) / 2 * cmath.exp(1j * math.radians(start + step * k)), z) for k in range(count)
+            ]
+        if kind == "ROW":
+            return [(first + turn * n.get("D", 0.0) * k, z) for k in range(count)]
+        if kind == "POS":
+            return [(first, z)]
+        grid = [(x if y % 2 == 0 else wide - 1 - x, y) for y in range(high) for x in range(wide)]
+        return [
+            (first + turn * complex(x * n.get("DX", 0.0), y * n.get("DY", 0.0)), z)
+            for x, y in grid
+            if kind == "PAT" or x in (0, wide - 1) or y in (0, high - 1)
+        ]
+
+    def _take_tool(self, text: str) -> None:
+        name = re.match(r"TOOL (?:CALL|DEF) ?(?:\"([^\"]*)\"|(\d+(?:\.\d+)?))", text)
+        if not name:
+            return
+        rest, tool = text[name.end() :], name[1] if name[1] is not None else f"{float(name[2]):g}"
+        if text.startswith("TOOL DEF"):
+            if length := re.search(r"(?<!D)L ?([-+]? ?[\d.]+)", rest):
+                self.lengths[tool] = (0.0, 0.0, float(length[1].replace(" ", "")) * self.unit)
+            return
+        longer = re.search(r"DL ?([-+]? ?[\d.]+)", rest)
+        self._lengthen(tool, float(longer[1].replace(" ", "")) * self.unit if longer else 0.0)
+        self.zero_changed = True
+
+    def _hole_here(self) -> None:
+        hole, zero = _Hole(self.cycle_name, self.cycle), self._zero(2)
+        level, depth, left = (zero + height * self.unit for height in hole.heights((self.at[2] - zero) / self.unit))
+        back = FEED if self.cycle_name in _BACK_AT_FEED else RAPID
+        self.plane = 2
+        for kind, height in ((RAPID, level), (FEED, depth), (back, level), (RAPID, left)):
+            self._to(kind, [*self.at[:2], height])
+
+    def _drill_spots(self, spots: Sequence[tuple[complex, float]], fast: bool = True) -> None:
+        surface = self.cycle["Q203"]
+        for spot, higher in spots:
+            there = [self._zero(0) + spot.real * self.unit, self._zero(1) + spot.imag * self.unit, self.at[2]]
+            self._to(RAPID if fast else FEED, there)
+            self.cycle["Q203"] = surface + higher
+            self._hole_here()
+        self.cycle["Q203"] = surface
+
+    def _step(self, kind: str, text: str) -> None:
+        n, codes = self._numbers(text), {int(code) for code in re.findall(r"(?<![A-Z])M(\d+)", text.replace("M ", "M"))}
+        end = [
+            self._zero(k) + n[letter] * self.unit if letter in n else self.at[k] + n.get("I" + letter, 0.0) * self.unit
+            for k, letter in enumerate("XYZ")
+        ]
+        if kind in ("RND", "CHF"):
+            size = n.get("R", math.nan)
+            bare = re.match(r" ?([-+]? ?\d*\.?\d+)", text)
+            self.corner = kind, (float(bare[1]) if bare else size) * self.unit, self.number
+        elif kind == "CC":
+            self._take_pole(n)
+        elif 140 in codes:
+            self._to(RAPID, [*self.at[:2], math.nan])
+        elif 91 in codes:
+            self._to(RAPID, [n[letter] * self.unit if letter in n else self.at[k] for k, letter in enumerate("XYZ")])
+        elif 92 in codes:
+            self._to(
+                RAPID, [math.nan if letter in n or "I" + letter in n else self.at[k] for k, letter in enumerate("XYZ")]
+            )
+        else:
+            self._draw(kind, n, end, text)
+            self.modally = self.modally or 89 in codes
+            if self.cycle_name and (99 in codes or (self.modally and kind in ("L", "LP") and n.keys() & set("XYZ"))):
+                self._hole_here()
+                self.modally = self.modally and 99 not in codes
+
+    def _take_pole(self, n: dict[str, float]) -> None:
+        named = {name[-1] for name in n}
+        self.around = (2, 0) if named == {"X", "Z"} else (1, 2) if named == {"Y", "Z"} else (0, 1)
+        for k, letter in enumerate("XYZ"):
+            if letter in n:
+                self.pole[k] = self._zero(k) + n[letter] * self.unit
+            elif "I" + letter in n or not named:
+                self.pole[k] = self.at[k] + n.get("I" + letter, 0.0) * self.unit
+
+    def _draw(self, kind: str, n: dict[str, float], end: Place, text: str) -> None:
+        """A move, straight or round."""
+        axes = self.around if kind in ("C", "CP", "LP", "CTP") else (0, 1)
+        if kind == "CR":
+            named = {name[-1] for name in n if name != "R"}
+            axes = (2, 0) if named == {"X", "Z"} else (1, 2) if named == {"Y", "Z"} else (0, 1)
+        a, b = axes
+        self.plane = 3 - a - b
+        pole, sweep, centre = complex(self.pole[a], self.pole[b]), 0.0, complex(math.nan)
+        here = complex(self.at[a], self.at[b])
+        left = "DR+" in text.replace(" ", "")
+        if kind in ("LP", "CTP", "CP"):
+            arm = abs(here - pole) if kind == "CP" else n["PR"] * self.unit if "PR" in n else self.arm
+            arm = abs(here - pole) + n["IPR"] * self.unit if "IPR" in n else arm
+            angle = math.radians(n["PA"]) if "PA" in n else cmath.phase(here - pole) + math.radians(n.get("IPA", 0.0))
+            there = pole + arm * cmath.exp(1j * angle)
+            end[a], end[b], self.arm = there.real, there.imag, arm
+        else:
+            self.arm = math.nan
+        there = complex(end[a], end[b])
+        if kind == "CP" and "IPA" in n:
+            centre, sweep = pole, math.radians(n["IPA"])
+        elif kind in ("C", "CP"):
+            centre, sweep = pole, self._turn_between(here - pole, there - pole, left)
+        elif kind == "CR":
+            half = (there - here) / 2
+            rise = math.sqrt(max((n["R"] * self.unit) ** 2 - abs(half) ** 2, 0.0)) * half / abs(half) * 1j
+            centre = here + half + (rise if (n["R"] > 0) == left else -rise)
+            sweep = self._turn_between(here - centre, there - centre, left)
+        elif kind in ("CT", "CTP"):
+            # the angle between tangent and chord is half of that of the arc
+            half_turn = cmath.phase((there - here) / self.way)
+            if abs(math.sin(half_turn)) > 1e-9:
+                radius = abs(there - here) / (2.0 * math.sin(half_turn))
+                centre, sweep = here + 1j * self.way * radius, 2.0 * half_turn
+        straight = not sweep
+        fast = straight and re.search(r"F ?MAX", text) is not None
+        if self.corner and straight:
+            self._cut_corner(end)
+            here = complex(self.at[0], self.at[1])
+        if straight:
+            self._to(RAPID if fast else FEED, end)
+            moved = there - here
+            self.way = moved / abs(moved) if (a, b) == (0, 1) and abs(moved) > 1e-9 else complex(math.nan)
+            return
+        middle = list(_NOWHERE)
+        middle[a], middle[b] = centre.real, centre.imag
+        self._to(CCW if sweep > 0 else CW, end, middle, sweep)
+        out = (there - centre) * (1j if sweep > 0 else -1j)
+        self.way = out / abs(out) if (a, b) == (0, 1) else complex(math.nan)
+
+    @staticmethod
+    def _turn_between(first: complex, second: complex, left: bool) -> float:
+        turn = cmath.phase(second / first)
+        if abs(second - first) < 1e-9 or turn == 0.0:
+            return 2.0 * math.pi if left else -2.0 * math.pi
+        return turn % (2.0 * math.pi) if left else -((-turn) % (2.0 * math.pi))
+
+    def _cut_corner(self, end: Place) -> None:
+        """Shorten the last move, and go round the corner or across it."""
+        assert self.corner is not None
+        (kind, size, number), self.corner = self.corner, None
+        last = list(self.rows.pop())
+        begin, corner, there = complex(*last[4:6]), complex(*self.at[:2]), complex(*end[:2])
+        arriving, leaving = (corner - begin) / abs(corner - begin), (there - corner) / abs(there - corner)
+        bend = cmath.phase(leaving / arriving)
+        reach = size if kind == "CHF" else size * abs(math.tan(bend / 2))
+        first, second = corner - reach * arriving, corner + reach * leaving
+        self.at = last[4:7]
+        own, self.number = self.number, int(last[0])
+        self._to(int(last[1]), [first.real, first.imag, last[9]])
+        self.number = number
+        if kind == "CHF":
+            self._to(FEED, [second.real, second.imag, last[9]])
+        elif reach:
+            centre = first + 1j * arriving * math.copysign(size, bend)
+            self._to(
+                CCW if bend > 0 else CW, [second.real, second.imag, last[9]], [centre.real, centre.imag, math.nan], bend
+            )
+        self.number = own
+
+
 # Programs: blocks in the order in which the control executes them.
 
 
@@ -860,6 +1274,10 @@ _AT_A_TIME, _BLOCKS_AT_A_TIME = 1 << 18, 8192
 def executed(source: Path, dialect: str, *, skip_deleted: bool = False) -> Iterator[tuple[str, Sequence[int]]]:
     """Yield the text of a file, a part at a time, with the line of each block, as the control executes it: calls are followed."""
     with source.open(encoding="latin-1", newline="\n") as stream:
+        if dialect == "heidenhain-klartext":  # its labels are anywhere
+            text = stream.read()
+            yield text, range(1, text.count("\n") + 2)
+            return
         if dialect in ("fanuc", "linuxcnc") and _may_call(source):
             blocks = _with_calls(stream.readlines(), dialect, skip_deleted)
             while some := list(itertools.islice(blocks, _BLOCKS_AT_A_TIME)):

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
+from compgen.programs import klartext
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect, codes_that_stay
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
@@ -125,6 +126,7 @@ class Reader:
         self.machine, self.dialect, self.source = machine, dialect, source
         self.setup = replace(setup, keep_unknown=kept)
         self._pattern = dialect.word_pattern()
+        self._sentences, self._pole_plane = klartext.Sentences(), 2
         self._name = re.compile(r"\s*([A-Z_][A-Z_0-9]+)\s*(\([^()\n]*\))?", re.IGNORECASE)
         #: How far corrected positions may leave the travel, mm.
         self.travel_slack_mm = machine.travel_margin_mm + 1e-6
@@ -160,6 +162,7 @@ class Reader:
         self.drilling: DrillingCycle | None = None
         self.calling = self._defining = self._ends_calls = False
         self._drilling_scale = 1.0
+        self._preset_number = ""
         self._modes: dict[str, str] = {}
         self.selected = self.loaded = ""
         self.length_on = self.tool_on = False
@@ -187,6 +190,11 @@ class Reader:
         found = None
         if self.dialect.name in ("fanuc", "linuxcnc"):
             found = written_out(path, self.dialect.name, skip_deleted=self.setup.skip_deleted)
+        if self.dialect.klartext:
+            found = klartext.lowered(path, skip_deleted=self.setup.skip_deleted)
+            if found is not None and not found.called:
+                self.line_in_file = found.line
+                return BytesIO(found.content)
         if found is None:
             return self._pointed(path.open("rb"))
         self.line_in_file = found.line
@@ -612,6 +620,8 @@ class Reader:
         dialect = self.dialect
         if at == len(body):
             return []
+        if dialect.klartext:
+            return self._sentence(text)
         if body[at] == "/":
             if self.setup.skip_deleted:
                 return []
@@ -656,6 +666,99 @@ class Reader:
             at = found.end()
             if not body[at:].strip():
                 break
+        return words
+
+    def _sentence(self, text: str) -> list[tuple[str, str, int, int]]:
+        """Read a line of Klartext; empty where it has nothing to do, or has been done."""
+        if MARK in text:
+            self._fail("the program has been corrected before; give the program as it comes from CAM")
+        said = self._sentences.of(text)
+        what, words = said.what, said.words
+        if said.deleted:
+            if self.setup.skip_deleted:
+                return []
+            self.assumed["blocks with / are executed"] = None
+        if what == "refused":
+            self._fail(said.number)
+        if what in ("begin", "end"):
+            self._begin_or_end(what, said.number)
+        elif self.seen_percent and self.closed_by_percent and what != "keep":
+            self._fail("blocks after END PGM, which the control does not read; give one program at a time")
+        elif what == "preset":
+            self._use_preset(said.number)
+        elif what in ("cycle", "more"):
+            self._take_cycle(what, said.number)
+        elif what == "shift":
+            self._modes = dict(said.modes)
+            self._shift_by_words(words)
+        elif what == "tool definition":
+            numbers = {letter: value for letter, value, *_ in words}
+            self._tools[numbers.get("T", "0")] = (0.0, 0.0, number_of(numbers.get("L", "0")) * self.scale)
+        elif what == "tool":
+            return words
+        elif what == "move":
+            self._modes = dict(said.modes)
+            return self._in_its_plane(words)
+        return []
+
+    def _begin_or_end(self, what: str, unit: str) -> None:
+        if what == "end":
+            self.ended = self.closed_by_percent = True
+            return
+        if self.seen_percent or self.started:
+            self._fail("a second program begins here; give one program at a time")
+        if not unit:
+            self._fail("BEGIN PGM without MM or INCH; give the whole first block")
+        self.seen_percent, self._unit_known, self.scale = True, True, MM_PER_INCH if unit == "INCH" else 1.0
+
+    def _use_preset(self, number: str) -> None:
+        """Choose a preset of the table: PRESET1, or PRESET if the program uses this one only."""
+        given, usual = self.setup.work_offsets_mm, self.dialect.work_offset
+        name = f"{usual}{number}"
+        if (
+            name not in given
+            and usual in given
+            and self._preset_number in ("", number)
+            and self.offset_name in ("", usual)
+        ):
+            self._preset_number, name = number, usual
+            self.assumed[f"{usual} is preset {number}, which cycle 247 activates"] = None
+        self.shift = (0.0,) * 3
+        self.named = [False] * 3
+        self._use_offset(name)
+
+    def _take_cycle(self, what: str, code: str) -> None:
+        if what == "cycle":
+            if not defines_hole(code, klartext=True):
+                self._fail(f"cycle {code[1:]} is not followed (200 to 203, 205 to 209, 240, 241 are); post its moves")
+            self.drilling, self.calling = DrillingCycle(code, (), {}), False
+            self._drilling_scale = self.scale
+            if code == "G208":
+                self.assumed["of bore milling (cycle 208) the place and the heights of the hole are corrected"] = None
+        if self.drilling is not None:
+            self.drilling = self.drilling.defined_further(self._text)
+
+    def _shift_by_words(self, words: list[tuple[str, str, int, int]]) -> None:
+        shift = list(self.shift)
+        for letter, value, *_ in words:
+            if letter in "ABC":
+                if number_of(value):
+                    self._fail(f"{letter}{value}: shifts of rotary axes are not followed")
+                continue
+            k = "XYZ".index(letter)
+            shift[k] = number_of(value) * self.scale + (shift[k] if self._incremental(letter) else 0.0)
+        self.shift = (shift[0], shift[1], shift[2])
+
+    def _in_its_plane(self, words: list[tuple[str, str, int, int]]) -> list[tuple[str, str, int, int]]:
+        """Choose the plane of an arc: that of the pole (CC X Z), or of the axes that CR names."""
+        letters = {letter for letter, *_ in words}
+        axes = {"XZ": 1, "YZ": 0, "IK": 1, "JK": 0}
+        of_words = axes.get("".join(sorted(letters & set("XYZIJK"))), 2)
+        if "CC" in letters:
+            self._pole_plane = of_words
+            if not letters & set("IJK"):
+                words = [("CC here", "", 0, 0), *words]
+        self.plane = self._pole_plane if letters & {"C", "CP"} else of_words if "CR" in letters else 2
         return words
 
     def _percent(self, rest: str) -> list[tuple[str, str, int, int]]:
@@ -1079,6 +1182,8 @@ class Reader:
                 return self._home(axes, self.home.get(action[5:]))
         if "preset" in single:
             return self._preset(axes)
+        if "lost height" in single:
+            return self._lose_height(axes)
         if "drill here" in single or (self.calling and moving):
             return self._hole(axes, single, moving)
         if "machine coordinates" in single:
@@ -1088,6 +1193,8 @@ class Reader:
             return self._cycle(motion, axes, values)
         if self.dialect.pole:
             self._set_pole(values, "pole here" in single)
+        if "helix" in single:
+            return self._helix(axes, values)
         arc = (
             self.motion in (CW, CCW)
             and "rapid once" not in single
@@ -1206,9 +1313,49 @@ class Reader:
         offset = self._offset()
         for k, letter in enumerate("IJK"):
             if letter in values:
-                self.pole[k] = (offset[k] if self.absolute else self.position[k]) + values[letter] * self.scale
+                self.pole[k] = (self.position[k] if self._incremental(letter) else offset[k]) + values[
+                    letter
+                ] * self.scale
             elif here:
                 self.pole[k] = self.position[k]
+
+    def _lose_height(self, axes: list[float | None]) -> str:
+        """M140: the tool goes back along its axis, to where the program does not say."""
+        if any(axis is not None for axis in axes):
+            self._fail("M140 and a move are in one block; divide the block")
+        self._move(RAPID, [*self.position[:2], math.nan], corrected=(0, 0, 0))
+        self.named[2] = False
+        return "keep"
+
+    def _helix(self, axes: list[float | None], values: dict[str, float]) -> str:
+        """CP: about the pole by an angle (IPA), or to one (PA), and along the axis of the plane."""
+        a, b = PLANE_AXES[self.plane]
+        if any(axes[k] is not None for k in (a, b)):
+            self._fail("CP with a coordinate in the plane of its pole; post the angle alone")
+        u, v = self.pole[a] - self.position[a], self.pole[b] - self.position[b]
+        if math.isnan(u + v) or math.hypot(u, v) == 0.0:
+            self._fail("CP needs a pole (CC), and a position that is known and not in it")
+        ccw, start = self.motion == CCW, math.atan2(-v, -u)
+        if "IPA" in values:
+            sweep = math.radians(values["IPA"])
+            if sweep == 0.0 or (sweep > 0) != ccw:
+                self._fail("CP: IPA and DR have to have one sign, and IPA is not 0")
+        else:
+            turn = (math.radians(values["PA"]) - start) * (1.0 if ccw else -1.0) % (2.0 * math.pi)
+            turn = 2.0 * math.pi if turn < 1e-9 or 2.0 * math.pi - turn < 1e-9 else turn
+            sweep = turn if ccw else -turn
+        if abs(sweep) > 2.0 * math.pi * MOST_TURNS:
+            self._fail(f"expected at most {MOST_TURNS} turns")
+        end, radius = self._target(axes), math.hypot(u, v)
+        end[a], end[b] = (
+            self.pole[a] + radius * math.cos(start + sweep),
+            self.pole[b] + radius * math.sin(start + sweep),
+        )
+        centre = [math.nan] * 3
+        centre[a], centre[b] = self.pole[a], self.pole[b]
+        self.named = [known or k in (a, b) for k, known in enumerate(self.named)]
+        self._move(CCW if ccw else CW, end, arc=tuple(centre), sweep=sweep)
+        return "arc"
 
     def _arc(self, end: list[float], values: dict[str, float]) -> None:
         start, (a, b) = self.position, PLANE_AXES[self.plane]

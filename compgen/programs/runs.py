@@ -154,6 +154,8 @@ class Words:
                 for k, with_move in zip(chosen, moving, strict=True)
             ]
             spoil(begin[chosen[~np.array(allowed)]])
+        if dialect.klartext:
+            plain[:] = False
         self.run_end = _ends_of_runs(plain)
         self._plain = plain
 

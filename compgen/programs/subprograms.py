@@ -121,7 +121,7 @@ class Pointed:
         for name in codes:
             self._inch = name == "G20" or (self._inch and name != "G21")
             self._drills = name in _DRILLS or (self._drills and name not in _ENDS_DRILLING)
-        if not self._plain.isdisjoint(codes):
+        if any(name in self._plain for name in codes):
             return line
         counts = self._drills and not re.search(rb"[IJ]\s*[-+.\d]", code, re.IGNORECASE)
         for word in reversed(list(_INTEGER.finditer(code))):

@@ -2,10 +2,15 @@
 
 import numpy as np
 
+from compgen.programs.dialects import DIALECTS
 from machines import machine_of
 
 OFFSETS_MM = {"G54": (12.7, -25.4, -50.8), "G55": (-25.4, 50.8, -38.1)}
 TOOLS_MM = {"1": (0.0, 0.0, 25.4), "2": (0.0, 0.0, 76.2)}
+
+
+#: Dialects whose blocks are words of a letter and a number.
+G_CODE = [name for name in DIALECTS if name != "heidenhain-klartext"]
 
 
 def mill():

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from programs.make import OFFSETS_MM, TOOLS_MM, mill, mixed_program, random_program
+from programs.make import G_CODE, OFFSETS_MM, TOOLS_MM, mill, mixed_program, random_program
 from scipy.spatial import cKDTree
 
 import compgen
@@ -209,7 +209,7 @@ def test_without_errors_a_program_stays_the_same_byte_for_byte(tmp_path, seed):
     assert result.counts["changed_blocks"] == 0
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", G_CODE)
 @pytest.mark.parametrize("seed", range(3))
 def test_blocks_read_together_give_what_single_blocks_give(tmp_path, seed, dialect, make_errors, monkeypatch):
     """However blocks are read and written, and whatever the size of the batches, the same bytes and figures come out."""

@@ -4,7 +4,7 @@ import re
 import time
 
 import pytest
-from programs.make import OFFSETS_MM, TOOLS_MM, mill, mixed_program, random_holes
+from programs.make import G_CODE, OFFSETS_MM, TOOLS_MM, mill, mixed_program, random_holes
 from programs.test_correct import run, shift
 from programs.test_dialects import cycle_errors
 
@@ -194,7 +194,7 @@ def test_an_axis_that_no_block_has_named_since_is_said(tmp_path):
 # Where the two readings differ, or what was written does, nothing is accepted.
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", G_CODE)
 def test_the_two_readings_agree_on_mixed_programs(tmp_path, dialect, monkeypatch):
     setup = Setup({**OFFSETS_MM, "PRESET": (1.5, 2.5, -60.0)}, TOOLS_MM)
     text, found = mixed_program(7, dialect, 900), []

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from programs import test_rs274 as rs274
+from programs.make import G_CODE
 from programs.test_correct import PLAIN, moves_of, run, shift
 
 from compgen.controls import CONTROLLERS
@@ -323,7 +324,7 @@ def at_the_edge(dialect, blocks, setup=EDGE):
     return text.replace("\n\n", "\n"), Setup({"G54": setup, "PRESET": setup}, {"1": (0.0, 0.0, 0.0)})
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", G_CODE)
 @pytest.mark.parametrize("blocks", ["G1 X10. F100\nX0.\nY20.", "G0 X0.\nG1 Y20. F100"])
 def test_a_program_that_the_correction_takes_beyond_the_travel_is_refused(tmp_path, dialect, blocks):
     """The machine goes 129 um too far to plus, so that X 0 of the program becomes -600.129 mm: by cuts and by rapid moves."""
@@ -369,7 +370,7 @@ def test_a_margin_of_the_machine_lets_them_pass_and_they_are_listed(tmp_path):
     assert result.reasons[0].startswith("2 blocks lead beyond the travel, by up to 0.229 mm (line 4: X -600.229")
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", G_CODE)
 def test_an_arc_whose_ends_stay_inside_may_leave_the_travel_by_its_correction(tmp_path, dialect):
     """A semicircle about X 30 with the radius 30 touches the end of the travel; the correction moves it 10 um beyond."""
     centre = "I+30. J+0.\nG3 X30. Y-30." if dialect == "heidenhain-iso" else "G3 X30. Y-30. I0. J-30."
@@ -409,7 +410,7 @@ def test_blocks_of_a_subprogram_have_the_lines_of_the_file(tmp_path):
 # --- what is said about the program ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@pytest.mark.parametrize("dialect", G_CODE)
 def test_m_codes_that_are_not_known_are_listed_all_at_once(tmp_path, dialect):
     """With their lines; the first is the line of the message. M88 in a comment and M8 are none of them."""
     comment = "; M88" if dialect in ("siemens", "heidenhain-iso") else "(M88)"

@@ -1,0 +1,968 @@
+"""Klartext programs of HEIDENHAIN as their control executes them: what a correction cannot keep is written as plain moves.
+
+Calls of labels and repeats are written out; Q parameters that are constant become numbers; polar lines, tangent arcs, roundings,
+chamfers and patterns of holes become lines, arcs and holes, since each place needs its own correction. All else stays as it is.
+The text that remains (L, CC, C, CR, CP, cycles with M99, M89, CYCL CALL) is that which :class:`compgen.programs.reader.Reader`
+reads. Sources: HEIDENHAIN Klartext Programming and Cycle Programming manuals.
+"""
+
+from __future__ import annotations
+
+import ast
+import cmath
+import math
+import operator
+import re
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from compgen.errors import InputError, visible_line
+from compgen.programs.dialects import VALUE
+from compgen.programs.subprograms import WrittenOut
+
+#: Numbers that are calculated here have so many decimals; the writer gives them those of the dialect.
+CALCULATED = 8
+_DEEPEST, _MOST_LINES, _MOST_HOLES = 20, 2_000_000, 100_000
+_NEEDED = re.compile(
+    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|PATTERN|DEF\s*22[01]|FN\s*\d|[A-Z=+*/( -]\s*Q[LR]?\d+\s*(?!\s*=|\d)",
+    re.IGNORECASE,
+)
+_STATEMENT = re.compile(r"\s*(?P<number>\d+(?=[\s/]|$))?\s*(?P<skip>/\d?)?\s*(?P<code>.*)", re.DOTALL)
+_USED = re.compile(
+    r"(?<![A-Z0-9_])(?P<word>I?[XYZABC]|I?P[RA]|R|REP\s*|Q\d+\s*=|(?:NUM|ROT|D|DX|DY|START|STEP)[XY]?)\s*"
+    r"(?P<sign>[+-]?)\s*(?P<name>Q[LR]?\d+)",
+    re.IGNORECASE,
+)
+_WORD = re.compile(
+    rf"(?<![A-Z])(I?(?:[XYZ]|PR|PA)|R(?=\s*(?:[+\-.1-9]|0\.))|NUM[XY]?|ROT[XY]?|D[XY]?|START|STEP|F)\s*({VALUE})",
+    re.IGNORECASE,
+)
+_TAIL = re.compile(
+    rf"(?<![A-Z])(?:R0|R[LR]|F\s*MAX|F\s*AUTO|F[ZU]?\s*(?:{VALUE}|Q[LR]?\d+)|M\d+)(?![\w.])", re.IGNORECASE
+)
+_MOTION = re.compile(r"(LP|L|CTP|CT|CP|CR|CC|C|RND|CHF)(?![A-Z])", re.IGNORECASE)
+_CYCLE_NUMBER = re.compile(rf"(Q\d+)(\s*=\s*)({VALUE})", re.IGNORECASE)
+_ASSIGNS = re.compile(r"(?:FN\s*\d+\s*:\s*)?(Q[LRS]?\d+)\s*=\s*(.+)", re.IGNORECASE | re.DOTALL)
+_PATTERN = re.compile(r"(POS|ROW|PAT|FRAME|CIRC|PITCHCIRC)\d+\s*\(([^()]*)\)", re.IGNORECASE)
+
+
+#: Words of a move, and what follows them.
+_MOVE_WORD = re.compile(
+    rf"\s*+(?:(?P<machine>M\s*140)\s*+(?:MB\s*+(?:MAX|{VALUE}))?"
+    rf"|(?P<inc>I)?(?P<axis>[XYZABCUVW])\s*+(?P<value>{VALUE})|(?P<polar>I?P[AR])\s*+(?P<angle>{VALUE})"
+    rf"|(?P<turn>DR\s*[+-])|(?P<comp>R[LR])(?![A-Z])|R0(?![.\d])|R\s*+(?P<radius>{VALUE})|(?P<max>F\s*+MAX)|F\s*+AUTO"
+    rf"|F[ZU]?\s*+(?:{VALUE}|[+-]?Q[LR]?\d+)|M\s*+(?P<m>\d+)|(?P<bare>R[+-](?=\s|$)))",
+    re.IGNORECASE,
+)
+_SETTINGS = re.compile(
+    r"BLK\s+FORM|\*|LBL\s*(?:\"|\d)|FUNCTION\s+RESET|FUNCTION\s+MODE\s+MILL|PLANE\s+RESET\s+STAY|TRANS\s+DATUM\s+RESET\s*$"
+    r"|FN\s*(?:[0-8]|16|18|20|26|27|28)\b|Q[LRS]?\d+\s*=|ADP\b|SPINDLE\b|SECTION\b|END\s+SECTION\b",
+    re.IGNORECASE,
+)
+#: Cycles that move nothing of X, Y and Z: dwell, spindle, tolerance; those with nothing in their lines end a turn.
+_STILL, _TURNED = (9, 13, 32), (8, 10, 11, 19, 26)
+_REFUSED = (
+    (
+        r"APPR|DEP",
+        "approaches and departures need cutter radius compensation, which is not followed; post lines and arcs with R0",
+    ),
+    (r"F(?:POL|L|LT|C|CT|SELECT)\b", "free contours (FK) are not followed; post lines and arcs"),
+    (r"TCH\s*PROBE", "where a probe stops is not known; take probing out of the program"),
+    (
+        r"PLANE|FUNCTION|M128|LN\b|SPL\b",
+        "a turned plane, TCPM, normals and splines are not followed; post a program with X, Y and Z",
+    ),
+    (
+        r"CALL\s*(?:PGM|LBL|SELECTED)|SEL\b|CYCL\s*DEF\s*12\b",
+        "calls another program; post one program without calls of files",
+    ),
+    (r"CYCL\s*CALL\s*P|PATTERN|LP|CTP?|RND|CHF", "is not followed where it stands; post lines and arcs"),
+    (
+        r"FN|IF\b|FOR\b|WHILE\b",
+        "conditions, jumps and readings of the control are not followed; post the program without them",
+    ),
+)
+
+
+@dataclass
+class Sentence:
+    """What a line of a program says: what to do, its words and their modes, and which number it has (cycle, preset)."""
+
+    what: str
+    words: list[tuple[str, str, int, int]] = field(default_factory=list)
+    modes: dict[str, str] = field(default_factory=dict)
+    number: str = ""
+    #: Whether a block with / that the control may skip.
+    deleted: bool = False
+
+
+class Sentences:
+    """Reads lines of a program; keeps whether a line goes on in the next one, and in what cycle lines with Q stand."""
+
+    def __init__(self) -> None:
+        self._continues, self._comment, self._cycle = False, False, ""
+
+    def of(self, line: str) -> Sentence:
+        """Return what a line says; "refused" with the reason as its number."""
+        body = line.rstrip()
+        goes_on, bare = body.endswith("~"), body.removesuffix("~")
+        code = bare.partition(";")[0].rstrip()
+        continued, self._continues = self._continues, goes_on
+        if continued and self._comment:
+            return Sentence("keep")
+        head = re.match(r"\s*(?:\d+(?=[\s/*;]|$))?\s*(/\d?)?\s*", code)
+        at = head.end() if head and not continued else len(code) - len(code.lstrip())
+        self._comment = not code[at:].strip() and ";" in bare
+        found = self._said(code, at)
+        found.deleted = bool(head and head[1]) and not continued
+        return found
+
+    def _said(self, code: str, at: int) -> Sentence:
+        text = code[at:].upper()
+        if not text.strip():
+            return Sentence("keep")
+        if self._cycle and re.match(r"Q\d+\s*=", text):
+            return self._more(text)
+        cycle, self._cycle = self._cycle, ""
+        if found := re.match(r"(BEGIN|END)\s+PGM\b.*?(MM|INCH)?\s*$", text):
+            return Sentence(found[1].lower(), number=found[2] or "")
+        if found := re.match(r"CYCL\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", text):
+            return self._defined(code, at, at + found.end(), int(found[1]), found[2])
+        del cycle
+        if re.match(r"CYCL\s*CALL(?!\s*P)", text):
+            return self._move(code, at + text.index("CALL") + 4, "CYCL CALL")
+        if found := re.match(r"TOOL\s+(CALL|DEF)", text):
+            return self._tool(code, at + found.end(), found[1])
+        if found := re.match(r"TRANS\s+DATUM\s+AXIS", text):
+            return self._shifted(code, at + found.end())
+        if re.match(r"TRANS\s+DATUM\s+RESET", text):
+            return Sentence("shift", [(letter, "0", at, at) for letter in "XYZ"], dict.fromkeys("XYZ", "AC"))
+        if _SETTINGS.match(text):
+            return Sentence("keep")
+        if found := re.match(r"(L|CC|CR|CP|C)(?![A-Z])", text):
+            return self._move(code, at + found.end(), found[1])
+        if found := re.match(r"STOP\b|(?=M\d)", text):
+            return self._move(code, at + found.end(), "STOP")
+        for pattern, reason in _REFUSED:
+            if re.match(pattern, text):
+                return Sentence("refused", number=f"{text[:20].strip()}: {reason}")
+        return Sentence(
+            "refused",
+            number=f"{text[:20].strip()!r} is not known in Klartext, and may move the machine; post lines and arcs",
+        )
+
+    def _more(self, text: str) -> Sentence:
+        """A further line of a cycle that is defined."""
+        number = re.match(rf"Q(\d+)\s*=\s*({VALUE})?", text)
+        if self._cycle == "247":
+            if not number or number[1] != "339" or not number[2]:
+                return Sentence("refused", number="cycle 247 needs the number of the preset: Q339=1")
+            return Sentence("preset", number=f"{float(number[2].replace(' ', '')):g}")
+        return Sentence("more")
+
+    def _defined(self, code: str, at: int, end: int, number: int, part: str | None) -> Sentence:
+        text = code[end:].upper()
+        if number == 7:
+            return self._shifted(code, end) if part not in (None, "0") else Sentence("keep")
+        if number in _STILL:
+            return Sentence("keep")
+        if number in _TURNED:
+            turned = part not in (None, "0") and any(float(value.replace(" ", "")) for value in re.findall(VALUE, text))
+            turned = turned or (number == 8 and bool(re.search("[XYZ]", text)) and part not in (None, "0"))
+            if number in (11, 26) and part not in (None, "0"):
+                turned = any(float(value.replace(" ", "")) != 1.0 for value in re.findall(VALUE, text))
+            if not turned:
+                return Sentence("keep")
+            return Sentence(
+                "refused",
+                number=f"cycle {number}: turned, scaled or mirrored coordinates are not followed; post without them",
+            )
+        if number == 247:
+            self._cycle = "247"
+            q = re.search(rf"Q339\s*=\s*({VALUE})", text)
+            return Sentence("preset", number=f"{float(q[1].replace(' ', '')):g}") if q else Sentence("keep")
+        self._cycle = str(number)
+        return Sentence("cycle", number=f"G{number}")
+
+    @staticmethod
+    def _shifted(code: str, at: int) -> Sentence:
+        found = Sentence("shift")
+        for word in re.finditer(rf"(I?)([XYZABC])\s*({VALUE})|#\s*\d+|([A-Z#]\S*)", code[at:], re.IGNORECASE):
+            if word[2] is None:
+                return Sentence(
+                    "refused", number=f"{word[0]}: datums of a table are not known; post the shift with X, Y and Z"
+                )
+            letter = word[2].upper()
+            found.words.append((letter, word[3], at + word.start(3), at + word.end(3)))
+            found.modes[letter] = "IC" if word[1] else "AC"
+        return found
+
+    @staticmethod
+    def _tool(code: str, at: int, kind: str) -> Sentence:
+        text = code[at:]
+        if axis := re.search(r"(?<![A-Z\"])([XYUVW])(?=\s|$)", text, re.IGNORECASE):
+            return Sentence("refused", number=f"the tool axis {axis[1].upper()} is not followed; expected Z")
+        if re.search(r"Q[LRS]?\d", text):
+            return Sentence("refused", number="the number of the tool is not constant; post it")
+        found, name = (
+            Sentence("tool" if kind == "CALL" else "tool definition"),
+            re.match(r"\s*(\"[^\"]*\"|\d+(?:\.\d+)?)", text),
+        )
+        if name:
+            found.words.append(("T", name[1], at + name.start(1), at + name.end(1)))
+        if not name and re.search(r"(?<![A-Z])DL", text, re.IGNORECASE):
+            return Sentence(
+                "refused",
+                number="TOOL CALL with DL and without a tool is not followed; post it with the number of the tool",
+            )
+        for word in re.finditer(rf"\b(DL|L)\s*({VALUE})", text[name.end() if name else 0 :], re.IGNORECASE):
+            found.words.append((word[1].upper(), word[2], at, at))
+        return found
+
+    def _move(self, code: str, at: int, kind: str) -> Sentence:
+        """Split a move into words: codes have no text."""
+        found, start = Sentence("move"), at
+        if kind != "STOP":
+            found.words.append((kind, "", at, at))
+        while code[at:].strip():
+            word = _MOVE_WORD.match(code, at)
+            if word is None:
+                return Sentence(
+                    "refused",
+                    number=f"{code[at:].strip()[:20]!r} cannot be read; expected words such as X+10.5, R0, F500 or M3",
+                )
+            part, at = word.groupdict(), word.end()
+            if part["comp"] or part["bare"]:
+                return Sentence(
+                    "refused",
+                    number=f"{word[0].strip()}: cutter radius compensation is not followed; post the path of the tool "
+                    "centre from CAM (R0)",
+                )
+            if part["axis"]:
+                letter = part["axis"].upper()
+                letter = "IJK"["XYZ".index(letter)] if kind == "CC" and letter in "XYZ" else letter
+                found.words.append((letter, part["value"], *word.span("value")))
+                found.modes[letter] = "IC" if part["inc"] else "AC"
+            elif part["polar"]:
+                found.words.append((part["polar"].upper(), part["angle"], *word.span("angle")))
+            elif part["turn"]:
+                found.words.append((re.sub(r"\s", "", part["turn"].upper()), "", *word.span("turn")))
+            elif part["radius"]:
+                found.words.append(("R", part["radius"], *word.span("radius")))
+            elif part["max"]:
+                found.words.append(("FMAX", "", *word.span("max")))
+            elif part["machine"]:
+                found.words.append(("M140", "", *word.span("machine")))
+            elif part["m"]:
+                found.words.append(("M", part["m"], *word.span("m")))
+        return self._whole(found, kind, code[start:])
+
+    @staticmethod
+    def _whole(found: Sentence, kind: str, text: str) -> Sentence:
+        """Refuse moves that lack what says where they lead."""
+        letters = [letter for letter, *_ in found.words]
+        axes = set(letters) & set("XYZ")
+        if kind in ("C", "CR", "CP") and not {"DR+", "DR-"} & set(letters):
+            return Sentence("refused", number=f"{kind} without DR+ or DR-; post the sense of the arc")
+        if kind in ("C", "CR") and not axes:
+            return Sentence("refused", number=f"{kind} without the coordinates of its end; post them")
+        if (
+            (kind == "CR") != ("R" in letters)
+            or (kind == "CP") != bool({"PA", "IPA"} & set(letters))
+            or {"PR", "IPR"} & set(letters)
+        ):
+            return Sentence(
+                "refused",
+                number=f"{kind}{text.rstrip()[:30]} has words that do not belong together; post L, C, CR, CP or LP",
+            )
+        for letter in set(letters):
+            if letters.count(letter) > 1 and letter != "M":
+                return Sentence("refused", number=f"{letter} is given twice in a block")
+        return found
+
+
+@dataclass
+class _Statement:
+    """A block with the lines that continue it: its lines in the file, its code without comments, and whether it is skipped."""
+
+    first: int
+    lines: list[str]
+    code: str = ""
+    deleted: bool = False
+
+
+def _statements(lines: list[str]) -> Iterator[_Statement]:
+    k = 0
+    while k < len(lines):
+        found = _Statement(k, [lines[k]])
+        while lines[k].rstrip().endswith("~") and k + 1 < len(lines):
+            k += 1
+            found.lines.append(lines[k])
+        k += 1
+        head = _STATEMENT.match(found.lines[0].partition(";")[0].rstrip().rstrip("~"))
+        found.code, found.deleted = (head["code"].strip(), bool(head["skip"])) if head else ("", False)
+        comment = not found.code and ";" in found.lines[0]
+        if not comment:
+            more = (line.partition(";")[0].rstrip().rstrip("~").strip() for line in found.lines[1:])
+            found.code = " ".join([found.code, *more]).strip()
+        yield found
+
+
+def lowered(source: Path, *, skip_deleted: bool = False) -> WrittenOut | None:
+    """Return a program with what the module's text names written as plain moves; None if there is nothing of it."""
+    content = source.read_bytes()
+    if not _NEEDED.search(content):
+        return None
+    return _Program(source, content.decode("latin-1").splitlines(keepends=True), skip_deleted).written()
+
+
+def holes_of_circle(q: dict[str, float]) -> list[complex]:
+    """Places of cycle 220: on a pitch circle, by the stepping angle or from the starting to the stopping angle."""
+    count, start, step = int(q["Q241"]), q["Q245"], q.get("Q247", 0.0)
+    if step == 0.0 and count > 1:
+        span = q["Q246"] - start
+        step = span / count if abs(abs(span) - 360.0) < 1e-9 else span / (count - 1)
+    centre = complex(q["Q216"], q["Q217"])
+    return [centre + cmath.rect(0.5 * q["Q244"], math.radians(start + k * step)) for k in range(count)]
+
+
+def holes_of_grid(
+    start: complex, step: tuple[float, float], count: tuple[int, int], turn_deg: float, *, frame: bool = False
+) -> list[complex]:
+    """Places of cycle 221 and of PAT: line by line, every other one backwards, turned about the first place."""
+    turn, places = cmath.rect(1.0, math.radians(turn_deg)), []
+    for line in range(count[1]):
+        columns = range(count[0]) if line % 2 == 0 else reversed(range(count[0]))
+        for column in columns:
+            if not frame or line in (0, count[1] - 1) or column in (0, count[0] - 1):
+                places.append(start + turn * complex(column * step[0], line * step[1]))
+    return places
+
+
+@dataclass
+class _Element:
+    """The last move of a contour, as a rounding needs it: where it begins, and its place in the output."""
+
+    start: list[float]
+    end: list[float]
+    straight: bool
+    place: int
+    tail: str
+    line: int
+
+
+@dataclass
+class _Program:
+    """Executes a program statement by statement; places are in its own coordinates and unit."""
+
+    source: Path
+    lines: list[str]
+    skip_deleted: bool
+    out: list[tuple[str, int]] = field(default_factory=list)
+    q: dict[str, float | None] = field(default_factory=dict)
+    at: list[float] = field(default_factory=lambda: [math.nan] * 3)
+    pole: list[float] = field(default_factory=lambda: [math.nan] * 3)
+    axes: tuple[int, int] = (0, 1)
+    tangent: complex | None = None
+    cycle: dict[str, float] = field(default_factory=dict)
+    cycle_lines: list[str] = field(default_factory=list)
+    points: list[tuple[float, float, float]] = field(default_factory=list)
+    element: _Element | None = None
+    corner: tuple[str, float, int] | None = None
+    polar: float = math.nan
+    shift: list[float] = field(default_factory=lambda: [0.0] * 3)
+    called: dict[str, None] = field(default_factory=dict)
+    written_lines: set[int] = field(default_factory=set)
+
+    def written(self) -> WrittenOut:
+        """Execute from the first statement to the end."""
+        every = list(_statements(self.lines))
+        labels: dict[str, int] = {}
+        for k, item in enumerate(every):
+            if label := re.match(r"LBL\s*(\"[^\"]+\"|\d+)", item.code, re.IGNORECASE):
+                if label[1] in labels and label[1] != "0":
+                    self._fail(item, f"LBL {label[1]} is given twice; give each its own number")
+                labels[label[1]] = k
+        self.calls = any(re.match(r"CALL\s*LBL", item.code, re.IGNORECASE) for item in every)
+        stack: list[int] = []
+        left: dict[int, int] = {}
+        k = 0
+        while k < len(every):
+            item, k = every[k], k + 1
+            if len(self.out) > _MOST_LINES:
+                self._fail(
+                    item,
+                    f"the program has more than {_MOST_LINES} lines when its calls are written out; post it in parts",
+                )
+            if item.deleted and self.skip_deleted:
+                self._keep(item)
+                continue
+            call = re.match(r"CALL\s*LBL\s*(\"[^\"]+\"|\d+)(?:\s*REP\s*(\S+))?", item.code, re.IGNORECASE)
+            if call:
+                k = self._call(item, call, k, labels, stack, left)
+            elif re.match(r"LBL\s*(?:\"|\d)", item.code, re.IGNORECASE):
+                self._comment(item) if self.calls else self._keep(item)
+                if re.match(r"LBL\s*0+\b", item.code, re.IGNORECASE) and stack:
+                    k = stack.pop()
+            else:
+                self._execute(item)
+                if self._ends(item.code) and self.calls:
+                    for rest in every[k:]:
+                        self._keep(rest) if not rest.code or self._closes(rest.code) else self._comment(rest)
+                    break
+        if self.corner:
+            raise InputError("a rounding or chamfer without a move after it", file=self.source, line=self.corner[2] + 1)
+        text = "".join(text for text, _ in self.out)
+        return WrittenOut(text.encode("latin-1"), np.array([line + 1 for _, line in self.out]), tuple(self.called))
+
+    def _fail(self, item: _Statement, message: str) -> NoReturn:
+        text = visible_line(item.lines[0].strip())[:60]
+        raise InputError(f"{message} (block: {text})", file=self.source, line=item.first + 1)
+
+    @staticmethod
+    def _ends(code: str) -> bool:
+        return re.search(r"(?<![A-Z])M0*(?:2|30)(?!\d)", code, re.IGNORECASE) is not None
+
+    @staticmethod
+    def _closes(code: str) -> bool:
+        return re.match(r"END\s+PGM", code, re.IGNORECASE) is not None
+
+    def _call(
+        self,
+        item: _Statement,
+        call: re.Match[str],
+        k: int,
+        labels: dict[str, int],
+        stack: list[int],
+        left: dict[int, int],
+    ) -> int:
+        """Follow a call of a label: a subprogram to LBL 0, or with REP the part of the program from the label again."""
+        name = call[1]
+        if name not in labels or name == "0":
+            self._fail(item, f"CALL LBL {name}: the label is not in this program; give one program with all its labels")
+        self._comment(item)
+        if call[2] is None:
+            if len(stack) >= _DEEPEST:
+                self._fail(item, f"calls within calls are followed to a depth of {_DEEPEST}")
+            stack.append(k)
+            self.called[f"LBL {name}"] = None
+            return labels[name] + 1
+        text = call[2].partition("/")[0]
+        times = self._value(item, text)
+        if times != int(times) or not 0 <= times <= 65534:
+            self._fail(item, f"REP {text}: expected a whole number of repeats")
+        if labels[name] >= k:
+            self._fail(item, f"REP of LBL {name}, which begins after the call, is not followed; post it without REP")
+        self.called[f"LBL {name} REP {int(times)}"] = None
+        remaining = left.pop(k, int(times))
+        if remaining:
+            left[k] = remaining - 1
+            return labels[name] + 1
+        return k
+
+    # Output.
+
+    def _keep(self, item: _Statement) -> None:
+        lines = list(item.lines)
+        if item.first in self.written_lines:  # a block has its number once
+            lines[0] = re.sub(r"^(\s*)\d+\s+", r"\1", lines[0])
+        self.written_lines.add(item.first)
+        self.out += [(line, item.first + k) for k, line in enumerate(lines)]
+
+    def _comment(self, item: _Statement) -> None:
+        """Keep a statement that is written out as a comment."""
+        for k, line in enumerate(item.lines):
+            bare = re.sub(r"^\s*\d*\s*", "", line) if not k else line.lstrip()
+            self._put(f"; {bare.rstrip().rstrip('~').rstrip()}", item, k)
+
+    def _put(self, text: str, item: _Statement, k: int = 0) -> None:
+        line = item.lines[0]
+        self.out.append((text + (line[len(line.rstrip("\r\n")) :] or "\n"), item.first + k))
+
+    # Numbers.
+
+    def _value(self, item: _Statement, text: str) -> float:
+        """The value of a number or an expression; refused if it is not constant."""
+        found = self._evaluated(text)
+        if found is None:
+            self._fail(
+                item,
+                f"{text.strip()!r} is not known before the program runs: only Q parameters that are constant are followed",
+            )
+        return found
+
+    def _evaluated(self, text: str) -> float | None:
+        known = {name: value for name, value in self.q.items() if value is not None}
+        try:
+            return evaluated(text, known)
+        except (ValueError, SyntaxError, ArithmeticError, KeyError, RecursionError, MemoryError):
+            return None
+
+    def _assign(self, item: _Statement, name: str, text: str) -> None:
+        name = name.upper()
+        if name in self.cycle:
+            self._fail(item, f"{name} is a number of the cycle that is defined; define the cycle again with it")
+        number = re.match(r"FN\s*(\d+)", item.code, re.IGNORECASE)
+        if number and int(number[1]) == 4:
+            text = re.sub(r"\bDIV\b", "/", text, flags=re.IGNORECASE)
+        if number and int(number[1]) == 5:
+            text = re.sub(r"\bSQRT\b", "SQRT ", text, flags=re.IGNORECASE)
+        followed = not number or int(number[1]) <= 8
+        self.q[name] = self._evaluated(text) if followed else None
+
+    def _substituted(self, item: _Statement) -> _Statement:
+        """The statement with numbers in place of Q parameters; those of feeds stay."""
+
+        def put(found: re.Match[str]) -> str:
+            value = self._value(item, found["name"]) * (-1.0 if found["sign"] == "-" else 1.0)
+            sign = "" if found["word"].strip().upper() in ("NUM", "NUMX", "NUMY", "REP") else "+"
+            return f"{found['word']}{value:{sign}.10g}"
+
+        lines = []
+        for line in item.lines:
+            code, mark, comment = line.partition(";")
+            lines.append(_USED.sub(put, code) + mark + comment)
+        return _Statement(item.first, lines, _USED.sub(put, item.code), item.deleted) if lines != item.lines else item
+
+    # Statements.
+
+    def _execute(self, item: _Statement) -> None:
+        code = item.code.upper()
+        if code.startswith("*") or not code:
+            return self._keep(item)
+        if (assigned := _ASSIGNS.fullmatch(item.code)) and not code.startswith("CYCL"):
+            self._assign(item, assigned[1], assigned[2])
+            return self._keep(item)
+        item = self._substituted(item)
+        code = item.code.upper()
+        motion = _MOTION.match(code)
+        if code.startswith("CYCL") and "DEF" in code[:10]:
+            return self._define(item, code)
+        if code.startswith("PATTERN"):
+            self.points = self._points(item)
+            return self._comment(item)
+        if re.match(r"CYCL\s*CALL\s*PAT", code):
+            return self._drill(item, self.points, code)
+        if re.match(r"CYCL\s*CALL\s*POS", code):
+            words = self._words(code)
+            if not {"X", "Y"} <= words.keys():
+                self._fail(item, "CYCL CALL POS without X and Y; post both")
+            return self._drill(item, [(words["X"], words["Y"], words.get("Z", 0.0))], code)
+        if motion:
+            return self._move(item, motion[1].upper(), code)
+        if re.match(r"FN\s*(?:9|10|11|12)\b", code):
+            self._fail(item, "jumps (FN 9 to FN 12) are not followed; post the program without conditions")
+        if unknown := re.match(r"FN\s*\d+\s*:\s*\w+\s+(Q[LR]?\d+)", code):
+            self.q[unknown[1]] = None
+        self._keep(item)
+        return None
+
+    @staticmethod
+    def _words(code: str) -> dict[str, float]:
+        return {name.upper(): float(value.replace(" ", "")) for name, value in _WORD.findall(code)}
+
+    def _define(self, item: _Statement, code: str) -> None:
+        """Take a definition of a cycle; patterns are drilled at once."""
+        number = re.match(r"CYCL\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", code)
+        name = int(number[1]) if number else 0
+        numbers = {key.upper(): float(value.replace(" ", "")) for key, _, value in _CYCLE_NUMBER.findall(item.code)}
+        self.q |= numbers
+        if name in (220, 221):
+            return self._pattern(item, name, numbers)
+        if name == 7 and number and number[2] not in (None, "0"):
+            words = self._words(code[number.end() :])
+            for k, letter in enumerate("XYZ"):
+                new = words.get(letter, self.shift[k] + words.get(f"I{letter}", 0.0))
+                self.at[k] += self.shift[k] - new
+                self.pole[k] += self.shift[k] - new
+                self.shift[k] = new
+        elif name == 247:
+            self.shift, self.at = [0.0] * 3, [math.nan] * 3
+        elif name >= 200:
+            self.cycle, self.cycle_lines = numbers, item.lines
+        self._keep(item)
+        return None
+
+    def _pattern(self, item: _Statement, name: int, q: dict[str, float]) -> None:
+        needed = (
+            ("Q216", "Q217", "Q244", "Q245", "Q241")
+            if name == 220
+            else ("Q225", "Q226", "Q237", "Q238", "Q242", "Q243")
+        )
+        if missing := [key for key in needed if key not in q] + ["Q246"] * (
+            name == 220 and not q.get("Q247") and "Q246" not in q
+        ):
+            self._fail(item, f"cycle {name} without {missing[0]}; give it")
+        for key in ("Q241", "Q242", "Q243"):
+            if key in q and not 1 <= q[key] == int(q[key]):
+                self._fail(item, f"{key}={q[key]:g}: expected a whole number of holes")
+        if name == 220:
+            places = holes_of_circle(q)
+        else:
+            count = int(q["Q242"]), int(q["Q243"])
+            places = holes_of_grid(complex(q["Q225"], q["Q226"]), (q["Q237"], q["Q238"]), count, q.get("Q224", 0.0))
+        for key in ("Q200", "Q203", "Q204"):
+            if key in q:
+                self.cycle = self.cycle | {key: q[key]} if self.cycle else {}
+        self._drill(item, [(place.real, place.imag, 0.0) for place in places], "FMAX", again=True)
+
+    def _points(self, item: _Statement) -> list[tuple[float, float, float]]:
+        """Places of PATTERN DEF, with what each adds to the surface."""
+        found: list[tuple[float, float, float]] = []
+        rest = re.sub(r"^PATTERN\s*DEF", "", _PATTERN.sub("", item.code), flags=re.IGNORECASE)
+        if rest.strip():
+            self._fail(
+                item,
+                f"PATTERN DEF with {rest.strip()[:20]!r} is not followed; post POS, ROW, PAT, FRAME, CIRC or PITCHCIRC",
+            )
+        for kind, inside in _PATTERN.findall(item.code.upper()):
+            w = self._words(inside)
+            if w.get("ROTX") or w.get("ROTY"):
+                self._fail(item, f"{kind} with ROTX or ROTY is not followed; post the places with POS")
+            counts = [w.get(key, 1.0) for key in ("NUM", "NUMX", "NUMY")]
+            if "X" not in w or "Y" not in w or any(not 1 <= one == int(one) <= _MOST_HOLES for one in counts):
+                self._fail(item, f"{kind} needs X, Y and whole numbers of places")
+            start, (count, columns, rows) = complex(w["X"], w["Y"]), map(int, counts)
+            if kind == "POS":
+                places = [start]
+            elif kind == "ROW":
+                places = holes_of_grid(start, (w.get("D", 0.0), 0.0), (count, 1), w.get("ROT", 0.0))
+            elif kind in ("PAT", "FRAME"):
+                step = w.get("DX", 0.0), w.get("DY", 0.0)
+                places = holes_of_grid(start, step, (columns, rows), w.get("ROT", 0.0), frame=kind == "FRAME")
+            else:
+                step_deg = w.get("STEP", 0.0) if kind == "PITCHCIRC" else 360.0 / count
+                angles = (math.radians(w.get("START", 0.0) + k * step_deg) for k in range(count))
+                places = [start + cmath.rect(0.5 * w.get("D", 0.0), angle) for angle in angles]
+            found += [(place.real, place.imag, w.get("Z", 0.0)) for place in places]
+        return found
+
+    def _drill(
+        self, item: _Statement, places: list[tuple[float, float, float]], code: str, *, again: bool = False
+    ) -> None:
+        """Write holes of a pattern, with the cycle defined anew where its surface or clearances are others."""
+        if not self.cycle or "Q203" not in self.cycle:
+            self._fail(item, "calls a drilling cycle at places, and none is defined before")
+        if not places:
+            self._fail(item, "calls a pattern, and none is defined before (PATTERN DEF)")
+        if len(places) > _MOST_HOLES:
+            self._fail(item, f"a pattern of more than {_MOST_HOLES} holes; post it in parts")
+        self._comment(item)
+        surface, now = self.cycle["Q203"], math.nan if again else self.cycle["Q203"]
+        feed = found[0] if (found := re.search(rf"F\s*{VALUE}", code)) else "FMAX"
+        more = "".join(f" {word}" for word in re.findall(r"M\d+", code) if int(word[1:]) not in (89, 99))
+        for x, y, z in places:
+            if surface + z != now:
+                now = surface + z
+                self._define_again(item, {**self.cycle, "Q203": now})
+            self._put(f"L X{x:+.{CALCULATED}f} Y{y:+.{CALCULATED}f} R0 {feed}{more} M99", item)
+            more = ""
+        if now != surface:
+            self._define_again(item, self.cycle)
+        clear = max(self.cycle.get("Q200", 0.0), self.cycle.get("Q204", 0.0))
+        self.at, self.element, self.tangent = [x, y, now + clear], None, None
+
+    def _define_again(self, item: _Statement, numbers: dict[str, float]) -> None:
+        def put(found: re.Match[str]) -> str:
+            name, value = found[1].upper(), numbers[found[1].upper()]
+            return (
+                found[0]
+                if float(found[3].replace(" ", "")) == value
+                else f"{found[1]}{found[2]}{value:+.10g}"
+                if name
+                else ""
+            )
+
+        for k, line in enumerate(self.cycle_lines):
+            code, mark, comment = line.partition(";")
+            text = _CYCLE_NUMBER.sub(put, re.sub(r"^(\s*)\d+\s+", r"\1", code) if not k else code) + mark + comment
+            self.out.append((text, item.first))
+
+    # Moves.
+
+    def _move(self, item: _Statement, kind: str, code: str) -> None:
+        words, (a, b) = self._words(code[len(kind) :]), self.axes
+        if kind in ("RND", "CHF"):
+            return self._corner(item, kind, words, code)
+        if kind == "CC":
+            return self._set_pole(item, words)
+        end = list(self.at)
+        for k, letter in enumerate("XYZ"):
+            end[k] = words.get(letter, end[k] + words.get(f"I{letter}", 0.0))
+        polar = kind in ("LP", "CTP")
+        if kind in ("LP", "CTP", "CP"):
+            self._polar_end(item, kind, words, end)
+        else:
+            self.polar = math.nan
+        machine = re.search(r"(?<![A-Z])M(?:91|92|140)(?!\d)", code) is not None
+        if machine:
+            end = [
+                math.nan if letter in words or f"I{letter}" in words or "140" in code else end[k]
+                for k, letter in enumerate("XYZ")
+            ]
+        if kind in ("CR", "CT", "CTP"):
+            named = [k for k, letter in enumerate("XYZ") if letter in words or f"I{letter}" in words]
+            a, b = (2, 0) if named == [0, 2] else (1, 2) if named == [1, 2] else (0, 1) if kind != "CTP" else (a, b)
+        start = list(self.at)
+        straight = kind in ("L", "LP")
+        if self.corner:
+            self._round(item, kind, end)
+            start = list(self.at)
+        tail = " ".join(re.sub(r"\s+", "", word) for word in _TAIL.findall(code))
+        if re.search(r"(?<![A-Z])R[LR](?![A-Z])", code):
+            self._fail(
+                item,
+                "RL and RR: cutter radius compensation is not followed; post the path of the tool centre from CAM (R0)",
+            )
+        rounded = self.rounded
+        self.rounded = False
+        place = len(self.out)
+        if kind in ("CT", "CTP"):
+            self._tangent_arc(item, start, end, (a, b), tail)
+        elif polar or (rounded and straight):
+            named_z = "Z" in words or "IZ" in words
+            letters = [k for k in range(3) if k in (a, b) or (k == 2 and named_z) or (rounded and k < 2)]
+            number = None if item.first in self.written_lines else re.match(r"\s*\d+\s+", item.lines[0])
+            self.written_lines.add(item.first)
+            text = " ".join(["L", *(self._word(k, end[k]) for k in letters), tail]).rstrip()
+            comment = item.lines[0].partition(";")
+            said = f" ;{comment[2].rstrip()}" if comment[1] else ""
+            self._put(f"{number[0] if number else ''}{text}{said}", item)
+            self.tangent = self._direction(start, end)
+        else:
+            self._keep(item)
+            self.tangent = self._tangent_after(kind, start, end, words, code, (a, b))
+        tested = straight and not machine and "M99" not in code and self.corner is None
+        self.element = _Element(start, end, straight, place, tail, item.first) if tested else None
+        self.at = end
+        if re.search(r"(?<![A-Z])M(?:99|89)(?!\d)", code) and self.cycle:
+            self.at[2] = math.nan
+        return None
+
+    rounded = False
+
+    @staticmethod
+    def _word(k: int, value: float) -> str:
+        return f"{'XYZ'[k]}{value:+.{CALCULATED}f}"
+
+    @staticmethod
+    def _direction(start: list[float], end: list[float]) -> complex | None:
+        way = complex(end[0] - start[0], end[1] - start[1])
+        return way / abs(way) if abs(way) > 1e-9 else None
+
+    def _set_pole(self, item: _Statement, words: dict[str, float]) -> None:
+        named = [k for k, letter in enumerate("XYZ") if letter in words or f"I{letter}" in words]
+        self.axes = (2, 0) if named == [0, 2] else (1, 2) if named == [1, 2] else (0, 1)
+        for k, letter in enumerate("XYZ"):
+            if letter in words:
+                self.pole[k] = words[letter]
+            elif f"I{letter}" in words:
+                self.pole[k] = self.at[k] + words[f"I{letter}"]
+            elif not named:
+                self.pole[k] = self.at[k]
+        self._keep(item)
+
+    def _polar_end(self, item: _Statement, kind: str, words: dict[str, float], end: list[float]) -> None:
+        """Find where polar words lead: about the pole, by the radius and the angle."""
+        a, b = self.axes
+        pole = complex(self.pole[a], self.pole[b])
+        if cmath.isnan(pole):
+            self._fail(item, f"{kind} without a pole before it; post CC")
+        here = complex(self.at[a], self.at[b]) - pole
+        radius = abs(here) if kind == "CP" or "IPR" in words else words.get("PR", self.polar)
+        radius = words.get("PR", radius) + words.get("IPR", 0.0)
+        if math.isnan(radius):
+            self._fail(item, f"{kind} without PR; give the radius from the pole")
+        turned = cmath.phase(here) + math.radians(words.get("IPA", 0.0))
+        angle = math.radians(words["PA"]) if "PA" in words else turned
+        there = pole + cmath.rect(radius, angle)
+        if cmath.isnan(there):
+            self._fail(item, f"{kind} from a position that is not known; post it in absolute")
+        end[a], end[b], self.polar = there.real, there.imag, radius
+
+    def _tangent_after(
+        self, kind: str, start: list[float], end: list[float], words: dict[str, float], code: str, axes: tuple[int, int]
+    ) -> complex | None:
+        """Direction of the tool in XY at the end of a move that stays as it is."""
+        if kind == "L":
+            return self._direction(start, end)
+        if axes != (0, 1):
+            return None
+        here, there = complex(*start[:2]), complex(*end[:2])
+        sense = 1.0 if "DR+" in re.sub(r"\s", "", code) else -1.0
+        if kind == "CR":
+            radius, chord = words.get("R", math.nan), there - here
+            height = math.sqrt(max(radius * radius - 0.25 * abs(chord) ** 2, 0.0))
+            side = sense if radius > 0 else -sense
+            centre = 0.5 * (here + there) + 1j * side * height * chord / (abs(chord) or 1.0)
+        else:
+            centre = complex(*self.pole[:2])
+        way = 1j * sense * (there - centre)
+        return None if cmath.isnan(way) or way == 0 else way / abs(way)
+
+    def _tangent_arc(
+        self, item: _Statement, start: list[float], end: list[float], axes: tuple[int, int], tail: str
+    ) -> None:
+        """Write CT as CC and C: the centre is where the normal at the start meets the bisector of the chord."""
+        if axes != (0, 1) or self.tangent is None:
+            self._fail(item, "CT needs a move in X and Y before it, from a known position; post CR or CC and C")
+        if end[2] != start[2] and not (math.isnan(end[2]) and math.isnan(start[2])):
+            self._fail(item, "CT that moves Z as well is not followed; post CP")
+        here, there, along = complex(*start[:2]), complex(*end[:2]), self.tangent
+        chord = there - here
+        side = (along.conjugate() * chord).imag  # of the chord, left of the tangent
+        if cmath.isnan(chord) or abs(chord) < 1e-9:
+            self._fail(item, "CT from a position that is not known, or to where the tool is; post CR")
+        if abs(side) < 1e-9 * abs(chord):
+            self._put(" ".join(["L", self._word(0, end[0]), self._word(1, end[1]), tail]).rstrip(), item)
+            return
+        radius = 0.5 * abs(chord) ** 2 / side
+        centre = here + 1j * along * radius
+        sense = 1.0 if radius > 0 else -1.0
+        self._comment(item)
+        self._put(f"CC {self._word(0, centre.real)} {self._word(1, centre.imag)}", item)
+        direction = "DR+" if sense > 0 else "DR-"
+        self._put(f"C {self._word(0, end[0])} {self._word(1, end[1])} {direction} {tail}".rstrip(), item)
+        if not any(math.isnan(value) for value in self.pole[:2]):
+            self._put(f"CC {self._word(0, self.pole[0])} {self._word(1, self.pole[1])}", item)
+        way = 1j * sense * (there - centre)
+        self.tangent = way / abs(way)
+
+    def _corner(self, item: _Statement, kind: str, words: dict[str, float], code: str) -> None:
+        size = words.get("R") if kind == "RND" else None
+        if size is None and (bare := re.match(rf"{kind}\s*({VALUE})", code)):
+            size = float(bare[1].replace(" ", ""))
+        if size is None or not size > 0:
+            self._fail(item, f"{kind} without a {'radius' if kind == 'RND' else 'length'} above 0")
+        if self.element is None or any(math.isnan(value) for value in (*self.element.start[:2], *self.element.end[:2])):
+            self._fail(
+                item, f"{kind} is followed between two straight moves from known positions; post its lines and arcs"
+            )
+        if self.corner:
+            self._fail(item, f"{kind} after {self.corner[0]} without a move between them")
+        self.corner = kind, size, item.first
+        self._comment(item)
+
+    def _round(self, item: _Statement, kind: str, end: list[float]) -> None:
+        """Shorten the move before a corner, and write the arc or chamfer in its place."""
+        assert self.corner is not None
+        assert self.element is not None
+        (what, size, line), before = self.corner, self.element
+        item = _Statement(line, [self.lines[line], *item.lines[:1]])
+        self.corner, self.rounded = None, True
+        here, corner, there = complex(*before.start[:2]), complex(*before.end[:2]), complex(*end[:2])
+        flat = before.start[2] == before.end[2] == end[2]
+        if kind not in ("L", "LP") or cmath.isnan(there) or not flat:
+            self._fail(item, f"{what} is followed between two straight moves in X and Y only; post its lines and arcs")
+        back, on = here - corner, there - corner
+        if not (back and on):
+            self._fail(item, f"{what} beside a move that leads nowhere")
+        back, on, lengths = back / abs(back), on / abs(on), (abs(back), abs(on))
+        cosine = (back.conjugate() * on).real
+        if what == "RND":
+            half = 0.5 * math.acos(max(-1.0, min(1.0, cosine)))
+            if half > 0.5 * math.pi - 1e-9:
+                return  # straight on: nothing to round
+            if half < 1e-6:
+                self._fail(item, f"{what} where the contour turns back")
+            size, radius = size / math.tan(half), size
+        if size > min(lengths) + 1e-9:
+            self._fail(
+                item,
+                f"{what} needs {size:.4g} of a move that is {min(lengths):.4g} long; the control refuses it as well",
+            )
+        first, second = corner + size * back, corner + size * on
+        eol = re.search(r"[\r\n]*$", self.out[before.place][0])
+        number = re.match(r"\s*\d+\s+", self.out[before.place][0])
+        words = [self._word(0, first.real), self._word(1, first.imag), before.tail]
+        if before.start[2] != before.start[2]:
+            self._fail(item, f"{what} while the position of Z is not known")
+        self.out[before.place] = (
+            f"{number[0] if number else ''}L {' '.join(words)}".rstrip() + (eol[0] if eol else "\n"),
+            before.line,
+        )
+        marker = item
+        if what == "RND":
+            turn = "DR+" if (back.conjugate() * on).imag < 0 else "DR-"
+            words = [self._word(0, second.real), self._word(1, second.imag), f"R{radius:+.{CALCULATED}f}", turn]
+            self._put(f"CR {' '.join(words)}", marker)
+        else:
+            self._put(f"L {self._word(0, second.real)} {self._word(1, second.imag)}", marker)
+        self.at = [second.real, second.imag, before.end[2]]
+
+
+def arc_text(text: str, before: list[str], words: list[str], piece: int, count: int, last: Collection[str]) -> str:
+    """Return the lines of one piece of an arc: the first has the words that are no coordinates, the last the M codes ``last``."""
+    end = text[len(text.rstrip()) :] or "\n"
+    code, mark, comment = text.rstrip().partition(";")
+    head = re.match(r"\s*(?:\d+\s+)?(?:/\d?\s*)?", code)
+    assert head is not None
+    tail = [re.sub(r"\s+", "", word) for word in _TAIL.findall(code)]
+    moved = [word for word in tail if word[0] in "Mm" and f"M{int(word[1:])}" in last]
+    words = [
+        *words,
+        *(word for word in tail if piece == 0 and word not in moved),
+        *(moved if piece == count - 1 else []),
+    ]
+    first = head[0] if piece == 0 else ""
+    skip = "/" if "/" in head[0] else ""
+    lines = [f"{skip}{line}{end}" for line in before]
+    said = f" {mark}{comment}" if mark and piece == 0 else ""
+    return "".join(lines) + first + " ".join(words) + said + end
+
+
+_OPERATORS: dict[type, Callable[[float, float], float]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: math.pow,
+}
+_FUNCTIONS: dict[str, Callable[[float], float]] = {
+    "SIN": lambda x: math.sin(math.radians(x)),
+    "COS": lambda x: math.cos(math.radians(x)),
+    "TAN": lambda x: math.tan(math.radians(x)),
+    "ASIN": lambda x: math.degrees(math.asin(x)),
+    "ACOS": lambda x: math.degrees(math.acos(x)),
+    "ATAN": lambda x: math.degrees(math.atan(x)),
+    "SQRT": math.sqrt,
+    "SQ": lambda x: x * x,
+    "ABS": abs,
+    "INT": math.trunc,
+    "NEG": operator.neg,
+    "LN": math.log,
+    "EXP": math.exp,
+}
+
+
+def evaluated(text: str, known: dict[str, float]) -> float:
+    """The value of an expression of HEIDENHAIN; KeyError, ValueError or SyntaxError if it has none."""
+    text = re.sub(r"\s+DIV\s+", "/", text.upper()).replace("^", "**")
+    if len(text) > 500:
+        raise ValueError("too long")
+    # a function takes the number or parenthesis after it
+    text = re.sub(
+        r"\b(SIN|COS|TAN|ASIN|ACOS|ATAN|SQRT|SQ|ABS|INT|NEG|LN|EXP)\s*([-+]?\s*(?:Q[LR]?\d+|[\d.]+))", r"\1(\2)", text
+    )
+
+    def value(node: ast.expr) -> float:
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](value(node.left), value(node.right))
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.UAdd | ast.USub):
+            return value(node.operand) * (-1.0 if isinstance(node.op, ast.USub) else 1.0)
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+            return float(node.value)
+        if isinstance(node, ast.Name):
+            return math.pi if node.id == "PI" else known[node.id]
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1:
+            return float(_FUNCTIONS[node.func.id](value(node.args[0])))
+        raise ValueError("no number")
+
+    found = value(ast.parse(re.sub(r"(?<![\w.])0+(?=\d)", "", text.strip()), mode="eval").body)
+    if not math.isfinite(found):
+        raise ValueError("no finite number")
+    return found
