@@ -171,7 +171,7 @@ def _unstated_lever(machine: Machine, name: str, axis: int, unknown: Sequence[in
     """Mean square, mm^2, of the levers of an angle on a run of an axis along a line of which positions are unknown."""
     terms = coefficients(machine.chain, machine.squareness_reference)
     levers = {term.lever for term in terms if term.error == name and term.output == axis}
-    travels = (machine.axes[lever].range_mm for lever in levers if lever in unknown)
+    travels = [axis_of.range_mm for lever, axis_of in enumerate(machine.axes) if lever in levers and lever in unknown]
     return sum(float(np.mean(np.square(np.linspace(*travel, 101)))) for travel in travels)
 
 
