@@ -857,7 +857,8 @@ class Reader:
                 if not {"G74", "G75"} & set(codes):
                     self._fail(f"{letter}: machine axes are not followed; post X, Y and Z")
                 letter = letter[0]
-            if letter in "ABCUVWE" and not setting:
+            dwells = letter == "U" and "G4" in codes and dialect.name == "fanuc"
+            if letter in "ABCUVWE" and not setting and not dwells:
                 self._further_axis(letter, text, value, codes)
                 continue
             if letter in values:

@@ -122,8 +122,9 @@ def test_it_is_asked_where_nothing_is_stated(tmp_path, block, unit, readings):
     assert refused.value.line == 5
 
 
-def test_a_dwell_is_no_length_and_asks_nothing(tmp_path):
-    read, _ = moves_of(tmp_path / "a", "G0 X0 Y0 Z0\nG4 X500\nG1 X5. F9\n")
+@pytest.mark.parametrize("dwell", ["G4 X500", "G04 U500", "G4 U1.5", "G4 P500"])
+def test_a_dwell_is_no_length_and_asks_nothing(tmp_path, dwell):
+    read, _ = moves_of(tmp_path / "a", f"G0 X0 Y0 Z0\n{dwell}\nG1 X5. F9\n")
     assert len(read) == 2
 
 
