@@ -258,7 +258,6 @@ ROTARY = ("A", "B", "C")
 _CHAIN_PATTERN = r"^W(?!.*([A-CFXYZ]).*\1)(?=.*F)(?=.*X)(?=.*Y)(?=.*Z)[A-CFXYZ]+T$"
 
 
-@toml_files.accepts({"type": "string", "pattern": _CHAIN_PATTERN, "examples": ["WFYXZT", "WCAYFXZT"]})
 @dataclass(frozen=True)
 class ProgramNumbers:
     """What NC programs of a machine mean by a number without a decimal point; ``integers`` None: that is asked."""
@@ -275,6 +274,7 @@ class ProgramNumbers:
     )
 
 
+@toml_files.accepts({"type": "string", "pattern": _CHAIN_PATTERN, "examples": ["WFYXZT", "WCAYFXZT"]})
 @dataclass(frozen=True)
 class Chain:
     """Kinematic chain from workpiece to tool, e.g. ``WFYXZT``, with rotary axes ``WCAYFXZT``; 0, 1, 2 are X, Y, Z.
