@@ -214,7 +214,7 @@ def test_three_axis_runs_of_a_machine_of_unknown_squareness_help_only_a_part_tha
     assert probable["probability_rigid_motion_removed"] >= 0.975
     assert probable["not_determined_rms_um"]["EC0Y"] > 20.0 and probable["worse_eighths"]
     assert not (out / "NOT-ACCEPTED-volcomp0.csv").exists()
-    assert set(result["not_measured"]) == set(result["measured"]["missing"])
+    assert set(result["not_measured"]) | {"EYY"} == set(result["measured"]["missing"])  # EYY: in part
     low, high = (probable["before_rms_um"][key] for key in ("low", "high"))
     assert high > 1.5 * low and probable["after_rms_um"]["high"] > low
 
