@@ -81,8 +81,9 @@ def test_laser_files_and_a_square_become_tables_and_the_commands_shown_do_the_sa
     assert "view/sheet.html" in site.get("/projects/1/measurement").text
     state = site.do("identify")
     found = values(site.project, state.last("identify"))
-    for name in ("EXX", "EYY"):
-        assert {place: found[name, place] for place in MEANS} == pytest.approx(MEANS, abs=1e-9)
+    # the line of X is not stated: angles may have moved the tool there, and part of each mean is theirs
+    assert {place: found["EYY", place] for place in MEANS} == pytest.approx(MEANS, abs=1e-9)
+    assert all(0.6 < found["EXX", place] / mean < 1.0 for place, mean in MEANS.items() if mean)
     assert found["EC0Y", ""] == pytest.approx(25.0)
     page = site.get("/projects/1/result").text
     assert "3</strong> errors identified" in page
@@ -551,8 +552,10 @@ def test_the_error_in_the_volume_is_drawn_before_any_tables_and_with_them(site):
         page = site.get(f"/projects/1/{name}").text
         shown = [float(value) for value in re.findall(r"at most ([\d.]+) µm", page)]
         assert shown[:3] == pytest.approx([40 * 23.5 / 24, 40 * 23.5 / 24, 20.0], abs=0.05)  # one decimal is shown
-        assert len(shown) == 6
-        assert max(shown[3:]) < 0.1
+        # what the tables leave is not drawn finer than the uncertainty of what was not measured
+        after = re.findall(r"at most &lt;1 µm, U ([\d.]+) µm", page)
+        assert (len(shown), len(after)) == (3, 3)
+        assert min(map(float, after)) > 40.0
         assert page.count('data-layer="') == 3
     assert "before and after the tables for siemens-cec" in site.get("/projects/1/result").text
 

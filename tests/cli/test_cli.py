@@ -84,7 +84,7 @@ def test_every_help_has_units_and_an_example_that_parses(name):
     outcome = CliRunner().invoke(cli, [name, "--help"])
     assert outcome.exit_code == 0
     assert any(unit in outcome.output for unit in ("mm", "um", "urad"))
-    example = outcome.output.split("Example:")[1].split("Options:")[0].split()
+    example = outcome.output.split("Example:")[1].strip().split("\n\n")[0].split()
     assert example[:2] == ["volcomp", name]
     command = cli.commands[name].loaded
     with command.make_context(name, example[2:]):
