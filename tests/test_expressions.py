@@ -15,6 +15,7 @@ from programs.test_correct import PLAIN, moves_of
 import compgen
 from compgen.controls.shared.scanner import number_pattern
 from compgen.errors import InputError
+from compgen.programs import klartext
 from compgen.programs.dialects import DIALECTS
 from compgen.programs.follower import _COMMENTS, _OTHER_COMMENTS
 from compgen.programs.follower import _runs as block_runs
@@ -33,6 +34,9 @@ MADE = {
     "follower._runs": [(block_runs(name), "match") for name in DIALECTS],
     "follower.__init__": [(re.compile(comments), "sub") for comments in (*_COMMENTS.values(), _OTHER_COMMENTS)],
     "subprograms.number": [(re.compile(r"\s*(?:N\s*\d+\s*)?[O:]\s*0*(\d+)(?!\d)"), "match")],
+    "correct._hole": [(re.compile(r"^(\s*)\d+\s+"), "sub"), (re.compile(r"^(\s*)N\d+\s*", re.IGNORECASE), "sub")],
+    "klartext._said": [(re.compile(pattern), "match") for pattern, _ in klartext._REFUSED],
+    "klartext._corner": [(re.compile(rf"{kind}\s*({klartext.VALUE})"), "match") for kind in ("RND", "CHF")],
     "scanner.number_pattern": [(number_pattern(exponent=3), "fullmatch"), (number_pattern(), "fullmatch")],
     "cells.plain_decimals": [
         (re.compile(rf"[+-]?(\d*|[1-9]\d{{0,2}}([{a}]\d{{3}})+)([{b}]\d*)?([eE][+-]?\d+)?"), "fullmatch")

@@ -403,8 +403,8 @@ class RotaryAxis(Displayed):
     Examples
     --------
     >>> import numpy as np
-    >>> import compgen
-    >>> compgen.RotaryAxis((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), np.linspace(0.0, 360.0, 13), modulo_deg=360.0)
+    >>> from compgen.data.machine import RotaryAxis
+    >>> RotaryAxis((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), np.linspace(0.0, 360.0, 13), modulo_deg=360.0)
     <RotaryAxis: 0 to 360 deg without end, 13 nodes>
     """
 

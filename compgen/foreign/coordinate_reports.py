@@ -64,17 +64,18 @@ _OTHER = re.compile(
 )
 _ANY_ROLE = "|".join(sorted(_ROLE, key=len, reverse=True))
 _GLUED = re.compile(rf"({_ANY_ROLE})([xyz])|([xyz])({_ANY_ROLE})")
-_NUMBER = r"([-+]?\d+(?:[.,]\d+)?)"
+_NUMBER = r"([-+]?\d++(?:[.,]\d++)?+)"
 #: A work offset or origin above a table: G54 X175 Y-325 Z-320.
 _OFFSET = re.compile(
-    rf"(?i)(G5[4-9](?:\.\d+)?(?:\s*P\d+)?|G5\d\d|work\s*offset|origin|ursprung|nullpunkt\w*|datum\s*shift|zero\s*point)\b"
-    rf"[^XYZ\d+-]*.*?X\s*[=:]?\s*{_NUMBER}[\s;,]+Y\s*[=:]?\s*{_NUMBER}[\s;,]+Z\s*[=:]?\s*{_NUMBER}"
+    rf"(?i)(G5[4-9](?:\.\d{{1,2}})?+(?:\s{{0,3}}P\d{{1,3}})?+|G5\d\d|work\s{{0,3}}offset|origin|ursprung|nullpunkt\w{{0,20}}+|"
+    rf"datum\s{{0,3}}shift|zero\s{{0,3}}point)\b.{{0,80}}?"
+    rf"X\s{{0,9}}[=:]?\s{{0,9}}{_NUMBER}[\s;,]{{1,9}}Y\s{{0,9}}[=:]?\s{{0,9}}{_NUMBER}[\s;,]{{1,9}}Z\s{{0,9}}[=:]?\s{{0,9}}{_NUMBER}"
 )
 _SETUP_LINE = re.compile(
-    r"(?i)^[\W_]*(?:set-?\s?up|aufspannung|spannlage|lage|clamping|pose|fixture|montage)\W*(?:no\.?|nr\.?)?\s*[:#=]?\s*(\d{1,3})\b"
+    r"(?i)^[\W_]*+(?:set-?\s?up|aufspannung|spannlage|lage|clamping|pose|fixture|montage)\W*+(?:n[or]\b\W*+)?+(\d{1,3})\b"
 )
 _UNITS_LINE = re.compile(
-    r"(?i)\b(?:units?|einheit(?:en)?|unites?|unita)\s*[=:/]?\s*\"?(mm|millimet\w*|in(?:ch(?:es)?)?|um|\u00b5m)\b"
+    r"(?i)\b(?:units?|einheit(?:en)?|unites?|unita)(?:\s*+[=:/])?+\s*+\"?(mm|millimet\w*+|in(?:ch(?:es)?)?|um|\u00b5m)\b"
     r"|\bin (mm|inch(?:es)?)\b"
 )
 _LOCATION = re.compile(r"(?i)(?:location|position|lage)\s+(?:of|von)\s+\w+\s+([^\s,]+)")
@@ -141,7 +142,7 @@ def _column(name: str, above: str = "") -> _Column:
 (None, 'other', None), (None, 'deviation', None)]
     """
     unit = split_name(name).unit or (split_name(above).unit if above else None)
-    plain = re.sub(r"[\[(<{][^\])>}]*[\])>}]", " ", unaccented(f"{above} {name}"))
+    plain = re.sub(r"[\[(<{][^\[(<{\])>}]*+[\])>}]", " ", unaccented(f"{above} {name}"))
     words = [word for word in re.split(r"[^a-z0-9\u4e00-\u9fff]+", plain) if word and known_unit(word) is None]
     axes, roles, rest, calibrated = [], [], [], False
     for word in words:
@@ -330,10 +331,11 @@ def _axis_of_name(name: str) -> tuple[str, int | None]:
     >>> _axis_of_name("Bohrung 1.X"), _axis_of_name("X-Wert_Kreis1"), _axis_of_name("Durchmesser_Kreis1")
     (('Bohrung 1', 0), ('Kreis1', 0), ('Durchmesser_Kreis1', None))
     """
-    behind = re.fullmatch(r"(.+?)[\s._:/-]+([XYZxyz])(?:[\s_-]?(?:wert|value|coord\w*|koord\w*))?", name.strip())
-    if behind:
-        return behind[1], AXES.index(behind[2].upper())
-    before = re.fullmatch(r"([XYZxyz])[\s_-]?(?:wert|value|coord\w*|koord\w*)[\s._:/-]+(.+)", name.strip())
+    whole = name.strip()
+    behind = re.search(r"(?i)(?<=[\s._:/-])([XYZ])(?:[\s_-]?(?:wert|value|coord\w*+|koord\w*+))?+$", whole)
+    if behind and (feature := whole[: behind.start()].rstrip(" \t._:/-")):
+        return feature, AXES.index(behind[1].upper())
+    before = re.fullmatch(r"(?i)([XYZ])[\s_-]?(?:wert|value|coord\w*|koord\w*)[\s._:/-]+(.+)", whole)
     return (before[2], AXES.index(before[1].upper())) if before else (name.strip(), None)
 
 
@@ -656,7 +658,7 @@ def read_dmis(source: Text, options: ImportOptions) -> Report:
         found = _DMIS.match(content.strip())
         if not found:
             continue
-        numbers = re.search(r"(?i)CART\s*,\s*([^,]+),([^,]+),([^,\s]+)", found[4])
+        numbers = re.search(r"(?i)CART\s*+,([^,]++),([^,]++),\s*+([^,\s]++)", found[4])
         if numbers is None:
             if found[1].upper() == "FA":
                 report.notes.append(f"line {line}: {found[2]} ({found[3].lower()}) has no place and was skipped")

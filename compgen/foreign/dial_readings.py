@@ -32,16 +32,16 @@ from compgen.foreign.findings import Imported
 from compgen.foreign.source import parse_number, shown
 
 _PLUNGER_WORDS = r"plunger|taster|messtaster|stylus|fuhler|messuhr|dial|gauge|indicator|palpeur|tastatore"
-_LEVEL_WORDS = r"level|wasserwaage|richtwaage|libelle|neigung\w*|niveau|livella"
+_LEVEL_WORDS = r"level|wasserwaage|richtwaage|libelle|neigung\w{0,20}+|niveau|livella"
 _SOME = re.compile(rf"(?i)(?<![a-zü])(?:{_PLUNGER_WORDS}|fühler|{_LEVEL_WORDS})")
-_PLUNGER = re.compile(rf"(?:{_PLUNGER_WORDS})[^xyz+-]*?([+-]?)\s*([xyz])\b")
+_PLUNGER = re.compile(rf"(?:{_PLUNGER_WORDS})[^xyz+-]{{0,60}}+([+-]?)\s{{0,9}}+([xyz])\b")
 _DIRECTION = re.compile(r"([+-])\s*([xyz])")
 _TRAVEL = re.compile(
     r"\b([xyz])[\s-]*(?:arm|schenkel|travel|achse|axis|verfahr\w*|weg|branche|braccio)\b|"
     r"\b(?:along|entlang|travel|arm|schenkel|verfahrweg|axis|achse|le long de)\s+([xyz])\b"
 )
 _TURNED = re.compile(r"reversed|turned|umgeschlagen|umschlag|gedreht|gewendet|retourne|capovolt")
-_LEVEL = re.compile(rf"(?:{_LEVEL_WORDS})\s*(?:along|entlang|in|le long de|lungo)?\s*([xyz])\b")
+_LEVEL = re.compile(rf"(?:{_LEVEL_WORDS})\s{{0,9}}+(?:(?:along|entlang|in|le long de|lungo)\s{{0,9}}+)?+([xyz])\b")
 #: Columns of a list of arms.
 _SPAN = frozenset(
     [
@@ -135,7 +135,7 @@ def dial_readings(grid: CellGrid, options: ImportOptions, form: str) -> Imported
 
 
 def _level(name: str) -> re.Match[str] | None:
-    flat = re.sub(r"[\[(].*?[\])]", " ", unaccented(name))
+    flat = re.sub(r"[\[(][^\[(\])]*+[\])]", " ", unaccented(name))
     return None if motions_in(name) else _LEVEL.search(flat)
 
 
@@ -301,10 +301,11 @@ def _squareness(name: str, first: _Arm, second: _Arm, u_mm: float, said: Mapping
 
 
 _STATED = re.compile(
-    r"([-+]?\d+(?:[.,]\d+)?)\s*(?:(?:\u00b1|\+-|\+/-)\s*(\d+(?:[.,]\d+)?))?\s*([a-z\u00b5\u03bc/\"]+)?\s*(?:/\s*(\d+(?:[.,]\d+)?)\s*(?:mm)?)?\s*$"
+    r"(?<![\d.,])([-+]?\d++(?:[.,]\d++)?+)\s*+(?:(?:\u00b1|\+-|\+/-)\s*+(\d++(?:[.,]\d++)?+)\s*+)?+"
+    r"([a-z\u00b5\u03bc\"]++(?:/[a-z\u00b5\u03bc]++)*+)?+\s*+(?:/\s*+(\d++(?:[.,]\d++)?+)\s*+(?:mm)?+)?+\s*+$"
 )
 _SQUARE_KEYS = re.compile(
-    r"square.*(error|deviation)|(error|deviation).*square|winkelfehler|abweichung.*winkel|winkel.*abweichung"
+    r"square.{0,60}(error|deviation)|(error|deviation).{0,60}square|winkelfehler|abweichung.{0,60}winkel|winkel.{0,60}abweichung"
 )
 
 

@@ -976,10 +976,11 @@ def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, Floa
 def _above(findings: TableFindings, key: str) -> tuple[str, str | None]:
     """The value that a line above the table states for a field, and its unit; empty without such a line."""
     name, text = _line_above(findings, key)
-    number = re.fullmatch(r"(\S*\d)\s*(\D*)", text)  # 150 mm, 150mm
-    if key == "plane" or number is None:
+    digits = [k for k, letter in enumerate(text) if letter.isdigit()]
+    value, unit = (text[: digits[-1] + 1], text[digits[-1] + 1 :].strip()) if digits else ("", "")  # 150 mm, 150mm
+    if key == "plane" or not value or len(value.split()) > 1:
         return text, None
-    return number[1], split_name(name).unit or known_unit(number[2])
+    return value, split_name(name).unit or known_unit(unit)
 
 
 def _line_above(findings: TableFindings, key: str) -> tuple[str, str]:

@@ -858,7 +858,7 @@ class Follower:
 # Klartext: sentences, not words with a letter.
 
 _MOST_STEPS = 5_000_000
-_SYMBOL = re.compile(r"\s*(\d++\.?\d*+|\.\d++|Q[LR]?\d+|[A-Z]+|\*\*|[-+*/^()])")
+_SYMBOL = re.compile(r"(\d++\.?\d*+|\.\d++|Q[LR]?\d++|(?<![A-Z])[A-Z]++|\*\*|[-+*/^()])")
 
 
 def _worth(text: str, known: dict[str, float]) -> float:
@@ -1018,7 +1018,7 @@ class KlartextFollower(Follower):
         elif text.startswith("PATTERN"):
             self.spots = [
                 spot
-                for kind, inside in re.findall(r"([A-Z]+)\d+ ?\(([^)]*)\)", text)
+                for kind, inside in re.findall(r"(?<![A-Z])([A-Z]++)\d++ ?\(([^()]*+)\)", text)
                 for spot in self._spots(kind, inside)
             ]
         elif text.startswith("CYCL CALL PAT"):

@@ -28,13 +28,13 @@ from compgen.programs.subprograms import WrittenOut
 CALCULATED = 8
 _DEEPEST, _MOST_LINES, _MOST_HOLES = 20, 2_000_000, 100_000
 _NEEDED = re.compile(
-    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|PATTERN|DEF\s*22[01]|FN\s*\d|[A-Z=+*/( -]\s*Q[LR]?\d+\s*(?!\s*=|\d)",
+    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|PATTERN|DEF\s*+22[01]|FN\s*+\d|(?<=[A-Z=+*/(\s-])Q[LR]?\d++(?!\s*+=)",
     re.IGNORECASE,
 )
 _STATEMENT = re.compile(r"\s*(?P<number>\d+(?=[\s/]|$))?\s*(?P<skip>/\d?)?\s*(?P<code>.*)", re.DOTALL)
 _USED = re.compile(
-    r"(?<![A-Z0-9_])(?P<word>I?[XYZABC]|I?P[RA]|R|REP\s*|Q\d+\s*=|(?:NUM|ROT|D|DX|DY|START|STEP)[XY]?)\s*"
-    r"(?P<sign>[+-]?)\s*(?P<name>Q[LR]?\d+)",
+    r"(?<![A-Z0-9_])(?P<word>I?[XYZABC]|I?P[RA]|REP\s*+|R|Q\d++\s*+=|(?:NUM|ROT|D|DX|DY|START|STEP)[XY]?)\s*+"
+    r"(?P<sign>[+-]?)\s*+(?P<name>Q[LR]?\d++)",
     re.IGNORECASE,
 )
 _WORD = re.compile(
@@ -128,8 +128,9 @@ class Sentences:
         if self._cycle and re.match(r"Q\d+\s*=", text):
             return self._more(text)
         cycle, self._cycle = self._cycle, ""
-        if found := re.match(r"(BEGIN|END)\s+PGM\b.*?(MM|INCH)?\s*$", text):
-            return Sentence(found[1].lower(), number=found[2] or "")
+        if found := re.match(r"(BEGIN|END)\s++PGM\b", text):
+            unit = next((name for name in ("MM", "INCH") if text.rstrip().endswith(name)), "")
+            return Sentence(found[1].lower(), number=unit)
         if found := re.match(r"CYCL\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", text):
             return self._defined(code, at, at + found.end(), int(found[1]), found[2])
         del cycle
@@ -941,12 +942,14 @@ _FUNCTIONS: dict[str, Callable[[float], float]] = {
 
 def evaluated(text: str, known: dict[str, float]) -> float:
     """The value of an expression of HEIDENHAIN; KeyError, ValueError or SyntaxError if it has none."""
-    text = re.sub(r"\s+DIV\s+", "/", text.upper()).replace("^", "**")
+    text = re.sub(r"(?<!\s)\s++DIV\s++", "/", text.upper()).replace("^", "**")
     if len(text) > 500:
         raise ValueError("too long")
     # a function takes the number or parenthesis after it
     text = re.sub(
-        r"\b(SIN|COS|TAN|ASIN|ACOS|ATAN|SQRT|SQ|ABS|INT|NEG|LN|EXP)\s*([-+]?\s*(?:Q[LR]?\d+|[\d.]+))", r"\1(\2)", text
+        r"\b(SIN|COS|TAN|ASIN|ACOS|ATAN|SQRT|SQ|ABS|INT|NEG|LN|EXP)\s*+([-+]?\s*+(?:Q[LR]?\d++|[\d.]++))",
+        r"\1(\2)",
+        text,
     )
 
     def value(node: ast.expr) -> float:
