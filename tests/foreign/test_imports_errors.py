@@ -181,7 +181,7 @@ def test_axes_and_squareness_of_one_workbook_in_one_command(call, tmp_path, chai
     square = [["Rechtwinkligkeit", "Wert [µrad]", "U (k=2) [µrad]"], ["EC0Y", 25, 6], ["EB0Z", -15, 6], ["EA0Z", 10, 6]]
     sheets = {"X": axis_sheet("X", 20, 0, 400), "Y": axis_sheet("Y", -30, 0, 300), "Rechtwinkligkeit": square}
     path = workbook(tmp_path, sheets)
-    code, _, err = call("identify", machine, path, "--out", tmp_path / "o", "--json")
+    code, _, err = call("identify", machine, path, "--prior", "none", "--out", tmp_path / "o", "--json")
     assert code == 0, err
     errors = read_errors(tmp_path / "o" / "identified.errors.csv")
     found = {name: (1e6 * value, 1e6 * u) for name, (value, u) in errors.squareness.items()}
@@ -190,7 +190,9 @@ def test_axes_and_squareness_of_one_workbook_in_one_command(call, tmp_path, chai
     # 20 um/m over 400 mm, -30 um/m over 300 mm, both zero at the reference point 0
     assert 1e3 * errors.curves["EXX"].at(400.0) == pytest.approx(8, abs=1e-6)
     assert 1e3 * errors.curves["EYY"].at(300.0) == pytest.approx(-9, abs=1e-6)
-    code, out, err = call("run", machine, path, "--controller", "isg-csv", "--out", tmp_path / "t", "--json")
+    code, out, err = call(
+        "run", machine, path, "--prior", "none", "--controller", "isg-csv", "--out", tmp_path / "t", "--json"
+    )
     assert code == 0, err
     assert json.loads(out)["accepted"] is True
 

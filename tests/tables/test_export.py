@@ -16,7 +16,7 @@ import compgen
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.files import sha256_of
-from compgen.errors import InputError
+from compgen.errors import CompgenWarning, InputError
 from compgen.pipeline import export_and_verify, run
 from compgen.resources import data_folder
 from compgen.tables import Provenance, export, load_format, render
@@ -291,7 +291,7 @@ def test_a_run_refuses_an_unverified_format_before_anything_is_written(
 ):
     templates = unverified(tmp_path / "own")
     with pytest.raises(InputError, match="--allow-unverified"):
-        run(small_machine, [small_lengths_file], ["siemens-cec", "isg-csv"], tmp_path / "out", templates=templates)
+        run(small_machine, [small_lengths_file], ["isg-csv"], tmp_path / "out", templates=templates)
     assert not (tmp_path / "out").exists()
 
 
@@ -322,12 +322,15 @@ def test_a_template_whose_text_cannot_be_read_back_leaves_nothing(small_machine,
     """The numbers get a decimal comma: the read-back finds it, after identification and fit, and nothing is written."""
     change = {"AX_EEC.INI.j2": lambda text: text.replace("M17", "$AA_ENC_COMP[0,0,AX1]=0,5\nM17")}
     templates = own_templates(tmp_path / "own", "siemens-eec", **change)
-    controllers = ["isg-csv", "siemens-eec"]
     with pytest.raises(InputError, match="cannot be read back") as caught:
-        run(small_machine, [small_lengths_file], controllers, tmp_path / "out", templates=templates)
+        run(small_machine, [small_lengths_file], ["siemens-eec"], tmp_path / "out", templates=templates)
     assert caught.value.file == "AX_EEC.INI"
     assert caught.value.line is not None
     assert not (tmp_path / "out").exists()
+    # beside another control it alone has no tables, and its row says why
+    with pytest.warns(CompgenWarning, match="siemens-eec: no tables: AX_EEC.INI:.*cannot be read back"):
+        run(small_machine, [small_lengths_file], ["isg-csv", "siemens-eec"], tmp_path / "out", templates=templates)
+    assert not list((tmp_path / "out").rglob("AX_EEC.INI"))
 
 
 def test_a_run_without_a_control_is_refused(small_machine, small_lengths_file, tmp_path):
