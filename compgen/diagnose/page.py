@@ -417,10 +417,10 @@ def _action(item: Mapping[str, Any]) -> str:
     if name.startswith("backlash_") and "c_um" in values:
         number = -2.0 * values["c_um"]
         sense = "stops short of its target" if number > 0 else "goes beyond its target"
+        play = f"{name[-1]} {sense} by {abs(number):.3g} um after each reversal: enter {number:+.3g} um as its backlash"
         return (
-            f"{name[-1]} {sense} by {abs(number):.3g} um after each reversal: enter {number:+.3g} um as its backlash where the "
-            "control counts play as positive (SINUMERIK MD32450, Fanuc 1851 in detection units), in addition to what is there; "
-            f"or export it (volcomp run);{todo.partition(';')[2] or ' check screw, nut and bearings'}"
+            f"{play} where the control counts play as positive (SINUMERIK MD32450, Fanuc 1851 in detection units), in addition "
+            "to what is there; or export it (volcomp run); look for play in screw and bearings"
         )
     if name == "warmup_drift" and in_seconds(item):
         return f"warm up for {3 * values['tau'] / SECONDS_PER_MIN:.0f} minutes (three time constants); {todo}"

@@ -923,9 +923,10 @@ class Reader:
     def _ask_integers(self, letter: str, text: str) -> NoReturn:
         unit = "inch" if self.scale == MM_PER_INCH else "mm"
         least = 1e-4 if unit == "inch" else 1e-3
-        value = number_of(text)
+        large = number_of(text)
+        small, word = large * least, f"{letter}{text}"
         self._fail(
-            f"{letter}{text} has no decimal point: {value:g} {unit}, or {value * least:g} {unit} "
+            f"{word} has no decimal point: {large:g} {unit}, or {small:g} {unit} "
             f"({text} increments of {least:g} {unit})? "
             'State [programs] integers = "mm" or "increments" (with increment_mm = 0.001) in the machine file, or --integers mm '
             "or --integers increments --increment-mm 0.001; or post it with a decimal point",

@@ -86,7 +86,7 @@ LABELS = (
     "from", "meaning", "allowed", "default", "key", "limit", "used", "margin", "over", "correction", "parameters", "effect",
     "equation", "resembles", "chain", "format", "name", "value", "position", "station drift", "smoothness", "free", "bias",
     "solver", "feature", "quantity", "line", "diameter", "distance", "parallelism", "only", "share", "Errors", "Controls",
-    "Properties", "Limits", "Sources", "Files", "Remarks", "Points", "Scatter", "Without", "nodes",
+    "better after new setup", "Properties", "Limits", "Sources", "Files", "Remarks", "Points", "Scatter", "Without", "nodes",
 )  # fmt: skip
 
 
