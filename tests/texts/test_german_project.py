@@ -253,12 +253,13 @@ def test_rows_of_a_list_keep_their_columns():
 
 
 def test_kind_and_place_of_a_message_are_german_around_it(tmp_path, capsys):
-    (tmp_path / "a.nc").write_text("G21 G90\nG1 X10 F100\nM30\n")
+    (tmp_path / "a.nc").write_text("G21 G90\nG1 X10. F100\nM30\n")
     words = ["correct", "zha-gantry", str(tmp_path / "a.nc"), "--errors", ERRORS, "--dialect", "fanuc"]
     code, _, told = said(capsys, *words, "--out", str(tmp_path / "out"), "--language", "de")
     assert code == 2
     assert " ".join(told.split()).endswith(
-        "X: X10 hat keinen Dezimalpunkt: mm oder Inkremente; mit Dezimalpunkt ausgeben (Satz: G1 X10 F100)"
+        "die Nullpunktverschiebung G54 ist nicht bekannt (angegeben: keine); --wcs G54=X,Y,Z in mm hinzufügen "
+        "(Satz: G1 X10. F100)"
     )
     assert told.startswith("Fehler: ")
     german = texts_of("de")
