@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,10 @@ def pytest_configure(config):
     if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ENOUGH_BYTES:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
     os.environ["COMPGEN_CONFIG"] = ""  # the tests do not depend on the user's own defaults
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # A shell gives what it starts in the background an ignored Ctrl-C, and programs that the tests start and
+        # interrupt would inherit that: they would never end.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 #: Files that take longest, in the order in which the processes of a run take them: at the end none waits for another.
