@@ -1,4 +1,4 @@
-"""``volcomp heat``: the model of heat from sessions of drift, and what controls run of it."""
+"""``volcomp heat``: the model of heat from sessions of drift."""
 
 from __future__ import annotations
 

@@ -27,6 +27,10 @@ COLDEST_C, HOTTEST_C = -40.0, 200.0
 LONGEST_GAP_S = 900.0
 #: A reading is a jump if it is this much from the one before, and so many times the usual step.
 JUMP_K, JUMP_STEPS = 1.5, 20.0
+#: The same reading in this many rows or more may be a sensor that is stuck.
+STUCK_ROWS = 30
+#: Fewest rows of a session: from fewer no step of time is usual, and nothing is learned of a lag.
+FEWEST_ROWS = 3
 
 
 @dataclass(frozen=True)
@@ -87,10 +91,15 @@ def read_drift(path: str | Path) -> DriftSession:
     if not present:
         raise InputError(f"has no displacement; expected one of the columns {', '.join(columns)}", file=table.path)
     temperatures, count = _temperatures(table)
+    if count < FEWEST_ROWS:
+        message = f"is too short: a session has at least {FEWEST_ROWS} rows without a long gap, this one {count}; leave it out"
+        raise InputError(message, file=table.path)
     moved = {name: table.numbers(column, empty=math.nan)[:count] for column, name in present.items()}
     for column, name in present.items():
         if not np.isfinite(moved[name]).any():
-            raise table.fail(0, column, "is empty in every row; leave the column out, or give readings")
+            raise table.fail(
+                0, column, f"is empty in every row{_of_rows(table, count)}; leave the column out, or give readings"
+            )
     rpm = table.numbers("spindle_rpm", empty=math.nan)[:count] if "spindle_rpm" in table.columns else None
     name = table.path.name.removesuffix(".csv").removesuffix(".drift")
     return DriftSession(name, temperatures, moved, rpm, sha256_of_file(table.path), table.metadata)
@@ -114,6 +123,11 @@ def _temperatures(table: CsvTable) -> tuple[Temperatures, int]:
         values = _plausible(table, column)[:count]
         values, said = _bridged(table, column, time_s[:count], values)
         notes += said
+        if len(values) >= STUCK_ROWS and np.ptp(values) == 0.0:
+            notes.append(
+                f"{table.path.name}: {column} is {values[0]:g} degC in all {len(values)} rows: a sensor that is stuck says "
+                "nothing of the machine; leave the column out if it is"
+            )
         if _jumps(values):
             broken.append(sensor)
             notes.append(f"{table.path.name}: {column} jumps as no machine warms: the sensor is not used")
@@ -186,6 +200,10 @@ def _before_gap(table: CsvTable, time_s: FloatArray) -> tuple[int, list[str]]:
     return count, [text]
 
 
+def _of_rows(table: CsvTable, count: int) -> str:
+    return "" if count == len(table) else f" of the {count} before the first gap that is too long"
+
+
 def _plausible(table: CsvTable, column: str) -> FloatArray:
     """Return the readings of a sensor, nan where none was read; refuse what no sensor of a machine reads."""
     values = table.numbers(column, empty=math.nan)
@@ -208,7 +226,7 @@ def _bridged(table: CsvTable, column: str, time_s: FloatArray, values: FloatArra
         return values, []
     rows = np.flatnonzero(known)
     if not rows.size:
-        raise table.fail(0, column, "is empty in every row; leave the column out")
+        raise table.fail(0, column, f"is empty in every row{_of_rows(table, len(values))}; leave the column out")
     at = time_s[rows]
     usual = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     apart = np.diff(np.concatenate([time_s[:1], at, time_s[-1:]]))

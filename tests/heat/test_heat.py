@@ -224,6 +224,30 @@ def test_rows_after_a_long_gap_are_not_used(tmp_path):
     assert len(found.temperatures) == len(found.moved["dz"]) == 3
 
 
+@pytest.mark.parametrize(
+    ("rows", "named"),
+    [
+        (["0,20,1"], "at least 3 rows without a long gap, this one 1;"),
+        (["0,20,1", "7200,20,2", "7260,20,2", "7320,21,2"], "at least 3 rows without a long gap, this one 1;"),
+        (["0,20,", "60,20,", "120,20,", "7200,20,2", "7260,20,2"], "dz_um: is empty in every row of the 3 before"),
+        (["0,,1", "60,,1", "120,,1", "7200,20,2", "7260,20,2"], "temp_a_c: is empty in every row of the 3 before"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::compgen.errors.CompgenWarning")
+def test_a_session_of_which_too_little_is_left_is_refused_by_name(tmp_path, rows, named):
+    """One row in one of four sessions had made the figures of all of them nan, and the reason a wrong one."""
+    text = "time_s,temp_a_c,dz_um\n" + "\n".join(rows) + "\n"
+    with pytest.raises(InputError, match=named) as caught:
+        read_drift(written(tmp_path, text))
+    assert caught.value.file.name == "a.drift.csv"
+
+
+def test_a_sensor_that_reads_one_value_all_day_is_said(tmp_path):
+    rows = "".join(f"{60 * k},21,{20 + k / 10},{k}\n" for k in range(40))
+    with pytest.warns(CompgenWarning, match="temp_bed_c is 21 degC in all 40 rows"):
+        read_drift(written(tmp_path, "time_s,temp_bed_c,temp_air_c,dz_um\n" + rows))
+
+
 def test_a_sensor_that_jumps_is_not_used(tmp_path, days):
     celsius = dict(days[0].temperatures.celsius)
     celsius["air"] = np.where(np.arange(len(celsius["air"])) > 100, 35.0, celsius["air"])
