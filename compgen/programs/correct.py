@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,17 @@ class ProgramCorrection:
 # Writing: the same blocks with other coordinates.
 
 
+class _Piece(NamedTuple):
+    """Piece ``number`` (from 0) ``of`` those into which a move is divided; ``share`` is the part of the move that it is."""
+
+    command_mm: FloatArray
+    centre_mm: FloatArray
+    sweep_rad: float
+    share: float
+    number: int
+    of: int
+
+
 @dataclass
 class ProgramWriter:
     """Rewrites blocks with corrected coordinates and keeps what the control then has, in mm of the machine axes.
@@ -278,9 +289,9 @@ class ProgramWriter:
         total = share_before[rows]
         for piece in range(count):
             command, centre = pieces.command_mm[rows.start + piece], pieces.centre_mm[rows.start + piece]
-            part = float(total[piece])
-            sweep = float(move.sweep_rad[0]) * part
-            texts.append(self._piece(block, move, command, centre, sweep, offset, (piece, count), part))
+            share = float(total[piece])
+            part = _Piece(command, centre, float(move.sweep_rad[0]) * share, share, piece, count)
+            texts.append(self._piece(block, move, part, offset))
             self.target_mm = np.array(command)
         if block.kind == "arc" and self.dialect.klartext:
             texts = [line for text in texts for line in text.splitlines(keepends=True)]
@@ -298,21 +309,11 @@ class ProgramWriter:
         self.changed += texts[0] != block.text
         return texts
 
-    def _piece(
-        self,
-        block: SingleBlock,
-        move: Moves,
-        command: FloatArray,
-        centre: FloatArray,
-        sweep: float,
-        offset: FloatArray,
-        number: tuple[int, int],
-        part: float,
-    ) -> str:
+    def _piece(self, block: SingleBlock, move: Moves, part: _Piece, offset: FloatArray) -> str:
         """Text of one piece of a move: the block with other numbers, or a new one with what differs."""
         if block.kind == "arc" and self.dialect.klartext:
-            return self._arc_sentence(block, move, command, centre, sweep, offset, number)
-        piece, count = number
+            return self._arc_sentence(block, move, part, offset)
+        command, centre, sweep, share, piece, count = part
         scale, digits = block.scale, self.digits(block.scale)
         unit = 10.0**-digits
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words} if piece == 0 else {}
@@ -375,7 +376,7 @@ class ProgramWriter:
             )
         if block.inverse_time and count > 1:
             text, first, last = next((t, a, b) for letter, t, a, b in block.words if letter == "F")
-            faster = f"{float(text) / part:.6g}"
+            faster = f"{float(text) / share:.6g}"
             if piece == 0:
                 changes.append((first, last, faster))
             else:
@@ -404,18 +405,9 @@ class ProgramWriter:
         ]
         return _spliced(block.text, changes, 0, ()) if changes else block.text
 
-    def _arc_sentence(
-        self,
-        block: SingleBlock,
-        move: Moves,
-        command: FloatArray,
-        centre: FloatArray,
-        sweep: float,
-        offset: FloatArray,
-        number: tuple[int, int],
-    ) -> str:
+    def _arc_sentence(self, block: SingleBlock, move: Moves, part: _Piece, offset: FloatArray) -> str:
         """Text of one piece of an arc of Klartext: CC where the pole is another one, then C, CR or CP."""
-        piece, count = number
+        command, centre, sweep, _, piece, count = part
         scale, digits, plane = block.scale, self.digits(block.scale), int(move.plane[0])
         a, b = PLANE_AXES[plane]
         kind = next(letter for letter, *_ in block.words if letter in ("C", "CR", "CP"))
@@ -618,7 +610,7 @@ class ProgramWriter:
         if len(move) == 5:
             named = any(word[0] == "Z" for word in block.words)
             place = np.array([*depth[:2], command[0, 2] if named else self.target_mm[2]])
-            text = self._piece(block, move, place, np.full(3, np.nan), 0.0, offset, (0, 1), 1.0)
+            text = self._piece(block, move, _Piece(place, np.full(3, np.nan), 0.0, 1.0, 0, 1), offset)
             self.target_mm = place
         if self.cycle is None or self.cycle[0] is not cycle:
             self.cycle = (cycle, cycle)
