@@ -442,13 +442,19 @@ def covariance_file_of(path: Path, errors: ErrorTable) -> Path | None:
 
 
 def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
-    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it does not match.
+    """Return the covariance file that an errors file refers to, if it exists and matches; warn if it is missing or does not.
 
     Fitted errors have that of the errors that were fitted: smoothing adds no knowledge, and taken as independent from node
     to node, what was hardly measured would be counted as many readings.
     """
     covariance_file = covariance_file_of(path, errors)
     if covariance_file is None:
+        if name := errors.metadata.get("covariance") or errors.metadata.get(OF_FITTED):
+            message = (
+                f"{path.name} refers to {name}, which is not beside it: u_value is used instead, independent from node to node, "
+                f"and the uncertainties come out wrong; copy {name} into {path.parent}"
+            )
+            warnings.warn(message, CompgenWarning, stacklevel=2)
         return None
     found = read_covariance(covariance_file)
     if "covariance" in errors.metadata:

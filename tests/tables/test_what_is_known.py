@@ -118,6 +118,14 @@ def test_a_covariance_of_another_identification_is_not_taken_for_fitted_errors(s
     (folder / "identified.covariance.npz").write_bytes(kept)
 
 
+@pytest.mark.parametrize("name", ["identified.errors.csv", "fitted.errors.csv"])
+def test_an_errors_file_that_was_copied_without_its_covariance_says_so(shop, found, known, folder, tmp_path, name):
+    fitted_in(folder, found, known, shop)
+    (tmp_path / name).write_bytes((folder / name).read_bytes())
+    with pytest.warns(CompgenWarning, match=r"refers to identified\.covariance\.npz, which is not beside it"):
+        assert covariance_named_by(tmp_path / name, read_errors(tmp_path / name)) is None
+
+
 def test_the_preflight_list_says_what_is_known_before_its_first_step(shop, found, known):
     exported = export(shop.machine, found.errors, "isg-csv")
     verification = verified_export(shop.machine, exported, found.errors, known=known)[1]
