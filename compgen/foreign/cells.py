@@ -512,11 +512,10 @@ def _note(row: Sequence[str], metadata: dict[str, str], comments: dict[str, str]
         for start, end in zip(pairs, [*pairs[1:], len(cells)], strict=True):
             metadata.setdefault(cells[start].rstrip(": ").lower(), " ".join(cells[start + 1 : end]))
         return
-    for mark in ("=", ":"):
-        if mark in text:
-            key, _, value = text.partition(mark)
-            metadata.setdefault(key.strip().lower(), " ".join([value.strip(), *cells[1:]]).strip())
-            return
+    if found := re.search("[=:]", text):  # the first one: "u: 2 um (k = 2)" is about u
+        key, value = text[: found.start()], text[found.end() :].strip()
+        metadata.setdefault(key.strip().lower(), " ".join([value, *cells[1:]]).strip())
+        return
     if 2 <= len(cells) <= _MOST_PAIR:
         metadata.setdefault(text.lower(), " ".join(cells[1:]))
     elif len(cells) == 1:

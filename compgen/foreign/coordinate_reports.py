@@ -400,12 +400,11 @@ def _remember(report: Report, row: Sequence[str]) -> None:
     text = " ".join(cells).lstrip("#% ")
     if _DIMENSION.search(text):
         return
-    for mark in ("=", ":"):
-        if mark in text and len(text) < 200:
-            key, _, value = text.partition(mark)
-            if 0 < len(key.strip()) < 40 and value.strip():
-                report.metadata.setdefault(key.strip().lower(), value.strip())
-            return
+    if (found := re.search("[=:]", text)) and len(text) < 200:
+        key, value = text[: found.start()].strip(), text[found.end() :].strip()
+        if 0 < len(key) < 40 and value:
+            report.metadata.setdefault(key.lower(), value)
+        return
     if len(cells) == 2 and parse_number(cells[0]) is None:
         report.metadata.setdefault(cells[0].lower(), cells[1])
 

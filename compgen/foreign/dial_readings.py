@@ -144,7 +144,7 @@ def _level(name: str) -> re.Match[str] | None:
 
 def _edges(table: Table, names: Sequence[str], options: ImportOptions, form: str) -> Imported:
     place = _position(table, names)
-    position_mm = np.array(table.numbers(place)) * MM_PER_LENGTH.get(split_name(place).unit or "mm", 1.0)
+    position_mm = np.array(table.numbers(place)) * _mm_of_place(table.grid, place, table.header_line)
     arms: dict[str, _Arm] = {}
     _nothing_left(table, [place, *names], options)
     for name in names:
@@ -152,11 +152,9 @@ def _edges(table: Table, names: Sequence[str], options: ImportOptions, form: str
         values = np.array(table.numbers(name, empty=True)) * sign * _mm_of(table.grid, name, table.metadata)
         known = np.isfinite(values)
         if known.sum() < 2:
-            raise table.grid.fail("has fewer than two readings", table.header_line, f"column {name}")
+            raise table.grid.fail("has fewer than two readings", table.header_line, name)
         if len(np.unique(position_mm[known])) < known.sum():
-            raise table.grid.fail(
-                "has a position twice; give the mean of repeats", table.header_line, f"column {place}"
-            )
+            raise table.grid.fail("has a position twice; give the mean of repeats", table.header_line, place)
         arm = arms.setdefault(error, _Arm(position_mm[known]))
         if not np.array_equal(arm.position_mm, position_mm[known]):
             text = f"the columns of {error} have readings at different positions; measure both set-ups at the same ones"
@@ -192,14 +190,12 @@ def _meaning(table: Table, name: str) -> tuple[str, float, bool]:
     plunger = _PLUNGER.search(flat)
     if plunger is None or not plunger[1]:
         text = "does not say where the plunger points: write plunger +Y or plunger -Y (towards what it touches)"
-        raise table.grid.fail(text, table.header_line, f"column {name}")
+        raise table.grid.fail(text, table.header_line, name)
     travel = _TRAVEL.search(re.sub(_PLUNGER, " ", flat)) or _TRAVEL.search(
         unaccented(" ".join([*table.metadata, *table.metadata.values()]))
     )
     if travel is None:
-        raise table.grid.fail(
-            "does not say which axis moves: write X arm, or along X", table.header_line, f"column {name}"
-        )
+        raise table.grid.fail("does not say which axis moves: write X arm, or along X", table.header_line, name)
     return (
         _error(table.grid, travel[1] or travel[2], plunger[2], table.header_line),
         _sign(plunger[1]),
@@ -223,7 +219,15 @@ def _mm_of(grid: CellGrid, name: str, metadata: Mapping[str, str]) -> float:
     )
     if unit not in MM_PER_LENGTH:
         what = f"{unit} is not a unit of length" if unit else "has no unit"
-        raise grid.fail(f"{what}: write the unit of the readings, for example [um] or [mm]", None, f"column {name}")
+        raise grid.fail(f"{what}: write the unit of the readings, for example [um] or [mm]", None, name)
+    return MM_PER_LENGTH[unit]
+
+
+def _mm_of_place(grid: CellGrid, name: str, line: int | None) -> float:
+    """Return the unit of positions or spans in mm; mm where the column names none."""
+    unit = split_name(name).unit or "mm"
+    if unit not in MM_PER_LENGTH:
+        raise grid.fail(f"{unit} is not a unit of length: where the reading was taken is in mm or in", line, name)
     return MM_PER_LENGTH[unit]
 
 
@@ -320,8 +324,10 @@ def _square(said: Mapping[str, str]) -> tuple[float, float, str]:
         scale = RAD_PER_ANGLE.get(unit or "") or (
             MM_PER_LENGTH[unit] / over if unit in MM_PER_LENGTH and over else None
         )
-        if found is None or scale is None:
-            raise InputError(f"{shown(text)} is not an angle such as 3 urad, 0.5 arcsec or 1.5 um/300 mm", field=key)
+        if found is None or scale is None or unaccented(text).strip()[: found.start()].strip():
+            raise InputError(
+                f"{shown(text)} is not an angle such as 3 urad, 0.5 \u00b1 0.2 arcsec or 1.5 um/300 mm", field=key
+            )
         u = _number(found[2]) * scale if found[2] else USUAL_SQUARE_URAD * 1e-6
         stated = "" if found[2] else f", u {USUAL_SQUARE_URAD:g} urad assumed"
         return _number(found[1]) * scale, u, f"the square has {text} more than 90 degrees as stated{stated}"
@@ -336,16 +342,35 @@ def _number(text: str) -> float:
     return float(text.replace(",", "."))
 
 
-def _u_reading(said: Mapping[str, str]) -> tuple[float, str]:
-    """Return the standard uncertainty of one reading, mm, and the words for it."""
+_U_KEYS = re.compile(
+    r"(?:(?:expanded|standard|erweiterte|elargie|estesa)\s+)?+(?:mess)?+(?:u\b|uncertainty|unsicherheit|incertitude|incertezza)"
+)
+_U_STATED = re.compile(r"\s*+(\d++(?:[.,]\d++)?+)\s*+([a-z\u00b5\u03bc\"]++(?:/[a-z]++)?+)?+\s*+(?:$|[(;,]|k\b)")
+_EXPANDED = re.compile(r"k\s*=\s*2|95\s*%|expanded|erweiterte|elargie|estesa")
+
+
+def _u_stated(said: Mapping[str, str], units: Mapping[str, float], usual: str) -> float | None:
+    """Return the standard uncertainty of one reading that a record states, in the unit of ``units``; None if it states none."""
     for key, text in said.items():
         flat = unaccented(key)
-        found = re.match(r"\s*(\d+(?:[.,]\d+)?)\s*(\S+)?", text)
-        if not re.match(r"u\b|uncertainty|unsicherheit|messunsicherheit|incertitude", flat) or found is None:
+        if not _U_KEYS.match(flat):
             continue
-        unit = known_unit(found[2] or "") or "um"
-        expanded = bool(re.search(r"k\s*=\s*2", f"{flat} {text}"))
-        value = _number(found[1]) * MM_PER_LENGTH.get(unit, MM_PER_UM) / (2.0 if expanded else 1.0)
+        found = _U_STATED.match(unaccented(text))
+        unit = known_unit(found[2]) if found and found[2] else usual
+        if found is None or unit not in units or _number(found[1]) == 0.0:
+            raise InputError(
+                f"{shown(text)} is not the uncertainty of a reading, such as 0.5 {usual} or 1 {usual} (k = 2)",
+                field=key,
+            )
+        expanded = bool(_EXPANDED.search(f"{flat} {unaccented(text)}"))
+        return _number(found[1]) * units[unit] / (2.0 if expanded else 1.0)
+    return None
+
+
+def _u_reading(said: Mapping[str, str]) -> tuple[float, str]:
+    """Return the standard uncertainty of one reading, mm, and the words for it."""
+    value = _u_stated(said, MM_PER_LENGTH, "um")
+    if value is not None:
         return value, f"standard uncertainty of a reading {value / MM_PER_UM:g} um, as stated"
     return (
         USUAL_READING_UM * MM_PER_UM,
@@ -371,7 +396,7 @@ def _listed(grid: CellGrid, options: ImportOptions) -> dict[str, _Arm] | None:
 def _list(grid: CellGrid, k: int, at: Mapping[str, int], words: Sequence[str]) -> dict[str, _Arm]:
     state = next((n for n, word in enumerate(words) if word in _STATE and n not in at.values()), None)
     scale = _mm_of(grid, grid.rows[k][at["reading"]], {})
-    span_unit = MM_PER_LENGTH.get(split_name(grid.rows[k][at["span"]]).unit or "mm", 1.0)
+    span_unit = _mm_of_place(grid, grid.rows[k][at["span"]], grid.lines[k])
     arms: dict[str, _Arm] = {}
     for row, line in zip(grid.rows[k + 1 :], grid.lines[k + 1 :], strict=True):
         cells = [*row, *[""] * (len(grid.rows[k]) - len(row))]
@@ -425,29 +450,27 @@ def _levels(table: Table, names: Sequence[str], options: ImportOptions, form: st
             "the file does not state whether the level was on the spindle side or on the table: give --mounted spindle or table "
             "(the signs are opposite)"
         )
-    position_mm = np.array(table.numbers(place)) * MM_PER_LENGTH.get(split_name(place).unit or "mm", 1.0)
+    position_mm = np.array(table.numbers(place)) * _mm_of_place(table.grid, place, table.header_line)
     if len(np.unique(position_mm)) < max(2, len(position_mm)):
         text = "needs two positions or more, each once; give the mean of repeats"
-        raise table.grid.fail(text, table.header_line, f"column {place}")
+        raise table.grid.fail(text, table.header_line, place)
     order = np.argsort(position_mm)
+    stated = _u_stated(said, RAD_PER_ANGLE, "urad")
     curves, understood = {}, {}
     for name in names:
         found = _level(name)
         assert found is not None  # the caller chose these
         along = found[1].upper()
         if along not in _TILT:
-            raise table.grid.fail("a level lies along X or Y", table.header_line, f"column {name}")
+            raise table.grid.fail("a level lies along X or Y", table.header_line, name)
         unit = split_name(name).unit
         if unit not in RAD_PER_ANGLE:
-            raise table.grid.fail(
-                "write the unit of the level: mm/m, um/m, arcsec or urad", table.header_line, f"column {name}"
-            )
+            raise table.grid.fail("write the unit of the level: mm/m, um/m, arcsec or urad", table.header_line, name)
         letter, sign = _TILT[along]
         error = f"E{letter}{(axis or 'X').upper()}"
         values = np.array(table.numbers(name)) * RAD_PER_ANGLE[unit] * sign * (-1.0 if side == "table" else 1.0)
         digits = max((len(cell.partition(".")[2]) for cell in table.column(name)), default=0)
-        u = 10.0**-digits * RAD_PER_ANGLE[unit] / np.sqrt(12.0)
-        u = max(u, 1e-6)
+        u = stated or max(10.0**-digits * RAD_PER_ANGLE[unit] / np.sqrt(12.0), 1e-6)
         curves[error] = Curve(position_mm[order], values[order] - values[order][0], np.full(len(order), u))
         understood[error] = (
             f"level along {along}: {len(order)} positions, up to {1e6 * np.abs(curves[error].value).max():.4g} urad"
@@ -455,7 +478,9 @@ def _levels(table: Table, names: Sequence[str], options: ImportOptions, form: st
     notes = [
         *table.grid.notes,
         "a positive number is counted as: the end at + of the level rises",
-        "u of a reading: a digit / sqrt(12), at least 1 urad",
+        f"standard uncertainty of a reading {stated / 1e-6:g} urad, as stated"
+        if stated
+        else "u of a reading: a digit / sqrt(12), at least 1 urad",
     ]
     data = marked_apart(ErrorTable(curves, {}, {"source": table.grid.path.name, "instrument": "level"}))
     return Imported(table.grid.path, form, "errors", data, understood, tuple(doubts), tuple(notes))

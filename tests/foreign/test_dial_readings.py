@@ -159,3 +159,54 @@ def test_a_position_that_occurs_twice_is_refused(tmp_path, head):
     path = written(tmp_path, f"Level on: table\nX position [mm];{head}\n100;1;1\n100;2;2\n")
     with pytest.raises(InputError, match="mean of repeats"):
         import_file(path)
+
+
+ARMS = "X arm (plunger +Y) [um];Y arm (plunger +X) [um]"
+
+
+@pytest.mark.parametrize(
+    ("top", "place", "message"),
+    [
+        ("", "Position [deg]", "deg is not a unit of length"),
+        ("u: -0.5 um\n", "Position [mm]", "u: '-0.5 um' is not the uncertainty"),
+        ("u: nan um\n", "Position [mm]", "uncertainty"),
+        ("u: 0 um\n", "Position [mm]", "uncertainty"),
+        ("u: 2 urad\n", "Position [mm]", "uncertainty"),
+        ("Messunsicherheit: gut\n", "Position [mm]", "uncertainty"),
+        ("Square error: 3 +- -2 urad\n", "Position [mm]", "not an angle"),
+        ("Square error: 3 um/300 in\n", "Position [mm]", "not an angle"),
+    ],
+)
+def test_what_a_record_states_and_cannot_be_read_is_not_replaced_by_an_assumption(tmp_path, top, place, message):
+    with pytest.raises(InputError, match=message):
+        import_file(written(tmp_path, table([place, *ARMS.split(";")], arms("EC0Y"), top)))
+
+
+def test_a_span_is_a_length(tmp_path):
+    text = "Travel;Plunger;Span [arcsec];Reading [um]\nX;+Y;300;5\nY;+X;300;-3\n"
+    with pytest.raises(InputError, match="arcsec is not a unit of length"):
+        import_file(written(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [
+        "u: 0.5 um",
+        "U: 1 µm (k=2)",
+        "u: 1 um (k = 2)",
+        "Expanded uncertainty: 1 um",
+        "Erweiterte Messunsicherheit: 1 µm",
+        "u = 0.0005 mm",
+    ],
+)
+def test_an_uncertainty_is_read_as_labs_write_it(tmp_path, stated):
+    found = import_file(written(tmp_path, table(["Position [mm]", *ARMS.split(";")], arms("EC0Y"), f"{stated}\n")))
+    assert any("uncertainty of a reading 0.5 um, as stated" in note for note in found.notes)
+
+
+def test_the_stated_uncertainty_of_a_level_is_its_u(tmp_path):
+    text = "Level on: spindle\n{}X position [mm];Level along X [mm/m]\n-800;0,000\n-400;0,010\n0;0,020\n"
+    found = import_file(written(tmp_path, text.format("U: 0.01 mm/m (k=2)\n")))
+    assert 1e6 * found.data.curves["EBX"].u == pytest.approx([5.0] * 3)
+    with pytest.raises(InputError, match="uncertainty of a reading"):
+        import_file(written(tmp_path, text.format("u: 3 um\n")))
