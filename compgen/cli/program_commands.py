@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import functools
+import time
+from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from compgen.cli.common import PATH, Command, json_option, language_option, options_of, out_option
+from compgen.cli.common import PATH, Command, json_option, language_option, options_of, stopped_by_signals
 from compgen.cli.shared_options import (
     covariance_of,
     machine_argument,
@@ -21,19 +23,20 @@ from compgen.cli.shared_options import (
     tool_offset,
     with_prior_class,
 )
-from compgen.cli.terminal import answer, complain, progress, table_of
+from compgen.cli.terminal import answer, complain, progress, say, table_of
 from compgen.data.error_table import read_reversal
-from compgen.data.files import OutputFolder, json_text, sha256_of_file
+from compgen.data.files import OutputFolder, exclusive, json_text, sha256_of, sha256_of_file
 from compgen.data.machine import INTEGERS, MM_PER_UNIT, Machine, ProgramNumbers, Vector3
 from compgen.effects import effects_reversal
-from compgen.errors import InputError, number_text
+from compgen.errors import InputError, number_text, visible
 from compgen.foreign import open_errors
 from compgen.identify.covariance import covariance_or_independent, posterior_with
 from compgen.identify.posterior import assumed_text, worse_text
-from compgen.programs import CorrectOptions, Setup, correct_program, model_of, read_tools
+from compgen.programs import CorrectOptions, FolderWatch, Setup, correct_program, model_of, read_tools
+from compgen.resources import program_version
 
 if TYPE_CHECKING:
-    from compgen.programs import Feature, PartMachine, PartPrediction
+    from compgen.programs import Feature, PartMachine, PartPrediction, ProgramCorrection, WatchedProgram
     from compgen.programs.path import ExactModel
 
 WCS_HELP = (
@@ -43,22 +46,23 @@ TOOLS_HELP = (
     "Tool lengths: CSV with tool, length_mm and optionally x_mm, y_mm; or a tool table of LinuxCNC, in machine_units of "
     "the machine file (mm)."
 )
+#: A watched program is taken when it has not changed for this long, s; the folder is looked at at least so often, s.
+SETTLE_S, LOOK_S = 2.0, 1.0
 
 
 def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
     found: dict[str, Vector3] = {}
     for text in given:
         name, _, numbers = text.partition("=")
-        name = "".join(name.split()).upper()  # G54.1 P3 is G54.1P3
         try:
             x, y, z = (float(part) for part in numbers.split(","))
         except ValueError:
             x = y = z = float("nan")
         if not name or not all(abs(part) < 1e6 for part in (x, y, z)):
             raise InputError(f"{text[:60]!r} is no work offset; expected e.g. G54=-400,150,-220 (mm)", field="--wcs")
-        if name in found:
+        if name.upper() in found:
             raise InputError(f"{name} is given twice; give it once", field="--wcs")
-        found[name] = (x, y, z)
+        found[name.strip().upper()] = (x, y, z)
     return found
 
 
@@ -148,10 +152,72 @@ def _not_measured(model: ExactModel, errors: Path) -> list[str]:
     return [text for text in (assumed_text(found), worse_text(found)) if text]
 
 
+@dataclass(frozen=True)
+class _Watching:
+    """What ``--watch`` and the options beside it say."""
+
+    folder: Path
+    once: bool
+    match: tuple[str, ...]
+    settle_s: float
+    subfolders: bool
+
+
+def watch_options(command: Command) -> Command:
+    """Add --watch and what belongs to it; the command receives ``watching``, and ``out`` with its default."""
+
+    @functools.wraps(command)
+    def wrapper(
+        *args: Any,
+        program: Path | None,
+        watch: Path | None,
+        once: bool,
+        match: tuple[str, ...],
+        settle_s: float | None,
+        subfolders: bool,
+        out: Path | None,
+        **options: Any,
+    ) -> Any:
+        if watch is None and (once or match or subfolders or settle_s is not None):
+            raise InputError(
+                "--once, --match, --settle-s and --subfolders belong to --watch; give the folder with --watch DIR"
+            )
+        if watch is not None and program is not None:
+            raise InputError("a PROGRAM and --watch exclude each other; give one of them", field="--watch")
+        if watch is None and program is None:
+            raise click.UsageError("Missing argument 'PROGRAM'.")
+        if watch is None and out is None:
+            raise click.UsageError("Missing option '--out'.")
+        watching = None
+        if watch is not None:
+            out = out or watch / "corrected"
+            settle_s = SETTLE_S if settle_s is None else settle_s
+            watching = _Watching(watch, once, match or ("*",), settle_s, subfolders)
+        return command(*args, program=program, watching=watching, out=out, **options)
+
+    decorated: Any = wrapper
+    text = (
+        "Folder for the results; with --watch each program gets a folder within it (default then: corrected, within the "
+        "watched folder)."
+    )
+    decorated = click.option("--out", metavar="DIR", type=PATH, help=text)(decorated)
+    text = f"With --watch: a program is taken when it has not changed for this long, s (default {SETTLE_S:g})."
+    decorated = click.option("--settle-s", type=click.FloatRange(0.1, 3600), help=text)(decorated)
+    text = "With --watch: only files whose names fit, e.g. '*.nc' (may be given several times; default: all)."
+    decorated = click.option("--match", multiple=True, metavar="PATTERN", help=text)(decorated)
+    text = "With --watch: correct programs in its subfolders, too; each gets a folder of the same path."
+    decorated = click.option("--subfolders", is_flag=True, help=text)(decorated)
+    text = "With --watch: correct what is in the folder and end; exit code 1 if a program was not accepted or refused."
+    decorated = click.option("--once", is_flag=True, help=text)(decorated)
+    text = "Folder that is watched until Ctrl-C: every program that is put there is corrected; the originals are only read."
+    decorated = path_option("--watch", text, metavar="DIR")(decorated)
+    return click.argument("program", type=PATH, required=False)(decorated)  # type: ignore[no-any-return]
+
+
 @click.command("correct")
 @machine_argument
 @prior_option
-@click.argument("program", type=PATH)
+@watch_options
 @program_options
 @options_of(CorrectOptions, "options")
 @click.option("--only", metavar="AXES", help="Correct only these axes, e.g. X,Y; the others stay as they are.")
@@ -161,7 +227,6 @@ def _not_measured(model: ExactModel, errors: Path) -> list[str]:
     multiple=True,
 )
 @click.option("--active-controller", metavar="NAME", help="Name of the control that the active tables belong to.")
-@out_option
 @language_option
 @json_option
 def correct_command(
@@ -171,6 +236,7 @@ def correct_command(
     reversal: Path | None,
     only: str | None,
     program: Path,
+    watching: _Watching | None,
     options: CorrectOptions,
     active: tuple[Path, ...],
     active_controller: str | None,
@@ -186,15 +252,55 @@ def correct_command(
     named NOT-ACCEPTED-... (exit code 1). Variables, subprograms of other files, cutter radius compensation, turned coordinates
     and rotary axes that turn are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may
     be corrected twice: tables that are active while the program runs are given with --active, unless ERRORS were measured with
-    them on.
+    them on. With --watch, in place of PROGRAM, every program that is put into a folder is corrected.
 
     \b
     Example:
       volcomp correct zha-gantry part.nc --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350 --out corrected/
+      volcomp correct zha-gantry --watch posted/ --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350
     """
     if bool(active) != (active_controller is not None):
         raise InputError("--active and --active-controller belong together; give both")
-    model = _model(machine, errors, reversal, only)
+    options.check()
+
+    def model() -> _Known:
+        return _known(_model(machine, errors, reversal, only), errors, active, active_controller)
+
+    def correct(known: _Known, source: Path, folder: Path) -> ProgramCorrection:
+        with progress(quiet=as_json) as show:
+            return correct_program(
+                known.model,
+                source,
+                folder,
+                options,
+                setup(machine),
+                errors_file=known.file,
+                show=show,
+                language=language,
+                remarks=known.remarks,
+            )
+
+    if watching is not None:
+        setup(machine)
+        given = click.get_current_context().params
+        files = [path for path in (errors, reversal, *active) if path is not None]
+        fixed = [repr((name, str(given[name]))) for name in sorted(given.keys() - _OF_THE_WATCH)]
+        fixed += [program_version(), sha256_of_file(machine.source) if machine.source else repr(machine)]
+        return _watch(watching, out, _CurrentErrors(model, correct, files, given.get("tools"), fixed), as_json)
+    known = model()
+    return _say_correction(correct(known, program, out), known.model, out, as_json)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """The machine as it is known: its model, name and SHA-256 of the file of the errors, what was not measured."""
+
+    model: ExactModel
+    file: tuple[str, str]
+    remarks: list[str]
+
+
+def _known(model: ExactModel, errors: Path, active: tuple[Path, ...], active_controller: str | None) -> _Known:
     remarks = _not_measured(model, errors)
     name = errors.name
     if active:
@@ -204,18 +310,10 @@ def correct_command(
         tables = read_tables(model.machine, active, str(active_controller), foreign=True)
         model = CompensatedModel(model.machine, model.errors, model.reversal, model.only, tables)
         name += f" with the active tables of {active_controller}"
-    with progress(quiet=as_json) as show:
-        result = correct_program(
-            model,
-            program,
-            out,
-            options,
-            setup(machine),
-            errors_file=(name, sha256_of_file(errors)),
-            show=show,
-            language=language,
-            remarks=remarks,
-        )
+    return _Known(model, (name, sha256_of_file(errors)), remarks)
+
+
+def _say_correction(result: ProgramCorrection, model: ExactModel, out: Path, as_json: bool) -> int:
     for reason in result.reasons:
         complain(f"not acceptable: {reason}", "red")
     found = {**result.as_dict(), "prior": model.machine.prior.as_dict()}
@@ -234,6 +332,110 @@ def correct_command(
     says = [*result.notes, *(f"assumed: {text}" for text in result.assumed)]
     answer(as_json, {**found, "file": str(out / result.file)}, table, counts, *says, f"-> {out / result.file}")
     return 0 if result.accepted else 1
+
+
+# ``volcomp correct --watch``.
+
+
+#: Options that say how a folder is watched, not how a program is corrected.
+_OF_THE_WATCH = {"watch", "once", "match", "settle_s", "subfolders", "out", "program", "as_json"}
+
+
+class _CurrentErrors:
+    """Corrects with the errors that the files state now: they are read again when one of them has changed.
+
+    ``tools`` is read for every program; ``fixed`` are conditions that do not change while this command runs.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[], _Known],
+        correct: Callable[[_Known, Path, Path], ProgramCorrection],
+        files: list[Path],
+        tools: Path | None,
+        fixed: list[str],
+    ) -> None:
+        self.read, self.apply, self.files, self.tools, self.fixed = read, correct, files, tools, fixed
+        self.digests = self._digests()
+        self.known: _Known | None = read()
+
+    def _digests(self) -> list[str]:
+        return [sha256_of_file(path) for path in self.files]
+
+    def conditions(self) -> str:
+        """Return a digest of all that decides a correction beside the program."""
+        try:
+            found = [*self._digests(), *([sha256_of_file(self.tools)] if self.tools else [])]
+        except InputError as error:  # each program is refused for it, and tried again when the file is back
+            found = [str(error)]
+        return sha256_of("\n".join([*self.fixed, *found]).encode())
+
+    def __call__(self, source: Path, folder: Path) -> ProgramCorrection:
+        digests = self._digests()
+        if digests != self.digests or self.known is None:
+            self.known = None  # never the old errors where the new ones cannot be read
+            self.known, self.digests = self.read(), digests
+            complain("the errors have changed and were read again; all programs in the folder are corrected again")
+        return self.apply(self.known, source, folder)
+
+
+def _watch(watching: _Watching, out: Path, correct: _CurrentErrors, as_json: bool) -> int:
+    """Correct what comes into the folder until a signal, or once what is there."""
+    settle_s = 0.0 if watching.once else watching.settle_s
+    watch = FolderWatch(
+        watching.folder, out, correct, watching.match, settle_s, correct.conditions, subfolders=watching.subfolders
+    )
+    found: dict[str, WatchedProgram] = {}
+    trouble = ""
+    out.mkdir(parents=True, exist_ok=True)
+    # two watches of a folder would write the same files
+    with exclusive(out / ".watch.lock", wait_s=0.0), stopped_by_signals() as stop:
+        if not (as_json or watching.once):
+            say(f"watching {watching.folder}; corrected programs go to {out}; Ctrl-C ends")
+        while not stop.is_set():
+            try:
+                for item in watch.look(time.monotonic()):
+                    found[item.name] = item
+                    _say_program(item, as_json)
+                    if stop.is_set():
+                        break
+                trouble = ""
+            except InputError as error:  # a drive of the network that is away for a while
+                if watching.once:
+                    raise
+                if str(error) != trouble:
+                    complain(f"{error}; it is tried again", "red")
+                trouble = str(error)
+            if watching.once:
+                break
+            stop.wait(min(LOOK_S, watching.settle_s / 2.0))
+    good = all(item.state in ("accepted", "deleted", "folder") for item in found.values())
+    counts = Counter("not looked into" if item.state == "folder" else item.state for item in found.values())
+    said = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "no program"
+    answer(as_json, {"accepted": good, "programs": [item.as_dict() for item in found.values()]}, said)
+    return 0 if good or not watching.once else 1
+
+
+def _say_program(item: WatchedProgram, as_json: bool) -> None:
+    """Say in a line what became of a program, and what was warned of."""
+    name = visible(item.name, flat=True)
+    for text in item.warnings:
+        complain(f"warning: {name}: {text}")
+    if item.state in ("refused", "not accepted"):
+        written = f" -> {item.file}" if item.file else ""
+        as_before = ", as before" if item.before else ""
+        complain(f"{name}: {item.state}{as_before}: {'; '.join(item.reasons)}{written}", "red")
+    elif item.state == "folder":
+        complain(f"{name}: {'; '.join(item.reasons)}")
+    elif as_json:
+        return
+    elif item.before:
+        say(f"{name}: accepted before, unchanged -> {item.file}")
+    elif item.result is None:
+        say(f"{name}: deleted; its corrected program stays in its folder")
+    else:
+        before, after = (figures.as_dict()["normal_max_um"] for figures in (item.result.before, item.result.after))
+        say(f"{name}: accepted, {before:.2f} um from the path before, {after:.2f} um after -> {item.file}")
 
 
 # ``volcomp part``.

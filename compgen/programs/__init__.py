@@ -10,17 +10,20 @@ if TYPE_CHECKING:
     from compgen.programs.features import Quantity
     from compgen.programs.part import Feature, PartMachine, PartPrediction, predict_part, rank_machines
     from compgen.programs.reader import Reader, Setup
+    from compgen.programs.watch import FolderWatch, WatchedProgram
 
 __all__ = [
     "DIALECTS",
     "CorrectOptions",
     "Feature",
+    "FolderWatch",
     "PartMachine",
     "PartPrediction",
     "ProgramCorrection",
     "Quantity",
     "Reader",
     "Setup",
+    "WatchedProgram",
     "correct_program",
     "model_of",
     "predict_part",

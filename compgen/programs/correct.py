@@ -56,6 +56,8 @@ MOST_LISTED, MOST_IN_PREFLIGHT = 100, 20
 GROWTH, FEW_BLOCKS = 2, 200
 #: Decimals of angles of Klartext, degrees.
 _ANGLE_DIGITS = 4
+#: Files beside a corrected program.
+CORRECTION_FILE, PREFLIGHT_FILE = "correction.json", "preflight.md"
 #: Characters of a comment in the first lines of a corrected program.
 LONGEST_COMMENT = 90
 _TENS = np.array([float(f"1e{k}") for k in range(16)])
@@ -75,6 +77,11 @@ class CorrectOptions:
     decimals: int | None = option(
         None, "Decimals of rewritten coordinates (default: those of the dialect, 3 to 6).", within=(1, 9)
     )
+
+    def check(self) -> None:
+        """Raise InputError for numbers with which nothing can be corrected."""
+        if not (self.tolerance_um > 0 and self.shortest_mm > 0):
+            raise InputError("the tolerance and the shortest move have to be above 0")
 
 
 @dataclass(frozen=True)
@@ -1254,8 +1261,9 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
     """
     source, dialect = Path(program), dialect_named(options.dialect)
     decimals = dialect.decimals if options.decimals is None else (options.decimals, options.decimals)
-    if not (options.tolerance_um > 0 and options.shortest_mm > 0):
-        raise InputError("the tolerance and the shortest move have to be above 0")
+    options.check()
+    if source.name in (CORRECTION_FILE, PREFLIGHT_FILE):
+        raise InputError("the corrected program would have the name of another result; rename the program", file=source)
     read_bytes(source, 1)
     folder = OutputFolder(out)
     reader = Reader(model.machine, dialect, setup, source)
@@ -1364,13 +1372,13 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
                 target.write("".join(header_lines(dialect, result, eol)).encode("latin-1"))
             shutil.copyfileobj(stream, target)
         folder.add_file(result.file, final)
-        folder.add("correction.json", json_text({**result.as_dict(), "sha256": sha256_of_file(final)}))
+        folder.add(CORRECTION_FILE, json_text({**result.as_dict(), "sha256": sha256_of_file(final)}))
         listed = preflight(result)
         if language != LANGUAGES[0]:
             from compgen.data.language import texts_of, wrapped
 
             listed = wrapped(texts_of(language).lines(listed))
-        folder.add("preflight.md", listed)
+        folder.add(PREFLIGHT_FILE, listed)
         folder.commit()
     return result
 
