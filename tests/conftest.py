@@ -3,6 +3,7 @@
 import os
 import shutil
 import signal
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +24,9 @@ def pytest_configure(config):
     """Put temporary folders into memory: a store or a published table waits for the disk with every file it writes."""
     if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > ENOUGH_BYTES:
         os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+    # Containers often forbid bytecode files; the programs that tests start would then compile all of their sources each time.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False
     os.environ["COMPGEN_CONFIG"] = ""  # the tests do not depend on the user's own defaults
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         # A shell gives what it starts in the background an ignored Ctrl-C, and programs that the tests start and
