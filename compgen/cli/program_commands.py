@@ -92,6 +92,7 @@ def program_options(command: Command) -> Command:
         gauge: str,
         integers: str | None,
         increment_mm: float | None,
+        subprograms: tuple[Path, ...],
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
@@ -99,11 +100,22 @@ def program_options(command: Command) -> Command:
         def setup(machine: Machine) -> Setup:
             lengths = read_tools(tools, MM_PER_UNIT[machine.units]) if tools else {}
             numbers = _integers(machine.programs, integers, increment_mm)
-            return Setup(_wcs(wcs), lengths, block_delete, codes, tool_offset("--gauge", gauge), *numbers)
+            missing = next((folder for folder in subprograms if not folder.is_dir()), None)
+            if missing is not None:
+                raise InputError(
+                    "is no folder; --subprograms needs one that exists", file=missing, field="--subprograms"
+                )
+            gauge_mm = tool_offset("--gauge", gauge)
+            return Setup(_wcs(wcs), lengths, block_delete, codes, gauge_mm, *numbers, subprograms)
 
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
+    text = (
+        "Folder with files that the program calls; each call is written out and corrected (may be given several times; the "
+        "first that has the file counts)."
+    )
+    decorated = path_option("--subprograms", text, metavar="DIR", multiple=True)(decorated)
     text = "Least input increment of the control, mm, e.g. 0.001 (0.0001 inch): for --integers increments."
     decorated = click.option("--increment-mm", type=click.FloatRange(1e-6, 1.0), help=text)(decorated)
     text = (

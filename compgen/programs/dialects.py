@@ -120,7 +120,8 @@ REFUSED = {
     "G16": _POLAR,
     **dict.fromkeys(("G5", "G5.1", "G5.2", "G5.3", "G6", "G6.1", "G6.2"), _SPLINE),
     **dict.fromkeys(("M95", "M96", "M199"), f"jumps, or lets something interrupt the program; {_CALLED}"),
-    **dict.fromkeys(("G65", "G66", "M98", "M97", "M198"), f"{_MACRO}, or M98 with its subprogram in the same file"),
+    **dict.fromkeys(("G65", "G66", "M98", "M97", "M198"), f"{_MACRO}, or M98 and G65 with "
+                    "the subprogram in the same file, or in a folder that --subprograms names"),
     "G10": _TABLES,
     "G44": "negative tool length is not followed; use G43",
     **dict.fromkeys(("G43.4", "G43.5", "G12.1", "G7.1", "G107", "G143", "G53.1"), _ROTARY),

@@ -1396,10 +1396,15 @@ class Agreement:
     """Follows a file beside its reader and refuses the first move on which the two differ."""
 
     def __init__(self, reader: Reader) -> None:
-        source, dialect = Path(reader.source), reader.dialect.name
+        source, dialect, found = Path(reader.source), reader.dialect.name, reader.written_out
         self.reader = reader
         self._follower = Follower(dialect, reader.setup, reader.machine)
-        self._blocks = executed(source, dialect, skip_deleted=reader.setup.skip_deleted)
+        if found is not None and found.resolved:
+            self._blocks: Iterator[tuple[str, Sequence[int]]] = iter(
+                [(found.content.decode("latin-1"), found.line.tolist())]
+            )
+        else:
+            self._blocks = executed(source, dialect, skip_deleted=reader.setup.skip_deleted)
         self._ahead = Moves.of_rows([])
 
     def hold(self, moves: Moves) -> None:
@@ -1433,8 +1438,8 @@ class Agreement:
 
 def read_twice(reader: Reader) -> Iterator[Batch]:
     """Yield the batches of a reader's program, each held against the moves of a follower of the same file."""
-    second = Agreement(reader)
     with reader.opened() as stream:
+        second = Agreement(reader)
         for batch in reader.batches(stream):
             if not reader.unknown:  # codes that are not known are refused at the end
                 second.hold(reader.numbered_as_in_file(batch.moves))

@@ -37,7 +37,7 @@ from compgen.programs.runs import (
     carried,
     centres_and_sweeps,
 )
-from compgen.programs.subprograms import Pointed, written_out
+from compgen.programs.subprograms import Pointed, WrittenOut, written_out
 
 MM_PER_INCH = 25.4
 #: Bytes that are read at a time, and the fewest blocks in a row that are read together.
@@ -63,6 +63,7 @@ class Setup:
     ``work_offsets_mm`` by name (``G54``), ``tools_mm`` the offsets that the control adds for a tool, by its number or name.
     ``integers`` says what a number without a decimal point is where controls differ (FANUC): mm, or increments of
     ``increment_mm``.
+    ``subprograms`` are the folders in which files that the program calls are looked for.
     ``gauge_mm`` is the tool offset of the model for a tool of length 0: from the origin of the tool carriage to the gauge point.
     """
 
@@ -73,6 +74,7 @@ class Setup:
     gauge_mm: Vector3 = (0.0, 0.0, 0.0)
     integers: str | None = None
     increment_mm: float | None = None
+    subprograms: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -179,6 +181,8 @@ class Reader:
         self.closed_by_percent = False
         self._line, self._text = 0, ""
         self.line_in_file: IntArray | None = None
+        #: The program with its calls written out, if it has any.
+        self.written_out: WrittenOut | None = None
         self._integers: tuple[Pointed, str] | None = None
         self._rows: list[tuple[float, ...]] = []
 
@@ -189,7 +193,8 @@ class Reader:
         path = Path(self.source)
         found = None
         if self.dialect.name in ("fanuc", "linuxcnc"):
-            found = written_out(path, self.dialect.name, skip_deleted=self.setup.skip_deleted)
+            setup = self.setup
+            found = written_out(path, self.dialect.name, skip_deleted=setup.skip_deleted, folders=setup.subprograms)
         if self.dialect.klartext:
             found = klartext.lowered(path, skip_deleted=self.setup.skip_deleted)
             if found is not None and not found.called:
@@ -197,10 +202,12 @@ class Reader:
                 return BytesIO(found.content)
         if found is None:
             return self._pointed(path.open("rb"))
-        self.line_in_file = found.line
-        self.assumed[f"calls are written out where they are, so that each is corrected: {', '.join(found.called)}"] = (
-            None
-        )
+        self.line_in_file, self.written_out = found.line, found
+        if found.called:
+            said = f"calls are written out where they are, so that each is corrected: {', '.join(found.called)}"
+            self.assumed[said] = None
+        if found.variables:
+            self.assumed[f"variables have the values that the program gives them: {', '.join(found.variables)}"] = None
         return self._pointed(BytesIO(found.content))
 
     def _pointed(self, stream: BinaryIO) -> BinaryIO | Pointed:
@@ -222,6 +229,11 @@ class Reader:
     def in_file(self, line: int) -> int:
         """Return the line of the file that a line of the program as it was opened is from."""
         return line if self.line_in_file is None or not line else int(self.line_in_file[line - 1])
+
+    def place_of(self, line: int) -> tuple[str | Path, int]:
+        """Return the file and the line in it that a line of the program as it was opened is from."""
+        places = self.written_out.places if self.written_out else ()
+        return places[line - 1] if places and line else (self.source, self.in_file(line))
 
     def batches(self, stream: BinaryIO | Pointed) -> Iterator[Batch]:
         """Yield the batches of a program; the last one is followed by the check that the program was whole."""
@@ -320,7 +332,8 @@ class Reader:
         shown = f" (block: {text})" if text else ""
         if self.unknown:
             shown += f"; before that, {self._said_unknown()}"
-        raise InputError(message + shown, file=self.source, line=self.in_file(self._line), field=field)
+        file, line = self.place_of(self._line)
+        raise InputError(message + shown, file=file, line=line, field=field)
 
     # Many blocks at a time.
 
@@ -824,7 +837,10 @@ class Reader:
         if rest[0] in "#[" or _VARIABLE.match(rest) or (dialect.pole and _VARIABLE_Q.match(rest)):
             self._fail(f"{rest[:20]!r}: variables and expressions are not followed; post the program with numbers")
         if rest[0] in "oO":
-            self._fail(f"{rest[:20]!r}: subprograms and loops are not followed; post one program without calls")
+            self._fail(
+                f"{rest[:20]!r}: the subprogram is not known; give the folder of its file with --subprograms, or post one "
+                "program without calls: subprograms and loops are not followed otherwise"
+            )
         if name:
             self._fail(
                 f"{name[1]} is not known in the dialect {dialect.name}, and may call a program or move; post the moves themselves"

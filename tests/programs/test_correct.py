@@ -443,14 +443,14 @@ def test_siemens_and_linuxcnc_stop_where_the_work_offset_is_another(tmp_path):
 START = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\n"
 REFUSED = [
     ("linuxcnc", START + "G41 D1\nM2\n", 3, "cutter radius compensation"),
-    ("linuxcnc", START + "#1=5\nM2\n", 3, "variables"),
-    ("linuxcnc", START + "G1 X[1+2] F9\nM2\n", 3, "variables and expressions"),
+    ("linuxcnc", START + "#1=#5420\nM2\n", 3, "#5420 is not known before the program runs: variables"),
+    ("linuxcnc", START + "G1 X[1+#2] F9\nM2\n", 3, "variables and expressions"),
     ("linuxcnc", START + "o100 call\nM2\n", 3, "subprograms"),
     ("fanuc", START + "M98 P1000\nM30\n", 3, "subprograms"),
     ("fanuc", START + "G65 P9810 X1.\nM30\n", 3, "subprograms and macros"),
     ("fanuc", START + "G68 X0. Y0. R30.\nM30\n", 3, "turned"),
     ("fanuc", START + "G5 P2\nM30\n", 3, "G5 is followed with P0 or P10000 only"),
-    ("fanuc", START + "WHILE[#1LT5]DO1\nM30\n", 3, "WHILE"),
+    ("fanuc", START + "WHILE[#1LT5]DO1\nM30\n", 3, "#1 is not known"),
     ("fanuc", START + "G1 X10 F100\nM30\n", 3, "decimal point"),
     ("fanuc", START + "G1 X1. A30. F100\nM30\n", 3, "turn while the tool cuts"),
     ("fanuc", START + "G0 A0.\nG0 B90.\nG0 X5. A90.\nM30\n", 5, "the rotary axis turns, from 0"),
