@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
-from compgen.programs import klartext
+from compgen.programs import klartext, sinumerik
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, Dialect, codes_that_stay
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
@@ -195,6 +195,12 @@ class Reader:
         if self.dialect.name in ("fanuc", "linuxcnc"):
             setup = self.setup
             found = written_out(path, self.dialect.name, skip_deleted=setup.skip_deleted, folders=setup.subprograms)
+        if self.dialect.name == "siemens":
+            names = {*self.dialect.codes, *self.dialect.refused} - {"DEF", "CALL", "EXTCALL", "PROC"}
+            setup = self.setup
+            found = sinumerik.called_and_computed(
+                path, names, skip_deleted=setup.skip_deleted, folders=setup.subprograms
+            )
         if self.dialect.klartext:
             found = klartext.lowered(path, skip_deleted=self.setup.skip_deleted)
             if found is not None and not found.called:

@@ -29,7 +29,7 @@ from compgen.programs.dialects import MARK
 from compgen.programs.path import IntArray
 
 #: Calls within calls, and blocks of a program that is written out.
-_DEEPEST, _MOST_BLOCKS = 10, 5_000_000
+DEEPEST, MOST_BLOCKS = 10, 5_000_000
 _MENTIONED = re.compile(
     rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]|G[ \t]*+0*+65(?![\d.])|[#\[]|O(?:\d++|<[^<>\n]*+>)[ \t]*+CALL", re.IGNORECASE
 )
@@ -163,7 +163,7 @@ class Pointed:
 
 # Variables and expressions of FANUC and LinuxCNC.
 
-_FUNCTIONS: dict[str, Callable[[float], float]] = {
+FUNCTIONS: dict[str, Callable[[float], float]] = {
     "ABS": abs,
     "ACOS": lambda x: math.degrees(math.acos(x)),
     "ASIN": lambda x: math.degrees(math.asin(x)),
@@ -212,10 +212,10 @@ _LEVELS: tuple[dict[str, Callable[[float, float], float]], ...] = (
 _TOKEN = re.compile(r"\s*+(\*\*|[-+*/]|[A-Z]++)", re.IGNORECASE)
 _PLAIN_NUMBER = re.compile(r"\s*+(\d++\.?\d*+|\.\d++)")
 _NAMED = re.compile(r"\s*+<([^<>\n]++)>")
-_MOST_NESTED = 40
+MOST_NESTED = 40
 
 
-class _NotKnown(ValueError):
+class NotKnown(ValueError):
     """A variable or expression has no value before the program runs."""
 
 
@@ -231,8 +231,8 @@ class _Expression:
     def bracketed(self) -> float:
         """Read ``[...]``."""
         self.depth += 1
-        if self.depth > _MOST_NESTED:
-            raise _NotKnown("brackets are too deep")
+        if self.depth > MOST_NESTED:
+            raise NotKnown("brackets are too deep")
         self.expect("[")
         found = self.level(0 if self.variables.linuxcnc else 2)
         self.expect("]")
@@ -245,12 +245,12 @@ class _Expression:
         first = self.level(2)
         word = _TOKEN.match(self.text, self.at)
         if word is None or word[1].upper() not in _LEVELS[1]:
-            raise _NotKnown("expected a comparison such as [#1 LT 5]")
+            raise NotKnown("expected a comparison such as [#1 LT 5]")
         self.at = word.end()
         second = self.level(2)
         self.expect("]")
         if 0.0 < abs(first - second) < _ABOUT_EQUAL:
-            raise _NotKnown(f"whether {first:.10g} and {second:.10g} are equal depends on the rounding of the control")
+            raise NotKnown(f"whether {first:.10g} and {second:.10g} are equal depends on the rounding of the control")
         return _LEVELS[1][word[1].upper()](first, second)
 
     def value(self) -> float:
@@ -270,7 +270,7 @@ class _Expression:
             return re.sub(r"\s", "", named[1]).lower()
         number = self._unsigned()
         if abs(number - round(number)) > _ABOUT_EQUAL:
-            raise _NotKnown(f"#{number:g} is no variable")
+            raise NotKnown(f"#{number:g} is no variable")
         return round(number)
 
     def _unsigned(self) -> float:
@@ -285,18 +285,18 @@ class _Expression:
         word = _TOKEN.match(self.text, self.at)
         name = word[1].upper() if word else ""
         self.at = word.end() if word else self.at
-        functions = {**_FUNCTIONS, **(_OF_LINUXCNC if self.variables.linuxcnc else {})}
+        functions = {**FUNCTIONS, **(_OF_LINUXCNC if self.variables.linuxcnc else {})}
         if name == "ATAN":
             first = self.bracketed()
             self._blank()
             if self._next() != "/":
                 if self.variables.linuxcnc:
-                    raise _NotKnown("ATAN needs two numbers: ATAN[1]/[2]")
+                    raise NotKnown("ATAN needs two numbers: ATAN[1]/[2]")
                 return math.degrees(math.atan(first))
             self.at += 1
             return math.degrees(math.atan2(first, self.bracketed()))
         if name not in functions:
-            raise _NotKnown(f"{self.text[self.at - len(name) :].strip()[:20]!r} is no number")
+            raise NotKnown(f"{self.text[self.at - len(name) :].strip()[:20]!r} is no number")
         return float(functions[name](self.bracketed()))
 
     def level(self, level: int) -> float:
@@ -306,7 +306,7 @@ class _Expression:
         found = self.level(level + 1)
         while (word := _TOKEN.match(self.text, self.at)) and word[1].upper() in _LEVELS[level]:
             if not self.variables.linuxcnc and word[1].upper() in ("MOD", "**"):
-                raise _NotKnown(f"{word[1]} is not followed")
+                raise NotKnown(f"{word[1]} is not followed")
             self.at = word.end()
             found = _LEVELS[level][word[1].upper()](found, self.level(level + 1))
         return found
@@ -321,7 +321,7 @@ class _Expression:
         """Read a sign."""
         self._blank()
         if self._next() != sign:
-            raise _NotKnown(f"{self.text[self.at :].strip()[:20]!r}: expected {sign}")
+            raise NotKnown(f"{self.text[self.at :].strip()[:20]!r}: expected {sign}")
         self.at += 1
 
 
@@ -353,23 +353,23 @@ class _Variables:
         said = f"#{name}" if isinstance(name, int) else f"#<{name}>"
         found = self._home(name).get(name)
         if found is None:
-            raise _NotKnown(f"{said} is not known before the program runs")
+            raise NotKnown(f"{said} is not known before the program runs")
         self.used[said] = None
         return found
 
     def assign(self, name: int | str, value: float) -> float:
         """Keep the value of a variable, and return it."""
         if isinstance(name, int) and (name < 1 or name >= _OF_THE_CONTROL[self.dialect]):
-            raise _NotKnown(f"#{name} is a variable of the control, which the program would change")
+            raise NotKnown(f"#{name} is a variable of the control, which the program would change")
         if not math.isfinite(value):
-            raise _NotKnown(f"#{name} is no number")
+            raise NotKnown(f"#{name} is no number")
         self._home(name)[name] = value
         return value
 
 
 _ASSIGNMENT = re.compile(r"#(?=[^=]*=)")
 _COMPUTED = re.compile(
-    r"(?<![A-Z#<])([A-Z])[ \t]*+(?=[-+]?[ \t]*+(?:[#\[]|(?:" + "|".join([*_FUNCTIONS, "ATAN"]) + r")\[))", re.IGNORECASE
+    r"(?<![A-Z#<])([A-Z])[ \t]*+(?=[-+]?[ \t]*+(?:[#\[]|(?:" + "|".join([*FUNCTIONS, "ATAN"]) + r")\[))", re.IGNORECASE
 )
 #: Letters whose numbers are written with a decimal point.
 _LENGTHS = frozenset("XYZUVWABCIJKQREF")
@@ -390,7 +390,7 @@ def written_out(
     The corrected program has no calls left. Calls of what is neither in the file nor in ``folders`` stay for the reader to
     refuse, as do variables that are not known before the program runs. ``skip_deleted``: the control skips blocks with ``/``.
     """
-    if not _mentions(source, _MENTIONED):
+    if not mentions(source, _MENTIONED):
         return None
     program = linked(source, dialect, folders)
     if any(MARK.encode() in line for line in program.lines[:40]):  # the reader refuses it
@@ -398,7 +398,8 @@ def written_out(
     return _Program(program, dialect, skip_deleted).written_out()
 
 
-def _mentions(source: Path, pattern: re.Pattern[bytes]) -> bool:
+def mentions(source: Path, pattern: re.Pattern[bytes]) -> bool:
+    """Whether the pattern, of at most 64 bytes, is anywhere in a file."""
     with source.open("rb") as stream:
         before = b""
         while chunk := stream.read(1 << 20):
@@ -413,10 +414,14 @@ def _mentions(source: Path, pattern: re.Pattern[bytes]) -> bool:
 
 @dataclass
 class Linked:
-    """A program with the files that it calls behind it: lines, and the file and line that each is from."""
+    """A program with the files that it calls behind it: lines, and the file and line that each is from.
+
+    ``main_lines`` are lines of the program: of its own lines each itself, of a file the line of its first call.
+    """
 
     lines: list[bytes]
     places: list[tuple[Path, int]]
+    main_lines: list[int] = field(default_factory=list)
 
     def text(self) -> str:
         """Its text, each byte a character."""
@@ -610,7 +615,7 @@ class _Program:
         raise InputError(message, file=path, line=line)
 
     def _add(self, text: bytes, k: int) -> None:
-        if len(self.out) > _MOST_BLOCKS:
+        if len(self.out) > MOST_BLOCKS:
             self._fail("calls make the program longer than 5e6 blocks; divide it", k)
         if self.places[k][0] == self.source:
             self._main_line = self.places[k][1]
@@ -623,7 +628,7 @@ class _Program:
         k, steps = rows.start, 0
         while k < rows.stop:
             steps += 1
-            if steps > _MOST_BLOCKS:
+            if steps > MOST_BLOCKS:
                 self._fail("a loop does not end within 5e6 blocks; post its blocks", k)
             found = self._structure(k, rows, depth)
             if found is not None:
@@ -666,8 +671,8 @@ class _Program:
         self, rows: range, name: str, repeats: int, depth: int, k: int, arguments: dict[int | str, float] | None
     ) -> None:
         """Follow a subprogram; with ``arguments`` it has variables of its own."""
-        if depth == _DEEPEST:
-            self._fail(f"calls are deeper than {_DEEPEST}, or call themselves", k)
+        if depth == DEEPEST:
+            self._fail(f"calls are deeper than {DEEPEST}, or call themselves", k)
         path = self.places[rows.start][0]
         said = name if path == self.source else f"{name} of {path.name}"
         self.called[said] = self.called.get(said, 0) + repeats
@@ -819,7 +824,7 @@ class _Program:
 
     def _steps(self, k: int) -> None:
         self._loops += 1
-        if self._loops > _MOST_BLOCKS:
+        if self._loops > MOST_BLOCKS:
             self._fail("loops do not end within 5e6 turns; post their blocks", k)
 
     def _calculated(self, read: Callable[[], float], k: int) -> float:
@@ -827,9 +832,9 @@ class _Program:
         self.resolved = True
         try:
             return float(read())
-        except (_NotKnown, ArithmeticError, ValueError) as error:
+        except (NotKnown, ArithmeticError, ValueError) as error:
             said = visible_line(self.blocks[k].text.decode("latin-1").strip())[:60]
-            why = str(error) if isinstance(error, _NotKnown) else "it has no value"
+            why = str(error) if isinstance(error, NotKnown) else "it has no value"
             self._fail(
                 f"{why}: variables and expressions are followed where they are constant; post the program with numbers "
                 f"(block: {said})",

@@ -142,7 +142,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("dialect", "blocks", "line", "file", "words"), REFUSED)
 def test_what_is_not_known_is_refused_where_it_is(tmp_path, monkeypatch, dialect, blocks, line, file, words):
-    monkeypatch.setattr("compgen.programs.subprograms._MOST_BLOCKS", 1000)
+    monkeypatch.setattr("compgen.programs.subprograms.MOST_BLOCKS", 1000)
     for name, text in {
         "O30.nc": "O30\nG1 X1.\nG12 I5.\nM99\n", "O31.nc": "%\nO31\nG1 X1.\n%\n", "O32.nc": "%\nO33\nM99\n%\n",
         "O34.nc": "M99\n", "0034.txt": "M99\n", "O35.nc": "O35\nM98 P35\nM99\n", "O9812.nc": "O9812\nX#24\nM99\n",
@@ -166,3 +166,63 @@ def test_without_folders_nothing_is_looked_for(tmp_path):
         correct_program(
             model_of(mill(), shift(), None), tmp_path / "p.nc", tmp_path / "out", CorrectOptions("fanuc"), PLAIN
         )
+
+
+SIEMENS = {
+    "file": ("HOLE", [[9, 0, 0], [9, 3, 0]]),
+    "number": ("L10 P2", [[0, 3, 0], [0, 6, 0]]),
+    "call": ('CALL "HOLE.SPF"\nEXTCALL "/_N_SPF_DIR/_N_L10_SPF"', [[9, 0, 0], [9, 3, 0], [9, 6, 0]]),
+    "procedure": ("R1=4\nSTEP(R1+1, -2)\nX=R1", [[5, 0, -2], [5, 8, -2], [4, 8, -2]]),
+    "default": ("STEP(5, -2, 1)", [[5, 0, -2], [5, 1, -2]]),
+    "variables": ("R1=2.5 R2=3\nR2=R1*2+R2\nG1 X=R1 Y=-R2\nX=(R1+R2)/2 Y=IC(R1)", [[2.5, -8, 0], [5.25, -5.5, 0]]),
+    "names": ("DEF REAL LEN=5, ANG\nANG=ATAN2(1,-1)\nG1 X=LEN*SIN(30) Y=ANG/10", [[2.5, 13.5, 0]]),
+    "cycle": (
+        "R5=-4\nF100\nCYCLE81(10, 0, 2, R5)",
+        [[0, 0, 2], [0, 0, -4], [0, 0, 2], [0, 0, 10]],
+    ),
+    "arc": ("R1=3\nG2 X=2*R1 Y0 CR=R1", [[6, 0, 0]]),
+    "plain": ("R1=1\nG1 X=5 Y=-3 F=200 Z=-.5", [[5, -3, -0.5]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SIEMENS)
+def test_siemens_by_hand(tmp_path, case):
+    (tmp_path / "HOLE.SPF").write_text("%_N_HOLE_SPF\n;$PATH=/_N_SPF_DIR\nG1 X9 ; deep\nL10\nM17\n")
+    (tmp_path / "L10.SPF").write_text("G91 Y3\nG90\nRET\n")
+    (tmp_path / "step.spf").write_text("; a step\nPROC STEP(REAL A, REAL D, REAL W=8)\nG1 X=A Z=D\nY=W M17\nX77\n")
+    blocks, expected = SIEMENS[case]
+    program = tmp_path / "p.mpf"
+    program.write_text(f"G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 Z0 F100\n{blocks}\nM30\n")
+    assert np.allclose(ends(program, "siemens", at(tmp_path))[2:], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "line", "file", "words"),
+    [
+        ("NONE", 4, "p.mpf", "NONE is not known"),
+        ("X=R5+1", 4, "p.mpf", "R5 is not known before"),
+        ("R1=$AA_IW[X]", 4, "p.mpf", "is no number"),
+        ("R1=5 X3", 4, "p.mpf", "divide the block"),
+        ("/R1=5", 4, "p.mpf", "block with /"),
+        ("CUT", 3, "CUT.SPF", "without M17"),
+        ("LOOPS", 1, "LOOPS.SPF", "call themselves"),
+        ("KEPT", 4, "p.mpf", "SAVE"),
+        ("BAD", 2, "BAD.SPF", "milling cycles"),
+        ("STEP(1,2,3)", 4, "p.mpf", "more parameters"),
+        ("R1=1\nIF R1==1 GOTOF END", 5, "p.mpf", "IF"),
+        ("R1=1/0", 4, "p.mpf", "no value"),
+    ],
+)  # fmt: skip
+def test_what_is_not_known_of_siemens_is_refused_where_it_is(tmp_path, blocks, line, file, words):
+    for name, text in {
+        "CUT.SPF": "G1 X1\n\n\n", "LOOPS.SPF": "LOOPS\nM17\n", "KEPT.SPF": "PROC KEPT SAVE\nM17\n",
+        "BAD.SPF": "G1 X1\nPOCKET3(1,2)\nM17\n", "STEP.SPF": "PROC STEP(REAL A, INT B)\nM17\n",
+    }.items():  # fmt: skip
+        (tmp_path / name).write_text(text)
+    program = tmp_path / "p.mpf"
+    program.write_text(f"G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 Z0 F100\n{blocks}\nM30\n")
+    with pytest.raises(InputError, match=re.escape(words)) as caught:
+        correct_program(
+            model_of(mill(), shift(x=10.0), None), program, tmp_path / "out", CorrectOptions("siemens"), at(tmp_path)
+        )
+    assert (caught.value.file.name, caught.value.line) == (file, line)
