@@ -25,6 +25,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.answers import ImportOptions
+from compgen.foreign.heads import FileHead, heads_of
 from compgen.foreign.source import open_measurement
 from compgen.identify import Identification, IdentifyOptions, covariance
 from compgen.identify.any_measurement import (
@@ -161,11 +162,13 @@ def identification_files(
     provenance: Provenance,
     checked: SelfCheck | None = None,
     proposed: NextBest | None = None,
+    measured_with: Sequence[FileHead] = (),
 ) -> dict[str, str | bytes]:
     """Return the contents of ``identified.errors.csv`` and its covariance, ``stations.csv`` and ``identify.json``.
 
-    ``proposed`` is what to measure next. Where a reversal was found, ``identified.reversal.csv`` is added. The two-step
-    method adds ``measured.deviations.csv``; deviations as input give no stations.
+    ``proposed`` is what to measure next, ``measured_with`` what each file says beside its readings. Where a reversal was
+    found, ``identified.reversal.csv`` is added. The two-step method adds ``measured.deviations.csv``; deviations as input
+    give no stations.
     """
     stations = result.stations
     columns: dict[str, Sequence[str] | FloatArray] = {
@@ -185,6 +188,7 @@ def identification_files(
         **result.summary(),
         **proposed_keys(proposed),
         "inputs": [{"name": name, "sha256": digest} for name, digest in provenance.inputs],
+        "files": [head.summary() for head in measured_with],
     }
     text = format_errors(result.errors, {"covariance": covariance.FILE_NAME} if result.has_covariance else {})
     files: dict[str, str | bytes] = {"identified.errors.csv": text}
@@ -659,7 +663,8 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
             checked[sub_folder] = exported, read, verification, extra_files
     evidence = evidence_files(machine, measurement, identification)
     output = OutputFolder(folder)
-    identified = identification_files(identification, provenance, proposed=proposed)
+    heads = heads_of(measurements)
+    identified = identification_files(identification, provenance, proposed=proposed, measured_with=heads)
     covered = identified.get(covariance.FILE_NAME)
     own = (covariance.FILE_NAME, covered) if isinstance(covered, bytes) else None
     add_identification(output, {**identified, **fit_files(fitted, own), **evidence})

@@ -272,8 +272,8 @@ def cli(context: click.Context) -> None:
     configured = _configured()
     if configured:
         context.default_map = {name: configured for lines in _COMMANDS.values() for name in lines}
-        # `report` takes a certificate by --dcc, for another purpose
-        context.default_map["report"] = {key: value for key, value in configured.items() if key != "certificate"}
+        # --certificate of `report` is called "handed" within the program: its "certificate" is that of --dcc
+        context.default_map["report"] = {"handed" if key == "certificate" else key: v for key, v in configured.items()}
 
 
 def main() -> None:

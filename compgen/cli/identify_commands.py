@@ -28,6 +28,7 @@ from compgen.data.machine import Machine
 from compgen.data.records import detect_format
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.answers import ImportOptions
+from compgen.foreign.heads import heads_of
 from compgen.foreign.source import open_measurement
 from compgen.identify import IdentifyOptions
 from compgen.identify.any_measurement import describe, evidence_files
@@ -144,7 +145,8 @@ def identify_command(
                     mapper=spread,
                 )
     proposed = next_measurements(result)
-    files = identification_files(result, provenance_of(machine.source, *measurements, instrument), checked, proposed)
+    sources = provenance_of(machine.source, *measurements, instrument)
+    files = identification_files(result, sources, checked, proposed, heads_of(measurements))
     output = OutputFolder(out)
     add_identification(output, {**files, **evidence_files(machine, measurement, result)})
     output.commit()

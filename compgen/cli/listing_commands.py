@@ -31,6 +31,7 @@ from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
 from compgen.effects.active import STATION_NAME
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.foreign.heads import heads_of, with_head
 from compgen.kinematics import modelled_errors
 from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
 from compgen.report.cards import card_summary, card_text, control_card, effect_card_text
@@ -237,7 +238,10 @@ def import_command(
     named = None if known is None else {"name": known.name, "outside": list(against)}
     summary = {**summary, "machine": named, "files": []}
     if target is not None and not summary["doubts"] and not against:
-        for name, text in {file.name: read_text(file)}.items() if kind is not None else item.files().items():
+        if kind is None:
+            (head,) = heads_of([file])
+            files = {name: with_head(text, head) for name, text in item.files().items()}
+        for name, text in {file.name: read_text(file)}.items() if kind is not None else files.items():
             target.add(name, text)
         summary["files"] = [str(path) for path in target.commit().values()]
     if as_json:

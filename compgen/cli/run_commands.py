@@ -67,14 +67,32 @@ if TYPE_CHECKING:
     type=PATH,
     help="Local copy of dcc.xsd (PTB): write dcc.xml only if it validates.",
 )
+@click.option(
+    "--certificate",
+    "handed",
+    metavar="FILE",
+    type=PATH,
+    help="Customer, machine, instruments, conditions (TOML, may be incomplete) for report.html; a copy goes to the folder. "
+    "Default: DIR/certificate.toml if it exists.",
+)
+@click.option(
+    "--pdf", "as_pdf", is_flag=True, help="Print report.html to report.pdf, with the Chromium of this computer."
+)
 @language_option
 @json_option
-def report_command(
-    folder: Path, out: Path | None, certificate: Path | None, schema: Path | None, language: str, as_json: bool
+def report_command(  # noqa: PLR0913  (options of the command)
+    folder: Path,
+    out: Path | None,
+    certificate: Path | None,
+    schema: Path | None,
+    handed: Path | None,
+    as_pdf: bool,
+    language: str,
+    as_json: bool,
 ) -> int:
     """Make the report of a folder that run, identify, verify or compare wrote, from the files in it.
 
-    Writes report.html (one file, no network; print it to PDF from a browser), report.json (its numbers), dossier.md and
+    Writes report.html (one file, no network; --pdf prints it to report.pdf), report.json (its numbers), dossier.md and
     dossier.json (documentation), calibration.json (results in the order of a calibration certificate), and with --dcc
     dcc.xml (Digital Calibration Certificate). Lengths in mm, errors in um and urad.
 
@@ -86,24 +104,17 @@ def report_command(
     from compgen.report.html.write import short_text
 
     OutputFolder(out or folder)
-    default = folder / "certificate.toml"
-    source = certificate or (default if default.is_file() else None)
-    also: Further | None = None  # writes dcc.xml
-    remark = ""
-    if source is None and schema is not None:
-        raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
-    if source is not None:
-        from compgen.report.dcc import NEWEST, certificate_files, read_certificate, read_schema
-
-        stated = read_certificate(source)
-        rules = None if schema is None else read_schema(schema)
-        also = partial(certificate_files, options=stated, schema=rules)
-        remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
-        if rules is not None:
-            remark = f"dcc.xml: DCC {rules.version}, valid against {rules.path}"
+    also, remark = _dcc(folder, certificate, schema, handed)
     with progress(quiet=as_json) as show:
         show("drawing the report")
-        report, paths = write_report(folder, out, also, language)
+        report, paths = write_report(folder, out, also, language, certificate=handed or certificate)
+        if as_pdf:
+            from compgen.report.pdf import pdf_of
+
+            show("printing the report")
+            printed = OutputFolder(out or folder)
+            printed.add("report.pdf", pdf_of(paths["report.html"]))
+            paths = {**paths, **printed.commit()}
     if as_json:
         print_json({**report.data, "paths": [str(path) for path in paths.values()]})
         return 0
@@ -114,12 +125,43 @@ def report_command(
     return 0
 
 
-def report_written(folder: Path, language: str, known: KnownTables | None = None) -> Path | None:
+def _dcc(
+    folder: Path, certificate: Path | None, schema: Path | None, handed: Path | None
+) -> tuple[Further | None, str]:
+    """Return what writes ``dcc.xml``, and what to say of it.
+
+    A ``certificate.toml`` that lies in the folder, or is there for the page alone, may be incomplete: then there is no DCC.
+    """
+    default = folder / "certificate.toml"
+    source = certificate or (default if default.is_file() and handed is None else None)
+    if source is None and schema is not None:
+        raise InputError("--dcc-schema needs a certificate; give its data with --dcc certificate.toml")
+    if source is None:
+        return None, ""
+    from compgen.report.dcc import NEWEST, certificate_files, read_certificate, read_schema
+
+    try:
+        stated = read_certificate(source)
+    except InputError as error:
+        if certificate is not None or schema is not None:
+            raise
+        read_certificate(source, complete=False)
+        return None, f"no dcc.xml: {error}"
+    rules = None if schema is None else read_schema(schema)
+    remark = f"dcc.xml: DCC {NEWEST}, not checked against the schema; --dcc-schema dcc.xsd does that"
+    if rules is not None:
+        remark = f"dcc.xml: DCC {rules.version}, valid against {rules.path}"
+    return partial(certificate_files, options=stated, schema=rules), remark
+
+
+def report_written(
+    folder: Path, language: str, known: KnownTables | None = None, certificate: Path | None = None
+) -> Path | None:
     """Write the report of a finished command into its folder; if this fails, the result remains."""
     from compgen.report.html import write_report
 
     try:
-        return write_report(folder, language=language, known=known)[1]["report.html"]
+        return write_report(folder, language=language, known=known, certificate=certificate)[1]["report.html"]
     except InputError as error:
         warnings.warn(f"the report could not be made: {error}", CompgenWarning, stacklevel=2)
         return None
@@ -138,7 +180,7 @@ class _Run(GroupedCommand):
         "Identification": ("options__", "prior"),
         "Smoothing and bounds of the tables": ("fitting__", "zone", "tools", "limits__"),
         "Tables on the control": ("active", "template_from", "style_from", "templates", "allow_unverified", "sample"),
-        "Verdict and output": ("allow_misfit", "explain", "no_report", "language", "as_json"),
+        "Verdict and output": ("allow_misfit", "explain", "no_report", "certificate", "language", "as_json"),
     }
 
 
@@ -167,6 +209,12 @@ class _Run(GroupedCommand):
 )
 @explain_option
 @click.option("--no-report", is_flag=True, help="Write neither report.html nor the files that belong to it.")
+@click.option(
+    "--certificate",
+    metavar="FILE",
+    type=PATH,
+    help="Customer, machine, instruments, conditions (TOML, may be incomplete) for report.html; a copy goes to DIR.",
+)
 @language_option
 @json_option
 def run_command(
@@ -186,6 +234,7 @@ def run_command(
     allow_misfit: bool,
     explain: bool,
     no_report: bool,
+    certificate: Path | None,
     language: str,
     as_json: bool,
 ) -> int:
@@ -211,6 +260,10 @@ def run_command(
     Example:
       volcomp run zha-gantry examples/zha-gantry.lengths.csv --controller isg-csv --out tables/
     """
+    if certificate is not None:  # what is wrong in it is found before the work begins
+        from compgen.report.dcc.laboratory import read_certificate
+
+        read_certificate(certificate, complete=False)
     with progress(quiet=as_json) as show:
         result = run(
             machine,
@@ -233,7 +286,7 @@ def run_command(
         if not no_report:
             show("drawing the report")
         known = {item.export.controller: (item.read, item.verification) for item in result.results if item.read}
-        report = None if no_report else report_written(out, language, known)
+        report = None if no_report else report_written(out, language, known, certificate)
     if report is not None:  # a new report replaces it; otherwise the earlier one is kept as PREVIOUS-...
         for path in result.earlier_report:
             path.unlink(missing_ok=True)

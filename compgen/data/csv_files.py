@@ -88,11 +88,20 @@ def parse_plain(content: str) -> CsvFile | None:
 def _note_metadata(line: str, metadata: dict[str, str]) -> bool:
     """Whether a stripped line is a comment or empty; a comment ``# key = value`` goes to ``metadata``."""
     if line.startswith("#"):
-        key, equals, value = line.lstrip("#").partition("=")
-        if equals and value.strip():  # an empty value is not set
-            metadata[key.strip()] = value.strip()
+        metadata.update([found] if (found := comment_of(line)) else [])
         return True
     return not line
+
+
+def comment_of(line: str) -> tuple[str, str] | None:
+    """Return key and value of a comment ``# key = value``; None for another line, and for an empty value.
+
+    >>> comment_of("# operator = A. Example"), comment_of("# a note")
+    (('operator', 'A. Example'), None)
+    """
+    key, equals, value = line.lstrip("#").partition("=")
+    # an empty value is not set
+    return (key.strip(), value.strip()) if line.startswith("#") and equals and value.strip() else None
 
 
 def parse_any(source: Path, content: str) -> CsvFile:

@@ -355,18 +355,32 @@ _READINGS = ("actual", "deviation", "correction", "value", "length", "x", "y", "
 #: Units in brackets that are neither a length nor an angle.
 _OTHER_UNIT = re.compile(r"(?i)[\[(]\s*(%|%\s?rh|rh|[hkm]?pa|m?bar|mmhg|ppm|m?v|m?a|k?w|k?n|hz|rpm|1/min|db)\s*[\])]")
 
-#: Lines above a table that are kept, by the words of the key.
-_FACTS = {
+#: Lines above a table that are kept, by the words of the key: of the instrument, and what a report to a customer names.
+FACTS = {
     "operator": ("operator", "bediener", "prufer", "pruefer", "messtechniker", "gemessenvon", "measuredby", "inspector",
                  "technician", "operateur", "operatore", "operador", "bearbeiter", "\u64cd\u4f5c\u5458", "\u6d4b\u91cf\u5458",
                  "\u68c0\u6d4b\u5458"),
     "instrument": ("instrument", "messgerat", "messmittel", "messsystem", "gerat", "device", "laser", "laserinterferometer",
                    "interferometer", "equipment", "appareil", "strumento", "instrumento", "equipo", "\u4eea\u5668"),
     "serial_number": ("serialnumber", "serialno", "seriennummer", "seriennr", "laserseriennummer", "serial", "sn",
-                      "laserserialno",
+                      "laserserialno", "lasersn",
                       "instrumentserialnumber", "gerateseriennummer",
                       "numerodeserie", "nodeserie", "matricola",
                       "numerodiserie", "\u5e8f\u5217\u53f7", "\u4eea\u5668\u7f16\u53f7"),
+    "customer": ("customer", "client", "kunde", "auftraggeber", "endkunde", "cliente", "orderedby", "\u5ba2\u6237"),
+    "order_number": ("order", "orderno", "ordernumber", "auftrag", "auftragsnr", "auftragsnummer", "bestellnr", "bestellnummer",
+                     "jobno", "jobnumber", "job", "commande", "ordine", "pedido"),
+    "certificate_number": ("certificate", "certificateno", "certificatenumber", "reportno", "reportnumber", "protokollnr",
+                           "protokollnummer", "prufprotokollnr", "kalibrierschein", "kalibrierscheinnr", "zertifikat",
+                           "zertifikatnr", "messprotokollnr", "berichtsnr", "prufberichtnr", "certificat", "certificado"),
+    "machine_manufacturer": ("manufacturer", "machinemanufacturer", "machinemaker", "maker", "hersteller", "maschinenhersteller",
+                             "fabricant", "costruttore", "fabricante"),
+    "machine_serial_number": ("machineno", "machinenumber", "machineserial", "machineserialno", "machineserialnumber",
+                              "machinesn", "maschinennr", "maschinennummer", "fabriknummer", "fabriknr", "maschnr",
+                              "numeromachine"),
+    "place": ("place", "location", "site", "ort", "messort", "standort", "aufstellort", "aufstellungsort", "lieu",
+              "luogo", "lugar"),
+    "laboratory": ("laboratory", "lab", "labor", "messlabor", "kalibrierlabor", "laboratoire", "laboratorio"),
 }  # fmt: skip
 _EXPANSION = ("expansion", "expansioncoefficient", "expcoeff", "coefficientofthermalexpansion", "cte", "materialexpansion",
               "ausdehnung", "ausdehnungskoeffizient", "wak", "langenausdehnungskoeffizient", "dilatation",
@@ -612,7 +626,7 @@ def metadata_of(findings: TableFindings, row_data: RowData) -> dict[str, str]:
 def _fact(key: str, text: str) -> dict[str, str]:
     """Return a line above a table with native name and unit; nothing if it is not clear."""
     column = split_name(key)
-    name = next((name for name, words in _FACTS.items() if column.word in words), None)
+    name = next((name for name, words in FACTS.items() if column.word in words), None)
     if name is not None and text:
         return {name: text}
     numbers = [value for word in re.findall(_NUMBER, text) if (value := parse_number(word)) is not None]

@@ -11,6 +11,8 @@
   wanted.addEventListener("change", nameTheme);
   nameTheme();
 
+  document.getElementById("print").addEventListener("click", function () { window.print(); });
+
   // which control is shown, and printed
   var chooser = document.getElementById("control");
   function showControl(number) {

@@ -69,7 +69,11 @@ def _statements(data: Mapping[str, Any], options: Certificate) -> Iterator[Eleme
     yield _statement("Measurement uncertainty", UNCERTAINTY, dcc("norm", "JCGM 100:2008"))
     for text in data["limitations"]:
         yield _statement("Limitation", flat(text))
-    for name, text in options.statements:  # the user's words: language unknown
+    further = (("Order number of the customer", options.order), ("Place of the machine", options.place))
+    for name, text in (
+        *(pair for pair in further if pair[1]),
+        *options.statements,
+    ):  # the user's words: language unknown
         yield dcc(
             "statement", dcc("name", dcc("content", flat(name))), dcc("declaration", dcc("content", text.strip()))
         )

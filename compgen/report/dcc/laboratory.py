@@ -71,8 +71,8 @@ class Certificate:
 
     number: str
     country: str
-    begin: datetime.date
-    end: datetime.date
+    begin: datetime.date | None
+    end: datetime.date | None
     location: str
     laboratory: Contact
     customer: Contact
@@ -85,6 +85,8 @@ class Certificate:
     control: Thing | None = None
     conditions: tuple[Condition, ...] = ()
     statements: tuple[tuple[str, str], ...] = ()
+    order: str = ""
+    place: str = ""
 
 
 #: Keys of ``[conditions]``: name, D-SI unit, refType of the public list, plausible limits.
@@ -160,57 +162,66 @@ CHECKS: dict[str, Callable[[Any], Any]] = {
 }
 
 
-def read_certificate(path: str | Path) -> Certificate:
+def read_certificate(path: str | Path, *, complete: bool = True) -> Certificate:
     """Read ``certificate.toml``.
+
+    ``complete`` is False for a page that says itself what is missing: then keys may be missing, and are empty.
 
     Raises
     ------
     InputError
-        for a key that is missing, unknown, or has an invalid value; the message names it.
+        for a key that is missing (if ``complete``), unknown, or has an invalid value; the message names it.
     """
     root = read_toml(path)
-    core = root.section("certificate")
-    begin, end = core.take("begin", date), core.take("end", date)
-    if end < begin:
+    needed: tuple[Any, ...] = () if complete else (None,)
+    named: tuple[Any, ...] = () if complete else ("",)
+    core = root.section("certificate", required=complete)
+    begin, end = core.take("begin", date, *needed), core.take("end", date, *needed)
+    if begin is not None and end is not None and end < begin:
         raise core.fail("end", f"{end} is before begin, {begin}")
-    laboratory = root.section("laboratory")
-    contact = _values(laboratory, "contact")
+    laboratory = root.section("laboratory", required=complete)
+    contact = _values(laboratory, "contact", complete=complete)
     control = root.section("control", required=False)
     found = Certificate(
-        number=core.take("number", text),
-        country=core.take("country", country),
+        number=core.take("number", text, *named),
+        country=core.take("country", country, *named),
         begin=begin,
         end=end,
-        location=core.take("location", choice(*LOCATIONS)),
+        location=core.take("location", choice(*LOCATIONS), *named),
         laboratory=Contact(**contact),
         laboratory_code=laboratory.take("code", text, ""),
-        customer=Contact(**_closed(root.section("customer"), "contact")),
-        persons=tuple(Person(**values) for values in _one_or_more(root, "person")),
-        machine=Thing(**_closed(root.section("machine"), "machine")),
-        equipment=tuple(Thing(**values) for values in _one_or_more(root, "equipment")),
+        customer=Contact(**_closed(root.section("customer", required=complete), "contact", complete=complete)),
+        persons=tuple(Person(**values) for values in _listed(root, "person", complete=complete)),
+        machine=Thing(
+            **{"name": "", **_closed(root.section("machine", required=complete), "machine", complete=complete)}
+        ),
+        equipment=tuple(Thing(**values) for values in _listed(root, "equipment", complete=complete)),
         received=core.take("received", date, None),
         issued=core.take("issued", date, None),
         control=Thing(**_closed(control, "control")) if control.data else None,
         conditions=_conditions(root.section("conditions", required=False)),
         statements=tuple((item["name"], item["text"]) for item in _all(root, "statement")),
+        order=core.take("order", text, ""),
+        place=core.take("place", text, ""),
     )
-    if found.received is not None and found.received > end:
+    if found.received is not None and end is not None and found.received > end:
         raise core.fail("received", f"{found.received} is after the end of the measurement, {end}")
-    if found.issued is not None and found.issued < end:
+    if found.issued is not None and end is not None and found.issued < end:
         raise core.fail("issued", f"{found.issued} is before the end of the measurement, {end}")
     for section in (laboratory, core, root):
         section.finish()
     return found
 
 
-def _values(section: Section, kind: str) -> dict[str, Any]:
+def _values(section: Section, kind: str, *, complete: bool = True) -> dict[str, Any]:
     """Return the keys of a kind of table; omitted ones are empty."""
     found = {}
     for entry in KEYS[kind]:
         key = entry.removesuffix("?")
         check = CHECKS.get(key, text)
         empty = None if check is flag else ""
-        found[key] = section.take(key, check, empty) if entry.endswith("?") else section.take(key, check)
+        optional = entry.endswith("?") or not complete
+        found[key] = section.take(key, check, empty) if optional else section.take(key, check)
     if found.get("certificate_sha256") and not found["certificate_number"]:
         raise section.fail(
             "certificate_sha256", "needs certificate_number, the number of the certificate with this hash"
@@ -218,21 +229,21 @@ def _values(section: Section, kind: str) -> dict[str, Any]:
     return found
 
 
-def _closed(section: Section, kind: str) -> dict[str, Any]:
+def _closed(section: Section, kind: str, *, complete: bool = True) -> dict[str, Any]:
     """Return the values of a table without further keys."""
-    found = _values(section, kind)
+    found = _values(section, kind, complete=complete)
     section.finish()
     return found
 
 
-def _all(root: Section, key: str) -> list[dict[str, Any]]:
-    return [_closed(section, key) for section in root.sections(key)]
+def _all(root: Section, key: str, *, complete: bool = True) -> list[dict[str, Any]]:
+    return [_closed(section, key, complete=complete) for section in root.sections(key)]
 
 
-def _one_or_more(root: Section, key: str) -> list[dict[str, Any]]:
-    """Return an array of tables with at least one entry."""
-    found = _all(root, key)
-    if not found:
+def _listed(root: Section, key: str, *, complete: bool) -> list[dict[str, Any]]:
+    """Return an array of tables, with at least one entry where the certificate must be complete."""
+    found = _all(root, key, complete=complete)
+    if complete and not found:
         raise root.fail(key, f"is missing; the schema or ISO/IEC 17025 requires at least one [[{key}]]")
     return found
 

@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from compgen.pipeline import NOT_MADE
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector
 from compgen.tables.verification import ERROR_DECIMALS, POSITION_DECIMALS, Verification
+
+if TYPE_CHECKING:
+    from compgen.report.dcc.laboratory import Certificate
 
 # The contents of a folder that ``run``, ``identify``, ``verify`` or ``compare`` wrote, read back for the report.
 
@@ -123,16 +126,22 @@ class ResultFolder:
     accuracy: Mapping[str, Any] = field(default_factory=dict)
     compare: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    certificate: Certificate | None = None
 
 
+#: What only the laboratory knows; a copy lies in the folder, so that the report can be made again.
+CERTIFICATE = "certificate.toml"
 #: Tables as a run has read them back, and their verification, by control.
 KnownTables = Mapping[str, tuple[ReadTables, Verification]]
 
 
-def read_folder(folder: str | Path, known: KnownTables | None = None) -> ResultFolder:
+def read_folder(
+    folder: str | Path, known: KnownTables | None = None, certificate: str | Path | None = None
+) -> ResultFolder:
     """Read the results in ``folder``; nothing outside it is read.
 
     ``known`` are tables and volumes that the run which wrote the folder still has: they are not read once more.
+    ``certificate`` is the file that states customer, machine and instruments; by default ``certificate.toml`` of the folder.
 
     Raises
     ------
@@ -172,7 +181,17 @@ def read_folder(folder: str | Path, known: KnownTables | None = None) -> ResultF
         accuracy=_json(base / "accuracy.json"),
         compare=_json(base / "compare.json"),
         notes=tuple(notes),
+        certificate=_certificate(base, certificate),
     )
+
+
+def _certificate(base: Path, given: str | Path | None) -> Certificate | None:
+    own = base / CERTIFICATE
+    if given is None and not own.is_file():
+        return None
+    from compgen.report.dcc.laboratory import read_certificate
+
+    return read_certificate(given or own, complete=False)
 
 
 def _kind(base: Path, controls: list[Path]) -> Kind:

@@ -22,13 +22,22 @@ from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_
 from compgen.accuracy.field import ErrorSource, Figure, error_source, volume_figures
 from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.error_table import ErrorTable
-from compgen.data.files import OutputFolder, json_text, json_values
+from compgen.data.files import OutputFolder, json_text, json_values, read_text
 from compgen.data.machine import Machine
-from compgen.data.names import COVERAGE, CURVE_NAMES, error_named
+from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError, number_text, one_line, um_text
 from compgen.identify.covariance import covariance_named_by
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.report.html.folder import ControlFolder, KnownTables, ResultFolder, TableCurve, read_folder, table_curves
+from compgen.report.handover import handed_over
+from compgen.report.html.folder import (
+    CERTIFICATE,
+    ControlFolder,
+    KnownTables,
+    ResultFolder,
+    TableCurve,
+    read_folder,
+    table_curves,
+)
 from compgen.report.html.pictures import (
     describe_error,
     draw_curve,
@@ -101,6 +110,11 @@ def _of_errors(source: ResultFolder, machine: Machine, errors: ErrorTable) -> di
     listed = coverage_of(machine, errors)
     for name in VOLUMETRIC if listed.missing else ():
         found.pop(name, None)
+    # of an axis whose positioning was not measured, 0 +- 0 would be a claim
+    unknown = [f"M_{axis}" for axis in AXES if f"E{axis}{axis}" not in errors.names]
+    found["axes"] = {key: item for key, item in found["axes"].items() if key not in unknown}
+    if not found["axes"]:
+        found.pop("axes")
     partial = f"{coverage.text}: no figures of the volume and its diagonals, because the other errors are unknown"
     groups = [
         {"name": GROUPS[name], "rows": _rows({key: item.summary() for key, item in group.items()})}
@@ -284,6 +298,11 @@ def content(source: ResultFolder) -> dict[str, Any]:
             **({} if source.residuals is None else source.residuals.stated),
             "errors_sha256": sorted({str(made.get("errors_sha256", "")) for made in manifests} - {""}),
         },
+        "handover": handed_over(
+            source.certificate,
+            identify.get("files") or [],
+            {} if source.residuals is None else source.residuals.stated,
+        ),
         "limitations": limitations(source),
         "notes": list(source.notes),
     }
@@ -596,7 +615,24 @@ def render_page(
         script=script,
         payload=script_data({picture.key: dict(picture.data) for picture in drawn if picture.data}),
         seconds=seconds,
+        running=css_string(running_text(data)),
     )
+
+
+def running_text(data: Mapping[str, Any]) -> str:
+    """Return what stands below every printed page, so that each is known to belong to this report."""
+    facts = {item["heading"]: item["text"] for item in data["handover"]["facts"]}
+    number = facts["Certificate number"]
+    return "  ".join(str(part) for part in (data["title"], number, data["provenance"]["date"]) if part)
+
+
+def css_string(text: str) -> Markup:
+    r"""Return a text as the inside of a CSS string, which no character of it can end.
+
+    >>> print(css_string('a"</style>'))
+    a\22 \3c \2f style\3e
+    """
+    return Markup("".join(char if char.isalnum() or char == " " else f"\\{ord(char):x} " for char in text[:120]))
 
 
 def page_environment(kind: str, language: str = LANGUAGES[0]) -> Environment:
@@ -674,6 +710,7 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
         "format": "compgen dossier 1",
         "machine": data["machine"] or {"name": data["title"]},
         "measured": {"inputs": data["provenance"]["inputs"], "date": data["provenance"]["date"]},
+        "handover": data["handover"],
         "model": {
             "kinematic_chain": data["machine"].get("chain"),
             "errors": [item["error"] for item in data["errors"]],
@@ -707,7 +744,12 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
     lines += ["Lengths in mm, errors in um and urad. Expanded uncertainties with k = 2.", ""]
     lines += _section("1. Machine and model", [*_pairs(machine), *_pairs(dossier["model"])])
     inputs = [[item["name"], f"`{one_line(item['sha256'])}`"] for item in dossier["measured"]["inputs"]]
-    lines += _section("2. What was measured", _table(["file", "SHA-256"], inputs, raw=1))
+    given = dossier["handover"]
+    facts = {item["heading"]: item["text"] for item in given["facts"]}
+    said = [
+        f"- {plain_markdown(item['file'])}: {plain_markdown(line)}" for item in given["files"] for line in item["lines"]
+    ]
+    lines += _section("2. What was measured", [*_table(["file", "SHA-256"], inputs, raw=1), *_pairs(facts), *said])
     rows = []
     for item in dossier["identified_errors"]:
         at = "" if item["at_mm"] is None else f"{item['at_mm']:g}"
@@ -907,10 +949,16 @@ class Report:
     data: Mapping[str, Any]
 
 
-def build_report(folder: str | Path, language: str = LANGUAGES[0], known: KnownTables | None = None) -> Report:
+def build_report(
+    folder: str | Path,
+    language: str = LANGUAGES[0],
+    known: KnownTables | None = None,
+    certificate: str | Path | None = None,
+) -> Report:
     """Read the results in ``folder`` and make their report, the page in a language; nothing is written.
 
-    ``known`` is what the run which wrote the folder still has, see :func:`compgen.report.html.folder.read_folder`.
+    ``known`` is what the run which wrote the folder still has, ``certificate`` the file that states customer, machine and
+    instruments: see :func:`compgen.report.html.folder.read_folder`.
 
     Raises
     ------
@@ -918,7 +966,7 @@ def build_report(folder: str | Path, language: str = LANGUAGES[0], known: KnownT
         if the folder contains no results, or one of its files cannot be read.
     """
     with one_thread():
-        source = read_folder(folder, known)
+        source = read_folder(folder, known, certificate)
         data = json_values(content(source))
         pictures = draw(source, data)
     page = render_page(source, data, pictures, language=language)
@@ -942,15 +990,18 @@ def write_report(
     also: Further | None = None,
     language: str = LANGUAGES[0],
     known: KnownTables | None = None,
+    certificate: str | Path | None = None,
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
     ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page;
-    ``known``: see :func:`build_report`.
+    ``known`` and ``certificate``: see :func:`build_report`.
     """
     target = OutputFolder(out if out is not None else folder)
-    report = build_report(folder, language, known)
+    report = build_report(folder, language, known, certificate)
     documents = also(report.data) if also is not None else {}
+    if certificate is not None:
+        target.add(CERTIFICATE, read_text(Path(certificate)))
     for name, text in report.files.items():
         target.add(name, text)
     for name, document in documents.items():

@@ -1,0 +1,172 @@
+"""A report that can be handed over: what files and certificate.toml name is on it, what nobody stated is listed, not invented."""
+
+import json
+import re
+
+import openpyxl
+import pytest
+
+from compgen.cli import cli
+from compgen.errors import InputError
+from compgen.foreign.heads import heads_of
+from compgen.report.handover import handed_over
+from compgen.report.html.write import css_string, running_text
+from compgen.report.pdf import browser, pdf_of
+
+# a foreign file is said to be read as what it is, with a warning
+pytestmark = pytest.mark.filterwarnings("ignore::compgen.errors.CompgenWarning")
+
+HEAD = (
+    "Messlabor Müller GmbH, Ulm",
+    "Messprotokoll  Nr. 12345",
+    "Kunde: Muster <AG>, Aalen",
+    "Auftrag: A-2026/77",
+    "Maschine: C30   Maschinen-Nr.: 4711",
+    "Laser: XL-80   Seriennummer: 99AZ12",
+    "Bediener: K. Huber",
+    "Datum: 12.03.2026",
+    "Achse: X",
+    "Temperatur 20,1 20,3 °C",
+)
+ROWS = [(0, 0.0, 0.1), (-200, 1.0, 1.2), (-400, 2.0, 2.1), (-600, 2.9, 3.0), (-800, 4.2, 4.1)]
+CERTIFICATE = """
+[certificate]
+order = "A-2026/78"
+place = "Halle 4"
+[customer]
+name = "Muster Werkzeugbau"
+city = "Aalen"
+[[equipment]]
+name = "XL-80"
+serial_number = "99AZ12"
+certificate_number = "D-K-1 2026-03"
+[[equipment]]
+name = "Level"
+serial_number = "L7"
+[conditions]
+air_temperature_c = [19.8, 20.6]
+"""
+
+
+def call(*words):
+    return cli.main([str(word) for word in words], standalone_mode=False)
+
+
+@pytest.fixture(scope="module")
+def lab_sheet(tmp_path_factory):
+    path = tmp_path_factory.mktemp("lab") / "sheet.txt"
+    rows = [";".join(f"{value}".replace(".", ",") for value in row) for row in ROWS]
+    lines = [*HEAD, "", "Position [mm];Lauf 1 [µm];Lauf 2 [µm]", *rows, "", "Unsicherheit: U = 1,2 µm, k = 2"]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def ran(lab_sheet, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("handed")
+    stated = folder / "mine.toml"
+    stated.write_text(CERTIFICATE)
+    out = folder / "out"
+    call("run", "zha-gantry", lab_sheet, "--controller", "siemens-cec", "--out", out, "--certificate", stated)
+    return out
+
+
+def test_every_line_of_a_lab_sheet_that_is_no_reading_is_kept(lab_sheet):
+    (head,) = heads_of([lab_sheet])
+    plain = {re.sub(r"\s{2,}", "; ", line) for line in HEAD}
+    assert plain <= set(head.lines)
+    assert "Unsicherheit: U = 1,2 µm, k = 2" in head.lines
+    assert len(head.lines) == len(HEAD) + 1  # no names of columns, no row of numbers
+    assert head.stated == {
+        "customer": "Muster <AG>, Aalen", "order_number": "A-2026/77", "certificate_number": "12345", "instrument": "XL-80",
+        "serial_number": "99AZ12", "operator": "K. Huber", "machine_serial_number": "4711",
+    }  # fmt: skip
+
+
+def test_a_workbook_says_the_same_as_the_text(lab_sheet, tmp_path):
+    book = openpyxl.Workbook()
+    for line in HEAD:
+        book.active.append([part for pair in re.split(r"\s{2,}", line) for part in pair.split(": ")])
+    book.active.append([])
+    for row in (("Position [mm]", "Lauf 1 [µm]", "Lauf 2 [µm]"), *ROWS):
+        book.active.append(list(row))
+    path = tmp_path / "sheet.xlsx"
+    book.save(path)
+    (head,), (text,) = heads_of([path]), heads_of([lab_sheet])
+    same = ("customer", "order_number", "operator", "certificate_number")
+    assert {key: head.stated.get(key) for key in same} == {key: text.stated[key] for key in same}
+    assert not any("Lauf" in line or "-200" in line for line in head.lines)
+
+
+def test_an_import_keeps_what_the_file_said(lab_sheet, tmp_path):
+    call("import", lab_sheet, "--out", tmp_path)
+    (native,) = tmp_path.glob("*.csv")
+    (before,), (after,) = heads_of([lab_sheet]), heads_of([native])
+    assert set(before.lines) <= set(after.lines)
+    assert before.stated.items() <= after.stated.items()
+
+
+def test_the_report_names_customer_order_place_instruments_and_the_lines_of_the_files(ran):
+    page = (ran / "report.html").read_text("utf-8")
+    for text in ("Muster Werkzeugbau, Aalen", "A-2026/78", "Halle 4", "4711", "D-K-1 2026-03", "L7", "19.8 to 20.6 °C",
+                 "Messprotokoll; Nr. 12345", "Kunde: Muster &lt;AG&gt;, Aalen", "A-2026/77"):  # fmt: skip
+        assert text in page, text
+    assert "<AG>" not in page
+    data = json.loads((ran / "report.json").read_text("utf-8"))["handover"]
+    # the laser of the file and that of the certificate are the same instrument: the same serial number
+    assert [(item["serial_number"], item["certificate"], item["file"]) for item in data["instruments"]] == [
+        ("99AZ12", "D-K-1 2026-03", "sheet.txt"),
+        ("L7", "", ""),
+    ]
+    assert {item["what"] for item in data["missing"]} == {"Laboratory", "Machine maker"} - {
+        item["heading"] for item in data["facts"] if item["text"]
+    }
+
+
+def test_a_copy_of_the_certificate_makes_the_same_report_again_and_an_incomplete_one_no_dcc(ran, capsys):
+    first = (ran / "report.html").read_text("utf-8")
+    call("report", ran)
+    assert (ran / "report.html").read_text("utf-8") == first
+    assert not (ran / "dcc.xml").exists()
+    assert "no dcc.xml" in capsys.readouterr().out
+
+
+def test_an_axis_whose_positioning_was_not_measured_has_no_figure(ran):
+    groups = json.loads((ran / "report.json").read_text("utf-8"))["accuracy"]["groups"]
+    assert [row["key"] for group in groups for row in group["rows"]] == ["M_X"]
+
+
+@pytest.mark.parametrize(
+    ("text", "field"),
+    [
+        ("[customer]\nnmae = 'x'\n", "nmae"),
+        ("[certificate]\nbegin = 2026-03-02\nend = 2026-03-01\n", "end"),
+        ("[conditions]\nair_temperature_c = 400\n", "air_temperature_c"),
+    ],
+)
+def test_a_wrong_certificate_is_refused_before_the_work_begins(text, field, lab_sheet, tmp_path, capsys):
+    (tmp_path / "c.toml").write_text(text)
+    words = ["run", "zha-gantry", lab_sheet, "--controller", "siemens-cec", "--certificate", tmp_path / "c.toml"]
+    with pytest.raises(InputError, match=field):
+        call(*words, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_of_nothing_stated_everything_is_missing_and_nothing_invented():
+    data = handed_over(None, [], {})
+    assert not any(item["text"] for item in data["facts"])
+    assert len(data["missing"]) == len(data["facts"]) + 3
+    assert data["instruments"] == data["conditions"] == data["persons"] == []
+
+
+def test_no_text_ends_the_style_that_it_is_written_into():
+    hostile = "a\"}</style><script>\\u{1}'"
+    assert not re.search(r"[\"'<>{}]", css_string(hostile))
+    facts = [{"heading": "Certificate number", "text": "7"}]
+    assert running_text({"title": "m", "handover": {"facts": facts}, "provenance": {"date": None}}) == "m  7"
+
+
+@pytest.mark.skipif(browser() is None, reason="no browser that prints")
+def test_the_page_is_printed_with_numbered_pages(ran):
+    made = pdf_of(ran / "report.html")
+    assert made.startswith(b"%PDF")
