@@ -17,7 +17,7 @@ import numpy as np
 from markupsafe import Markup, escape
 
 from compgen.app.project import Measurement, Project, ProjectState
-from compgen.app.steps import ANSWERS, PROGRAM_FIELDS, Step, command_line
+from compgen.app.steps import ANSWERS, CERTIFICATE_FIELDS, PROGRAM_FIELDS, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -34,6 +34,7 @@ from compgen.data.new_machine import in_words
 from compgen.data.prior import CLASS_WORDS
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
+from compgen.foreign.source import parse_number
 from compgen.kinematics import exact_error
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.dialects import DIALECTS
@@ -49,6 +50,7 @@ from compgen.report.html.pictures import (
     uncertainty_um,
 )
 from compgen.report.html.write import assumptions_of, judged, proposed_rows
+from compgen.report.pdf import browser
 from compgen.tables import load_format
 from compgen.tables.verification import MISFIT_CODES
 
@@ -469,6 +471,53 @@ def toml_value(value: Any, *, plain: bool = False) -> str:
     return json.dumps(value)
 
 
+def certificate_text(stated: Mapping[str, str]) -> str:
+    """Return ``certificate.toml`` from what was typed into the form for the report.
+
+    Raises
+    ------
+    InputError
+        for a temperature that is no number.
+
+    >>> print(certificate_text({"customer": "Muster", "instruments": "XL-80; 99AZ; D-1", "air_low": "19.8", "air_high": "20.6"}))
+    [customer]
+    name = "Muster"
+    <BLANKLINE>
+    [[equipment]]
+    name = "XL-80"
+    serial_number = "99AZ"
+    certificate_number = "D-1"
+    <BLANKLINE>
+    [conditions]
+    air_temperature_c = [19.8, 20.6]
+    <BLANKLINE>
+    """
+    sections: dict[str, dict[str, str]] = {}
+    for field, (section, key) in CERTIFICATE_FIELDS.items():
+        if stated.get(field):
+            sections.setdefault(f"[[{section}]]" if section == "person" else f"[{section}]", {})[key] = stated[field]
+    blocks = [[head, *(f"{key} = {toml_value(text)}" for key, text in own.items())] for head, own in sections.items()]
+    for row in filter(None, map(str.strip, stated.get("instruments", "").splitlines())):
+        parts = zip(("name", "serial_number", "certificate_number"), map(str.strip, row.split(";", 2)), strict=False)
+        blocks.append(["[[equipment]]", *(f"{key} = {toml_value(text)}" for key, text in parts if text)])
+    known = {"air": "air_temperature_c", "machine": "machine_temperature_c"}
+    ranges = {
+        key: [stated[n] for n in (f"{place}_low", f"{place}_high") if stated.get(n)] for place, key in known.items()
+    }
+    lines = [
+        f"{key} = [{_degrees(texts[0], key)}, {_degrees(texts[-1], key)}]" for key, texts in ranges.items() if texts
+    ]
+    blocks += [["[conditions]", *lines]] if lines else []
+    return "\n\n".join("\n".join(block) for block in blocks) + "\n"
+
+
+def _degrees(text: str, field: str) -> float:
+    value = parse_number(text.replace(",", "."))
+    if value is None:
+        raise InputError(f"{text!r} is no temperature; write e.g. 20.4", field=field)
+    return value
+
+
 _HEADER = re.compile(r"\s*(#\s*)?\[([\w.-]+)\]\s*(#.*)?$")
 
 
@@ -751,6 +800,7 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
         "values": {picture.key: picture.data for picture in (*drawn, *volume)},
         "squareness": squareness_rows(errors) if errors else [],
         "current": state.current("identify") is not None, "views": list(project.pages_of(step)),
+        "handed": state.last("certificate"), "can_print": browser() is not None,
         "found": found, "diagnosis": diagnosis, "diagnosed_views": list(project.pages_of(found)),
         "gap": gap_picture(diagnosis), "applied": applied,
         "may_add": found is not None and "extended.toml" in project.files_of(found) and not applied,

@@ -60,7 +60,16 @@ from compgen.app.project import (
     file_name,
     not_written,
 )
-from compgen.app.steps import CORRECT_FIELDS, FIT_FIELDS, PROGRAM_FIELDS, Step, answer, command_line
+from compgen.app.steps import (
+    CERTIFICATE_FIELDS,
+    CERTIFICATE_LISTS,
+    CORRECT_FIELDS,
+    FIT_FIELDS,
+    PROGRAM_FIELDS,
+    Step,
+    answer,
+    command_line,
+)
 from compgen.controls import CONTROLLERS
 from compgen.data.charts import LABEL
 from compgen.data.files import json_text, read_text, working_folder, write_file
@@ -87,10 +96,13 @@ from compgen.identify.options import StatedNumbers
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.pictures import describe_error, thousands
 from compgen.report.html.write import markdown
+from compgen.report.pdf import pdf_of
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 
 #: Largest request (files that are dropped together), largest part of a form that is not a file, bytes; parts of a form.
 LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 200_000_000, 2_000_000, 400
+#: Characters of a field of several lines.
+LONGEST_LIST = 4_000
 #: A page that has not been heard of for this long is closed; background windows are slowed to one call a minute, s.
 SILENT_S = 200.0
 #: The program ends this long after the last page was closed, s.
@@ -731,13 +743,40 @@ def _instrument(state: ProjectState) -> list[str]:
 def identify(runner: Runner, state: ProjectState) -> None:
     """Identify the errors, and write the report."""
     words = _inputs(state)
-    runner.start("identifying the errors", "result", [_identify_task(runner.project, words)])
+    runner.start("identifying the errors", "result", [_identify_task(runner.project, state, words)])
 
 
-def _identify_task(project: Project, words: Sequence[str]) -> StepTask:
+def _identify_task(project: Project, state: ProjectState, words: Sequence[str]) -> StepTask:
     folder = project.new_folder("identify")
-    commands = [["identify", *words, "--out", folder], ["report", folder, *_language()]]
+    commands = [["identify", *words, "--out", folder], ["report", folder, *_certificate(state), *_language()]]
     return StepTask(Step(0, "identify", "Errors identified", commands, folder))
+
+
+def _certificate(state: ProjectState) -> list[str]:
+    """Return the option for the report with what was typed about customer, machine and instruments."""
+    last = state.last("certificate")
+    return [] if last is None else [f"--certificate={last.data['certificate']}"]
+
+
+@action("result", "certificate")
+def hand_over_report(runner: Runner, state: ProjectState) -> None:
+    """Keep what only the laboratory knows, and make the reports of the last result and its tables again with it."""
+    stated = {name: text for name in CERTIFICATE_FIELDS if (text := _field(name))}
+    for name in CERTIFICATE_LISTS:
+        text = request.form.get(name, "").replace("\r\n", "\n").strip()
+        if len(text) > LONGEST_LIST or any(ord(char) < 32 and char != "\n" for char in text):
+            raise InputError(f"expected lines of at most {LONGEST_LIST} characters together", field=name)
+        stated |= {name: text} if text else {}
+    steps = [step for step in (state.last("identify"), state.current("run")) if step is not None]
+    if not steps:
+        raise InputError("calculate a result first: there is no report yet")
+    folder = runner.project.new_folder("certificate")
+    path = f"{folder}/certificate.toml"
+    write_file(runner.project.path(path), contents.certificate_text(stated), private=True)
+    commands = [["report", step.folder, f"--certificate={path}", *_language()] for step in steps]
+    title = "Customer, machine and instruments for the report"
+    step = Step(0, "certificate", title, commands, folder, data={"certificate": path, "stated": stated})
+    runner.start("making the report again", "result", [StepTask(step)])
 
 
 @action("result", "diagnose")
@@ -761,7 +800,7 @@ def apply_diagnosis(runner: Runner, state: ProjectState) -> None:
     state = runner.project.add(
         Step(0, "machine", "Machine with the effects that were found", data={"machine": machine}), state.revision
     )
-    runner.start("identifying with the effect", "result", [_identify_task(runner.project, _inputs(state))])
+    runner.start("identifying with the effect", "result", [_identify_task(runner.project, state, _inputs(state))])
 
 
 @action("tables", "options")
@@ -790,7 +829,7 @@ def make_tables(runner: Runner, state: ProjectState) -> None:
     words, control = _inputs(state), _control()
     folder = runner.project.new_folder("tables")
     typed, fit = _fit_words()
-    words = ["run", *words, "--controller", control, *fit, *_language(), "--out", folder]
+    words = ["run", *words, "--controller", control, *fit, *_certificate(state), *_language(), "--out", folder]
     words += [f"--{name}" for name in ("allow-unverified", "allow-misfit") if request.form.get(name)]
     kind = (CONTROLLERS[control].sample_setting or "style_from").replace("_", "-")
     words += [f"--active={path}" for path in _uploaded(runner.project, folder, "active")]
@@ -1018,11 +1057,24 @@ def view_page(number: int, step: int, name: str) -> Response:
         abort(404, "There is no such page.")
     text = path.read_text(encoding="utf-8")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
-    policy += "; sandbox allow-scripts"  # of no origin: a page in a project of somebody else reaches none of ours
+    # of no origin: a page in a project of somebody else reaches none of ours; to print is modal
+    policy += "; sandbox allow-scripts allow-modals"
     hashes = re.findall(r"'sha256-[A-Za-z0-9+/=]{44}'", Markup(text[:3000]).unescape().partition("</head>")[0])
     response = Response(text, mimetype="text/html")
     scripts = f"; script-src {' '.join(hashes)}" if hashes else ""
     response.headers["Content-Security-Policy"] = f"{policy}; frame-ancestors 'none'{scripts}"
+    return response
+
+
+@pages.get(f"/projects/<{_NUMBER}:number>/steps/<{_NUMBER}:step>/print/<path:name>")
+def printed_page(number: int, step: int, name: str) -> Response:
+    """Send a page that a command wrote as PDF."""
+    project, found = _step(number, step)
+    path = project.pages_of(found).get(name)
+    if path is None:
+        abort(404, "There is no such page.")
+    response = Response(pdf_of(path), mimetype="application/pdf")
+    response.headers["Content-Disposition"] = f'attachment; filename="{path.stem}.pdf"'
     return response
 
 

@@ -131,6 +131,15 @@ CORRECT_FIELDS = ("tolerance-um", "shortest-mm", "decimals", "only")
 PROGRAM_FIELDS = ("dialect", "wcs", "gauge", "keep-unknown", "tables", *CORRECT_FIELDS)
 #: Numbers known without a file.
 NUMBERS = ("squareness", "backlash", "scale")
+#: What the form for the report asks, with section and key of ``certificate.toml``.
+CERTIFICATE_FIELDS = {
+    "customer": ("customer", "name"), "customer_city": ("customer", "city"), "order": ("certificate", "order"),
+    "number": ("certificate", "number"), "laboratory": ("laboratory", "name"), "laboratory_city": ("laboratory", "city"),
+    "manufacturer": ("machine", "manufacturer"), "model": ("machine", "model"), "serial": ("machine", "serial_number"),
+    "place": ("certificate", "place"), "person": ("person", "name"),
+}  # fmt: skip
+#: Further fields of that form: instruments, a line for each with name; serial number; certificate, and conditions.
+CERTIFICATE_LISTS = ("instruments", "air_low", "air_high", "machine_low", "machine_high")
 _OUT: dict[str, Check | None] = {"out": inside}
 _PAGES: dict[str, Check | None] = {**_OUT, "language": language}
 _READINGS: dict[str, Check | None] = {**dict.fromkeys(NUMBERS, typed), "instrument": inside}
@@ -147,11 +156,11 @@ COMMANDS: Mapping[str, Syntax] = {
     "import": Syntax((inside,), {**_OUT, **dict.fromkeys(ANSWERS, typed), "machine": machine_word, "json": None}),
     "accuracy": Syntax((machine_word, inside), _PAGES),
     "identify": Syntax((machine_word, inside), {**_OUT, **_READINGS}, several=True),
-    "report": Syntax((inside,), {"language": language, "dcc": inside}),
+    "report": Syntax((inside,), {"language": language, "dcc": inside, "certificate": inside}),
     "diagnose": Syntax((machine_word, inside), {**_PAGES, "instrument": inside}, several=True),
     "options": Syntax((machine_word, inside), _PAGES),
     "run": Syntax((machine_word, inside), {
-        **_PAGES, **_READINGS, **_FIT, "controller": name, "allow-unverified": None, "allow-misfit": None,
+        **_PAGES, **_READINGS, **_FIT, "controller": name, "certificate": inside, "allow-unverified": None, "allow-misfit": None,
         **dict.fromkeys(("active", "style-from", "template-from"), inside)}, several=True),
     "verify": Syntax((machine_word, inside), {**_OUT, "controller": name, "errors": inside}, several=True),
     "part": Syntax((machine_word, inside), {**_PROGRAM, "tables": inside, "controller": name}),
@@ -325,6 +334,7 @@ KINDS: Mapping[str, Kind] = {
     "identify": Kind(("identify", "report")),
     "diagnose": Kind(("diagnose",)),
     "options": Kind(("options",)),
+    "certificate": Kind(("report",), {"certificate": inside, "stated": named((*CERTIFICATE_FIELDS, *CERTIFICATE_LISTS), text)}),
     "run": Kind(("run",), {"control": name}, {"fit": named(FIT_FIELDS, line)}),
     "verify": Kind(("verify",), {"control": name}),
     "program": Kind((), {"program": inside, "typed": named(PROGRAM_FIELDS, line)},

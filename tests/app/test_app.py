@@ -640,3 +640,24 @@ def test_a_plan_says_what_a_ballbar_will_determine_and_what_to_add(site):
     assert re.search(r'<th scope="row">EXX</th><td class="n">[\d.]+</td><td>µm</td>', site.get("/projects/1/plan").text)
     site.do("machine/text", {"text": (site.project.folder / state.machine).read_text() + "# again\n"})
     assert site.get("/projects/1/plan").text.count("changed after this plan") == 3
+
+
+def test_customer_machine_and_instruments_reach_the_report_and_later_ones(site, tmp_path):
+    head = "Kunde: <b>Muster</b>\nNr. 12345\nAchse: X\n\nPosition [mm];Abweichung [um]\n"
+    rows = "".join(f"{50 * k};{0.5 * k}\n" for k in range(8))
+    site.do("machine/describe", MILL)
+    assert "there is no report yet" in site.post("/projects/1/certificate", {"order": "A-7"}).text
+    (tmp_path / "axis-x.csv").write_text(head + rows)
+    site.do("measurement/add", upload(tmp_path / "axis-x.csv"))
+    site.do("identify")
+    instruments = "XL-80; 99AZ12; D-1\nLevel; L7"
+    state = site.do("certificate", {"order": "A-7", "serial": '4"711', "instruments": instruments})
+    page = site.project.files_of(state.last("identify"))["report.html"].read_text("utf-8")
+    for text in ("A-7", "4&#34;711", "99AZ12", "D-1", "L7", "Nr. 12345", "&lt;b&gt;Muster"):
+        assert text in page, text
+    shown = site.get("/projects/1/result").text
+    assert 'value="A-7"' in shown
+    assert "XL-80; 99AZ12; D-1" in shown
+    again = site.do("identify").last("identify")  # the next report has it without being asked
+    assert "A-7" in site.project.files_of(again)["report.html"].read_text("utf-8")
+    assert "no temperature" in site.post("/projects/1/certificate", {"air_low": "warm"}).text
