@@ -298,7 +298,8 @@ def correct_command(
         files = [path for path in (errors, reversal, *active) if path is not None]
         fixed = [repr((name, str(given[name]))) for name in sorted(given.keys() - _OF_THE_WATCH)]
         fixed += [program_version(), sha256_of_file(machine.source) if machine.source else repr(machine)]
-        return _watch(watching, out, _CurrentErrors(model, correct, files, given.get("tools"), fixed), as_json)
+        read = [path for path in (given["tools"],) if path is not None]
+        return _watch(watching, out, _CurrentErrors(model, correct, files, read, given["subprograms"], fixed), as_json)
     known = model()
     return _say_correction(correct(known, program, out), known.model, out, as_json)
 
@@ -356,7 +357,8 @@ _OF_THE_WATCH = {"watch", "once", "match", "settle_s", "subfolders", "out", "pro
 class _CurrentErrors:
     """Corrects with the errors that the files state now: they are read again when one of them has changed.
 
-    ``tools`` is read for every program; ``fixed`` are conditions that do not change while this command runs.
+    ``also`` (tools) and the files in ``folders`` are read for every program; ``fixed`` are conditions that do not change while
+    this command runs.
     """
 
     def __init__(
@@ -364,10 +366,12 @@ class _CurrentErrors:
         read: Callable[[], _Known],
         correct: Callable[[_Known, Path, Path], ProgramCorrection],
         files: list[Path],
-        tools: Path | None,
+        also: list[Path],
+        folders: Sequence[Path],
         fixed: list[str],
     ) -> None:
-        self.read, self.apply, self.files, self.tools, self.fixed = read, correct, files, tools, fixed
+        self.read, self.apply, self.files, self.fixed = read, correct, files, fixed
+        self.also, self.folders = also, folders
         self.digests = self._digests()
         self.known: _Known | None = read()
 
@@ -377,8 +381,12 @@ class _CurrentErrors:
     def conditions(self) -> str:
         """Return a digest of all that decides a correction beside the program."""
         try:
-            found = [*self._digests(), *([sha256_of_file(self.tools)] if self.tools else [])]
-        except InputError as error:  # each program is refused for it, and tried again when the file is back
+            found = [*self._digests(), *map(sha256_of_file, self.also)]
+            for folder in self.folders:
+                found += [
+                    f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in sorted(folder.iterdir())
+                ]
+        except (InputError, OSError) as error:  # each program is refused for it, and tried again when the file is back
             found = [str(error)]
         return sha256_of("\n".join([*self.fixed, *found]).encode())
 

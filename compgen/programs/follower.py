@@ -1403,6 +1403,8 @@ class Agreement:
             self._blocks: Iterator[tuple[str, Sequence[int]]] = iter(
                 [(found.content.decode("latin-1"), found.line.tolist())]
             )
+        elif reader.linked is not None:
+            self._blocks = iter([(reader.linked.text(), reader.linked.main_lines)])
         else:
             self._blocks = executed(source, dialect, skip_deleted=reader.setup.skip_deleted)
         self._ahead = Moves.of_rows([])

@@ -22,7 +22,7 @@ import numpy as np
 
 from compgen.errors import InputError, visible_line
 from compgen.programs.dialects import VALUE
-from compgen.programs.subprograms import WrittenOut
+from compgen.programs.subprograms import DEEPEST, Linked, WrittenOut, file_of
 
 #: Numbers that are calculated here have so many decimals; the writer gives them those of the dialect.
 CALCULATED = 8
@@ -78,7 +78,7 @@ _REFUSED = (
     ),
     (
         r"CALL\s*(?:PGM|LBL|SELECTED)|SEL\b|CYCL\s*DEF\s*12\b",
-        "calls another program; post one program without calls of files",
+        "calls another program: give its folder with --subprograms (CALL PGM), or post one program without calls of files",
     ),
     (r"CYCL\s*CALL\s*P|PATTERN|LP|CTP?|RND|CHF", "is not followed where it stands; post lines and arcs"),
     (
@@ -313,12 +313,120 @@ def _statements(lines: list[str]) -> Iterator[_Statement]:
         yield found
 
 
-def lowered(source: Path, *, skip_deleted: bool = False) -> WrittenOut | None:
-    """Return a program with what the module's text names written as plain moves; None if there is nothing of it."""
-    content = source.read_bytes()
+def lowered(source: Path, program: Linked | None, *, skip_deleted: bool = False) -> WrittenOut | None:
+    """Return a program with what the module's text names written as plain moves; None if there is nothing of it.
+
+    ``program`` is what :func:`linked` has found.
+    """
+    content = source.read_bytes() if program is None else b"".join(program.lines)
     if not _NEEDED.search(content):
         return None
-    return _Program(source, content.decode("latin-1").splitlines(keepends=True), skip_deleted).written()
+    lines = content.decode("latin-1").splitlines(keepends=True)
+    numbers = list(range(1, len(lines) + 1))
+    program = program or Linked([], [(source, k) for k in numbers], numbers)
+    return _Program(program, lines, skip_deleted).written()
+
+
+_PGM = re.compile(r"(\s*\d*\s*)CALL\s+PGM\s+(\"[^\"]+\"|\S+)\s*(;.*)?$", re.IGNORECASE | re.DOTALL)
+_ANY_LABEL = re.compile(r"((?:CALL\s*)?LBL\s*)(\"[^\"]+\"|\d+)", re.IGNORECASE)
+
+
+def linked(source: Path, folders: Collection[Path]) -> Linked | None:
+    """Put the programs that are called (CALL PGM) behind M30 of a program, with labels of their own; None without calls."""
+    lines = source.read_bytes().decode("latin-1").splitlines(keepends=True) if folders else []
+    if not any(map(_PGM.match, lines)):
+        return None
+    found = Linked([], [(source, k + 1) for k in range(len(lines))], list(range(1, len(lines) + 1)))
+    _Linker(found, list(folders), lines).link()
+    found.lines = [line.encode("latin-1") for line in lines]
+    return found
+
+
+@dataclass
+class _Linker:
+    """What is put behind a program: lines of the programs that are called, each as a label by the name of its file."""
+
+    program: Linked
+    folders: list[Path]
+    lines: list[str]
+    known: dict[Path, str] = field(default_factory=dict)
+    behind: list[tuple[str, tuple[Path, int], int]] = field(default_factory=list)
+
+    def link(self) -> None:
+        """Change calls to those of labels, and put the programs before END PGM."""
+        lines, places = self.lines, self.program.places
+        end = next(
+            (k for k, line in enumerate(lines) if re.match(r"\s*\d*\s*END\s+PGM", line, re.IGNORECASE)), len(lines)
+        )
+        unit = self._unit(lines)
+        for k in range(end):
+            lines[k] = self._called(lines[k], places[k], k + 1, unit, 1)
+        if not self.behind:
+            return
+        if not any(_Program.ends(line.partition(";")[0]) for line in lines[:end]):
+            what = "calls a program and has no M30 before END PGM; post it with M30"
+            raise InputError(what, file=places[0][0], line=min(end + 1, len(lines)))
+        lines[end:end] = [text for text, _, _ in self.behind]
+        places[end:end] = [place for _, place, _ in self.behind]
+        self.program.main_lines[end:end] = [main for _, _, main in self.behind]
+
+    @staticmethod
+    def _unit(lines: list[str]) -> str:
+        first = next((line for line in lines if re.match(r"\s*\d*\s*BEGIN\s+PGM", line, re.IGNORECASE)), "")
+        return "INCH" if first.rstrip().upper().endswith("INCH") else "MM"
+
+    def _called(self, line: str, place: tuple[Path, int], main: int, unit: str, depth: int) -> str:
+        call = _PGM.match(line)
+        if call is None:
+            return line
+        if depth > DEEPEST:
+            raise InputError(f"calls are deeper than {DEEPEST}, or call themselves", file=place[0], line=place[1])
+        name = re.split(r"[/\\:]", call[2].strip('"'))[-1]
+        stem = re.escape(re.sub(r"\.H$", "", name, flags=re.IGNORECASE))
+        path = file_of(rf"{stem}\.h", self.folders, name, place)
+        if path is None:
+            return line
+        if path not in self.known:
+            self.known[path] = f'"PGM {path.name}"'
+            self._put(path, main, unit, depth)
+        rest = line[len(line.rstrip("\r\n")) :]
+        return f"{call[1]}CALL LBL {self.known[path]}{' ' + call[3].rstrip() if call[3] else ''}{rest}"
+
+    def _put(self, path: Path, main: int, unit: str, depth: int) -> None:
+        lines = path.read_bytes().decode("latin-1").splitlines(keepends=True)
+        if self._unit(lines) != unit:
+            raise InputError(
+                f"is in {self._unit(lines)}, and the program that calls it in {unit}; post both alike", file=path
+            )
+        own = [f"LBL {self.known[path]}\n"]
+        where = [(path, 1)]
+        ended = False
+        for k, line in enumerate(lines, 1):
+            code = line.partition(";")[0]
+            ended = ended or re.match(r"\s*\d*\s*END\s+PGM", code, re.IGNORECASE) is not None
+            if _Program.ends(code):
+                raise InputError(
+                    "ends the program by M2 or M30, and is called by another; post it without", file=path, line=k
+                )
+            if re.match(r"\s*\d*\s*(?:BEGIN|END)\s+PGM", code, re.IGNORECASE):
+                continue
+            line = self._called(line, (path, k), main, unit, depth + 1)
+            if not re.search(r'LBL\s*"PGM ', line):
+                line = _ANY_LABEL.sub(lambda one: self._label(one, path), line.partition(";")[0]) + line[len(code) :]
+            own.append(re.sub(r"^(\s*)\d+\s+", r"\1", line))
+            where.append((path, k))
+        if not ended:
+            raise InputError("has no END PGM: it may have been cut; give all of it", file=path, line=max(len(lines), 1))
+        own.append("LBL 0\n")
+        where.append((path, len(lines)))
+        self.behind += [
+            (text if text.endswith("\n") else f"{text}\n", at, main) for text, at in zip(own, where, strict=True)
+        ]
+
+    @staticmethod
+    def _label(found: re.Match[str], path: Path) -> str:
+        label = found[2].strip('"')
+        return found[0] if re.fullmatch("0+", label) else f'{found[1]}"{label} {path.name}"'
 
 
 def holes_of_circle(q: dict[str, float]) -> list[complex]:
@@ -360,7 +468,7 @@ class _Element:
 class _Program:
     """Executes a program statement by statement; places are in its own coordinates and unit."""
 
-    source: Path
+    program: Linked
     lines: list[str]
     skip_deleted: bool
     out: list[tuple[str, int]] = field(default_factory=list)
@@ -411,21 +519,26 @@ class _Program:
                     k = stack.pop()
             else:
                 self._execute(item)
-                if self._ends(item.code) and self.calls:
+                if self.ends(item.code) and self.calls:
                     for rest in every[k:]:
                         self._keep(rest) if not rest.code or self._closes(rest.code) else self._comment(rest)
                     break
         if self.corner:
-            raise InputError("a rounding or chamfer without a move after it", file=self.source, line=self.corner[2] + 1)
-        text = "".join(text for text, _ in self.out)
-        return WrittenOut(text.encode("latin-1"), np.array([line + 1 for _, line in self.out]), tuple(self.called))
+            path, line = self.program.places[self.corner[2]]
+            raise InputError("a rounding or chamfer without a move after it", file=path, line=line)
+        text, main_lines = "".join(text for text, _ in self.out), self.program.main_lines
+        lines = np.array([main_lines[line] for _, line in self.out])
+        places = [self.program.places[line] for _, line in self.out]
+        return WrittenOut(text.encode("latin-1"), lines, tuple(self.called), places)
 
     def _fail(self, item: _Statement, message: str) -> NoReturn:
         text = visible_line(item.lines[0].strip())[:60]
-        raise InputError(f"{message} (block: {text})", file=self.source, line=item.first + 1)
+        path, line = self.program.places[item.first]
+        raise InputError(f"{message} (block: {text})", file=path, line=line)
 
     @staticmethod
-    def _ends(code: str) -> bool:
+    def ends(code: str) -> bool:
+        """Whether a block ends the program."""
         return re.search(r"(?<![A-Z])M0*(?:2|30)(?!\d)", code, re.IGNORECASE) is not None
 
     @staticmethod

@@ -37,7 +37,7 @@ from compgen.programs.runs import (
     carried,
     centres_and_sweeps,
 )
-from compgen.programs.subprograms import Pointed, WrittenOut, written_out
+from compgen.programs.subprograms import Linked, Pointed, WrittenOut, written_out
 
 MM_PER_INCH = 25.4
 #: Bytes that are read at a time, and the fewest blocks in a row that are read together.
@@ -183,6 +183,8 @@ class Reader:
         self.line_in_file: IntArray | None = None
         #: The program with its calls written out, if it has any.
         self.written_out: WrittenOut | None = None
+        #: A program of Klartext with the programs that it calls behind it.
+        self.linked: Linked | None = None
         self._integers: tuple[Pointed, str] | None = None
         self._rows: list[tuple[float, ...]] = []
 
@@ -202,9 +204,10 @@ class Reader:
                 path, names, skip_deleted=setup.skip_deleted, folders=setup.subprograms
             )
         if self.dialect.klartext:
-            found = klartext.lowered(path, skip_deleted=self.setup.skip_deleted)
+            self.linked = klartext.linked(path, self.setup.subprograms)
+            found = klartext.lowered(path, self.linked, skip_deleted=self.setup.skip_deleted)
             if found is not None and not found.called:
-                self.line_in_file = found.line
+                self.line_in_file, self.written_out = found.line, found
                 return BytesIO(found.content)
         if found is None:
             return self._pointed(path.open("rb"))
@@ -850,6 +853,7 @@ class Reader:
         if name:
             self._fail(
                 f"{name[1]} is not known in the dialect {dialect.name}, and may call a program or move; post the moves themselves"
+                + (", or give the folder of its file with --subprograms" if dialect.name == "siemens" else "")
             )
         self._fail(f"{rest[:20]!r} cannot be read; expected words such as X10.5")
 

@@ -226,3 +226,64 @@ def test_what_is_not_known_of_siemens_is_refused_where_it_is(tmp_path, blocks, l
             model_of(mill(), shift(x=10.0), None), program, tmp_path / "out", CorrectOptions("siemens"), at(tmp_path)
         )
     assert (caught.value.file.name, caught.value.line) == (file, line)
+
+
+KLARTEXT = {
+    "plain": ("CALL PGM STEP\nCALL PGM TNC:\\NC\\step.h ; again", [[0, 3, 0], [0, 6, 0]]),
+    "parameters": ('Q5=+4\nCALL PGM "DEEP.H"\nL X+Q6', [[4, 0, 0], [4, 3, 0], [7, 3, 0]]),
+    "labels": ("CALL PGM REPS\nLBL 1\nL IX+1\nCALL LBL 1 REP 1", [[0, 2, 0], [0, 4, 0], [0, 6, 0], [1, 6, 0], [2, 6, 0]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", KLARTEXT)
+def test_klartext_by_hand(tmp_path, case):
+    """Labels belong to their program, Q parameters to all."""
+    (tmp_path / "STEP.H").write_text("0 BEGIN PGM STEP MM\n1 L IY+3 F100\n2 END PGM STEP MM\n")
+    (tmp_path / "deep.h").write_text(
+        "0 BEGIN PGM DEEP MM\n1 L X+Q5 F100\n2 CALL PGM STEP\n3 Q6=+7\n4 END PGM DEEP MM\n"
+    )
+    (tmp_path / "reps.h").write_text(
+        "0 BEGIN PGM REPS MM\n1 LBL 1\n2 L IY+2 F9\n3 CALL LBL 1 REP 2\n4 END PGM REPS MM\n"
+    )
+    program = tmp_path / "p.h"
+    blocks, expected = KLARTEXT[case]
+    program.write_text(f"0 BEGIN PGM P MM\n1 TOOL CALL 1 Z S9\nL X+0 Y+0 Z+0 R0 FMAX\n{blocks}\nM30\nEND PGM P MM\n")
+    setup = at(tmp_path, tools_mm={"1": (0.0, 0.0, 0.0)})
+    assert np.allclose(ends(program, "heidenhain-klartext", setup)[1:], expected, atol=1e-6)
+    result = correct_program(
+        model_of(mill(), shift(x=10.0), None), program, tmp_path / "out", CorrectOptions("heidenhain-klartext"), setup
+    )
+    assert result.accepted
+    assert not re.search(r"^\d* ?CALL", (tmp_path / "out/p.h").read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "line", "file", "words"),
+    [
+        ("CALL PGM NONE", 4, "p.h", "--subprograms"),
+        ("CALL PGM ENDS", 2, "ends.h", "M2 or M30"),
+        ("CALL PGM INCH", None, "inch.h", "post both alike"),
+        ("CALL PGM CUT", 2, "cut.h", "cut"),
+        ("CALL PGM BAD", 3, "bad.h", "APPR"),
+        ("CALL PGM SELF", 2, "self.h", "deeper|depth|themselves"),
+    ],
+)
+def test_what_is_not_known_of_klartext_is_refused_where_it_is(tmp_path, blocks, line, file, words):
+    for name, text in {
+        "ends.h": "BEGIN PGM E MM\nM30\nEND PGM E MM\n", "inch.h": "BEGIN PGM E INCH\nEND PGM E INCH\n",
+        "cut.h": "BEGIN PGM E MM\nL X+1 F9\n", "bad.h": "BEGIN PGM E MM\nL X+1 F9\nAPPR LT X+5\nEND PGM E MM\n",
+        "self.h": "BEGIN PGM E MM\nCALL PGM SELF\nEND PGM E MM\n",
+    }.items():  # fmt: skip
+        (tmp_path / name).write_text(text)
+    program = tmp_path / "p.h"
+    program.write_text(f"0 BEGIN PGM P MM\n1 TOOL CALL 1 Z S9\nL X+0 Y+0 Z+0 R0 FMAX\n{blocks}\nM30\nEND PGM P MM\n")
+    setup = at(tmp_path, tools_mm={"1": (0.0, 0.0, 0.0)})
+    with pytest.raises(InputError, match=words) as caught:
+        correct_program(
+            model_of(mill(), shift(x=10.0), None),
+            program,
+            tmp_path / "out",
+            CorrectOptions("heidenhain-klartext"),
+            setup,
+        )
+    assert (caught.value.file.name, caught.value.line) == (file, line)

@@ -346,10 +346,17 @@ def test_a_restart_says_what_is_unchanged_and_ends_as_before(call, posted, tmp_p
     errors = tmp_path / "e.errors.csv"
     errors.write_text(ERRORS.read_text())
     unchanged = []
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib/O7.nc").write_text("O7")
+    called = ("--subprograms", tmp_path / "lib")
     for more in ((), ("--tolerance-um", "2"), ("--errors", errors), ("--errors", errors), ("--wcs", "G55=0,0,0")):
         found = json.loads(call(*words(posted, "--once", "--json", *more))[1])
         unchanged.append(found["programs"][0]["unchanged"])
     assert unchanged == [True, False, False, True, False]
+    for text in ("O7", "O7 (changed)"):
+        (tmp_path / "lib/O7.nc").write_text(text)
+        found = [json.loads(call(*words(posted, "--once", "--json", *called))[1])["programs"][0] for _ in range(2)]
+        assert [item["unchanged"] for item in found] == [False, True]
     call(*words(posted, "--once", "--errors", errors))
     errors.write_text(errors.read_text() + "\n")
     found = json.loads(call(*words(posted, "--once", "--json", "--errors", errors))[1])
