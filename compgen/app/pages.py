@@ -74,7 +74,7 @@ from compgen.controls import CONTROLLERS
 from compgen.data.charts import LABEL
 from compgen.data.files import json_text, read_text, working_folder, write_file
 from compgen.data.language import texts_of
-from compgen.data.machine import load_machine, machine_files
+from compgen.data.machine import INTEGERS, load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.new_machine import chains_of, in_words
 from compgen.data.prior import class_named
@@ -887,7 +887,8 @@ def use_program(runner: Runner, state: ProjectState) -> None:
     step, project, machine = _identified(state), runner.project, _machine_of(state)
     setup = _program_setup(project, state)
     typed, name = setup["typed"], Path(setup["program"]).name
-    words = [f"--{option}={typed[option]}" for option in ("dialect", "gauge", "keep-unknown") if typed[option]]
+    taken = ("dialect", "gauge", "keep-unknown", "integers", "increment-mm")
+    words = [f"--{option}={typed[option]}" for option in taken if typed[option]]
     words += [f"--wcs={text.strip()}" for text in typed["wcs"].split(";") if text.strip()]
     words += [f"--tools={setup['tools']}"] * bool(setup["tools"]) + ["--block-delete"] * setup["block-delete"]
     reversal, errors = f"{step.folder}/identified.reversal.csv", f"{step.folder}/identified.errors.csv"
@@ -919,6 +920,8 @@ def _program_setup(project: Project, state: ProjectState) -> dict[str, Any]:
     typed = {name: _field(name) for name in PROGRAM_FIELDS}
     if typed["dialect"] not in DIALECTS:
         raise InputError("choose the dialect of the program")
+    if typed["integers"] not in ("", *INTEGERS):
+        raise InputError("choose what a number without a decimal point is")
     if typed["tables"] and typed["tables"] not in [str(step.number) for step in state.steps if step.kind == "run"]:
         raise InputError("these tables are not in the project any more")
     setup = {"program": known.get("program", ""), "tools": known.get("tools", ""), "typed": typed}

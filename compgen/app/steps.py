@@ -128,7 +128,7 @@ def _option_names(kind: type) -> list[str]:
 ANSWERS, FIT_FIELDS = tuple(_option_names(ImportOptions)), tuple(_option_names(FitOptions))
 #: What one types for an NC program, and which of it only its correction takes: options of ``volcomp correct``.
 CORRECT_FIELDS = ("tolerance-um", "shortest-mm", "decimals", "only")
-PROGRAM_FIELDS = ("dialect", "wcs", "gauge", "keep-unknown", "tables", *CORRECT_FIELDS)
+PROGRAM_FIELDS = ("dialect", "wcs", "gauge", "keep-unknown", "integers", "increment-mm", "tables", *CORRECT_FIELDS)
 #: Numbers known without a file.
 NUMBERS = ("squareness", "backlash", "scale")
 #: What the form for the report asks, with section and key of ``certificate.toml``.
@@ -145,7 +145,8 @@ _PAGES: dict[str, Check | None] = {**_OUT, "language": language}
 _READINGS: dict[str, Check | None] = {**dict.fromkeys(NUMBERS, typed), "instrument": inside}
 _FIT: dict[str, Check | None] = {**dict.fromkeys(FIT_FIELDS, typed), "robust": None}
 _PROGRAM: dict[str, Check | None] = {
-    **_PAGES, **dict.fromkeys(("gauge", "keep-unknown", "wcs"), typed), **dict.fromkeys(("errors", "reversal", "tools"), inside),
+    **_PAGES, **dict.fromkeys(("gauge", "keep-unknown", "wcs", "increment-mm"), typed), "integers": name,
+    **dict.fromkeys(("errors", "reversal", "tools"), inside),
     "dialect": name, "block-delete": None,
 }  # fmt: skip
 COMMANDS: Mapping[str, Syntax] = {

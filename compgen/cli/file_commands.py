@@ -17,7 +17,7 @@ from compgen import effects
 from compgen.cli.common import json_option, print_json
 from compgen.cli.shared_options import check_settings
 from compgen.cli.terminal import answer, complain, say
-from compgen.controls import CONTROLLERS, controller_named
+from compgen.controls import CONTROLLERS, controller_named, program_instead
 from compgen.data import toml_files
 from compgen.data.csv_files import whole_number
 from compgen.data.files import OutputFolder, name_problem
@@ -297,8 +297,7 @@ def init_command(
         raise InputError(f"{name!r} {problem}", field="NAME")
     if target.exists() and not force:
         raise InputError("exists; --force overwrites it", file=target)
-    for control in controls:
-        controller_named(control)
+    _refuse_unknown(controls)
     understood, assumed = _chain(chain, asks)
     ranges = {letter: _travel(letter, travel, asks) for letter in AXES}
     counts = _nodes(nodes, ranges)
@@ -306,7 +305,10 @@ def init_command(
         text = click.prompt(
             f"Controls ({', '.join(sorted(CONTROLLERS))}; several with commas)", default="none", err=True
         )
-        controls = () if text == "none" else tuple(controller_named(item.strip()).name for item in text.split(","))
+        controls = () if text == "none" else tuple(item.strip() for item in text.split(","))
+        _refuse_unknown(controls)
+    instead = [said for control in controls if (said := program_instead(control))]
+    controls = tuple(control for control in controls if program_instead(control) is None)
     if asks and class_name is None:
         listed = ", ".join(CLASS_WORDS.values())
         class_name = click.prompt(f"What kind of machine is it ({listed})", default=CLASS_WORDS[USUAL_CLASS], err=True)
@@ -324,8 +326,15 @@ def init_command(
     summary = {"file": str(target), "name": name, "chain": understood.name, "meaning": meaning, "questions": questions}
     for question in questions:
         complain(f"question: {question}")
-    answer(as_json, summary, f"{target}: {understood.name}: {meaning}", f"volcomp check {target} checks it")
+    summary["programs"] = instead
+    answer(as_json, summary, f"{target}: {understood.name}: {meaning}", f"volcomp check {target} checks it", *instead)
     return 0
+
+
+def _refuse_unknown(controls: Sequence[str]) -> None:
+    for control in controls:
+        if program_instead(control) is None:
+            controller_named(control)
 
 
 def _asked(question: str, option: str, asks: bool) -> str:

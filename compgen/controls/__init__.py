@@ -96,10 +96,27 @@ NOT_PUBLIC = {
 }
 
 
+#: Controls that have no compensation tables, with the dialect of their programs: the program itself is corrected.
+WITHOUT_TABLES = {"grbl": "grbl", "grblhal": "grbl", "fluidnc": "grbl"}
+
+
+def program_instead(name: str) -> str | None:
+    """Return what corrects a control that has no compensation tables; None for any other name."""
+    dialect = WITHOUT_TABLES.get(name.strip().lower())
+    if dialect is None or name in CONTROLLERS:
+        return None
+    return (
+        f"{name} has no compensation tables: correct its NC programs, "
+        f"volcomp correct MACHINE PROGRAM --errors ERRORS --dialect {dialect} --wcs G54=X,Y,Z --out DIR"
+    )
+
+
 def controller_named(name: str) -> type[AnyController]:
     """Return the class of the control ``name``, to be called with a machine; InputError with suggestions if unknown."""
     if name in NOT_PUBLIC and name not in CONTROLLERS:
         raise InputError(f"there is no controller {name!r}: {NOT_PUBLIC[name]}")
+    if instead := program_instead(name):
+        raise InputError(instead)
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 

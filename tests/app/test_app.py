@@ -515,11 +515,29 @@ def test_an_nc_program_is_predicted_and_corrected_for_a_scale_error(site):
     assert page.count("were changed after this") == page.count('class="card top')
 
 
+def test_numbers_without_a_decimal_point_are_what_the_page_says(site):
+    """X300 is 300 mm or 0.3 mm, and X is 100 um/m too long; without a choice the page shows both readings."""
+    site.do("machine/describe", MILL)
+    site.do("numbers", {"scale-X": "100"})
+    site.do("identify")
+    text = PROGRAM.replace("X400. Y50.", "X300")
+    sent = {**TYPED, "program": (io.BytesIO(text.encode()), "part.nc"), "what": "correct"}
+    site.post("/projects/1/program/use", sent)
+    assert "X300 has no decimal point" in site.get("/projects/1/program").text
+    for choice, expected in (("mm", 300 / 1.0001), ("increments", 0.3 / 1.0001)):
+        more = {"integers": choice, "increment-mm": "0.001" if choice == "increments" else "", "what": "correct"}
+        step = site.do("program/use", {**TYPED, **more}).last("correct")
+        found = site.project.files_of(step)["part.nc"].read_text()
+        assert re.search(rf"^G1 X{round(expected, 3):g}", found, flags=re.MULTILINE), choice
+    assert '<option value="increments" selected>' in site.get("/projects/1/program").text
+    assert site.post("/projects/1/program/use", {**TYPED, "integers": "inch", "what": "part"}).status_code == 409
+
+
 def test_a_program_that_cannot_be_followed_is_refused_with_its_line_and_its_set_up_is_kept(site):
     site.do("machine/describe", MILL)
     site.do("numbers", {"scale-X": "100"})
     site.do("identify")
-    program = PROGRAM.replace("G1 X100. F500", "#1=4")
+    program = PROGRAM.replace("G1 X100. F500", "#1=#5021")
     site.post(
         "/projects/1/program/use", {**TYPED, "program": (io.BytesIO(program.encode()), "bad.nc"), "what": "correct"}
     )

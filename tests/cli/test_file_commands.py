@@ -502,3 +502,26 @@ def test_the_help_of_run_groups_its_options_and_names_every_kind_of_file(call):
         assert f"*.{kind}.csv" in text
     other = text.partition("\nOther options:")[2]
     assert other.count("  --") <= 4  # new options belong to a group
+
+
+@pytest.mark.parametrize("control", ["grbl", "grblHAL", "FluidNC"])
+def test_a_control_without_tables_leads_to_the_correction_of_programs(call, tmp_path, control):
+    """The machine file is written, without a section of the control; other commands say what to use instead."""
+    mill = (
+        "--chain",
+        "WXYFZT",
+        "--travel",
+        "X=0..600",
+        "--travel",
+        "Y=0..400",
+        "--travel",
+        "Z=0..500",
+        "--out",
+        tmp_path,
+    )
+    code, out, error = call("init", "my-mill", *mill, "--control", control)
+    assert (code, f"{control} has no compensation tables" in out) == (0, True)
+    assert "volcomp correct MACHINE PROGRAM --errors ERRORS --dialect grbl" in " ".join(out.split())
+    assert "[controllers" not in (tmp_path / "my-mill.toml").read_text()
+    code, _, error = call("controllers", control)
+    assert (code, "volcomp correct" in " ".join(error.split())) == (2, True)
