@@ -7,6 +7,7 @@ in um and urad (``*.errors.csv``). :class:`ReversalCurves` adds the difference b
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,7 +22,16 @@ from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
 from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
 from compgen.data.files import read_text
-from compgen.data.names import AXES, CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.names import (
+    AXES,
+    CURVE_NAMES,
+    ERROR_INDEX,
+    ERROR_NAMES,
+    LARGEST,
+    MM_PER_UM,
+    SQUARENESS_NAMES,
+    error_named,
+)
 from compgen.data.records import axes_of, within
 from compgen.errors import CompgenWarning, InputError, nearest, repeated
 
@@ -258,6 +268,41 @@ ARMS = {"EC0Y": ("EYX", "EXY"), "EB0Z": ("EZX", "EXZ"), "EA0Z": ("EZY", "EYZ")}
 
 #: Slope and standard uncertainty of the lines of straightness curves, rad.
 Lines = Mapping[str, tuple[float, float]]
+
+
+#: Comment of a table: lengths, mm, of the arms of the squares that its squareness errors were read from.
+SPANS_KEY = "squareness_span_mm"
+
+
+def format_spans(spans_mm: Mapping[str, tuple[float, float]]) -> str:
+    """Return the comment :data:`SPANS_KEY`.
+
+    >>> format_spans({"EC0Y": (300.0, 200.0)})
+    'EC0Y 300 200'
+    """
+    return "; ".join(f"{name} {first:g} {second:g}" for name, (first, second) in spans_mm.items())
+
+
+def square_spans_mm(table: ErrorTable) -> dict[str, tuple[float, float]]:
+    """Return the lengths of the two arms, in the order of :data:`ARMS`, of each square that a table was read from.
+
+    Raises
+    ------
+    InputError
+        for a comment that is not understood.
+    """
+    found = {}
+    for entry in filter(None, (part.strip() for part in table.metadata.get(SPANS_KEY, "").split(";"))):
+        match = re.fullmatch(r"(E[ABC]0[YZ])\s+([0-9.]{1,12})\s+([0-9.]{1,12})", entry)
+        try:
+            spans = (float(match[2]), float(match[3])) if match and match[1] in ARMS else None
+        except ValueError:
+            spans = None
+        if match is None or spans is None or not 0 < min(spans) <= max(spans) < LARGEST:
+            text = f"{entry[:60]!r} is not a squareness error and the lengths of two arms in mm, such as EC0Y 300 300"
+            raise InputError(text, field=SPANS_KEY)
+        found[match[1]] = spans
+    return found
 
 
 def is_apart(table: ErrorTable) -> bool:

@@ -51,7 +51,7 @@ from compgen.foreign.laser_files import Capture
 from compgen.identify import Identification
 from compgen.identify.axis_tests import positioning_errors
 from compgen.identify.identification import metadata_of, without_adjustment
-from compgen.identify.stated import factor_of_numbers, is_stated
+from compgen.identify.stated import factor_of_numbers, is_stated, over_travel
 from compgen.instruments.sixdof_instrument import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns | Artefact | Circles
@@ -258,6 +258,7 @@ def given_errors(machine: Machine, table: ErrorTable, *, whole: bool = True) -> 
     InputError
         for errors that do not match the machine's travel or chain.
     """
+    table = over_travel(machine, table)
     model = bool(table.squareness) and not is_apart(table)
     own, lines = about_own_lines(table)
     own = table if model else own

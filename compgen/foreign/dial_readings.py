@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ARMS, Curve, ErrorTable, marked_apart
+from compgen.data.error_table import ARMS, SPANS_KEY, Curve, ErrorTable, format_spans, marked_apart
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
 from compgen.foreign.answers import ImportOptions
@@ -245,6 +245,7 @@ def _squares(
     notes.append(about_u)
     understood: dict[str, object] = {}
     squareness: dict[str, tuple[float, float]] = {}
+    spans_mm: dict[str, tuple[float, float]] = {}
     used: set[str] = set()
     for name, (first, second) in ARMS.items():
         if first not in arms or second not in arms:
@@ -253,10 +254,9 @@ def _squares(
         squareness[name] = value, u
         used |= {first, second}
         notes.append(text)
-        spans = [f"{np.ptp(arms[error].position_mm):g}" for error in (first, second)]
-        understood[name] = (
-            f"{1e6 * value:.4g} urad, u {1e6 * u:.3g} urad, over {' and '.join(spans)} mm ({first}, {second})"
-        )
+        spans_mm[name] = (float(np.ptp(arms[first].position_mm)), float(np.ptp(arms[second].position_mm)))
+        spans = " and ".join(f"{span:g}" for span in spans_mm[name])
+        understood[name] = f"{1e6 * value:.4g} urad, u {1e6 * u:.3g} urad, over {spans} mm ({first}, {second})"
     curves = {}
     for error, arm in arms.items():
         if error in used:
@@ -278,7 +278,10 @@ def _squares(
         )  # fmt: skip
         notes.append(f"{error}: {reversal}; the slope is how it lay")
         understood[error] = f"{len(order)} positions, up to {np.abs(curves[error].value).max() / MM_PER_UM:.4g} um"
-    table = marked_apart(ErrorTable(curves, squareness, {"source": grid.path.name, "instrument": "dial gauge"}))
+    metadata = {"source": grid.path.name, "instrument": "dial gauge"}
+    if spans_mm:
+        metadata[SPANS_KEY] = format_spans(spans_mm)
+    table = marked_apart(ErrorTable(curves, squareness, metadata))
     return Imported(grid.path, form, "errors", table, understood, (), tuple(dict.fromkeys(notes)))
 
 
@@ -357,7 +360,7 @@ def _u_stated(said: Mapping[str, str], units: Mapping[str, float], usual: str) -
             continue
         found = _U_STATED.match(unaccented(text))
         unit = known_unit(found[2]) if found and found[2] else usual
-        if found is None or unit not in units or _number(found[1]) == 0.0:
+        if found is None or unit is None or unit not in units or _number(found[1]) == 0.0:
             raise InputError(
                 f"{shown(text)} is not the uncertainty of a reading, such as 0.5 {usual} or 1 {usual} (k = 2)",
                 field=key,

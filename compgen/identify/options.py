@@ -12,10 +12,18 @@ import numpy as np
 
 from compgen.data.arguments import of_kind, text_of
 from compgen.data.csv_files import FloatArray, read_csv
-from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.error_table import ARMS, SPANS_KEY, Curve, ErrorTable, ReversalCurves, format_spans
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
-from compgen.data.machine import Machine
-from compgen.data.names import AXES, LARGEST, MM_PER_UM, RAD_PER_URAD, SMALLEST, SQUARENESS_NAMES
+from compgen.data.machine import MM_PER_UNIT, Machine
+from compgen.data.names import (
+    AXES,
+    LARGEST,
+    MM_PER_UM,
+    RAD_PER_URAD,
+    SMALLEST,
+    SQUARENESS_NAMES,
+    error_named,
+)
 from compgen.data.toml_files import flag, not_negative, option
 from compgen.errors import InputError, nearest
 from compgen.identify.adjust.propagation import SystematicInputs
@@ -366,6 +374,7 @@ _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 _STATED = re.compile(
     rf"({_NUMBER})(?:\s*/\s*({_NUMBER}))?(?:\s*(?:±|\+-|\+/-)\s*({_NUMBER}))?\s*([a-zA-Zµ\"]+(?:/[a-z]+)?)?"
 )
+_SPAN = re.compile(r"(\d{1,6}(?:\.\d{1,6})?)(?:\s?[x×]\s?(\d{1,6}(?:\.\d{1,6})?))?\s?(mm|in|\")?")
 #: What each squareness error is, and what a positive one looks like.
 SQUARENESS = {
     "EC0Y": ("Y to X", "the angle between +X and +Y is larger than 90 degrees"),
@@ -401,9 +410,10 @@ class StatedNumbers:
     squareness: Mapping[str, str] = option(
         None,
         "Squareness error, urad unless another unit follows (um/m, mm/m, arcsec, or a ratio such as 0.02/300), with its "
-        "standard uncertainty: EC0Y=25±3. Positive: EC0Y and EA0Z, angle above 90 degrees between +X and +Y, +Y and +Z; "
+        "standard uncertainty: EC0Y=25±3. @ and the length of the arms of the square, mm, where they are shorter than the "
+        "travel: EC0Y=25±3@300, or 25±3@300x200. Positive: EC0Y and EA0Z, angle above 90 degrees between +X and +Y, +Y and +Z; "
         "EB0Z, angle below 90 degrees between +X and +Z. May be given several times.",
-        metavar="NAME=VALUE[±U][UNIT]",
+        metavar="NAME=VALUE[±U][UNIT][@SPAN]",
         factory=dict,
     )
     backlash: Mapping[str, str] = option(
@@ -438,7 +448,43 @@ class StatedNumbers:
             reference = machine.reference_point_mm[axis]
             at = np.unique([*machine.axes[axis].range_mm, reference])
             curves[f"E{letter}{letter}"] = Curve(at, value * (at - reference), np.abs(u * (at - reference)))
-        return ErrorTable(curves, squareness, {"machine": machine.name, "source": STATED_SOURCE})
+        metadata = {"machine": machine.name, "source": STATED_SOURCE}
+        if spans := self.spans_mm(machine):
+            metadata[SPANS_KEY] = format_spans(spans)
+        return ErrorTable(curves, squareness, metadata)
+
+    def spans_mm(self, machine: Machine) -> dict[str, tuple[float, float]]:
+        """Return the lengths of the arms of the squares that the squareness errors were read from, where they are given.
+
+        Raises
+        ------
+        InputError
+            for lengths that are not understood, or longer than the travel of both axes.
+        """
+        found = {}
+        for name, text in self.squareness.items():
+            _, mark, span = text.partition("@")
+            if not mark:
+                continue
+            match = _SPAN.fullmatch(span.strip())
+            scale = MM_PER_UNIT["inch"] if match and match[3] in ("in", '"') else 1.0
+            arms = tuple(float(match[k] or match[1]) * scale for k in (1, 2)) if match else (0.0, 0.0)
+            if not min(arms) > 0.0:
+                raise InputError(
+                    f"{text!r} for {name}: {span.strip()!r} is no length of arms; give it in mm, such as 25±3@300, or that of "
+                    "both arms, 25±3@300x200",
+                    field="--squareness",
+                )
+            axes = [machine.axes[error_named(curve).axis] for curve in ARMS[name]]
+            if all(arm > axis.length_mm + 1.0 for arm, axis in zip(arms, axes, strict=True)):
+                travels = " and ".join(f"{axis.length_mm:g}" for axis in axes)
+                raise InputError(
+                    f"{text!r} for {name}: the arms are longer than the travel of both axes ({travels} mm); give the length over "
+                    "which the square was read, mm",
+                    field="--squareness",
+                )
+            found[name] = (arms[0], arms[1])
+        return found
 
     def squarenesses(self) -> dict[str, tuple[float, float]]:
         """Return squareness errors with their standard uncertainty, rad; InputError for what is not understood."""
@@ -455,7 +501,7 @@ class StatedNumbers:
                 what = f"{name!r} is not a squareness error; {'this may be' if key in _ABOUT else 'these are'} {'; '.join(shown)}"
                 what += " (drawings: docs/instruments.md)"
                 raise InputError(what, field="--squareness")
-            found[name] = _value(text, ANGLES, "--squareness", name)
+            found[name] = _value(text.partition("@")[0], ANGLES, "--squareness", name)
         return found
 
     def scales(self) -> dict[str, tuple[float, float]]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import ARMS, Curve, ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.prior import DETERMINED, PriorSettings
@@ -66,6 +66,8 @@ WORSE_CURVE, WORSE_ALL = 2.2, 1.5
 FLAT = 10.0
 #: Factor by which the sizes of a class grow until the machine is no longer worse than it.
 RAISE = 3.0
+#: Places of a square over which its mean is taken, where nobody said where it stood.
+_PLACES = 100
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,37 @@ def processes_of(machine: Machine, prior: PriorSettings, names: Sequence[str]) -
         zero = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
         found[name] = Process(name, prior.size(name), prior.scale(name), axis.length_mm, tuple(zero))
     return found
+
+
+def square_sd(machine: Machine, name: str, spans_mm: tuple[float, float]) -> float:
+    """Standard deviation, rad, of what a square of the given arms reads beside the squareness ``name`` of the whole travel.
+
+    The arms are shorter than the travel and stand anywhere: bent guides tilt them, and angles that change along an arm act with
+    the distance from the reference lines. The mean over places of the prior variance; arms longer than the travel end with it.
+    """
+    if machine.prior.is_none:
+        return 0.0
+    pair = [error_named(curve) for curve in ARMS[name]]
+    axes = [error.axis for error in pair]
+    lower, upper = machine.lower_mm, machine.upper_mm
+    span = np.minimum(spans_mm, (upper - lower)[axes])
+    highest = upper.copy()
+    highest[axes] -= span
+    points = np.repeat(np.random.default_rng(0).uniform(lower, highest, (_PLACES, 3))[:, None], 3, axis=1)
+    weight = np.zeros(
+        (3, 3)
+    )  # of the corner and the two ends by component: the sum of both slopes, a turn of the whole is out
+    for k, error in enumerate(pair):
+        points[:, k + 1, error.axis] += span[k]
+        weight[[0, k + 1], error.direction] += np.array([-1.0, 1.0]) / span[k]
+    matrix = c_matrix(machine, points.reshape(-1, 3)).reshape(_PLACES, 3, 3, -1)
+    shown = np.einsum("po,lpon->nlp", weight, matrix)
+    variance = 0.0
+    for curve, process in processes_of(machine, machine.prior, ERROR_NAMES).items():
+        at, own = points[:, :, error_named(curve).axis], shown[ERROR_INDEX[curve]]
+        covariance = process.covariance(at.ravel(), at.ravel()).reshape(_PLACES, 3, _PLACES, 3)
+        variance += float(np.einsum("lp,lplq,lq->", own, covariance, own)) / _PLACES
+    return float(np.sqrt(max(variance, 0.0)))
 
 
 # --- the state ------------------------------------------------------------------------------------------------------

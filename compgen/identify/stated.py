@@ -16,7 +16,7 @@ from compgen.data.axis_runs import AxisRuns
 from compgen.data.circles import Circles
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import SPANS_KEY, Curve, ErrorTable, square_spans_mm
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.effects.active import added, effects_reversal
@@ -27,6 +27,7 @@ from compgen.identify.any_measurement import Measurement, MixedMeasurement
 from compgen.identify.axis_tests import SAME_TARGET_MM, identify_circles, two_way_mean, u_scale_of
 from compgen.identify.identification import Identification
 from compgen.identify.options import STATED_SOURCE, StatedNumbers
+from compgen.identify.posterior import square_sd
 
 #: Standard uncertainty of a typed number that states none, and of a measured one where nothing was repeated: that of a
 #: granite square or a dial gauge, um and urad (um/m).
@@ -49,6 +50,29 @@ def without_stated(measurement: Measurement | ErrorTable) -> Measurement | Error
         return None if is_stated(measurement) else measurement
     parts = tuple((name, part) for name, part in measurement.parts if not is_stated(part))
     return parts[0][1] if len(parts) == 1 else MixedMeasurement(parts)
+
+
+def over_travel(machine: Machine, errors: ErrorTable) -> ErrorTable:
+    """Return errors whose squareness is that of the whole travel, where it was read from squares with shorter arms.
+
+    What the guides do within and beside the arms adds to the uncertainty (:func:`compgen.identify.posterior.square_sd`). A
+    reading without an uncertainty has that of a granite square.
+
+    Raises
+    ------
+    InputError
+        for arms that the errors state and nobody understands.
+    """
+    spans = square_spans_mm(errors)
+    if not spans:
+        return errors
+    squareness = dict(errors.squareness)
+    for name in spans.keys() & squareness.keys():
+        value, u = squareness[name]
+        own = ASSUMED_URAD * RAD_PER_URAD if np.isnan(u) else u
+        squareness[name] = value, float(np.hypot(own, square_sd(machine, name, spans[name])))
+    kept = {key: text for key, text in errors.metadata.items() if key != SPANS_KEY}
+    return errors.replace(squareness=squareness, metadata=kept)
 
 
 def given_numbers(result: Identification) -> bool:
@@ -114,7 +138,9 @@ def check_errors(numbers: StatedNumbers, measured: Identification, u_scale: floa
 
     ``u_scale`` is the uncertainty of the scale of the instrument where there is no prior, which contains it otherwise.
     """
-    for name, typed in numbers.squarenesses().items():
+    typed_errors = numbers.errors(measured.layout.machine)
+    typed_squareness = {} if typed_errors is None else over_travel(measured.layout.machine, typed_errors).squareness
+    for name, typed in typed_squareness.items():
         if name in measured.errors.squareness:
             _compare("--squareness", name, typed, _squareness(measured, name))
     for letter, typed in numbers.scales().items():

@@ -6,16 +6,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.axis_runs import AxisRuns, format_axis_runs
 from compgen.data.circles import PLANES, Circles
-from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
+from compgen.data.error_table import ARMS as CURVES_OF_ARMS
+from compgen.data.error_table import (
+    Curve,
+    ErrorTable,
+    ReversalCurves,
+    format_errors,
+    read_errors,
+    square_spans_mm,
+)
+from compgen.data.names import ERROR_NAMES, error_named
 from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning, InputError
+from compgen.foreign.converted import given_errors
 from compgen.identify import joint_covariance
 from compgen.identify.any_measurement import MixedMeasurement
 from compgen.identify.options import StatedNumbers
+from compgen.identify.posterior import processes_of
 from compgen.pipeline import identified_reversal, identify_beside
 from machines import machine_of
 
@@ -295,3 +307,95 @@ def test_both_commands_refuse_a_contradiction_and_leave_nothing(tmp_path, small_
             assert run_command(cli, [*words, *wrong.split()]) == 2
             assert "contradicts" in capsys.readouterr().err
             assert not (tmp_path / "o").exists()
+
+
+# --- a square that is shorter than the travel -----------------------------------------------------------------------
+
+
+SQUARES = [("EC0Y", "25±3@300"), ("EC0Y", "25±3@300x200"), ("EB0Z", "25±3 um/m @ 300 mm"), ("EA0Z", "25±3@12in")]
+
+
+@pytest.mark.parametrize(("name", "text"), SQUARES)
+def test_what_the_guides_do_along_the_arms_of_a_square_is_in_its_uncertainty(name, text):
+    machine = mill()
+    errors = StatedNumbers(squareness={name: text}).errors(machine)
+    value, u = given_errors(machine, errors).errors.squareness[name]
+    assert value == pytest.approx(25e-6)
+    first, second = square_spans_mm(errors)[name]
+    assert u == pytest.approx(np.hypot(3e-6, scatter_of_squares(machine, name, (first, second))), rel=0.2)
+
+
+def scatter_of_squares(machine, name, spans_mm, machines=120):
+    """Rms of what squares read beside the squareness, rad: exact readings of machines drawn from the prior, at any place."""
+    rng = np.random.default_rng(3)
+    pair = [error_named(curve) for curve in CURVES_OF_ARMS[name]]
+    span = [min(one, machine.axes[error.axis].length_mm) for one, error in zip(spans_mm, pair, strict=True)]
+    drawn = {}
+    for curve, process in processes_of(machine, machine.prior, ERROR_NAMES).items():
+        at = np.linspace(*machine.axes[error_named(curve).axis].range_mm, 31)
+        root = np.linalg.cholesky(process.covariance(at, at) + 1e-18 * np.eye(31))
+        drawn[curve] = at, root @ rng.normal(size=(31, machines))
+    read = []
+    for k in range(machines):
+        table = ErrorTable({curve: Curve(at, value[:, k], np.zeros(31)) for curve, (at, value) in drawn.items()})
+        corner = rng.uniform(machine.lower_mm, machine.upper_mm)
+        for error, length in zip(pair, span, strict=True):
+            low, high = machine.axes[error.axis].range_mm
+            corner[error.axis] = rng.uniform(low, high - length)
+        points = np.tile(corner, (3, 1))
+        for n, (error, length) in enumerate(zip(pair, span, strict=True), start=1):
+            points[n, error.axis] += length
+        tip = compgen.predict(machine, table, compgen.Points(points), exact=True)
+        read.append(
+            sum(
+                (tip[n, error.direction] - tip[0, error.direction]) / length
+                for n, (error, length) in enumerate(zip(pair, span, strict=True), start=1)
+            )
+        )
+    return float(np.sqrt(np.mean(np.square(read))))
+
+
+def test_a_short_square_that_differs_from_the_whole_travel_is_no_contradiction():
+    machine, measured = mill(), circle(square=SQUARE_URAD)
+    for text, refused in (("70±3", True), ("70±3@120", False)):
+        numbers = StatedNumbers(squareness={"EC0Y": text})
+        both = MixedMeasurement((("circle", measured), ("numbers", numbers.errors(machine))))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CompgenWarning)
+            if refused:
+                with pytest.raises(InputError, match="contradicts"):
+                    identify_beside(machine, both, numbers)
+            else:
+                value, u = identify_beside(machine, both, numbers).errors.squareness["EC0Y"]
+                assert 1e6 * u > 3.0 and 1e6 * value < 70.0
+
+
+@pytest.mark.parametrize(
+    "text", ["25@", "25@0", "25@-300", "25@nan", "25@300x", "25@1e3", "25@300 um", "25@9000", "@300", "25@300@200"]
+)
+def test_a_length_of_arms_that_is_not_understood_is_refused(text):
+    with pytest.raises(InputError, match="EC0Y"):
+        StatedNumbers(squareness={"EC0Y": text}).errors(mill())
+
+
+def test_only_squareness_is_read_from_a_square():
+    with pytest.raises(InputError, match="not understood"):
+        StatedNumbers(scale={"X": "25@300"}).errors(mill())
+    with pytest.raises(InputError, match="not understood"):
+        StatedNumbers(backlash={"X": "6@300"}).reversal()
+
+
+def test_without_a_prior_a_square_says_what_it_states():
+    machine = mill(NONE)
+    errors = StatedNumbers(squareness={"EC0Y": "25±3@300"}).errors(machine)
+    assert given_errors(machine, errors).errors.squareness["EC0Y"] == pytest.approx((25e-6, 3e-6))
+
+
+def test_the_arms_of_an_imported_square_stay_with_its_errors_file(tmp_path):
+    errors = StatedNumbers(squareness={"EC0Y": "25±3@300"}).errors(mill())
+    path = tmp_path / "square.errors.csv"
+    path.write_text(format_errors(errors), encoding="utf-8")
+    assert given_errors(mill(), read_errors(path)).errors.squareness["EC0Y"][1] > 10e-6
+    path.write_text(path.read_text(encoding="utf-8").replace("EC0Y 300 300", "EC0Y long"), encoding="utf-8")
+    with pytest.raises(InputError, match="lengths of two arms"):
+        given_errors(mill(), read_errors(path))
