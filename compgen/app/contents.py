@@ -28,7 +28,7 @@ from compgen.data.deviations import Artefact, Deviations
 from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_text
-from compgen.data.machine import CHAINS, Chain, machine_files, read_machine
+from compgen.data.machine import CHAINS, ROTARY, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
 from compgen.data.new_machine import in_words
 from compgen.data.prior import CLASS_WORDS
@@ -395,26 +395,50 @@ def _arrow(x: float, y: float, axis: int) -> str:
     return f'<path class="arrow" d="M{x - dx:.1f} {y - dy:.1f}L{x + dx:.1f} {y + dy:.1f}"/>{letter}'
 
 
+#: Half the axes of the ellipse of a turn about X, Y, Z in the view, units of the picture.
+_TURNS = ((7.0, 14.0), (15.0, 14.0), (20.0, 8.0))
+
+
+def _turn(x: float, y: float, letter: str) -> str:
+    """An arrow around a rotary axis, with its letter."""
+    rx, ry = _TURNS[ROTARY.index(letter)]
+    arc = f"M{x - 0.94 * rx:.1f} {y + 0.34 * ry:.1f}A{rx} {ry} 0 1 1 {x + 0.94 * rx:.1f} {y + 0.34 * ry:.1f}"
+    return f'<path class="arrow" d="{arc}"/><text x="{x + rx + 5:.1f}" y="{y + 5:.1f}">{letter}</text>'
+
+
+def _along(chain: Chain) -> tuple[list[str], list[str]]:
+    """Axes that carry the tool, and axes that carry the workpiece, each from the foundation outwards."""
+    tool = [letter for letter, tool_side in reversed(chain.passed) if tool_side]
+    return tool, [letter for letter, tool_side in chain.passed if not tool_side]
+
+
 def chain_picture(chain: Chain) -> Markup:
     """Draw which body carries which: the table side in front, the tool side on the column, an arrow for each axis."""
     bodies, arrows = [_box((0, 0, 0), (270, 130, 16), "bed"), _box((110, 96, 16), (56, 30, 172), "bed")], []
+    on_tool, on_table = _along(chain)
     x, y, z, w, h = 104.0, 96.0, 112.0, 68.0, 60.0
-    for row, axis in enumerate(chain.tool_side):  # each shows its top right edge beside the next, where its line begins
-        y -= 22.0
-        bodies.append(_box((x, y, z), (w, 22, h), f"axis{axis}"))
-        (px, py), (ax, ay) = _view(x + w, y + 14.0, z + h - 4.0), (326.0, 46.0 + 62.0 * row)
-        end = ax - _ARROWS[axis][0] - 7.0
-        arrows.append(f'<path class="leader" d="M{px:.1f} {py:.1f}L{end:.1f} {ay:.1f}"/>{_arrow(ax, ay, axis)}')
+    deep, apart = (22.0, 62.0) if len(on_tool) < 4 else (80.0 / len(on_tool), 212.0 / len(on_tool))
+    for row, letter in enumerate(on_tool):  # each shows its top right edge beside the next, where its line begins
+        y -= deep
+        axis = (*AXES, *ROTARY).index(letter)
+        bodies.append(_box((x, y, z), (w, deep, h), f"axis{axis}"))
+        (px, py), (ax, ay) = _view(x + w, y + 0.64 * deep, z + h - 4.0), (326.0, 46.0 + apart * row)
+        end = ax - (_ARROWS[axis][0] if axis < 3 else _TURNS[axis - 3][0]) - 7.0
+        arrow = _arrow(ax, ay, axis) if axis < 3 else _turn(ax, ay, letter)
+        arrows.append(f'<path class="leader" d="M{px:.1f} {py:.1f}L{end:.1f} {ay:.1f}"/>{arrow}')
         x, w, h = x + 6.0, w - 12.0, h - 8.0
     px, py = _view(x + 0.5 * w, y, z)
     bodies.append(f'<path class="tool" d="M{px - 6:.1f} {py:.1f}v14h12v-14zM{px - 2:.1f} {py + 14:.1f}v18h4v-18z"/>')
     left, front, z, width, depth = 24.0, 6.0, 16.0, 216.0, 66.0
-    for axis in chain.workpiece_side:
-        height = 30.0 if axis == 2 else 17.0
+    inset, low = (14.0, 17.0) if len(on_table) < 4 else (9.0, 16.0)
+    for letter in on_table:
+        axis = (*AXES, *ROTARY).index(letter)
+        height = (30.0 if len(on_table) < 4 else 24.0) if axis in (2, 3, 4) else low
         bodies.append(_box((left, front, z), (width, depth, height), f"axis{axis}"))
         px, py = _view(left, front, z + 0.5 * height)
-        arrows.append(_arrow(px + (44.0, width - 20.0, 0.62 * width)[axis], py, axis))
-        left, front, width, depth, z = left + 14.0, front + 5.0, width - 28.0, depth - 10.0, z + height
+        right = px + (44.0, width - 20.0, 0.62 * width, 20.0, 0.42 * width, 0.7 * width)[axis]
+        arrows.append(_arrow(right, py, axis) if axis < 3 else _turn(right, py, letter))
+        left, front, width, depth, z = left + inset, front + 5.0, width - 2.0 * inset, depth - 10.0, z + height
     bodies.append(_box((left + 0.5 * width - 24.0, front + 6.0, z), (48, max(18.0, depth - 14.0), 16), "work"))
     title = f"{chain.name}: {in_words(chain)}"
     marker = (
@@ -695,7 +719,7 @@ def machine_page(project: Project, state: ProjectState) -> dict[str, Any]:
     controls = [name for name in parsed.get("controllers", {}) if name in CONTROLLERS]
     return {
         "machine": machine, "text": text, "parsed": parsed,
-        "chain": Chain(chain) if chain in CHAINS else None, "in_words": in_words, "picture": chain_picture,
+        "chain": Chain(chain) if chain and not problem else None, "in_words": in_words, "picture": chain_picture,
         "shipped": sorted(machine_files(())), "example": Chain("WXYFZT"), "chains": [Chain(name) for name in CHAINS],
         "cards": [load_format(name) for name in sorted(CONTROLLERS)], "classes": CLASS_WORDS,
         "controls": [(load_format(name), settings_of(text, name), open_points(name))

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from compgen import effects
 from compgen.cli.common import json_option, print_json
@@ -22,17 +23,20 @@ from compgen.data import toml_files
 from compgen.data.csv_files import whole_number
 from compgen.data.files import OutputFolder, name_problem
 from compgen.data.machine import (
+    ROTARY,
     Chain,
     Emphasis,
     Interval,
     Machine,
+    RotaryAxis,
+    Vector3,
     load_machine,
     machine_files,
     machine_of,
     parse_machine,
 )
 from compgen.data.names import AXES
-from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.data.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.data.prior import CLASS_WORDS, USUAL_CLASS, class_named
 from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
@@ -241,7 +245,15 @@ def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:
     "--travel",
     multiple=True,
     metavar="AXIS=LOW..HIGH",
-    help="Travel of an axis in mm, e.g. X=-800..0, or in another unit, X=0..24in; once for each of X, Y, Z.",
+    help="Travel of an axis in mm, e.g. X=-800..0, or in another unit, X=0..24in; once for each of X, Y, Z. Of a rotary axis "
+    "in degrees, A=-110..30, or C=endless.",
+)
+@click.option(
+    "--point",
+    "points",
+    multiple=True,
+    metavar="AXIS=X,Y,Z",
+    help="A point of the line of a rotary axis with all axes at zero, mm, e.g. A=0,0,-50.",
 )
 @click.option(
     "--nodes",
@@ -272,6 +284,7 @@ def init_command(
     name: str | None,
     chain: str | None,
     travel: tuple[str, ...],
+    points: tuple[str, ...],
     nodes: tuple[str, ...],
     controls: tuple[str, ...],
     out: Path,
@@ -287,6 +300,8 @@ def init_command(
     \b
     Example:
       volcomp init my-mill --chain WXYFZT --travel X=0..600 --travel Y=0..400 --travel Z=0..500
+      volcomp init five --chain "trunnion in A and C, table in Y, head in X and Z" --travel X=-400..400 --travel Y=-300..300
+        --travel Z=-300..400 --travel A=-110..30 --travel C=endless --point A=0,0,-50 --point C=0,0,0
     """
     asks = sys.stdin.isatty() and not as_json
     name = name or _asked("Name of the machine", "NAME", asks)
@@ -298,9 +313,14 @@ def init_command(
     if target.exists() and not force:
         raise InputError("exists; --force overwrites it", file=target)
     _refuse_unknown(controls)
-    understood, assumed = _chain(chain, asks)
+    understood, assumed, words = _chain(chain, asks)
+    travel = tuple(part for text in travel for part in text.split(","))
+    turning = [part for part in travel if part.strip()[:1].upper() in understood.rotary]
+    travel = tuple(part for part in travel if part not in turning)
     ranges = {letter: _travel(letter, travel, asks) for letter in AXES}
-    counts = _nodes(nodes, ranges)
+    counts = _nodes(nodes, ranges, understood)
+    rotary, open_points = _rotary(understood, words, turning, points, counts, asks)
+    assumed += open_points
     if asks and not controls:
         text = click.prompt(
             f"Controls ({', '.join(sorted(CONTROLLERS))}; several with commas)", default="none", err=True
@@ -314,10 +334,10 @@ def init_command(
         class_name = click.prompt(f"What kind of machine is it ({listed})", default=CLASS_WORDS[USUAL_CLASS], err=True)
     class_name = None if class_name is None else class_named(class_name)
     # a control with mandatory settings is read only once they are stated
-    plain = machine_text(name, understood, ranges, counts)
+    plain = machine_text(name, understood, ranges, counts, rotary=rotary)
     machine = parse_machine(plain, target)
     sections = [_control_section(machine, control) for control in dict.fromkeys(controls)]
-    written = machine_text(name, understood, ranges, counts, sections, class_name)
+    written = machine_text(name, understood, ranges, counts, sections, class_name, rotary)
     found = parse_machine(written, target)
     output = OutputFolder(out)
     output.add(target.name, written)
@@ -345,8 +365,8 @@ def _asked(question: str, option: str, asks: bool) -> str:
     return str(click.prompt(question, err=True)).strip()
 
 
-def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
-    """The chain, and what was assumed about it."""
+def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str], str]:
+    """The chain, what was assumed about it, and the words."""
     words = words or _asked('What moves what (e.g. "table moves in X and Y, head in Z")', "--chain", asks)
     fits = chains_of(words)
     if not fits:
@@ -358,14 +378,91 @@ def _chain(words: str | None, asks: bool) -> tuple[Chain, list[str]]:
         for number, text in enumerate(listed, start=1):
             click.echo(f"  {number}  {text}", err=True)
         chosen = click.prompt("Which of them", type=click.IntRange(1, len(fits)), default=1, err=True)
-        return fits[chosen - 1], []
+        return fits[chosen - 1], [], words
     sides = {frozenset(item.tool_side) for item in fits}
     if len(sides) > 1:
         raise InputError(
             f"{words!r} can mean {len(fits)} machines; give one of the codes: {'. '.join(listed)}", field="--chain"
         )
     others = ", or ".join(listed[1:])
-    return fits[0], [f"{words!r} is taken as {listed[0]}. Is it {others}? If so, give that code"] if others else []
+    asked = [f"{words!r} is taken as {listed[0]}. Is it {others}? If so, give that code"] if others else []
+    unnamed = [letter for letter in fits[0].name[1:-1] if letter != "F" and letter not in words.upper()]
+    if unnamed and not asked:
+        asked = [f"{words!r} is taken as {listed[0]}. If it is another machine, name all its axes"]
+    return fits[0], asked, words
+
+
+def _rotary(
+    chain: Chain, words: str, travel: Sequence[str], points: Sequence[str], counts: Mapping[str, int], asks: bool
+) -> tuple[dict[str, RotaryAxis], list[str]]:
+    """The rotary axes of the chain, and questions about what was not stated."""
+    given = {"--travel": _by_letter(travel, chain, "--travel"), "--point": _by_letter(points, chain, "--point")}
+    directions, found, questions = rotary_directions(words, chain), {}, []
+    for letter in chain.rotary:
+        x, y, z = (float(other == letter) for other in ROTARY)
+        direction = directions.get(letter, (x, y, z))
+        if letter in directions:
+            questions.append(f"[axes.{letter}] direction: {list(direction)} is assumed of a nutating axis; is it that?")
+        text = given["--travel"].get(letter) or (
+            click.prompt(f"Travel of {letter} in degrees, e.g. -110..30, or endless", err=True) if asks else None
+        )
+        if text is None:
+            text = "endless" if letter == "C" and (letter, False) in chain.passed else "-90..90"
+            questions.append(
+                f"[axes.{letter}]: a travel {text} degrees is assumed; give it: --travel {letter}=-110..30"
+            )
+        place = given["--point"].get(letter) or (
+            click.prompt(f"A point of the line of {letter}, all axes at zero, mm", default="0,0,0", err=True)
+            if asks
+            else None
+        )
+        if place is None:
+            place = "0,0,0"
+            questions.append(
+                f"[axes.{letter}] point_mm: [0, 0, 0] is assumed; where is its axis line with all axes at zero? "
+                f"--point {letter}=0,0,-50"
+            )
+        found[letter] = _rotary_axis(letter, direction, text, place, counts[letter])
+    return found, questions
+
+
+def _rotary_axis(letter: str, direction: Vector3, travel: str, point: str, nodes: int) -> RotaryAxis:
+    """One rotary axis from ``-110..30`` or ``endless`` and ``0,0,-50``."""
+    try:
+        x, y, z = (float(part) for part in point.split(","))
+        place = toml_files.vector3([x, y, z])
+    except ValueError:
+        raise InputError(
+            f"{letter}={point!r} is not of the form AXIS=X,Y,Z in mm, e.g. A=0,0,-50", field="--point"
+        ) from None
+    if travel.strip().lower() in ("endless", "endlos", "modulo", "360"):
+        return RotaryAxis(direction, place, np.linspace(0.0, 360.0, nodes), modulo_deg=360.0)
+    ends = re.fullmatch(r"\s*([-+]?[\d.]+)\s*(?:\.\.+|:|\bto\b|\bbis\b)\s*([-+]?[\d.]+?)\s*(?:deg|\u00b0)?\s*", travel)
+    try:
+        low, high = toml_files.interval([float(part) for part in ends.groups()] if ends else [])
+    except ValueError as error:
+        raise InputError(
+            f"{letter}={travel!r} is not of the form AXIS=LOW..HIGH in degrees, e.g. A=-110..30, or C=endless; {error}",
+            field="--travel",
+        ) from None
+    return RotaryAxis(direction, place, np.linspace(low, high, nodes), range_deg=(low, high))
+
+
+def _by_letter(given: Sequence[str], chain: Chain, option: str) -> dict[str, str]:
+    """Texts of an option by rotary axis."""
+    found: dict[str, str] = {}
+    for text in given:
+        letter, _, value = text.strip().partition("=")
+        letter = letter.strip().upper()
+        if letter not in chain.rotary:
+            known = ", ".join(chain.rotary) or "none"
+            raise InputError(
+                f"{text!r}: the chain {chain.name} has no rotary axis {letter[:10]} (it has {known})", field=option
+            )
+        if letter in found:
+            raise InputError(f"{letter} is given twice; give it once", field=option)
+        found[letter] = value
+    return found
 
 
 def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
@@ -429,14 +526,14 @@ def _ends_mm(text: str) -> tuple[float, float]:
     return (ends[0], ends[1]) if len(ends) == 2 else (min(0.0, ends[0]), max(0.0, ends[0]))
 
 
-def _nodes(given: Sequence[str], ranges: Mapping[str, Interval]) -> dict[str, int]:
-    """The number of nodes of each axis, from ``11`` or ``X=11``."""
-    found = {letter: usual_nodes(ends) for letter, ends in ranges.items()}
+def _nodes(given: Sequence[str], ranges: Mapping[str, Interval], chain: Chain) -> dict[str, int]:
+    """The number of nodes of each axis, from ``11`` or ``X=11``; of a rotary axis 13 if nothing says otherwise."""
+    found = {letter: usual_nodes(ends) for letter, ends in ranges.items()} | dict.fromkeys(chain.rotary, 13)
     for part in given:
         letters, equals, number = part.rpartition("=")
         chosen = letters.strip().upper() if equals else AXES
         count = whole_number(number.strip())
-        if count is None or not 2 <= count <= 10001 or any(item not in AXES for item in chosen):
+        if count is None or not 2 <= count <= 10001 or any(item not in found for item in chosen):
             raise InputError(f"{part!r} is not of the form [AXIS=]N with N from 2 to 10001, e.g. X=11", field="--nodes")
         found |= dict.fromkeys(chosen, count)
     return found

@@ -255,6 +255,10 @@ def _name(value: Any) -> str:
 
 #: Rotary axes about X, Y, Z (ISO 841).
 ROTARY = ("A", "B", "C")
+#: Angle between an axis and the direction of its letter beyond which it is asked whether that is meant.
+MOST_NUTATING_DEG = 60.0
+#: Cosine beyond which a direction counts as opposite to that of its letter: no smallest rotation leads there.
+OPPOSITE = 1.0 - 1e-6
 _CHAIN_PATTERN = r"^W(?!.*([A-CFXYZ]).*\1)(?=.*F)(?=.*X)(?=.*Y)(?=.*Z)[A-CFXYZ]+T$"
 
 
@@ -272,6 +276,16 @@ class ProgramNumbers:
         None,
         meaning="least input increment of the control, mm: 0.001 (0.0001 inch, 0.001 deg); needed for increments",
     )
+
+
+def _chain_fault(name: object) -> str:
+    """What is wrong with the letters of a chain, after a semicolon; empty if only their order is."""
+    letters = name[:40] if isinstance(name, str) else ""
+    twice = sorted({letter for letter in letters if letters.count(letter) > 1})
+    unknown = sorted(set(letters) - {"W", "F", "T", *AXES, *ROTARY})
+    if unknown:
+        return f"; {', '.join(unknown)} is no axis"
+    return f"; {', '.join(twice)} appears twice" if twice else ""
 
 
 @toml_files.accepts({"type": "string", "pattern": _CHAIN_PATTERN, "examples": ["WFYXZT", "WCAYFXZT"]})
@@ -299,7 +313,7 @@ class Chain:
         if not isinstance(self.name, str) or not re.fullmatch(_CHAIN_PATTERN, self.name):
             raise InputError(
                 f"chain {self.name!r} is not valid; expected W, then X, Y, Z and F once each, then T, e.g. the name "
-                "'WFYXZT'; rotary axes A, B, C at most once each between them, e.g. 'WCAYFXZT'"
+                f"'WFYXZT'; rotary axes A, B, C at most once each between them, e.g. 'WCAYFXZT'{_chain_fault(self.name)}"
             )
         left, _, right = self.linear[1:-1].partition("F")
         object.__setattr__(self, "workpiece_side", tuple(AXES.index(axis) for axis in reversed(left)))
@@ -390,7 +404,64 @@ class Axis(Displayed):
         return Overview(f"{self.range_mm[0]:g} to {self.range_mm[1]:g} mm, {len(self.nodes_mm)} nodes")
 
 
-_angle = toml_files.bounded("an angle from -36000 to 36000 degrees", minimum=-36000.0, maximum=36000.0)
+_MOST_DEG = 36000.0
+_angle = toml_files.bounded("an angle from -36000 to 36000 degrees", minimum=-_MOST_DEG, maximum=_MOST_DEG)
+#: How far the length of a stated direction may be from 1, by rounding.
+_UNIT = 2e-3
+#: Ends of a travel within two turns in radians, which no axis has in degrees unless they are whole or half ones.
+_TURN_RAD = 2.0 * np.pi
+
+
+def _few_digits(angle_deg: float) -> bool:
+    """Whether an angle is a whole or half number of degrees."""
+    return abs(2.0 * angle_deg - round(2.0 * angle_deg)) < 1e-9
+
+
+@toml_files.accepts(
+    {
+        **toml_files.accepted(toml_files.interval),
+        "items": {"type": "number", "minimum": -_MOST_DEG, "maximum": _MOST_DEG},
+    }
+)
+def _turns(value: object) -> tuple[float, float]:
+    """Return the lower and upper end of the travel of a rotary axis, degrees; radians are refused."""
+    low, high = toml_files.interval(value)
+    if max(abs(low), abs(high)) > _MOST_DEG:
+        raise ValueError("expected angles within a hundred turns; is the unit degrees?")
+    if max(abs(low), abs(high)) < 1.001 * _TURN_RAD and not (_few_digits(low) and _few_digits(high)):
+        degrees = f"[{np.degrees(low):.4g}, {np.degrees(high):.4g}]"
+        raise ValueError(
+            f"expected degrees; are these radians ({degrees} degrees)? A short travel ends at half degrees"
+        )
+    return low, high
+
+
+@toml_files.accepts({"type": "number", "exclusiveMinimum": 0})
+def _modulo(value: object) -> float:
+    """Return after how many degrees an axis without end repeats: whole turns, or an even part of one."""
+    found = toml_files.positive(value)
+    turns = max(found / 360.0, 360.0 / found)
+    if abs(turns - round(turns)) > 1e-9 or found > _MOST_DEG:
+        radians = abs(found - _TURN_RAD) < 0.01
+        raise ValueError(
+            "expected degrees: 360, not 2 pi" if radians else "expected 360 degrees, or an even part of them"
+        )
+    return found
+
+
+@toml_files.accepts(
+    {**toml_files.accepted(toml_files.vector3), "items": {"type": "number", "minimum": -1.1, "maximum": 1.1}}
+)
+def _direction(value: object) -> Vector3:
+    """Return the direction of a rotary axis, a unit vector."""
+    x, y, z = toml_files.vector3(value)
+    length = float(np.linalg.norm((x, y, z)))
+    if length < 1e-9:
+        raise ValueError("expected a direction such as [0.0, 0.0, 1.0]; (0, 0, 0) has none")
+    if abs(length - 1.0) > _UNIT:
+        unit = ", ".join(f"{part / length:.6g}" for part in (x, y, z))
+        raise ValueError(f"expected a vector of length 1, this has {length:.4g}; of its direction is [{unit}]")
+    return x, y, z
 
 
 @dataclass(frozen=True, repr=False)
@@ -414,16 +485,22 @@ class RotaryAxis(Displayed):
     )
     nodes_deg: FloatArray = toml_files.part_setting(
         {
-            "nodes": {"anyOf": [toml_files.accepted(check) for check in (_NODES, toml_files.ascending)]},
-            "direction": toml_files.accepted(toml_files.vector3),
+            "nodes": {
+                "anyOf": [toml_files.accepted(check) for check in (_NODES, toml_files.ascending)],
+                "description": "nodes of the error motions: how many there are, or at which angles, degrees",
+            },
+            "direction": {
+                **toml_files.accepted(_direction),
+                "description": "nominal direction, a unit vector: the tool turns by + about it relative to the workpiece",
+            },
         },
         required=True,
     )
     range_deg: tuple[float, float] | None = toml_files.setting(
-        toml_files.interval, None, meaning="lower and upper end of the travel, degrees"
+        _turns, None, meaning="lower and upper end of the travel, degrees"
     )
     modulo_deg: float | None = toml_files.setting(
-        toml_files.positive, None, meaning="an axis that turns without end: after how many degrees it repeats, 360"
+        _modulo, None, meaning="an axis that turns without end: after how many degrees it repeats, 360"
     )
     reference_deg: float = toml_files.setting(_angle, 0.0, meaning="where the errors of the axis are zero, degrees")
 
@@ -448,6 +525,12 @@ class RotaryAxis(Displayed):
         nodes = numbers("nodes_deg", self.nodes_deg, None)
         if len(nodes) < 2 or (np.diff(nodes) <= 0.0).any():
             raise InputError("expected at least two angles in ascending order, degrees", field="nodes_deg")
+        turn = self.range_deg is None and nodes[-1] - nodes[0] <= high + 1e-9
+        if not turn and np.abs(nodes[[0, -1]] - (low, high)).max() > 1e-9:
+            raise InputError(
+                f"range from {nodes[0]:g} to {nodes[-1]:g} degrees; expected {low:g} ... {high:g}, the travel",
+                field="nodes_deg",
+            )
         object.__setattr__(self, "nodes_deg", nodes)
 
     @property
@@ -643,11 +726,22 @@ class Machine(Displayed):
         short = [
             (letter, axis.length_mm) for letter, axis in zip(AXES, self.axes, strict=True) if axis.length_mm < FEW_MM
         ]
+        far = {letter: self._from_letter_deg(letter) for letter in self.rotary}
         return [
             f"[axes.{letter}] range_mm: is the travel really {length:g} mm? The unit is mm, not m or inch ({length:g} in are "
             f"{25.4 * length:.5g} mm)"
             for letter, length in short
+        ] + [
+            f"[axes.{letter}] direction: is it really {angle:.0f} degrees from {AXES[ROTARY.index(letter)]}? ISO 841 names an "
+            "axis by the direction that it turns about"
+            for letter, angle in far.items()
+            if angle > MOST_NUTATING_DEG
         ]
+
+    def _from_letter_deg(self, letter: str) -> float:
+        """Angle between a rotary axis and the direction of its letter."""
+        cosine = self.rotary[letter].direction[ROTARY.index(letter)]
+        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
     def controller_settings(self, name: str) -> toml_files.Section:
         """Return a new section with the settings of one control (empty if the file has none)."""
@@ -741,11 +835,27 @@ def _read_rotary(section: toml_files.Section, chain: Chain) -> dict[str, RotaryA
             raise section.fail(
                 letter, f"the chain {chain.name} has no axis {letter}; put the letter into it, or omit [axes.{letter}]"
             )
+    for letter in section.data:
+        if letter not in (*AXES, *ROTARY):
+            raise section.fail(letter, f"is no axis; known: {', '.join((*AXES, *ROTARY))}", kind="unknown")
     found = {}
     for letter in sorted(chain.rotary):
+        if letter not in section:
+            raise section.fail(
+                letter,
+                f"is missing; the chain {chain.name} has it: describe it with point_mm, range_deg or modulo_deg, and nodes",
+                kind="missing",
+                instead={"point_mm": [0.0, 0.0, 0.0], "range_deg": [-90.0, 90.0], "nodes": 7},
+            )
         own = section.section(letter)
         x, y, z = (float(k == ROTARY.index(letter)) for k in range(3))
-        direction = own.take("direction", _offset, (x, y, z))
+        direction = own.take("direction", _direction, (x, y, z))
+        if ROTARY.index(letter) == int(np.argmin(direction)) and min(direction) < -OPPOSITE:
+            message = f"points against {letter} of ISO 841; reverse it, and the sign of the angles"
+            raise own.fail("direction", message, kind="value", instead=(x, y, z))
+        if not {key for key in own.data if "point" in key or "pivot" in key or "mm" in key}:
+            message = "is missing: a point of the axis line with all axes at zero, machine coordinates, e.g. [0.0, 0.0, -50.0]"
+            raise own.fail("point_mm", message, kind="missing", instead=[0.0, 0.0, 0.0])
         stated = toml_files.stated_settings(RotaryAxis, own)
         low, high = stated.get("range_deg") or (0.0, stated.get("modulo_deg", 360.0))
         if isinstance(own.data.get("nodes"), list):
@@ -756,7 +866,7 @@ def _read_rotary(section: toml_files.Section, chain: Chain) -> dict[str, RotaryA
         try:
             found[letter] = RotaryAxis(direction, nodes_deg=nodes, **stated)
         except InputError as error:
-            raise own.fail(error.field or "nodes", error.message) from None
+            raise own.fail("nodes" if error.field == "nodes_deg" else error.field or "nodes", error.message) from None
     return found
 
 

@@ -172,14 +172,13 @@ class Section:
         full = f"{self.name}.{key}" if self.name else key
         # the line of the key, or of its table's header if the file does not have the key
         inside, count, own = not self.name, -1, None
-        parent, _, last = self.name.rpartition(".")
-        around, inline = bool(self.name) and not parent, None  # a table may be the value of a key: last = { key = ... }
+        table, inline, depth = "", None, 0  # a table may be the value of a key: last = { key = ... }, or a dotted key
         for number, line in enumerate(self.text.split("\n"), start=1):
             header = re.match(r"\s*\[\[?\s*([^\[\],]+?)\s*\]\]?\s*(#.*)?$", line)
             if header:
                 table = re.sub(r"[\"' ]", "", header.group(1))
                 count += table == self.name
-                inside, around = table == self.name and count == self._nth, table == parent
+                inside = table == self.name and count == self._nth
                 own = number if inside else own
                 if table == full and max(count, 0) == self._nth:
                     own = number
@@ -187,8 +186,10 @@ class Section:
             elif inside and re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*=", line):
                 own = number
                 break
-            elif around and inline is None and re.match(rf"\s*[\"']?{re.escape(last)}[\"']?\s*[=.]", line):
-                inline = number
+            elif self.name and (given := re.match(r"\s*([\w.\"' -]+?)\s*=", line)):
+                dotted = ".".join(filter(None, (table, re.sub(r"[\"' ]", "", given.group(1)))))
+                if f"{full}.".startswith(f"{dotted}.") and len(dotted) > depth:
+                    inline, depth = number, len(dotted)
         place = f"[{self.name}] {key}" if self.name else key
         error = SettingError(message, file=self.path, line=own or inline, field=visible_line(place))
         error.place, error.kind, error.instead = (*self.place, key), kind, instead
@@ -521,7 +522,7 @@ def section_schema(*kinds: type, **more: Schema) -> dict[str, Any]:
             data = item.metadata
             key, said = data.get("key") or item.name, data.get("meaning") or described.get(item.name, "")
             if isinstance(data.get("part"), Mapping):
-                properties |= {each: {**schema, "description": said} for each, schema in data["part"].items()}
+                properties |= {each: {"description": said, **schema} for each, schema in data["part"].items()}
             elif {"check", "part"} & set(data):
                 properties[key] = _property(item, said)
                 required += [key] if data.get("required") else []

@@ -122,7 +122,7 @@ def passing_order(machine: Machine) -> list[tuple[int, bool]]:
     return [(axis, True) for axis in reversed(chain.tool_side)] + [(axis, False) for axis in chain.workpiece_side]
 
 
-def _travel(machine: Machine, values: FloatArray, position_mm: FloatArray) -> list[FloatArray]:
+def travel_vectors(machine: Machine, values: FloatArray, position_mm: FloatArray) -> list[FloatArray]:
     """Travel vectors q a of the three axes, each (n, 3)."""
     units = np.eye(3)
     turns = _squareness_vectors(machine, values)
@@ -136,7 +136,7 @@ def tip_position(
     machine: Machine, values: FloatArray, position_mm: FloatArray, tool_mm: FloatArray | None = None
 ) -> FloatArray:
     """Actual tool tip in the workpiece frame for errors ``values`` (n, 21) at positions (n, 3): shape (n, 3), mm."""
-    travel = _travel(machine, values, position_mm)
+    travel = travel_vectors(machine, values, position_mm)
     tip = np.broadcast_to(tool_of(machine, tool_mm), position_mm.shape)
     for axis, tool_side in passing_order(machine):
         delta, eps = values[:, 6 * axis : 6 * axis + 3], values[:, 6 * axis + 3 : 6 * axis + 6]
@@ -155,7 +155,7 @@ def exact_columns(
 
     At zero errors the derivative is C of :func:`compgen.kinematics.first_order.c_matrix`.
     """
-    travel = _travel(machine, values, position_mm)
+    travel = travel_vectors(machine, values, position_mm)
     turns = _squareness_vectors(machine, values)
     tip = np.array(np.broadcast_to(tool_of(machine, tool_mm), position_mm.shape))
     # derivatives by component and error, in the order in which the bodies are passed: the others are still zero

@@ -20,23 +20,23 @@ import numpy as np
 
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
-from compgen.data.machine import ROTARY, Machine
+from compgen.data.machine import OPPOSITE, ROTARY, Machine
 from compgen.data.names import AXES
 from compgen.data.rotary import RotaryErrors
 from compgen.errors import InputError
-from compgen.kinematics.exact_chain import _travel, level_rotations, rotate
+from compgen.kinematics.exact_chain import cross_matrices, level_rotations, rotate, travel_vectors
 
 
 @cache
 def _own_axes(letter: str, direction: tuple[float, float, float]) -> FloatArray:
     """Smallest rotation (3, 3) that takes x, y or z of the letter to the direction of the axis."""
     along, u = np.eye(3)[ROTARY.index(letter)], np.array(direction)
-    cross, cosine = np.cross(along, u), float(along @ u)
-    if cosine < -1.0 + 1e-12:
+    cosine = float(along @ u)
+    if cosine < -OPPOSITE:
         raise InputError(
             f"direction of {letter} is opposite to its axis; reverse the sign of its angles", field="direction"
         )
-    matrix = np.array([[0.0, -cross[2], cross[1]], [cross[2], 0.0, -cross[0]], [-cross[1], cross[0], 0.0]])
+    matrix = cross_matrices(np.cross(along, u)[None])[0]
     return np.asarray(np.eye(3) + matrix + matrix @ matrix / (1.0 + cosine))
 
 
@@ -58,7 +58,7 @@ def tip_pose(
     """
     count = len(position_mm)
     values = errors.at(position_mm)
-    travel = _travel(machine, values, position_mm)
+    travel = travel_vectors(machine, values, position_mm)
     motions = rotary.motions(machine, angle_deg)
     tip = np.array(np.broadcast_to(machine.tool_offset_mm if tool_mm is None else tool_mm, (count, 3)), dtype=float)
     turned = np.tile(np.eye(3), (count, 1, 1))
@@ -103,15 +103,8 @@ def pose_error(
     tip, turned = tip_pose(machine, errors, rotary, position_mm, angle_deg, tool_mm)
     nominal, straight = tip_pose(machine, ErrorTable(), RotaryErrors(), position_mm, angle_deg, tool_mm)
     between = np.einsum("nij,nkj->nik", turned, straight)
-    skew = 0.5 * np.stack(
-        [
-            between[:, 2, 1] - between[:, 1, 2],
-            between[:, 0, 2] - between[:, 2, 0],
-            between[:, 1, 0] - between[:, 0, 1],
-        ],
-        axis=1,
-    )
-    return tip - nominal, skew
+    # the small rotation is the antisymmetric part; einsum with the generators of rotation picks it
+    return tip - nominal, 0.5 * np.einsum("nij,kij->nk", between, cross_matrices(np.eye(3)))
 
 
 def joints_of_tip(

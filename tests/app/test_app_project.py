@@ -157,6 +157,23 @@ def test_answers_become_the_options_of_import():
     assert options.units == {"deviation": "um", "position": "mm"}
 
 
+@pytest.mark.parametrize("name", ["WCAYFXZT", "WCYFXZBT", "WXYFZCBT", "WFXYZCAT", "WCBXYZFT", "WBXFYZCAT"])
+def test_the_drawing_shows_what_turns(name):
+    drawing = chain_picture(Chain(name))
+    letters = [letter for letter in name if letter in "XYZABC"]
+    assert sorted(re.findall(r">([A-Z])</text>", drawing)) == sorted(letters)
+    # what turns is drawn with an arc, what moves with a line
+    assert len(re.findall(r'class="arrow" d="M[\d.]+ [\d.]+A', drawing)) == len(Chain(name).rotary)
+    points = [
+        tuple(map(float, pair.split(","))) for part in re.findall(r'points="([^"]+)"', drawing) for pair in part.split()
+    ]
+    assert all(0 <= x <= 380 and 0 <= y <= 280 for x, y in points)
+    # bodies are drawn from the foundation: those that carry the tool, then those that carry the workpiece
+    bodies = [int(found) for found in re.findall(r'"axis(\d) front"', drawing)]
+    left, _, right = name[1:-1].partition("F")
+    assert bodies == ["XYZABC".index(letter) for letter in right + left[::-1]]
+
+
 @pytest.mark.parametrize("name", CHAINS)
 def test_the_drawing_has_an_arrow_for_each_axis_and_stays_within_its_frame(name):
     drawing = chain_picture(Chain(name))

@@ -400,6 +400,40 @@ def test_a_file_that_exists_is_overwritten_by_force_only(call):
     assert [len(axis.nodes_mm) for axis in read_machine("m.toml").axes] == [7, 7, 3]
 
 
+FIVE = ["--travel", "A=-110..30", "--travel", "C=endless", "--point", "A=0,0,-50", "--point", "C=1,2,3"]
+
+
+def test_a_machine_with_rotary_axes_is_described_in_words(call):
+    words = "trunnion in A and C, table in Y, column in X, head in Z"
+    code, stdout, stderr = call("init", "five", "--chain", words, *TRAVEL, *FIVE)
+    assert (code, stderr) == (0, "") and "WCAYFXZT" in stdout and "workpiece turns in C, carried by A" in stdout
+    machine = read_machine("five.toml")
+    assert machine.rotary["A"].range_deg == (-110.0, 30.0) and machine.rotary["A"].point_mm == (0.0, 0.0, -50.0)
+    assert machine.rotary["C"].modulo_deg == 360.0 and machine.rotary["C"].point_mm == (1.0, 2.0, 3.0)
+    assert call("check", "five.toml")[0] == 0
+    # what is not stated is assumed aloud
+    code, _, stderr = call("init", "nut", "--chain", "nutating head", *TRAVEL)
+    assert code == 0 and stderr.count("question: ") == 6 and "where is its axis line" in stderr
+    assert read_machine("nut.toml").rotary["B"].direction == pytest.approx([0.0, 0.5**0.5, 0.5**0.5])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--travel", "B=0..90"], "is not of the form AXIS=LOW..HIGH"),
+        (["--point", "B=0,0,1"], "has no rotary axis B (it has C, A)"),
+        (["--point", "A=0,1"], "is not of the form AXIS=X,Y,Z"),
+        (["--point", "A=0,0,1", "--point", "A=0,0,2"], "A is given twice"),
+        (["--travel", "A=30..-110"], "with the lower number first"),
+        (["--travel", "A=-1.92..0.52"], "are these radians"),
+        (["--travel", "A=some"], "is not of the form AXIS=LOW..HIGH in degrees"),
+    ],
+)
+def test_bad_answers_about_rotary_axes_write_nothing(words, message, call):
+    code, _, stderr = call("init", "m", "--chain", "WCAYFXZT", *TRAVEL, *words)
+    assert code == 2 and message in " ".join(stderr.split()) and list(Path().iterdir()) == []
+
+
 def test_words_with_two_orders_are_taken_as_named_and_asked_about(call):
     code, stdout, stderr = call("init", "m", "--chain", "table moves in X and Y, head in Z", *TRAVEL, "--json")
     answer = json.loads(stdout)

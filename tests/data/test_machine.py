@@ -8,7 +8,8 @@ import pytest
 
 from compgen.controls import CONTROLLERS
 from compgen.data import machine as machine_module
-from compgen.data.machine import CHAINS, Chain, load_machine, machine_files, read_machine
+from compgen.data.machine import CHAINS, Chain, load_machine, machine_files, machine_of, read_machine
+from compgen.data.toml_files import problems_of
 from compgen.effects import active_effects
 from compgen.errors import CompgenWarning, InputError
 from compgen.resources import data_folder
@@ -329,3 +330,60 @@ def test_what_programs_need_of_a_machine(saved):
         ("travel_margin_mm = 101", "from 0 to 100 mm"),
     ):
         assert message in refusal(saved(f"{line}\n{text}"))
+
+
+# --- rotary axes -----------------------------------------------------------------------------------------------------
+
+FIVE = """name = "trunnion"
+chain = "WCAYFXZT"
+axes.X = { range_mm = [-400.0, 400.0], nodes = 7 }
+axes.Y = { range_mm = [-400.0, 400.0], nodes = 7 }
+axes.Z = { range_mm = [-300.0, 400.0], nodes = 7 }
+axes.A = { point_mm = [0.0, 0.0, -50.0], range_deg = [-110.0, 30.0], nodes = 8 }
+axes.C = { point_mm = [0.0, 0.0, 0.0], modulo_deg = 360.0, nodes = 13 }
+"""
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "said"),
+    [
+        ("WCAYFXZT", "WCACYFXZT", 2, "C appears twice"),
+        ("WCAYFXZT", "WCAYFXZCT", 2, "C appears twice"),
+        ("WCAYFXZT", "WCUYFXZT", 2, "U is no axis"),
+        ("WCAYFXZT", "WCYFXZT", 6, "the chain WCYFXZT has no axis A"),
+        ("axes.A", "axes.D", 6, "is no axis; known: X, Y, Z, A, B, C"),
+        ("nodes = 8", "nodes = 8, direction = [0.0, 0.0, 0.0]", 6, "(0, 0, 0) has none"),
+        ("nodes = 8", "nodes = 8, direction = [0.0, 1.0, 1.0]", 6, "of its direction is [0, 0.707107, 0.707107]"),
+        ("nodes = 8", "nodes = 8, direction = [0.0, 0.0072, 0.0071]", 6, "expected a vector of length 1"),
+        ("nodes = 8", "nodes = 8, direction = [-1.0, 0.0, 0.0]", 6, "points against A of ISO 841; reverse it"),
+        ("nodes = 8", "nodes = 8, direction = [0.0, 1.0]", 6, "expected three numbers"),
+        ("-110.0, 30.0", "30.0, -110.0", 6, "with the lower number first"),
+        ("-110.0, 30.0", "-1.9199, 0.5236", 6, "are these radians ([-110, 30] degrees)"),
+        ("-110.0, 30.0", "-1.5708, 1.5708", 6, "are these radians ([-90, 90] degrees)"),
+        ("-110.0, 30.0", "-11000000.0, 30.0", 6, "is the unit degrees"),
+        ("360.0", "6.2832", 7, "360, not 2 pi"),
+        ("360.0", "350.0", 7, "expected 360 degrees, or an even part of them"),
+        ("point_mm = [0.0, 0.0, -50.0], ", "", 6, "point_mm: is missing: a point of the axis line"),
+        ("point_mm = [0.0, 0.0, -50.0]", "pivot_mm = [0.0, 0.0, -50.0]", 6, "point_mm"),
+        ("range_deg", "range_rad", 6, "range_rad"),
+        ("nodes = 8", "nodes = [-1.9, 0.0, 0.5]", 6, "expected -110 ... 30, the travel"),
+        ("nodes = 8", "nodes = [-200.0, 0.0, 200.0]", 6, "expected -110 ... 30, the travel"),
+        ("nodes = 8", "nodes = 8, reference_deg = 45.0", 6, "45 degrees is outside"),
+    ],
+)  # fmt: skip
+def test_an_impossible_rotary_axis_is_refused_with_its_line(tmp_path, old, new, line, said):
+    (tmp_path / "m.toml").write_text(FIVE.replace(old, new, 1))
+    problems = problems_of(tmp_path / "m.toml", lambda root: machine_of(root, tmp_path / "m.toml")).problems
+    assert any(said in str(problem) and problem.line == line for problem in problems), [str(one) for one in problems]
+
+
+@pytest.mark.parametrize(
+    ("direction", "asked"),
+    [([0.7071, 0.0, 0.7071], False), ([0.0, 0.7071, 0.7071], True), ([-0.6, 0.0, 0.8], True), ([1.0, 0.0, 0.0], False)],
+)
+def test_a_nutating_direction_is_taken_and_one_far_from_its_letter_asked_about(tmp_path, direction, asked):
+    (tmp_path / "m.toml").write_text(FIVE.replace("nodes = 8", f"nodes = 8, direction = {direction}"))
+    machine = read_machine(tmp_path / "m.toml")
+    unit = np.array(direction) / np.linalg.norm(direction)
+    assert machine.rotary["A"].direction == pytest.approx(unit, abs=1e-15)
+    assert bool(machine.doubts) == asked

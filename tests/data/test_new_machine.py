@@ -3,7 +3,7 @@
 import pytest
 
 from compgen.data.machine import CHAINS, parse_machine
-from compgen.data.new_machine import chains_of, in_words, machine_text, usual_nodes
+from compgen.data.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.data.prior import class_named
 from compgen.errors import InputError
 
@@ -61,6 +61,55 @@ def test_what_words_leave_open_gives_every_chain_that_they_allow():
     assert found == {name for name in CHAINS if name.index("X") < name.index("F")}
     # a slide may be on the column or below the table where both move
     assert {item.name for item in chains_of("slide in X, column in Y, table in Z")} == {"WZFYXT", "WZXFYT"}
+
+
+@pytest.mark.parametrize(
+    ("words", "chain"),
+    [
+        ("trunnion in A and C, table in Y, head in X and Z", "WCAYFXZT"),
+        ("table in Y, column in X, head in Z, trunnion A, rotary table C", "WCAYFXZT"),
+        ("A: trunnion, C: table, Y: table, X: column, Z: head", "WCAYFXZT"),
+        ("A trunnion with B and C, the table in X and Y, a head in Z", "WCBXYFZT"),
+        ("Schwenkbrücke in A, Rundtisch in C, Tisch in Y, Ständer in X, Kopf in Z", "WCAYFXZT"),
+        ("table turns in C and moves in Y; column in X; head moves in Z and turns in B", "WCYFXZBT"),
+        ("head in Z and B, table in X and Y. A saddle below", "WXYFZBT"),
+        ("Gabelkopf in C und A, Portal in X, Querbalken in Y, Kopf in Z", "WFXYZCAT"),
+        ("fork head AC, gantry in X, beam Y, ram Z", "WFXYZCAT"),
+        ("table b axis, c axis; column x, beam y, head z", "WCBFXYZT"),
+        ("knee in Z, saddle in Y, table in X, A axis on the table", "WAXYZFT"),
+        # words that name no axis: the usual machine of the kind
+        ("trunnion", "WCAYFXZT"),
+        ("table and head", "WCYFXZBT"),
+        ("fork head", "WXYFZCBT"),
+        ("nutating head", "WCYFXZBT"),
+        ("wcayfxzt", "WCAYFXZT"),
+    ],
+)
+def test_rotary_axes_are_on_the_table_or_on_the_head_as_words_say(words, chain):
+    assert chains_of(words)[0].name == chain
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("table in A, head in A and Z, table in X and Y", "A is carried by 'table' and by 'head'"),
+        ("A and C", "names A, C, and not what carries it"),
+        ("table in X, saddle in Y and C, head in Z", "is C an axis of the table or of the head"),
+        ("WCACYFXZT", "C appears twice"),
+        ("WCUYFXZT", "names no axes"),
+    ],
+)
+def test_rotary_axes_that_words_leave_open_are_refused(words, said):
+    with pytest.raises(InputError, match=said):
+        chains_of(words)
+
+
+def test_a_nutating_head_has_its_axis_at_45_degrees():
+    for words in ("nutating head", "nutating fork head in C and B, gantry in X, beam in Y, ram in Z"):
+        (letter, direction), *others = rotary_directions(words, chains_of(words)[0]).items()
+        assert (letter, others) == ("B", [])
+        assert direction == pytest.approx([0.0, 0.5**0.5, 0.5**0.5], abs=1e-9)
+    assert rotary_directions("fork head", chains_of("fork head")[0]) == {}
 
 
 @pytest.mark.parametrize("words", ["", "foo", "a big mill", "X, Y, Z"])
