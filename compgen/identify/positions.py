@@ -15,6 +15,7 @@ from compgen.data.deviations import FAR_MM, PART, Artefact, Deviations, aligned,
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.data.records import MEASURED_COLUMNS
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.determined import FAINT, SHOWS, Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
@@ -449,7 +450,7 @@ def artefact_observations(
     """
     tool_mm = np.broadcast_to(tool_of(machine, artefact.tool_mm), artefact.measured_mm.shape)
     position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
-    check_travel(machine, position_mm, artefact.origin)
+    check_travel(machine, position_mm, artefact.origin, MEASURED_COLUMNS)
     expected_mm = layout.tips(around, position_mm, tool_mm) - tool_mm - position_mm
     largest_mm = float(np.abs(expected_mm).max())
     if largest_mm > FAR_MM:  # no machine: noise, enlarged by directions that the set-ups hardly determine

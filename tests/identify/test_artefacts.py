@@ -181,6 +181,9 @@ def test_files_say_what_is_wrong_with_them(tmp_path, machine, errors):
     mirrored = [(name, x, y, z, -mx, my, setup) for name, x, y, z, mx, my, setup in rows]
     with pytest.raises(InputError, match="mirrored"):
         identify_measurement(machine, open_measurement([written(tmp_path / "b.artefact.csv", mirrored)]))
+    far = [(name, x, y, z, mx, my + 5e3, setup) for name, x, y, z, mx, my, setup in rows]
+    with pytest.raises(InputError, match="column my_mm: .* outside the travel"):
+        identify_measurement(machine, open_measurement([written(tmp_path / "f.artefact.csv", far)]))
 
 
 def test_set_ups_that_hardly_separate_plate_and_machine_are_named_as_the_reason(tmp_path):

@@ -14,6 +14,7 @@ from compgen.data.error_table import free_basis, hat_matrix, spline_matrix
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
+from compgen.data.records import POSITION_COLUMNS
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
@@ -315,10 +316,16 @@ def dead_lengths_of(lengths: Lengths) -> IntArray:
 _ROUNDING_MM = 1e-3
 
 
-def check_travel(machine: Machine, position_mm: FloatArray, origin: Sequence[tuple[str, int]] = ()) -> None:
+def check_travel(
+    machine: Machine,
+    position_mm: FloatArray,
+    origin: Sequence[tuple[str, int]] = (),
+    columns: Sequence[str] = POSITION_COLUMNS,
+) -> None:
     """Raise InputError, with file, line and column, for the first position (n, 3) outside the travel.
 
-    ``origin`` is file and line of each row; without it the message gives the number of the point.
+    ``origin`` is file and line of each row; without it the message gives the number of the point. ``columns`` are those of
+    the positions in the file.
     """
     for axis in range(3):
         along = np.ascontiguousarray(position_mm[:, axis])
@@ -332,7 +339,7 @@ def check_travel(machine: Machine, position_mm: FloatArray, origin: Sequence[tup
             f"of {AXES[axis]} of machine {machine.name!r}: wrong machine file, wrong axis order or wrong unit?",
             file=file,
             line=line,
-            field=f"column {AXES[axis].lower()}_mm",
+            field=f"column {columns[axis]}",
         )
 
 
