@@ -46,6 +46,7 @@ from compgen.pipeline import (
 from compgen.report.terminal import advice_text, identification_table
 
 if TYPE_CHECKING:
+    from compgen.identify.spheres import SphereIdentification
     from compgen.tables.active import ActiveTables
 
 
@@ -167,11 +168,26 @@ def _identify_spheres(
     machine: Machine, measurements: tuple[Path, ...], out: Path, options: IdentifyOptions, as_json: bool
 ) -> int:
     """Identify the position errors of rotary axes, and write them with what the poses leave open."""
+    from compgen.report.terminal import sphere_table
+
+    result, files = _sphere_files(machine, measurements, options)
+    write_all(out, files)
+    if as_json:
+        print_json(result.summary())
+    else:
+        stdout.print(sphere_table(result))
+        stdout.print(f"{out / 'identified.errors.csv'}, {out / 'identify.json'}")
+    return 0 if result.rank else 1
+
+
+def _sphere_files(
+    machine: Machine, measurements: tuple[Path, ...], options: IdentifyOptions
+) -> tuple[SphereIdentification, dict[str, str]]:
+    """Position errors of rotary axes, and the files that say so."""
     import json
 
     from compgen.data.rotary import format_machine_errors, read_spheres
     from compgen.identify.spheres import identify_spheres
-    from compgen.report.terminal import sphere_table
 
     others = [path for path in measurements if detect_format(path) != "sphere"]
     if others:
@@ -179,22 +195,39 @@ def _identify_spheres(
             "contains no centres of spheres; identify the linear axes and the rotary axes separately", file=others[0]
         )
     result = identify_spheres(machine, read_spheres(machine, measurements), u_um=options.u_deviation_um)
-    output = OutputFolder(out)
     provenance = provenance_of(machine.source, *measurements)
-    output.add(
-        "identified.errors.csv",
-        format_machine_errors(ErrorTable(), result.errors, {"machine": machine.name, "source": "sphere centres"}),
-    )
-    output.add(
-        "identify.json", json.dumps({**result.summary(), "provenance": dict(provenance.inputs)}, indent=2) + "\n"
-    )
-    output.commit()
-    if as_json:
-        print_json(result.summary())
-    else:
+    metadata = {"machine": machine.name, "source": "sphere centres"}
+    data = {**result.summary(), "provenance": dict(provenance.inputs)}
+    return result, {
+        "identified.errors.csv": format_machine_errors(ErrorTable(), result.errors, metadata),
+        "identify.json": json.dumps(data, indent=2) + "\n",
+    }
+
+
+def run_spheres(
+    machine: Machine,
+    measurements: tuple[Path, ...],
+    controllers: tuple[str, ...],
+    out: Path,
+    options: IdentifyOptions,
+    as_json: bool,
+) -> int:
+    """Identify the position errors of rotary axes, and write them as parameters of one control."""
+    from compgen.cli.rotary_commands import export_parameters
+    from compgen.controls.rotary_parameters import target_of
+    from compgen.report.terminal import sphere_table
+
+    if len(set(controllers)) > 1:
+        raise InputError(
+            f"one at a time, please: {controllers[0]} takes parameters of rotary axes", field="--controller"
+        )
+    OutputFolder(out)
+    target_of(machine, controllers[0])
+    result, files = _sphere_files(machine, measurements, options)
+    write_all(out, files)
+    if not as_json:
         stdout.print(sphere_table(result))
-        stdout.print(f"{out / 'identified.errors.csv'}, {out / 'identify.json'}")
-    return 0 if result.rank else 1
+    return export_parameters(machine, out / "identified.errors.csv", controllers[0], out, as_json)
 
 
 @click.command("fit")

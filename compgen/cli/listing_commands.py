@@ -19,6 +19,7 @@ from compgen.cli.common import PATH, json_option, option_name, options_of, print
 from compgen.cli.shared_options import open_machine
 from compgen.cli.terminal import answer, say, stdout
 from compgen.controls import CONTROLLERS
+from compgen.controls.rotary_parameters import ABOUT
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.deviations import Artefact, Deviations, Part
 from compgen.data.error_table import ErrorTable
@@ -54,18 +55,29 @@ def controllers_command(name: str | None, as_json: bool) -> int:
     Example:
       volcomp controllers siemens-cec
     """
+    if name is not None and name in ABOUT:
+        about = ABOUT[name]
+        answer(
+            as_json,
+            {"name": name, **about},
+            f"{name}: {about['title']}",
+            *(f"  {key}: {text}" for key, text in about.items()),
+        )
+        return 0
     if name is not None:
         shown, origin = control_card(name), CONTROLS.origins.get(name)
         answer(as_json, {**shown.summary(), "plugin": origin}, card_text(shown, origin))
         return 0
     cards = [load_format(known) for known in sorted(CONTROLLERS)]
     if as_json:
-        print_json({card.name: _listed(card) for card in cards})
+        print_json({card.name: _listed(card) for card in cards} | {key: dict(about) for key, about in ABOUT.items()})
         return 0
     table = Table("name", "control", "what it can express", "format", box=box.SIMPLE)
     for card in cards:
         origin = CONTROLS.origins.get(card.name)
         table.add_row(card.name, card.title, card.expresses, f"{card.evidence}{', plug-in' if origin else ''}")
+    for key, about in ABOUT.items():
+        table.add_row(key, about["title"], about["expresses"], about["evidence"])
     stdout.print(table)
     return 0
 

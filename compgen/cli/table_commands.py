@@ -29,7 +29,7 @@ from compgen.cli.shared_options import (
     unverified_option,
 )
 from compgen.cli.terminal import answer, complain, progress, say, say_paths, stdout
-from compgen.controls import CONTROLLERS
+from compgen.controls import CONTROLLERS, ROTARY_TARGETS
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors, read_reversal
 from compgen.data.files import OutputFolder, write_file
@@ -187,11 +187,18 @@ def export_command(
     NOT-ACCEPTED-... (exit code 1). check/check-program.md says what the machine should read at five positions. With
     --active, ERRORS belong to the machine with its old tables; bare.errors.csv gets those without.
 
+    Of a machine with rotary axes the controls linuxcnc-trt, linuxcnc-tdr, linuxcnc-5axis, siemens-toolcarrier and fanuc-5axis
+    get the parameters that say where its rotary axes are (mm).
+
     \b
     Example:
       volcomp export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
     """
     OutputFolder(out)
+    if controller in ROTARY_TARGETS:
+        from compgen.cli.rotary_commands import export_parameters
+
+        return export_parameters(machine, errors, controller, out, as_json)
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     known = None if active is not None else covariance_of(errors, table, None, independent=False)
@@ -263,6 +270,10 @@ def read_command(
     Example:
       volcomp read zha-gantry tables/volcomp0.csv --controller isg-csv --points p.points.csv --out correction.csv
     """
+    if controller in ROTARY_TARGETS:
+        from compgen.cli.rotary_commands import read_parameters
+
+        return read_parameters(machine, tables, controller, points, out, as_json)
     where = read_points(points)
     parsed = read_tables(machine, tables, controller, foreign=True)
     for text in parsed.contradictions:
@@ -320,6 +331,10 @@ def verify_command(
       volcomp verify zha-gantry tables/volcomp0.csv --controller isg-csv --errors identified.errors.csv --out check/
     """
     OutputFolder(out)
+    if controller in ROTARY_TARGETS:
+        from compgen.cli.rotary_commands import verify_parameters
+
+        return verify_parameters(machine, tables, controller, errors, out, as_json)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     parsed, table = read_tables(machine, tables, controller), open_errors(errors)

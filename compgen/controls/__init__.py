@@ -89,6 +89,9 @@ CONTROLLERS = Controls(
 )
 
 
+#: Names of what takes parameters of rotary axes; :mod:`compgen.controls.rotary_parameters` makes them.
+ROTARY_TARGETS = ("linuxcnc-trt", "linuxcnc-tdr", "linuxcnc-5axis", "siemens-toolcarrier", "fanuc-5axis")
+
 #: Controls that users request but whose file format is not published: what to use instead.
 NOT_PUBLIC = {
     "siemens-vcs": "the file format of the SINUMERIK volumetric compensation system is not public; export with another "
@@ -120,6 +123,9 @@ def controller_named(name: str) -> type[AnyController]:
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
+        if name in ROTARY_TARGETS:
+            raise InputError(f"{name} takes parameters of rotary axes; use it with export, verify, read or run")
+
         # probable matches: controls with the word in their name, in the title of their card, or anywhere in the card
         folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}
         cards = {known: folder / known / "format.toml" for known, folder in folders.items()}
@@ -134,6 +140,15 @@ def controller_named(name: str) -> type[AnyController]:
     return CONTROLLERS[name]
 
 
-__all__ = ["CONTROLLERS", "AnyController", "Controller", "Monomial", "SourceFile", "Term", "controller_named"]
+__all__ = [
+    "CONTROLLERS",
+    "ROTARY_TARGETS",
+    "AnyController",
+    "Controller",
+    "Monomial",
+    "SourceFile",
+    "Term",
+    "controller_named",
+]
 
 load_on_first_use(__name__, ["AnyController", "Controller", "Monomial", "SourceFile", "Term"])

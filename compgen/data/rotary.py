@@ -55,10 +55,13 @@ def position_names(letter: str) -> tuple[str, ...]:
 ROTARY_NAMES: tuple[str, ...] = tuple(
     name for letter in ROTARY for name in (*motion_names(letter), *position_names(letter))
 )
-#: By name: letter of the axis, component of its small motion (0 to 5: X, Y, Z, A, B, C), whether it is a constant.
+#: Offset of the gauge point of the spindle in the last body, from the nominal one: it turns with a rotary head.
+SPINDLE = ("TX", "TY", "TZ")
+#: By name: letter of the axis (none: of the spindle), component of its small motion (0 to 5: X, Y, Z, A, B, C), constant
+#: or not.
 _PLACES: dict[str, tuple[str, int, bool]] = {
     name: (name[-1], "XYZABC".index(name[1]), name[2] == "0") for name in ROTARY_NAMES
-}
+} | {name: ("", k, True) for k, name in enumerate(SPINDLE)}
 
 
 def si_per_unit(name: str) -> float:
@@ -106,12 +109,17 @@ class RotaryErrors(Displayed):
             for name in names:
                 if name not in _PLACES or _PLACES[name][2] != constant:
                     what = "a constant of a rotary axis" if constant else "an error motion of a rotary axis"
-                    raise InputError(f"{name!r} is not {what}; {nearest(name, ROTARY_NAMES)}", field="errors")
+                    raise InputError(f"{name!r} is not {what}; {nearest(name, _PLACES)}", field="errors")
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the errors that are present."""
-        return tuple(name for name in ROTARY_NAMES if name in self.curves or name in self.constants)
+        return tuple(name for name in _PLACES if name in self.curves or name in self.constants)
+
+    @property
+    def spindle_mm(self) -> FloatArray:
+        """Offset of the gauge point of the spindle (3,), mm."""
+        return np.array([self.constants.get(name, (0.0, 0.0))[0] for name in SPINDLE])
 
     def motions(self, machine: Machine, angle_deg: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
         """Small motions D (n, 6) of each rotary axis at angles (n,): mm and rad, zero at its reference."""
@@ -178,7 +186,7 @@ def _rotary_of(table: CsvTable) -> RotaryErrors:
         if name in _PLACES:
             rows.setdefault(name, []).append(row)
         elif name not in ERROR_NAMES:
-            raise table.fail(row, "error", f"{name!r} is not an error; {nearest(name, (*ERROR_NAMES, *ROTARY_NAMES))}")
+            raise table.fail(row, "error", f"{name!r} is not an error; {nearest(name, (*ERROR_NAMES, *_PLACES))}")
     curves, constants = {}, {}
     for name, own in rows.items():
         unit = si_per_unit(name)

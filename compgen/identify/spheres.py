@@ -24,14 +24,21 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, MM_PER_UM, SQUARENESS_NAMES
 from compgen.data.prior import CLASSES, USUAL_CLASS
-from compgen.data.rotary import JOINTS, TIP, RotaryErrors, SphereCentres, position_names, si_per_unit, unit_of
+from compgen.data.rotary import (
+    JOINTS,
+    SPINDLE,
+    TIP,
+    RotaryErrors,
+    SphereCentres,
+    position_names,
+    si_per_unit,
+    unit_of,
+)
 from compgen.errors import ConvergenceError, InputError
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 
 #: Sizes of position errors of a machine that was set up by usual means (one standard deviation), um and urad.
 OFFSET_UM, TILT_URAD = 100.0, 300.0
-#: Offset of the gauge point of the spindle in the last body of a machine with a rotary head, from the nominal one.
-SPINDLE = ("TX", "TY", "TZ")
 #: A combination is determined if its uncertainty is at most this share of what was assumed of it.
 DETERMINED = 1.0 / 3.0
 #: Names that appear in a combination with less than this share of the largest are left out of its words.
@@ -141,7 +148,7 @@ class SphereIdentification(Displayed):
 
 def _unit(name: str) -> tuple[str, float]:
     """Unit in files, and its factor to mm or rad, of a position error or an offset of the spindle."""
-    return ("um", MM_PER_UM) if name in SPINDLE else (unit_of(name), si_per_unit(name))
+    return unit_of(name), si_per_unit(name)
 
 
 @dataclass(frozen=True)
@@ -175,9 +182,7 @@ class _Model:
 
     def tip(self, x: FloatArray) -> FloatArray:
         """Tip minus what an R-test read, (n, 3): where the sphere must be."""
-        offset = [x[self.names.index(name)] if name in self.names else 0.0 for name in SPINDLE]
-        tool_mm = self.spheres.tool_mm + np.array(offset)
-        tip = tip_pose(self.machine, *self.tables(x), self.joint_mm, self.spheres.angle_deg, tool_mm)[0]
+        tip = tip_pose(self.machine, *self.tables(x), self.joint_mm, self.spheres.angle_deg, self.spheres.tool_mm)[0]
         return tip - np.nan_to_num(self.spheres.deviation_mm)
 
     def columns(self, x: FloatArray) -> FloatArray:
@@ -197,12 +202,8 @@ class _Model:
 
 
 def _constants(names: Sequence[str], values: FloatArray, u: FloatArray) -> dict[str, tuple[float, float]]:
-    """Constants of the rotary axes by name, without the offsets of the spindle."""
-    return {
-        name: (float(value), float(own))
-        for name, value, own in zip(names, values, u, strict=True)
-        if name not in SPINDLE
-    }
+    """Constants of the rotary axes by name."""
+    return {name: (float(value), float(own)) for name, value, own in zip(names, values, u, strict=True)}
 
 
 def _model(machine: Machine, spheres: SphereCentres, raised: float = 1.0) -> _Model:

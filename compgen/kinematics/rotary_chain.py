@@ -61,6 +61,7 @@ def tip_pose(
     travel = travel_vectors(machine, values, position_mm)
     motions = rotary.motions(machine, angle_deg)
     tip = np.array(np.broadcast_to(machine.tool_offset_mm if tool_mm is None else tool_mm, (count, 3)), dtype=float)
+    tip = tip + rotary.spindle_mm
     turned = np.tile(np.eye(3), (count, 1, 1))
     for letter, tool_side in machine.chain.passed:
         if letter in AXES:
@@ -102,9 +103,13 @@ def pose_error(
     """Error of the tip (n, 3) in the workpiece frame, mm, and of the orientation of the tool (n, 3) in it, rad."""
     tip, turned = tip_pose(machine, errors, rotary, position_mm, angle_deg, tool_mm)
     nominal, straight = tip_pose(machine, ErrorTable(), RotaryErrors(), position_mm, angle_deg, tool_mm)
+    return tip - nominal, rotation_between(turned, straight)
+
+
+def rotation_between(turned: FloatArray, straight: FloatArray) -> FloatArray:
+    """Small rotations (n, 3), rad, that take orientations ``straight`` (n, 3, 3) to ``turned``: the antisymmetric part."""
     between = np.einsum("nij,nkj->nik", turned, straight)
-    # the small rotation is the antisymmetric part; einsum with the generators of rotation picks it
-    return tip - nominal, 0.5 * np.einsum("nij,kij->nk", between, cross_matrices(np.eye(3)))
+    return np.asarray(0.5 * np.einsum("nij,kij->nk", between, cross_matrices(np.eye(3))))
 
 
 def joints_of_tip(

@@ -1,0 +1,205 @@
+"""``export``, ``verify``, ``read`` and ``run`` for parameters of rotary axes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from compgen.cli.terminal import answer, complain, say, say_paths
+from compgen.controls.rotary_parameters import believed, lines_of, target_of
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable
+from compgen.data.files import REJECTED_PREFIX, OutputFolder, read_text, write_file
+from compgen.data.machine import Machine
+from compgen.data.names import COVERAGE, MM_PER_UM
+from compgen.data.rotary import RotaryErrors, format_poses, read_machine_errors, read_poses, si_per_unit
+from compgen.errors import InputError
+from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
+from compgen.pipeline import provenance_of
+from compgen.tables.rotary_parameters import RotaryExport, export_rotary, judged
+
+
+def export_parameters(machine: Machine, errors: Path, controller: str, out: Path, as_json: bool) -> int:
+    """Write the parameters of a control for errors of rotary axes, read back, emulated and judged."""
+    target = target_of(machine, controller)
+    _, rotary = read_machine_errors(errors)
+    result = export_rotary(machine, target, _some(rotary, errors), _covariance(errors, rotary))
+    output = OutputFolder(out)
+    prefix = REJECTED_PREFIX if result.reasons else ""
+    output.add(prefix + target.file, result.text)
+    summary = {"machine": machine.name, **result.summary()}
+    output.add("result.json", json.dumps(summary, indent=2) + "\n")
+    inputs = dict(provenance_of(machine.source, errors).inputs)
+    files = [{"name": prefix + target.file, "sha256": summary["files"][target.file]}]
+    output.add(
+        "manifest.json", json.dumps({"controller": controller, "files": files, "inputs": inputs}, indent=2) + "\n"
+    )
+    output.add("preflight.md", preflight(machine, result))
+    paths = output.commit()
+    for text in result.reasons:
+        complain(f"not acceptable: {text}", "red")
+    answer(as_json, {**summary, "paths": [str(path) for path in paths or ()]}, parameters_table(result))
+    if not as_json:
+        say_paths([out / name for name in (prefix + target.file, "result.json", "manifest.json", "preflight.md")])
+    return 1 if result.reasons else 0
+
+
+def _some(rotary: RotaryErrors, path: Path) -> RotaryErrors:
+    if not rotary.names:
+        raise InputError("contains no errors of rotary axes; identify them from *.sphere.csv files first", file=path)
+    return rotary
+
+
+def _covariance(errors: Path, rotary: RotaryErrors) -> tuple[tuple[str, ...], FloatArray] | None:
+    """Covariance of the constants, mm and rad: of the identification beside the file if it is that of its errors."""
+    found, names = errors.parent / "identify.json", tuple(rotary.constants)
+    try:
+        data = json.loads(read_text(found)) if found.is_file() else {}
+    except ValueError:
+        data = {}
+    stated = data.get("errors", {})
+    same = isinstance(stated, dict) and set(names) <= set(stated) and data.get("kind") == "sphere"
+    units = np.array([si_per_unit(name) for name in names])
+    if same and all(
+        abs(stated[name]["value"] * unit - rotary.constants[name][0]) < 1e-5 * unit
+        for name, unit in zip(names, units, strict=True)
+    ):
+        order = [list(stated).index(name) for name in names]
+        return names, np.array(data["covariance"])[np.ix_(order, order)] * np.outer(units, units)
+    u = np.array([rotary.constants[name][1] for name in names])
+    return None if np.isnan(u).any() or not len(u) else (names, np.diag(u**2))
+
+
+def parameters_table(result: RotaryExport) -> Table:
+    """The numbers, with their uncertainty, and what they leave."""
+    before, after = result.before, result.after
+    table = Table(
+        "parameter",
+        "without errors",
+        "exported",
+        "U (k = 2)",
+        box=box.SIMPLE,
+        title=result.target.title,
+        title_justify="left",
+    )
+    for name, value in result.numbers.items():
+        u = result.u.get(name)
+        digits = 6 if name in result.target.unitless else 4
+        shown = "" if u is None else f"{COVERAGE * u:.{digits}f}"
+        table.add_row(name, f"{result.nominal[name]:.{digits}f}", f"{value:.{digits}f}", shown)
+    table.caption = "\n".join(
+        [
+            f"tip over all poses, part set up: rms {before.rms_um:.2f} -> {after.rms_um:.2f} um, largest {before.max_um:.2f} -> "
+            f"{after.max_um:.2f} um" + ("" if result.after_u_um is None else f" (u {result.after_u_um:.2f} um rms)"),
+            f"tool axis against what the control knows: rms {before.rms_urad:.1f} -> {after.rms_urad:.1f} urad",
+            *([f"not expressed: {', '.join(result.not_expressed)}"] if result.not_expressed else []),
+        ]
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def preflight(machine: Machine, result: RotaryExport) -> str:
+    """What to check before the parameters are used."""
+    target, before, after = result.target, result.before, result.after
+    rows = [f"| `{name}` | {result.nominal[name]:.6f} | {value:.6f} |" for name, value in result.numbers.items()]
+    turned = [
+        f"{letter} of the control is minus {letter} of the machine file" for letter, s in target.sense.items() if s < 0
+    ]
+    zeros = [
+        f"- {letter}: the zero is off by {value / 1e-6:+.1f} urad (`E{letter}0{letter}`): every command of {letter} should be "
+        f"{-value * 57.29577951308232 * target.sense.get(letter, 1.0):+.6f} degrees more, by the reference position of the axis"
+        for letter in machine.rotary
+        if (value := result.zeros.get(letter, 0.0))
+    ]
+    return "\n".join(
+        [
+            f"# {target.title}",
+            "",
+            f"Machine {machine.name}, chain {machine.chain.name}. Lengths in {machine.units}.",
+            "",
+            "| number | without errors | exported (mm) |",
+            "|---|---|---|",
+            *rows,
+            "",
+            f"Over the travel, all angles and tools of 0 to 200 mm, with the part set up: tip rms {before.rms_um:.2f} -> "
+            f"{after.rms_um:.2f} um, largest {before.max_um:.2f} -> {after.max_um:.2f} um; tool axis rms "
+            f"{before.rms_urad:.1f} -> {after.rms_urad:.1f} urad.",
+            "",
+            "## What is known about signs",
+            "",
+            *(f"- {how}: {text}" for how, text in target.stated),
+            "",
+            "## Before use",
+            "",
+            "- Write down the numbers that are on the control now. Those without errors are what it should hold if it was set up "
+            "from the machine file; if it holds others, find out why before you change them.",
+            *(f"- {text}." for text in turned),
+            *zeros,
+            "- Two probed poses show the sense of each axis: `volcomp check MACHINE --spheres FILE` names an axis that turns the "
+            "other way round than the machine file says.",
+            "- Probe a sphere at four poses of the rotary axes again: it must stay where it is.",
+            *(f"- Not expressed by this control: {name}." for name in result.not_expressed),
+            "",
+        ]
+    )
+
+
+def verify_parameters(
+    machine: Machine, tables: Sequence[Path], controller: str, errors: Path, out: Path, as_json: bool
+) -> int:
+    """Judge a file of parameters against the errors of the rotary axes."""
+    target = target_of(machine, controller)
+    path = parameter_file(tables, target.file)
+    text = read_text(path)
+    _, rotary = read_machine_errors(errors)
+    result = judged(machine, target, _some(rotary, errors), target.parse(machine, text, path), text)
+    output = OutputFolder(out)
+    output.add("result.json", json.dumps({"machine": machine.name, **result.summary()}, indent=2) + "\n")
+    output.commit()
+    for reason in result.reasons:
+        complain(f"not acceptable: {reason}", "red")
+    answer(as_json, result.summary(), parameters_table(result))
+    return 1 if result.reasons else 0
+
+
+def parameter_file(tables: Sequence[Path], name: str) -> Path:
+    """The file of parameters: given, or in the folder of an export."""
+    if len(tables) != 1:
+        raise InputError(f"expected one file, {name}, or the folder of the export", file=tables[1])
+    path = tables[0]
+    if not path.is_dir():
+        return path
+    found = [path / name, path / f"{REJECTED_PREFIX}{name}"]
+    return next((file for file in found if file.is_file()), found[0])
+
+
+def read_parameters(
+    machine: Machine, tables: Sequence[Path], controller: str, points: Path, out: Path, as_json: bool
+) -> int:
+    """What the control adds to the positions of X, Y, Z at poses, against one with the numbers of the machine file."""
+    target = target_of(machine, controller)
+    path = parameter_file(tables, target.file)
+    numbers = target.parse(machine, read_text(path), path)
+    poses = read_poses(machine, points)
+    count = len(poses.position_mm)
+    tool = np.array(machine.tool_offset_mm if poses.tool_mm is None else poses.tool_mm)
+    tool = np.broadcast_to(tool, (count, 3))
+    nominal = believed(target, machine, target.numbers(lines_of(machine)))
+    tip, _ = tip_pose(nominal, ErrorTable(), RotaryErrors(), poses.position_mm, poses.angle_deg, tool)
+    added = joints_of_tip(believed(target, machine, numbers), tip, poses.angle_deg, tool) - poses.position_mm
+    columns = {f"c{axis}_um": added[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
+    write_file(out, format_poses(poses, columns, {"machine": machine.name, "controller": controller}))
+    largest = float(np.linalg.norm(added, axis=1).max() / MM_PER_UM)
+    data: dict[str, Any] = {"points": count, "controller": controller, "max_um": largest, "file": str(out)}
+    if as_json:
+        answer(True, data)
+    else:
+        say(f"{count} poses: the control adds up to {largest:.2f} um to X, Y, Z -> {out}")
+    return 0
