@@ -297,11 +297,12 @@ def init_command(
     On a terminal it asks for everything that no option gives. Every key has a comment with its meaning and unit; settings of
     a control that only its owner can know, such as the sign of a table, are left as comments for you to complete.
 
+    Rotary axes are described, too: --chain "trunnion in A and C, table in Y, column in X, head in Z" --travel A=-110..30
+    --travel C=endless --point A=0,0,-50 (degrees, mm). Words such as "fork head" alone mean the usual machine.
+
     \b
     Example:
       volcomp init my-mill --chain WXYFZT --travel X=0..600 --travel Y=0..400 --travel Z=0..500
-      volcomp init five --chain "trunnion in A and C, table in Y, head in X and Z" --travel X=-400..400 --travel Y=-300..300
-        --travel Z=-300..400 --travel A=-110..30 --travel C=endless --point A=0,0,-50 --point C=0,0,0
     """
     asks = sys.stdin.isatty() and not as_json
     name = name or _asked("Name of the machine", "NAME", asks)
