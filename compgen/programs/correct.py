@@ -53,7 +53,7 @@ SAME_MM = 1e-6
 #: How many blocks that lead beyond the travel are listed.
 MOST_LISTED, MOST_IN_PREFLIGHT = 100, 20
 #: A program that has grown by more than this many times, and by more than so many blocks, is said to have.
-GROWTH, FEW_BLOCKS = 2, 200
+GROWTH, FEW_BLOCKS = 1, 200
 #: Decimals of angles of Klartext, degrees.
 _ANGLE_DIGITS = 4
 #: Files beside a corrected program.

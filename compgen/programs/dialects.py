@@ -29,6 +29,7 @@ _GRBL = {
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
     **{"G28.1": "store home", "G30.1": "store home"},
     **{"G43.1": "tool offset", "G49": "no tool", "G92": "preset", "G92.1": "no preset", "G91.1": "centre incremental"},
+    **{f"G38.{k}": "probe" for k in range(2, 6)},
 }
 _LENGTH = {"G43": "tool", "G49": "no tool", "G98": "initial level", "G99": "R level", "G73": "cycle 73"}
 _LINUXCNC = {
@@ -45,7 +46,7 @@ _FANUC = {
     **_CYCLES,
     **_LENGTH,
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
-    **{"G54.1": "work offset", "G92": "preset", "G92.1": "no preset", "G52": "shift"},
+    **{"G54.1": "work offset", "G92": "preset", "G92.1": "no preset", "G52": "shift", "G31": "probe"},
     # left-hand and right-hand tapping feed out, fine boring and boring by hand do not; Q of G76 is a way aside at the bottom
     **{"G74": "cycle 84", "G84": "cycle 84", "G76": "cycle 86", "G88": "cycle 86"},
     # Haas: offsets G110 to G129 and G154 P1 to P99
@@ -63,6 +64,7 @@ _SIEMENS = {
     **{"G74": "unknown position", "G75": "unknown position", "TRANS": "shift all", "ATRANS": "shift more"},
     **{"ROT": "shift off", "SCALE": "shift off", "MIRROR": "shift off", "MCALL": "modal call"},
     **dict.fromkeys((*(f"CYCLE{k}" for k in range(81, 90)), "CYCLE840"), "drill here"),
+    **dict.fromkeys((f"CYCLE{k}" for k in range(971, 998)), "probe"),
     **{f"G{k}": "work offset" for k in range(505, 600)},
     **dict.fromkeys(("G60", "G601", "G602", "G603", "G641", "G642", "G643", "G644", "G645", "G290"), "nothing"),
     **dict.fromkeys(
@@ -85,6 +87,7 @@ _HEIDENHAIN = {
     # a cycle is defined by its block and executed by G79, M99, or by all positions after M89
     **{"G79": "drill here", "M99": "drill here", "M89": "calls", "M91": "machine coordinates"},
     **dict.fromkeys(("G83", "G84", "G85"), "definition"),
+    **{f"G{k}": "probe" for k in range(400, 500)},
     # G62 is the tolerance (cycle 32), G36 turns the spindle, G38 stops, G51 names the next tool
     **{"G62": "setting", "G36": "setting", "G38": "nothing", "G51": "setting"},
 }
@@ -150,7 +153,7 @@ _HEIDENHAIN_REFUSED = {
     "G247": "the datum that the program chooses is not known; choose it at the control",
     **dict.fromkeys((f"G{k}" for k in (37, *range(56, 60), *range(74, 79), *range(120, 126), 127)), _MILLED),
     **dict.fromkeys((f"G{k}" for k in (204, 208, *range(210, 240), *range(251, 300))), _MILLED),
-    **dict.fromkeys((f"G{k}" for k in (55, *range(400, 500))), _PROBED),
+    "G55": _PROBED,
     **dict.fromkeys(("M92", "M104"), "positions from a point of the maker, and older datums, are not known; use M91"),
     **dict.fromkeys(("M112", "M113", "M114", "M115", "M128", "M130", "M138", "M144"), _ROTARY),
     **dict.fromkeys(("M142", "M143"), "deletes settings that the program does not show; post the program without it"),
@@ -173,7 +176,6 @@ _SIEMENS_REFUSED = {
     **dict.fromkeys(("HOLES1", "HOLES2", "CYCLE801", "CYCLE802"), _PATTERN),
     **dict.fromkeys(("LONGHOLE", "SLOT1", "SLOT2", "POCKET1", "POCKET2", "POCKET3", "POCKET4"), _MILLED),
     **dict.fromkeys((f"CYCLE{k}" for k in (*range(60, 65), *range(70, 80), 90, 899)), _MILLED),
-    **dict.fromkeys((f"CYCLE{k}" for k in range(971, 998)), _PROBED),
     "G291": "programs in the ISO dialect are read with --dialect fanuc",
 }  # fmt: skip
 _M_CODES = (*range(10), 10, 11, 13, 14, 19, 29, 30, *range(40, 46), 48, 49, 60)

@@ -172,7 +172,12 @@ _COMMON: _Does = {
     **_each("preset", 92),
     **_each("no preset", 92.1),
 }
-_GRBL: _Does = {**_COMMON, **_each("store", 28.1, 30.1), **_each("typed length", 43.1)}
+_GRBL: _Does = {
+    **_COMMON,
+    **_each("store", 28.1, 30.1),
+    **_each("typed length", 43.1),
+    **_each("lost", 38.2, 38.3, 38.4, 38.5),
+}
 _CYCLES: _Does = {
     **{f"G{k}": ("cycle", float(k)) for k in (73, 81, 82, 83, 85, 86, 89)},
     **{"G98": ("to R", 0.0), "G99": ("to R", 1.0), "G43": ("length", 0.0)},
@@ -196,6 +201,7 @@ _TABLES: dict[str, _Does] = {
         **{"G74": ("cycle", 84.0), "G84": ("cycle", 84.0), "G76": ("cycle", 86.0), "G88": ("cycle", 86.0)},
         **_each("fixture", *range(110, 130), 154, 54.1),
         **_each("frame", 52),
+        **_each("lost", 31),
         **_each("quiet", 5, 5.1, 8, 103, 187, 22, 23, 25, 26, 54.2, 54.4),
     },
     "siemens": {
@@ -207,7 +213,7 @@ _TABLES: dict[str, _Does] = {
         **_each("lost", 74, 75),
         **_each("quiet", 25, 26),
         **_each("modally", "MCALL"),
-        **_each("turn", "CYCLE800"),
+        **_each("turn", "CYCLE800", *(f"CYCLE{k}" for k in range(971, 998))),
         **_each("frame", "TRANS", number=_ANEW),
         **_each("frame", "ATRANS", number=_MORE),
         **_each("frame", "ROT", "SCALE", "MIRROR", number=_OFF),
@@ -226,6 +232,7 @@ _TABLES: dict[str, _Does] = {
         **_each("modally", "M89"),
         **_each("machine", "M91"),
         **_each("define", 83, 84, 85, *range(200, 300)),
+        **_each("turn", *range(400, 500)),
     },
 }
 #: What takes the words of its block for itself, so that they are no move.
@@ -511,7 +518,7 @@ class Follower:
             self._set_length(kind, words)
         elif kind in ("frame", "offset", "no preset", "store"):
             self._set_zero(code, kind, number, words)
-        elif kind == "turn" and words.call and words.call[1].strip():
+        elif kind == "turn" and (self.heidenhain or (words.call and words.call[1].strip())):
             self.at = [math.nan] * 3
         elif kind in ("define", "modally", "tool"):
             self._set_hole(code, kind, words)
@@ -1011,6 +1018,8 @@ class KlartextFollower(Follower):
             self.done = True
         elif define := re.match(r"CYCL ?DEF ?(\d+)(?:[ .]*\. ?(\d+))?", text):
             self._take(int(define[1]), define[2], text[define.end() :])
+        elif text.startswith("TCH"):
+            self.at, self.way = [math.nan] * 3, complex(math.nan)
         elif text.startswith("TOOL"):
             self._take_tool(text)
         elif text.startswith("TRANS DATUM"):

@@ -71,7 +71,6 @@ _REFUSED = (
         "approaches and departures need cutter radius compensation, which is not followed; post lines and arcs with R0",
     ),
     (r"F(?:POL|L|LT|C|CT|SELECT)\b", "free contours (FK) are not followed; post lines and arcs"),
-    (r"TCH\s*PROBE", "where a probe stops is not known; take probing out of the program"),
     (
         r"PLANE|FUNCTION|M128|LN\b|SPL\b",
         "a turned plane, TCPM, normals and splines are not followed; post a program with X, Y and Z",
@@ -128,6 +127,9 @@ class Sentences:
         if self._cycle and re.match(r"Q\d+\s*=", text):
             return self._more(text)
         cycle, self._cycle = self._cycle, ""
+        if found := re.match(r"TCH\s*PROBE\s*(\d+)(?:\s*\.\s*(\d+))?", text):
+            self._cycle = "probe"
+            return Sentence("probe", number=f"TCH PROBE {found[1]}") if found[2] in (None, "0") else Sentence("keep")
         if found := re.match(r"(BEGIN|END)\s++PGM\b", text):
             unit = next((name for name in ("MM", "INCH") if text.rstrip().endswith(name)), "")
             return Sentence(found[1].lower(), number=unit)
@@ -159,6 +161,8 @@ class Sentences:
     def _more(self, text: str) -> Sentence:
         """A further line of a cycle that is defined."""
         number = re.match(rf"Q(\d+)\s*=\s*({VALUE})?", text)
+        if self._cycle == "probe":
+            return Sentence("keep")
         if self._cycle == "247":
             if not number or number[1] != "339" or not number[2]:
                 return Sentence("refused", number="cycle 247 needs the number of the preset: Q339=1")
@@ -656,6 +660,8 @@ class _Program:
         motion = _MOTION.match(code)
         if code.startswith("CYCL") and "DEF" in code[:10]:
             return self._define(item, code)
+        if code.startswith("TCH"):
+            return self._probe(item)
         if code.startswith("PATTERN"):
             self.points = self._points(item)
             return self._comment(item)
@@ -674,6 +680,14 @@ class _Program:
             self.q[unknown[1]] = None
         self._keep(item)
         return None
+
+    def _probe(self, item: _Statement) -> None:
+        """Keep a block that probes: where the tool is after it, and what it has found, is not known."""
+        self.q |= {key.upper(): float(value.replace(" ", "")) for key, _, value in _CYCLE_NUMBER.findall(item.code)}
+        results = re.findall(r"\bQ[LR]?\d+\b(?!\s*=)", item.code.upper())
+        self.q |= dict.fromkeys((*results, *(f"Q{k}" for k in (*range(115, 120), *range(150, 200)))))
+        self.at, self.element, self.tangent = [math.nan] * 3, None, None
+        self._keep(item)
 
     @staticmethod
     def _words(code: str) -> dict[str, float]:

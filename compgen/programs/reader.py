@@ -162,7 +162,7 @@ class Reader:
         self.last_arc: int | None = None
         #: The drilling cycle that a block has defined, and whether all positions call it (MCALL, M89).
         self.drilling: DrillingCycle | None = None
-        self.calling = self._defining = self._ends_calls = False
+        self.calling = self._defining = self._ends_calls = self._probing = False
         self._drilling_scale = 1.0
         self._preset_number = ""
         self._modes: dict[str, str] = {}
@@ -175,6 +175,8 @@ class Reader:
         self.named = [False] * 3
         #: Least and largest machine positions of moves that are corrected, (2, 3); nan before there are any.
         self.reached_mm = np.full((2, 3), np.nan)
+        #: Codes that probe, with their lines.
+        self.probed: dict[str, dict[int, None]] = {}
         #: M codes that are not known, with their lines: all are said at the end.
         self.unknown: dict[str, dict[int, None]] = {}
         self.ended = self.seen_percent = self.started = False
@@ -307,6 +309,7 @@ class Reader:
         """Refuse a program that ends in the middle, or has M codes that are not known."""
         if self._integers and self._integers[0].used:
             self.assumed[self._integers[1]] = None
+        self._say_probed()
         if self.unknown:
             first = min(map(self.in_file, next(iter(self.unknown.values()))))
             raise InputError(self._said_unknown(), file=self.source, line=first)
@@ -710,6 +713,9 @@ class Reader:
             self._use_preset(said.number)
         elif what in ("cycle", "more"):
             self._take_cycle(what, said.number)
+        elif what == "probe":
+            self._note_probe(said.number)
+            self.position, self.named = [math.nan] * 3, [False] * 3
         elif what == "shift":
             self._modes = dict(said.modes)
             self._shift_by_words(words)
@@ -797,7 +803,12 @@ class Reader:
 
     def _takes_definition(self, body: str) -> bool:
         """Take a block that defines a cycle from G200, or goes on doing so: ``G200 DRILLING``, ``Q200=2 ;SET-UP CLEARANCE``."""
-        begun = re.match(r"\s*(?:N\d+\s*)?(G2\d\d)\b", body, re.IGNORECASE)
+        begun = re.match(r"\s*(?:N\d+\s*)?(G[24]\d\d)\b", body, re.IGNORECASE)
+        self._probing = bool(begun and begun[1][1] == "4") or (self._probing and not begun)
+        if self._probing and begun:
+            self._note_probe(begun[1].upper())
+            self.position, self.named, self._defining = [math.nan] * 3, [False] * 3, True
+            return True
         if begun:
             code = begun[1].upper()
             if not defines_hole(code):
@@ -808,6 +819,8 @@ class Reader:
         elif not self._defining or not re.match(r"\s*(?:N\d+\s*)?Q\d+\s*=", body, re.IGNORECASE):
             self._defining = self._defining and body.lstrip().startswith(";")
             return False
+        elif self._probing:
+            return True
         assert self.drilling is not None
         self.drilling = self.drilling.defined_further(self._text)
         return True
@@ -822,6 +835,10 @@ class Reader:
                 # all shifts and angles are 0: the plane is not turned, but the cycle may draw the tool back
                 self.position, self.named = [math.nan] * 3, [False] * 3
                 self.assumed["CYCLE800 without angles leaves the rotary axes where the errors were measured"] = None
+                return name.end()
+            if dialect.name == "siemens" and name[2] and dialect.codes.get(code) == "probe":
+                self._note_probe(code)
+                self.position, self.named = [math.nan] * 3, [False] * 3
                 return name.end()
             if dialect.name == "siemens" and name[2] and defines_hole(code):
                 self.drilling = DrillingCycle.called(code, self._text, name.start(2), name[2])
@@ -1066,6 +1083,11 @@ class Reader:
             actions.append("done")
         elif meaning == "calls":
             self.calling = True
+        elif meaning == "probe":
+            self._note_probe(code)
+            actions.append("unknown position")
+            if self.dialect.name in ("linuxcnc", "grbl"):  # there it stays in force like G1
+                self.motion = None
         elif meaning == "last arc":
             if self.last_arc is None:
                 self._fail(f"{code} goes on in the direction of the last arc, and there is none before; post G2 or G3")
@@ -1081,6 +1103,24 @@ class Reader:
             actions.append(f"home {code}")
         elif meaning != "nothing":
             actions.append(meaning)
+
+    def _note_probe(self, code: str) -> None:
+        """Keep where the program probes: its block stays as it is, and where the tool is after it is not known."""
+        self.probed.setdefault(code, {})[self._line] = None
+
+    def _say_probed(self) -> None:
+        texts = [
+            f"{code} in line {', '.join(map(str, self._lines_said(lines)))}" for code, lines in self.probed.items()
+        ]
+        if texts:
+            said = (
+                f"probing is not corrected ({'; '.join(texts)}): what it measures is where the control counts to be, with the "
+                "errors of the machine at that place; a work offset or tool length that is set from it is the one that was given"
+            )
+            self.assumed[said] = None
+
+    def _lines_said(self, lines: Mapping[int, None]) -> list[int]:
+        return list(dict.fromkeys(map(self.in_file, lines)))[:MOST_LINES]
 
     def _end_preset(self, code: str, values: dict[str, float]) -> None:
         """End G92: FANUC names the axes, which end G52 as well; in other dialects axis words beside it are a move."""

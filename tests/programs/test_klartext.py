@@ -306,7 +306,7 @@ REFUSED = [
     ("FN 9: IF +Q1 EQU +1 GOTO LBL 5", 4, "FN 9"),
     ("CALL LBL 9", 4, "LBL 9"),
     ("CALL PGM TNC:\\A.H", 4, "another program"),
-    ("TCH PROBE 410 DATUM", 4, "probe"),
+    ("TCH PROBE 410 DATUM\nL X+5 F9", 5, "position of X is not known"),
     ("PLANE SPATIAL SPA+0 SPB+10 SPC+0 STAY", 4, "plane"),
     ("FUNCTION TCPM F TCP", 4, "TCPM"),
     ("FC DR- R5", 4, "FK"),

@@ -469,3 +469,55 @@ def test_a_program_that_grows_much_is_said_to(tmp_path):
     assert result.notes[0][1:] in (tmp_path / "out" / "preflight.md").read_text()
     coarse, _ = run(tmp_path, text, rough, "fanuc", setup, tolerance_um=20.0)
     assert coarse.notes == () and coarse.counts["added_blocks"] < 20
+
+
+# --- probing: blocks stay, and where the tool is after them is not known ----------------------------------------------
+
+PROBED = {
+    "fanuc": ("G21 G90 G17 G54\nG0 X1. Y1. Z5.\n", "G31 Z-5. F50\n", "G0 Z5.\nX2.\n", "G1 X9. F90\nM30\n", "G31 in line 3"),
+    "linuxcnc": ("G21 G90 G17 G54\nG0 X1 Y1 Z5\n", "G38.2 Z-5 F50\n", "G0 Z5\nX2\n", "G1 X9 F90\nM2\n", "G38.2 in line 3"),
+    "grbl": ("G21 G90 G17 G54\nG0 X1 Y1 Z5\n", "G38.3 Z-5 F50\n", "G0 Z5\nX2\n", "G1 X9 F90\n", "G38.3 in line 3"),
+    "siemens": (
+        "G71 G90 G17 G54\nG0 X1 Y1 Z5\n", "CYCLE978(100,10001,,1,10,5,2)\n", "G0 X2 Y1 Z5\n", "G1 X9 F90\nM30\n",
+        "CYCLE978 in line 3",
+    ),
+    "heidenhain-iso": (
+        "%A G71 *\nN1 G00 G90 G40 X+1 Y+1 Z+5*\n", "N2 G419 Q263=+5 ;1ST POINT\nQ261=-5 ;HEIGHT\n", "N3 G00 X+2 Y+1 Z+5*\n",
+        "N4 G01 X+9 F90*\nN5 M30*\nN99 %A G71 *\n", "G419 in line 3",
+    ),
+    "heidenhain-klartext": (
+        "0 BEGIN PGM A MM\nTOOL CALL 1 Z S9\nL X+1 Y+1 Z+5 R0 FMAX\n",
+        "TCH PROBE 419 DATUM ~\n  Q263=+5 ;1ST POINT ~\n  Q261=-5 ;HEIGHT\nTCH PROBE 0.0 REF. PLANE Q5 Z-\n"
+        "TCH PROBE 0.1 X+1 Y+1 Z-5\n",
+        "L X+2 Y+1 Z+5 R0 FMAX\n", "L X+9 F90\nM30\nEND PGM A MM\n", "TCH PROBE 419 in line 4; TCH PROBE 0 in line 7",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", PROBED)
+def test_probing_passes_uncorrected_and_says_what_it_measures(tmp_path, dialect):
+    """The machine is 10 um off in X: the block that probes keeps its bytes, moves that are placed after it are corrected."""
+    begin, probe, placed, cut, said = PROBED[dialect]
+    setup = Setup({"G54": (0.0, 0.0, 0.0), "PRESET": (0.0, 0.0, 0.0)}, {"1": (0.0, 0.0, 0.0)})
+    result, corrected = run(tmp_path, begin + probe + placed + cut, shift(x=10.0), dialect, setup)
+    assert result.accepted
+    assert probe in corrected
+    assert re.search(r"X\+?8\.99 ", corrected)
+    (note,) = [text for text in result.assumed if "probing is not corrected" in text]
+    assert said in note
+    with pytest.raises(InputError, match="not known"):  # a cut from where the probe stopped
+        run(tmp_path, begin + probe + cut, shift(x=10.0), dialect, setup)
+
+
+def test_what_a_probe_has_found_is_no_constant(tmp_path):
+    begin, probe, placed, cut, _ = PROBED["heidenhain-klartext"]
+    setup = Setup({"PRESET": (0.0, 0.0, 0.0)}, {"1": (0.0, 0.0, 0.0)})
+    for name in ("Q5", "Q160"):
+        with pytest.raises(InputError, match=name):
+            run(
+                tmp_path,
+                begin + probe + placed + cut.replace("X+9", f"X+{name}"),
+                shift(),
+                "heidenhain-klartext",
+                setup,
+            )
