@@ -143,18 +143,28 @@ NO_CLASS = (
 @click.command("check")
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option("--kind", type=click.Choice(list(KINDS)), help="Kind of the files; default: recognised by their keys.")
+@click.option(
+    "--spheres",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="*.sphere.csv (mm, degrees): two probed poses of a sphere say whether each rotary axis turns as the machine file says.",
+)
 @json_option
-def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> int:
+def check_command(files: tuple[str, ...], kind: str | None, spheres: Path | None, as_json: bool) -> int:
     """List every problem of machine, job, scenario and instrument files at once.
 
     FILE is a TOML file, the name of a machine, or a folder: all *.toml files in it are checked, even if one is broken. A
     machine file is read with the settings of all of its controls. Values that are possible but unlikely, such as a travel
     of 0.8 mm, are listed as questions, not as problems. Exit code 2 if there is a problem.
 
+    With --spheres and one machine: whether its rotary axes turn as its file says (exit code 1 if one does not).
+
     \b
     Example:
       volcomp check zha-gantry
     """
+    if spheres is not None:
+        return _check_senses(files, spheres, as_json)
     listing: list[dict[str, Any]] = []
     for path, named in _paths(files):
         try:
@@ -210,6 +220,24 @@ def check_command(files: tuple[str, ...], kind: str | None, as_json: bool) -> in
         say(*(f"  {'question' if '?' in text else 'warning'}: {text}" for text in item["warnings"]), style="yellow")
         say(*(f"  hint: {text}" for text in item.get("hints", [])))
     return 2 if count else 0
+
+
+def _check_senses(files: Sequence[str], spheres: Path, as_json: bool) -> int:
+    """Say which way each rotary axis of a machine turns."""
+    from compgen.data.rotary import read_spheres
+    from compgen.identify.spheres import senses
+
+    if len(files) != 1:
+        raise InputError("expected one machine", field="--spheres")
+    machine = load_machine(files[0])
+    found = senses(machine, read_spheres(machine, [spheres]))
+    data = {sense.letter: {"verdict": sense.verdict, "as_stated_mm": sense.as_stated_mm, "reversed_mm": sense.reversed_mm,
+                           "text": sense.text} for sense in found}  # fmt: skip
+    if as_json:
+        print_json({"machine": machine.name, "senses": data})
+    for sense in () if as_json else found:
+        say(sense.text, style={"reversed": "red", "not told": "yellow"}.get(sense.verdict))
+    return 1 if any(sense.verdict == "reversed" for sense in found) else 0
 
 
 def _paths(files: Sequence[str]) -> list[tuple[Path, bool]]:

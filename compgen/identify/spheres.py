@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -222,6 +223,66 @@ def _model(machine: Machine, spheres: SphereCentres, raised: float = 1.0) -> _Mo
     return _Model(machine, spheres, joints, names, np.array([*(raised * np.array(sizes)), *linear]))
 
 
+@dataclass(frozen=True)
+class Sense:
+    """Whether a rotary axis turns as the machine file says: distances from the sphere if it does, and if it does not, mm.
+
+    ``verdict`` is ``"agrees"``, ``"reversed"``, or ``"not told"`` where both fit alike, or neither.
+    """
+
+    letter: str
+    as_stated_mm: float
+    reversed_mm: float
+    verdict: str
+
+    @property
+    def text(self) -> str:
+        """The verdict in words."""
+        figures = f"the sphere moves by {self.as_stated_mm:.3f} mm as the file says, by {self.reversed_mm:.3f} mm reversed (rms)"
+        if self.verdict == "agrees":
+            return f"{self.letter} turns as the machine file says: {figures}"
+        if self.verdict == "reversed":
+            return f"{self.letter} turns the other way round than the machine file says: {figures}"
+        return (
+            f"{self.letter}: the poses do not tell which way it turns: {figures}. Probe the sphere, farther from the axis, at "
+            f"two angles of {self.letter} that are some 30 to 120 degrees apart, the other rotary axes at rest"
+        )
+
+
+#: Distances below which no sense is told, and by which one must exceed the other.
+_TOLD_MM, _TOLD_TIMES = 0.5, 4.0
+
+
+def senses(machine: Machine, spheres: SphereCentres) -> tuple[Sense, ...]:
+    """Which way each rotary axis turns: two poses of one sphere are enough, at any angles that are not opposite.
+
+    A sphere stays where it is on the table. With the sense of an axis reversed, its poses lie on another curve, mm apart;
+    errors of the axis lines move them by tenths.
+    """
+    joints = spheres.found_mm
+    if spheres.coordinates == TIP:
+        joints = joints_of_tip(machine, joints, spheres.angle_deg, spheres.tool_mm)
+    place, letters = spheres.places[0], tuple(machine.rotary)
+    if len(spheres) < 2:
+        raise InputError("contains one pose; two poses of one sphere are needed", file=_file_of(spheres))
+    moved: dict[tuple[float, ...], float] = {}
+    for signs in product((1.0, -1.0), repeat=len(letters)):
+        angle = {letter: sign * spheres.angle_deg[letter] for letter, sign in zip(letters, signs, strict=True)}
+        tip, _ = tip_pose(machine, ErrorTable(), RotaryErrors(), joints, angle, spheres.tool_mm)
+        apart = _centred(tip - np.nan_to_num(spheres.deviation_mm), place)
+        moved[signs] = float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    found = []
+    for k, letter in enumerate(letters):
+        stated, other = (min(size for signs, size in moved.items() if signs[k] == sign) for sign in (1.0, -1.0))
+        told = max(stated, other) > max(_TOLD_MM, _TOLD_TIMES * min(stated, other))
+        found.append(Sense(letter, stated, other, ("agrees" if stated < other else "reversed") if told else "not told"))
+    return tuple(found)
+
+
+def _file_of(spheres: SphereCentres) -> str | None:
+    return spheres.origin[0][0] if spheres.origin else None
+
+
 def identify_spheres(
     machine: Machine, spheres: SphereCentres, *, u_um: float | None = None, separate: bool = True
 ) -> SphereIdentification:
@@ -237,8 +298,15 @@ def identify_spheres(
     Raises
     ------
     InputError
-        for fewer than four poses of a sphere.
+        for fewer than four poses of a sphere, and for an axis that turns the other way round than the machine file says.
     """
+    wrong = [sense.text for sense in senses(machine, spheres) if sense.verdict == "reversed"]
+    if wrong:
+        text = "; ".join(wrong)
+        raise InputError(
+            f"{text}. Reverse the sign of its angles in the file, or find out which way it turns",
+            file=_file_of(spheres),
+        )
     model, raised = _model(machine, spheres), 1.0
     place, names = spheres.places
     for k, name in enumerate(names):

@@ -11,7 +11,7 @@ from compgen.data.machine import Axis, Chain, Machine, RotaryAxis
 from compgen.data.prior import PriorSettings
 from compgen.data.rotary import RotaryErrors, format_spheres, position_names, read_machine_errors, read_spheres, unit_of
 from compgen.errors import InputError
-from compgen.identify.spheres import WITHOUT_EFFECT, identify_spheres
+from compgen.identify.spheres import WITHOUT_EFFECT, identify_spheres, senses
 from compgen.simulate.spheres import SphereProbe
 
 KINDS = {"table-table": "WCAYFXZT", "head-table": "WCYFXZBT", "head-head": "WXYFZCBT"}
@@ -239,3 +239,57 @@ def test_positions_of_the_tip_give_the_same_as_positions_of_the_axes(tmp_path):
         joints = tmp_path / "j.sphere.csv"
         joints.write_text(format_spheres(spheres))
         read_spheres(machine, [file, joints])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("turned", [0, 1])
+def test_two_poses_say_which_way_an_axis_turns(kind, turned):
+    """The machine turns one axis the other way round: its poses are those of the file with the sign of that angle changed."""
+    from dataclasses import replace
+
+    machine = machine_of(KINDS[kind])
+    letter = tuple(machine.rotary)[turned]
+    other = next(name for name in machine.rotary if name != letter)
+    spheres, _ = measured(machine, np.random.default_rng(9), (120.0,), poses=60)
+    for axis in (letter, other):  # a pair of poses that differ by 60 degrees of one axis
+        angle = spheres.angle_deg
+        probe = SphereProbe(((60.0, 40.0, 20.0),), (120.0,), 4, 2.0)
+        at = {name: np.array([10.0, 10.0]) for name in machine.rotary} | {axis: np.array([0.0, 60.0])}
+        truth = RotaryErrors({}, {name: (0.1, 0.0) for name in position_names(axis)[:2]})
+        place = np.tile([60.0, 40.0, 20.0], (2, 1))
+        joint = probe._found(machine, ErrorTable(), truth, place, at, np.tile([0.0, 0.0, -120.0], (2, 1)))
+        pair = replace(spheres.part(np.array([0, 1])), found_mm=joint, angle_deg=at)
+        pair = replace(pair, tool_mm=np.tile([0.0, 0.0, -120.0], (2, 1)))
+        found = {sense.letter: sense.verdict for sense in senses(machine, pair)}
+        assert found[axis] == "agrees"
+        assert angle  # the poses of the campaign are not changed
+        swapped = replace(pair, angle_deg={**at, axis: -at[axis]})
+        assert {sense.letter: sense.verdict for sense in senses(machine, swapped)}[axis] == "reversed"
+    wrong = replace(spheres, angle_deg={**spheres.angle_deg, letter: -spheres.angle_deg[letter]})
+    with pytest.raises(InputError, match=f"{letter} turns the other way round than the machine file says"):
+        identify_spheres(machine, wrong)
+    assert {sense.verdict for sense in senses(machine, spheres)} == {"agrees"}
+
+
+def test_poses_that_do_not_tell_say_so(folder, call):
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    code, out, err = call("check", "five.toml", "--spheres", "sim/trunnion.sphere.csv")
+    assert code == 0 and out.count("turns as the machine file says") == 2, err
+    lines = Path("sim/trunnion.sphere.csv").read_text().splitlines()
+    lines = [line for line in lines if not line.startswith("# rows")]
+    start = next(k for k, line in enumerate(lines) if line.startswith("cx_mm"))
+    cells = [line.split(",") for line in lines[start + 1 :]]
+    Path("same.sphere.csv").write_text("\n".join([*lines[: start + 1], *([lines[start + 1]] * 2)]) + "\n")
+    code, out, err = call("check", "five.toml", "--spheres", "same.sphere.csv", "--json")
+    assert code == 0 and {item["verdict"] for item in json.loads(out)["senses"].values()} == {"not told"}, err
+    column = lines[start].split(",").index("c_deg")
+    for row in cells:
+        row[column] = str(360.0 - float(row[column]))
+    Path("x.sphere.csv").write_text("\n".join([*lines[: start + 1], *(",".join(row) for row in cells)]) + "\n")
+    code, out, err = call("check", "five.toml", "--spheres", "x.sphere.csv")
+    assert code == 1 and "C turns the other way round" in out
+    code, out, err = call("check", "zha-gantry", "--spheres", "x.sphere.csv")
+    assert code == 2 and "has none" in " ".join(err.split())
+    Path("one.sphere.csv").write_text("\n".join(lines[: start + 2]) + "\n")
+    code, out, err = call("check", "five.toml", "--spheres", "one.sphere.csv")
+    assert code == 2 and "two poses of one sphere" in " ".join(err.split())
