@@ -30,6 +30,7 @@ _GRBL = {
     **{"G28.1": "store home", "G30.1": "store home"},
     **{"G43.1": "tool offset", "G49": "no tool", "G92": "preset", "G92.1": "no preset", "G91.1": "centre incremental"},
     **{f"G38.{k}": "probe" for k in range(2, 6)},
+    "G10": "write offset",
 }
 _LENGTH = {"G43": "tool", "G49": "no tool", "G98": "initial level", "G99": "R level", "G73": "cycle 73"}
 _LINUXCNC = {
@@ -47,6 +48,7 @@ _FANUC = {
     **_LENGTH,
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
     **{"G54.1": "work offset", "G92": "preset", "G92.1": "no preset", "G52": "shift", "G31": "probe"},
+    "G10": "write offset",
     # left-hand and right-hand tapping feed out, fine boring and boring by hand do not; Q of G76 is a way aside at the bottom
     **{"G74": "cycle 84", "G84": "cycle 84", "G76": "cycle 86", "G88": "cycle 86"},
     # Haas: offsets G110 to G129 and G154 P1 to P99
@@ -113,7 +115,7 @@ _ROTARY = "moves of rotary axes and a turned plane are not followed; post a prog
 _SPLINE = "splines are not followed; post lines and arcs"
 _PATTERN = "patterns of holes are not followed; post X and Y of each hole"
 _TURNING = "belongs to turning; correct programs for milling"
-_TABLES = "writes offsets while the program runs, so that they are not known; set them at the control"
+_TABLES = "writes offsets that the correction does not follow; set them at the control"
 #: Why a code is refused, and what to do; the same in all dialects unless a dialect gives the code a meaning.
 REFUSED = {
     **dict.fromkeys(("G41", "G42", "G41.1", "G42.1"), f"cutter radius compensation is not followed; {_CAM}"),
@@ -287,6 +289,20 @@ def _register_of_fanuc(name: str) -> int | None:
         return 7001 + 20 * (number - 1) if number <= 20 else 14401 + 20 * (number - 21)
     names = {**{f"G{54 + k}": 5221 + 20 * k for k in range(6)}, **{f"G{110 + k}": 7001 + 20 * k for k in range(20)}}
     return names.get(name)
+
+
+def written_offset(dialect: str, values: Mapping[str, float], active: str) -> str | None:
+    """Return the name of the work offset that G10 writes; None if it writes anything else (tools, the external offset)."""
+    what, number = values.get("L"), values.get("P")
+    if what not in (2.0, 20.0) or number is None or number != int(number) or values.get("R", 0.0):
+        return None
+    k = int(number)
+    if dialect == "fanuc":
+        if what == 20.0:
+            return f"G54.1P{k}" if 1 <= k <= 300 else None
+        return f"G{53 + k}" if 1 <= k <= 6 else None
+    names = ("G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3")[: 6 if dialect == "grbl" else 9]
+    return (active or "G54") if k == 0 else names[k - 1] if 1 <= k <= len(names) else None
 
 
 def _register_of_linuxcnc(name: str) -> int | None:

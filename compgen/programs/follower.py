@@ -177,6 +177,7 @@ _GRBL: _Does = {
     **_each("store", 28.1, 30.1),
     **_each("typed length", 43.1),
     **_each("lost", 38.2, 38.3, 38.4, 38.5),
+    **_each("datum", 10),
 }
 _CYCLES: _Does = {
     **{f"G{k}": ("cycle", float(k)) for k in (73, 81, 82, 83, 85, 86, 89)},
@@ -202,6 +203,7 @@ _TABLES: dict[str, _Does] = {
         **_each("fixture", *range(110, 130), 154, 54.1),
         **_each("frame", 52),
         **_each("lost", 31),
+        **_each("datum", 10),
         **_each("quiet", 5, 5.1, 8, 103, 187, 22, 23, 25, 26, 54.2, 54.4),
     },
     "siemens": {
@@ -236,7 +238,7 @@ _TABLES: dict[str, _Does] = {
     },
 }
 #: What takes the words of its block for itself, so that they are no move.
-_TAKES_WORDS = {"quiet", "dwell", "frame", "offset", "typed length", "store", "turn", "tool"}
+_TAKES_WORDS = {"quiet", "dwell", "frame", "offset", "typed length", "store", "turn", "tool", "datum"}
 _ENDS = {"siemens": ("M2", "M17", "M30")}
 #: Cycles that leave the depth at feed, and where the arguments of a cycle of SINUMERIK say what its depth counts from.
 _BACK_AT_FEED = {"CYCLE84", "CYCLE840", "CYCLE85", "CYCLE89", "G84", "G85", "G201", "G202", "G206", "G207", "G209"}
@@ -313,6 +315,9 @@ class Follower:
         self.at: Place = [math.nan] * 3
         self.homes = {"G28": list(machine.reference_place_mm), "G30": [math.nan] * 3}
         self.fixture: Sequence[float] = setup.work_offsets_mm.get("PRESET" if self.heidenhain else "G54", _NOWHERE)
+        #: Work offsets as they are now, and which of them is in force.
+        self.datums: dict[str, Sequence[float]] = dict(setup.work_offsets_mm)
+        self.datum = "G54"
         self.preset, self.frame, self.length = [0.0] * 3, [0.0] * 3, [0.0] * 3
         self.lengthened = False
         self.lengths = dict(setup.tools_mm)
@@ -514,6 +519,8 @@ class Follower:
             self.to_r = number > 0
         elif kind in ("fixture", "no fixture"):
             self.fixture = (0.0, 0.0, 0.0) if kind == "no fixture" else self._fixture(code, words.number.get("P"))
+        elif kind == "datum":
+            self._set_datum(words)
         elif kind.endswith("length"):
             self._set_length(kind, words)
         elif kind in ("frame", "offset", "no preset", "store"):
@@ -533,7 +540,24 @@ class Follower:
     def _fixture(self, code: str, given: float | None) -> Sequence[float]:
         if self.dialect == "fanuc" and given is not None and code in ("G54", "G54.1", "G154"):
             code = f"{'G154' if code == 'G154' else 'G54.1'}P{given:g}"
-        return self.setup.work_offsets_mm.get(code, _NOWHERE)
+        self.datum = code
+        return self.datums.get(code, _NOWHERE)
+
+    def _set_datum(self, words: _Words) -> None:
+        """G10 L2: the zero of a work offset; L20: the zero from which the tool is where its words say (of FANUC G54.1)."""
+        number, row = words.number, int(words.number.get("P", 0.0))
+        names = ["G54", "G55", "G56", "G57", "G58", "G59", "G59.1", "G59.2", "G59.3"]
+        here = number.get("L") == 20.0 and self.dialect != "fanuc"
+        extra = number.get("L") == 20.0 and not here
+        name = f"G54.1P{row}" if extra else names[row - 1] if row else self.datum
+        place = list(self.datums.get(name, _NOWHERE))
+        for k, value in enumerate(words.axes()):
+            if value is not None:
+                from_there = self.at[k] - self.frame[k] - self.preset[k] - self.length[k]
+                place[k] = (from_there if here else 0.0) + (-value if here else value) * self.unit
+        self.datums[name] = place
+        if name == self.datum:
+            self.fixture = place
 
     def _set_length(self, kind: str, words: _Words) -> None:
         if kind == "no length":

@@ -24,7 +24,7 @@ from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs import klartext, sinumerik
 from compgen.programs.cycles import DrillingCycle, defines_hole
-from compgen.programs.dialects import MARK, Dialect, codes_that_stay
+from compgen.programs.dialects import MARK, REFUSED, Dialect, codes_that_stay, written_offset
 from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
 from compgen.programs.runs import (
     LONGEST_BLOCK,
@@ -133,6 +133,8 @@ class Reader:
         #: How far corrected positions may leave the travel, mm.
         self.travel_slack_mm = machine.travel_margin_mm + 1e-6
         self.used_offsets: dict[str, Vector3] = {}
+        #: Work offsets that the program has written (G10).
+        self.written: dict[str, Vector3] = {}
         self.used_tools: dict[str, Vector3] = {}
         self.assumed: dict[str, None] = {}
         self._tools = dict(setup.tools_mm)
@@ -941,6 +943,8 @@ class Reader:
                 actions.insert(0, meaning)
             else:
                 self._modal(code, meaning, values, actions)
+        if "write offset" in actions:
+            return self._write_offset(values)
         if "modal call" in actions:
             self.calling = "drill here" in actions
             if self.calling and (problem := self.drilling.problem() if self.drilling else "no cycle is called"):
@@ -1186,7 +1190,7 @@ class Reader:
         self.length = length
 
     def _use_offset(self, name: str) -> None:
-        if name not in self.setup.work_offsets_mm:
+        if name not in self.setup.work_offsets_mm and name not in self.written:
             given = ", ".join(self.setup.work_offsets_mm) or "none"
             self._fail(f"the work offset {name} is not known (given: {given}); add --wcs {name}=X,Y,Z in mm")
         if name != self.offset_name:
@@ -1195,8 +1199,38 @@ class Reader:
                     f"{name} while TRANS is active: controls keep or end the shift; post TRANS without axes before"
                 )
             self.named = [False] * 3
-        self.offset_name, self.work = name, self.setup.work_offsets_mm[name]
-        self.used_offsets[name] = self.work
+        self.offset_name, self.work = name, self.written.get(name) or self.setup.work_offsets_mm[name]
+        if name not in self.written:
+            self.used_offsets[name] = self.work
+
+    def _write_offset(self, values: dict[str, float]) -> str:
+        """G10: a work offset is what the program says, from here on; L20 of LinuxCNC and grbl: at the place where the tool is."""
+        dialect = self.dialect.name
+        name = written_offset(dialect, values, self.offset_name)
+        if self.cycle is not None:
+            self._fail(f"G10 within a drilling cycle {REFUSED['G10']}, or end the cycle by G80 before")
+        if name is None or not self.absolute:
+            why = "in incremental blocks its numbers are added to what the control has" if name else REFUSED["G10"]
+            self._fail(f"G10: {why}; L2 and L20 with P of a work offset are followed in absolute")
+        here = values["L"] == 20.0 and dialect != "fanuc"
+        known = self.written.get(name) or self.setup.work_offsets_mm.get(name)
+        given = [values.get(letter) for letter in "XYZ"]
+        if known is None and any(value is None for value in given):
+            self._use_offset(name)  # says how it is given
+        place = list(known or (0.0,) * 3)
+        for k, value in enumerate(given):
+            if value is not None and here and math.isnan(self.position[k]):
+                self._fail(f"G10 L20 {'XYZ'[k]} at a position that is not known; position it in absolute first")
+            if value is not None:
+                beside = self.length[k] + self.preset[k] + self.shift[k]
+                place[k] = value * self.scale if not here else self.position[k] - beside - value * self.scale
+        self.written[name] = (place[0], place[1], place[2])
+        if name == (self.offset_name or self.dialect.work_offset):
+            self.offset_name, self.work = name, self.written[name]
+            self.named = [known and value is None for known, value in zip(self.named, given, strict=True)]
+        x, y, z = (round(value, 6) + 0.0 for value in place)
+        self.assumed[f"{name} is X{x:g} Y{y:g} Z{z:g} mm of the machine, as the program writes it (G10)"] = None
+        return "preset" if here and any(value is not None for value in given) else "keep"
 
     def _offset(self) -> Vector3:
         x, y, z = map(sum, zip(self.work, self.shift, self.preset, self.length, strict=True))

@@ -511,7 +511,7 @@ REFUSED = [
     ("heidenhain-iso", "%A G71 *\nG00 G90 X+0 Y+0 Z+0*\nG12 H+90*\nN9 %A G71 *\n", 3, "G12"),
     ("grbl", "G21 G90\nG0 X0 Y0 Z0\nG38.2 Z-5 F9\nG1 X5\n", 4, "position of Z is not known"),
     ("grbl", "G21 G90\nG0 X0 Y0 Z0\n$H\n", 3, "command for the control"),
-    ("grbl", "G21 G90\nG10 L20 P1 X0\n", 2, "set them at the control"),
+    ("grbl", "G21 G90\nG10 L20 P9 X0\n", 2, "set them at the control"),
     ("linuxcnc", START + "M73\nM2\n", 3, "modal states"),
     ("linuxcnc", START + "G92.3\nM2\n", 3, "another program"),
     ("linuxcnc", START + "G7\nM2\n", 3, "turning"),

@@ -150,6 +150,23 @@ def test_local_shifts_and_stored_reference_points(tmp_path):
     assert_same(ours(program), canonical(program, tmp_path))
 
 
+def test_work_offsets_that_the_program_writes(tmp_path, make_errors):
+    """G10 L2 states a zero of the machine, L20 the place where the tool is: with tool length, G92, in inch, and of others."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X1 Y2 Z3\nG1 X4 F100\nG10 L2 P1 X10 Y-5 Z-40\nG1 X5 Y1 Z2\n"
+        "G10 L20 P0 X2 Z1\nX3 Y3 Z3\nG10 L20 P2 Y5 Z0\n"
+        "G55 G0 X0 Y0 Z1\nG1 X1\nG20\nG10 L2 P3 X1 Y1 Z-1\nG56 G0 X0 Y0 Z0.5\nG1 X0.5\nG21\n"
+        "G92 X20\nG10 L20 P3 X1\nG1 X7\nG54 G0 X0 Y0 Z5\nM2\n%\n"
+    )
+    assert_same(ours(program), canonical(program, tmp_path))
+    result = correct_program(
+        model_of(mill(), make_errors(mill(), 3), None), program, tmp_path / "out", CorrectOptions(), SETUP
+    )
+    assert result.accepted
+    assert sum("as the program writes it (G10)" in text for text in result.assumed) == 5
+
+
 def test_calls_of_subprograms_in_the_same_file_are_written_out_as_the_interpreter_executes_them(tmp_path, make_errors):
     """Nested, repeated, in absolute and in incremental; the corrected program has no calls and moves alike."""
     program = tmp_path / "p.ngc"

@@ -7,16 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from programs import test_rs274 as rs274
-from programs.make import G_CODE
+from programs.make import G_CODE, mill
 from programs.test_correct import PLAIN, moves_of, run, shift
 
 from compgen.controls import CONTROLLERS
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import read_machine
 from compgen.errors import InputError
-from compgen.programs import Setup, read_tools
+from compgen.programs import Reader, Setup, read_tools
 from compgen.programs.dialects import DIALECTS
-from compgen.programs.path import points_of
+from compgen.programs.follower import read_twice
+from compgen.programs.path import Moves, points_of
 from machines import machine_of
 
 
@@ -521,3 +522,43 @@ def test_what_a_probe_has_found_is_no_constant(tmp_path):
                 "heidenhain-klartext",
                 setup,
             )
+
+
+WRITTEN = {
+    "fanuc": "G21 G90 G17\nG10 L2 P2 X-10. Y0. Z0.\nG55 G0 X30. Y0. Z0.\nG1 X40. F90\nG10 L20 P1 X5. Y0. Z0.\n"
+    "G54.1 P1 G0 X15. Y0. Z0.\nG1 X40. F90\nM30\n",
+    "grbl": "G21 G90 G17\nG10 L2 P2 X-10 Y0 Z0\nG55 G0 X30 Y0 Z0\nG1 X40 F90\nG10 L20 P2 X25\nG0 X15\nG1 X40 F90\n",
+}
+
+
+@pytest.mark.parametrize("dialect", WRITTEN)
+def test_a_work_offset_that_the_program_writes_needs_no_wcs(tmp_path, dialect):
+    """Both cuts go from X 20 to X 30 and from X 20 to X 45 of the machine, which is 10 um too far."""
+    path = tmp_path / "p.nc"
+    path.write_text(WRITTEN[dialect])
+    reader = Reader(mill(), DIALECTS[dialect], Setup(), path)
+    moves = Moves.joined([batch.moves for batch in read_twice(reader)])
+    assert moves.end_mm[moves.kind == 1][:, 0].tolist() == [30.0, 45.0]
+    result, corrected = run(tmp_path, WRITTEN[dialect], shift(x=10.0), dialect, Setup())
+    assert result.accepted
+    assert re.search(r"G1 X39\.99 F90", corrected)
+    assert "IS NOT THAT OF" not in corrected  # nothing was given that could be another
+    assert "G55 is X-10 Y0 Z0 mm of the machine, as the program writes it (G10)" in result.assumed
+
+
+@pytest.mark.parametrize(
+    ("dialect", "block", "words"),
+    [
+        ("fanuc", "G10 L2 P0 X1.", "set them at the control"),
+        ("fanuc", "G10 L10 P1 R5.", "set them at the control"),
+        ("fanuc", "G91 G10 L2 P1 X1.", "incremental"),
+        ("fanuc", "G10 L2 P3 X1.", "--wcs G56"),
+        ("linuxcnc", "G10 L2 P1 X1 R30", "set them at the control"),
+        ("linuxcnc", "G30 Z5\nG10 L20 P1 Z0", "not known"),
+        ("linuxcnc", "G10 L1 P1 Z5", "set them at the control"),
+    ],
+)
+def test_what_g10_writes_beside_work_offsets_is_refused(tmp_path, dialect, block, words):
+    text = f"G21 G90 G17 G54\nG0 X0. Y0. Z0.\n{block}\nG1 X9. F9\nM30\n"
+    with pytest.raises(InputError, match=words):
+        run(tmp_path, text, shift(), dialect, Setup({"G54": (0.0, 0.0, 0.0)}))
