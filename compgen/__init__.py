@@ -37,6 +37,14 @@ _HOMES = {
     "compgen.plugins": "load_plugins",
     "compgen.simulate": "read_scenario simulate write_simulation",
 }
+#: Public in :mod:`compgen.readers`, and found here as well: `compgen.read_axis_runs`; ``read_artefact`` and ``read_part`` are
+#: the readers of one file or several, by the name that one tries first.
+_OF_READERS = (
+    "ActiveTables Artefact AxisRuns Circles Diagonals DriftSession ImportOptions ReversalCurves SafetyLimits SixDof "
+    "SixDofInstrument SphereCentres StatedNumbers Temperatures open_errors open_measurement read_active read_artefact "
+    "read_artefacts read_axis_runs read_circles read_diagonals read_drift read_instrument read_part read_parts read_sixdof "
+    "read_spheres read_stations read_temperatures"
+)
 #: Names that were public until 0.1; they remain in the modules that define them.
 _DEPRECATED = {
     "compgen.data.error_table": "format_reversal",
@@ -76,7 +84,11 @@ sys.modules[__name__].__class__ = type(
     (ModuleType,),
     {
         name: make(name, home)
-        for table, make in ((_HOMES, on_first_use), (_DEPRECATED, _deprecated))
+        for table, make in (
+            ({"compgen.readers": _OF_READERS}, on_first_use),
+            (_HOMES, on_first_use),
+            (_DEPRECATED, _deprecated),
+        )
         for home, names in table.items()
         for name in names.split()
     },

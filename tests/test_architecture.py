@@ -29,6 +29,7 @@ ORDER = (
     ("fleet",),
     ("app",),
     ("cli",),
+    ("readers",),  # public names of several rooms, for scripts: none of the rooms uses it
     ("controllers", "core"),  # former homes of the plug-in interface, for one minor version
     ("__main__",),
 )

@@ -1060,8 +1060,8 @@ def view_page(number: int, step: int, name: str) -> Response:
         abort(404, "There is no such page.")
     text = path.read_text(encoding="utf-8")
     policy = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'"
-    # of no origin: a page in a project of somebody else reaches none of ours; to print is modal
-    policy += "; sandbox allow-scripts allow-modals"
+    # of no origin: a page in a project of somebody else reaches none of ours
+    policy += "; sandbox allow-scripts"
     hashes = re.findall(r"'sha256-[A-Za-z0-9+/=]{44}'", Markup(text[:3000]).unescape().partition("</head>")[0])
     response = Response(text, mimetype="text/html")
     scripts = f"; script-src {' '.join(hashes)}" if hashes else ""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.display import Tabular
 from compgen.data.names import AXES, BODY_DIAGONALS
 from compgen.data.records import AXIS, DIRECTION, POSITION, RUN, RUN_DEVIATION, Field, Schema, fail_at
 from compgen.errors import InputError, repeated
@@ -22,7 +23,7 @@ LINE_COLUMNS = ("line_x_mm", "line_y_mm", "line_z_mm")
 
 
 @dataclass(frozen=True)
-class AxisRuns:
+class AxisRuns(Tabular):
     """Actual minus target position along the moving axis, n readings.
 
     Parameters
@@ -54,6 +55,10 @@ class AxisRuns:
     def axes(self) -> tuple[int, ...]:
         """Axes that were measured, ascending."""
         return tuple(int(axis) for axis in np.unique(self.axis))
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.axis.csv``, each (n,)."""
+        return _AXIS_RUNS.cells(self)
 
     def line_mm(self) -> FloatArray:
         """Positions of all axes (n, 3): that of the moving axis, and of the others as stated, nan where they are not."""

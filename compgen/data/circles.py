@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview
+from compgen.data.display import Displayed, Overview, Tabular
 from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, one_of, uncertainties, within
 from compgen.errors import InputError
 
@@ -21,7 +21,7 @@ LARGEST_RADIUS_MM = 1e4
 
 
 @dataclass(frozen=True, repr=False)
-class Circles(Displayed):
+class Circles(Displayed, Tabular):
     """Radial deviations along circles in planes of two axes, n readings.
 
     Parameters
@@ -52,6 +52,10 @@ class Circles(Displayed):
     covariates: Mapping[str, FloatArray] = field(default_factory=dict)
     metadata: Mapping[str, str] = field(default_factory=dict)
     origin: Sequence[tuple[str, int]] = ()
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.circle.csv``, each (n,)."""
+        return _CIRCLES.cells(self)
 
     def __len__(self) -> int:
         """Return the number of readings."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from compgen.data.arguments import numbers
 from compgen.data.comparison import best_rotation
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview, ranges_of
+from compgen.data.display import Displayed, Overview, Tabular, ranges_of
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import (
     APPROACH,
@@ -63,7 +63,7 @@ class RoughPose:
 
 
 @dataclass(frozen=True, repr=False)
-class Deviations(Displayed):
+class Deviations(Displayed, Tabular):
     """Actual minus commanded position of the tool tip, at n positions.
 
     Parameters
@@ -109,6 +109,10 @@ class Deviations(Displayed):
     def __len__(self) -> int:
         """Return the number of positions."""
         return len(self.position_mm)
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.deviations.csv``, each (n,)."""
+        return _DEVIATIONS.cells(_with_measured_u(self))
 
     def overview(self) -> Overview:
         """Number of positions, the measured components, and the bounding box."""
@@ -182,10 +186,14 @@ def format_deviations(deviations: Deviations) -> str:
 
     A component must be measured everywhere or nowhere; where it was not measured it has no uncertainty either.
     """
-    if deviations.u_mm is not None:
-        nowhere = np.isnan(deviations.deviation_mm).all(axis=0)
-        deviations = replace(deviations, u_mm=np.where(nowhere, np.nan, deviations.u_mm))
-    return _DEVIATIONS.format(deviations, deviations.metadata)
+    return _DEVIATIONS.format(_with_measured_u(deviations), deviations.metadata)
+
+
+def _with_measured_u(deviations: Deviations) -> Deviations:
+    if deviations.u_mm is None:
+        return deviations
+    nowhere = np.isnan(deviations.deviation_mm).all(axis=0)
+    return replace(deviations, u_mm=np.where(nowhere, np.nan, deviations.u_mm))
 
 
 # Features of parts made on the machine and measured elsewhere: ``*.part.csv`` (nominal and measured coordinates).
@@ -279,7 +287,7 @@ def _origin(table: CsvTable) -> FloatArray | None:
 
 
 @dataclass(frozen=True, repr=False)
-class Part(Displayed):
+class Part(Displayed, Tabular):
     """Features of a part as another machine measured them, n rows: what ``*.part.csv`` contains.
 
     Parameters
@@ -320,6 +328,10 @@ class Part(Displayed):
         )
         return aligned(found)
 
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.part.csv``, each (n,)."""
+        return _PARTS.cells(_part_columns(self))
+
     def overview(self) -> Overview:
         """Numbers of features and set-ups, and the box of the machine that they cover."""
         title = f"{len(self)} features of a part in {len(np.unique(self.setup))} set-ups"
@@ -328,7 +340,12 @@ class Part(Displayed):
 
 def format_part(part: Part) -> str:
     """Return the text of a ``*.part.csv`` file: coordinates in mm with 6 decimals (1 nm)."""
-    columns = SimpleNamespace(
+    origin = ", ".join(f"{value:.6g}" for value in part.origin_mm)
+    return _PARTS.format(_part_columns(part), {**part.metadata, "origin_mm": origin})
+
+
+def _part_columns(part: Part) -> SimpleNamespace:
+    return SimpleNamespace(
         **vars(part),
         xy_mm=part.nominal_mm[:, :2],
         z_mm=part.nominal_mm[:, 2:],
@@ -337,15 +354,13 @@ def format_part(part: Part) -> str:
         labels={"setup": part.setup},
         covariates={},
     )
-    origin = ", ".join(f"{value:.6g}" for value in part.origin_mm)
-    return _PARTS.format(columns, {**part.metadata, "origin_mm": origin})
 
 
 # An artefact (plate, ring, step gauge) measured by the machine's own probe: ``*.artefact.csv``.
 
 
 @dataclass(frozen=True, repr=False)
-class Artefact(Displayed):
+class Artefact(Displayed, Tabular):
     """Features of artefacts as the machine's own probe measured them, n rows.
 
     Parameters
@@ -373,6 +388,10 @@ class Artefact(Displayed):
     def __len__(self) -> int:
         """Return the number of rows."""
         return len(self.feature)
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.artefact.csv``, each (n,)."""
+        return _ARTEFACTS.cells(_artefact_columns(self))
 
     def overview(self) -> Overview:
         """Numbers of features and set-ups, and the box of the machine that they cover."""
@@ -464,11 +483,14 @@ def format_artefact(artefact: Artefact) -> str:
     """
     if artefact.calibrated.any() != artefact.calibrated.all():
         raise InputError("calibrated and uncalibrated features need a file each; write them separately")
-    columns = SimpleNamespace(**vars(artefact), xy_mm=artefact.nominal_mm[:, :2], z_mm=artefact.nominal_mm[:, 2])
     calibrated = "true" if artefact.calibrated.all() else "false"
     # the place of a component that was not measured already contains the origin
     metadata = {key: value for key, value in artefact.metadata.items() if key != "origin_mm"}
-    return _ARTEFACTS.format(columns, {**metadata, "calibrated": calibrated})
+    return _ARTEFACTS.format(_artefact_columns(artefact), {**metadata, "calibrated": calibrated})
+
+
+def _artefact_columns(artefact: Artefact) -> SimpleNamespace:
+    return SimpleNamespace(**vars(artefact), xy_mm=artefact.nominal_mm[:, :2], z_mm=artefact.nominal_mm[:, 2])
 
 
 def setups_of(deviations: Deviations) -> NDArray[np.int64]:

@@ -10,7 +10,8 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TYPE_CHECKING, Literal
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,40 @@ class Panel:
     bars: tuple[Bars, ...] = ()
     x_label: str = ""
     x_scale: Literal["linear", "log"] = "linear"
+
+
+def package(name: str, what: str) -> Any:
+    """Return an optional package of other makers; ImportError that says how to install it.
+
+    Raises
+    ------
+    ImportError
+        if it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ImportError(f"{what} needs {name}, which is not installed: pip install {name}") from error
+
+
+class Tabular(ABC):
+    """A record that is a table: its columns are those of its file, with the unit in the name (um, urad, mm)."""
+
+    @abstractmethod
+    def to_columns(self) -> dict[str, Sequence[str] | Values]:
+        """Return the columns by name, each (n,); numbers are not rounded."""
+
+    def to_dataframe(self) -> Any:
+        """Return the columns as a ``pandas.DataFrame``; ``attrs`` has the comments of the file.
+
+        Raises
+        ------
+        ImportError
+            if pandas is not installed.
+        """
+        frame = package("pandas", "to_dataframe()").DataFrame(dict(self.to_columns()))
+        frame.attrs.update(getattr(self, "metadata", {}))
+        return frame
 
 
 class Displayed(ABC):

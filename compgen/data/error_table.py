@@ -13,14 +13,14 @@ from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
-from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
+from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.data.files import read_text
 from compgen.data.names import (
     AXES,
@@ -93,7 +93,7 @@ def _line(name: str, curve: Curve) -> PlottedLine:
 
 
 @dataclass(frozen=True, repr=False)
-class ErrorTable(Drawable):
+class ErrorTable(Drawable, Tabular):
     """Some or all of the 21 errors of a machine, in mm and rad; an error that is absent is zero.
 
     ``curves`` holds the 18 functions by name, ``squareness`` the constants by name as (value, uncertainty).
@@ -131,6 +131,51 @@ class ErrorTable(Drawable):
             if not np.isfinite(value) or u < 0.0:
                 expected = "value and standard uncertainty of zero or more (nan: unknown), rad"
                 raise InputError(f"is ({value:g}, {u:g}); expected {expected}", field=f"squareness[{name}]")
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.errors.csv``: values in um and urad, each (n,); no position for squareness."""
+        names: list[str] = []
+        rows: list[FloatArray] = [np.empty((0, 3))]
+        for name in self.names:
+            unit = error_named(name).si_per_unit
+            if name in self.squareness:
+                found = np.array([[np.nan, *self.squareness[name]]])
+            else:
+                curve = self.curves[name]
+                found = np.column_stack([curve.position_mm, curve.value, curve.u])
+            names += [name] * len(found)
+            rows.append(found / [1.0, unit, unit])
+        position_mm, value, u_value = np.concatenate(rows).T
+        return {"error": names, "position_mm": position_mm, "value": value, "u_value": u_value}
+
+    def to_xarray(self) -> Any:
+        """Return an ``xarray.Dataset``: each curve over the positions of its axis, with ``u_NAME``; squareness without any.
+
+        Curves of one axis at the same positions share the coordinate (``x_mm``), another one has its own (``EXX_mm``). ``units``
+        of each variable is um or urad, as in files.
+
+        Raises
+        ------
+        ImportError
+            if xarray is not installed.
+        """
+        xarray = package("xarray", "to_xarray()")
+        made: dict[str, Any] = {}
+        places: dict[str, FloatArray] = {}
+        for name in self.names:
+            own = error_named(name)
+            attributes = {"units": own.unit}
+            if name in self.squareness:
+                pair = np.array(self.squareness[name]) / own.si_per_unit
+                made |= {name: ((), pair[0], attributes), f"u_{name}": ((), pair[1], attributes)}
+                continue
+            curve, place = self.curves[name], f"{'xyz'[own.axis]}_mm"
+            if not np.array_equal(places.setdefault(place, curve.position_mm), curve.position_mm):
+                place = f"{name}_mm"
+                places[place] = curve.position_mm
+            made[name] = (place, curve.value / own.si_per_unit, attributes)
+            made[f"u_{name}"] = (place, curve.u / own.si_per_unit, attributes)
+        return xarray.Dataset(made, coords=places, attrs=dict(self.metadata))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -425,28 +470,7 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
     EC0Y,,30.000000000,1.000000000
     """
     of_kind("errors", errors, ErrorTable)
-    names: list[str] = []
-    positions: list[float] = []
-    values: list[float] = []
-    u_values: list[float] = []
-    for name in errors.names:
-        unit = error_named(name).si_per_unit
-        if name in errors.squareness:
-            rows: Iterable[tuple[float, float, float]] = [(np.nan, *errors.squareness[name])]
-        else:
-            curve = errors.curves[name]
-            rows = zip(curve.position_mm, curve.value, curve.u, strict=True)
-        for position, value, u_value in rows:
-            names.append(name)
-            positions.append(position)
-            values.append(value / unit)
-            u_values.append(u_value / unit)
-    columns: dict[str, Sequence[str] | FloatArray] = {
-        "error": names,
-        "position_mm": np.array(positions),
-        "value": np.array(values),
-        "u_value": np.array(u_values),
-    }
+    columns = errors.to_columns()
     digits = {"position_mm": 6, "value": 9, "u_value": 9}
     return format_csv(columns, {**errors.metadata, **(metadata or {})}, digits)
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import labels_of, paths_of, whole_numbers
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview, ranges_of, shortened
+from compgen.data.display import Displayed, Overview, Tabular, ranges_of, shortened
 from compgen.data.records import (
     APPROACH,
     ARCHIVE,
@@ -44,7 +44,7 @@ __all__ = [
 
 
 @dataclass(frozen=True, repr=False)
-class Lengths(Displayed):
+class Lengths(Displayed, Tabular):
     """Displacement readings of one or more tracer stations; n readings, S stations.
 
     Parameters
@@ -96,6 +96,10 @@ class Lengths(Displayed):
             raise InputError(text, field="station")
         if len(labels_of("point", self.point)) != count:
             raise InputError(f"has {len(self.point)} labels for {count} readings", field="point")
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``*.lengths.csv``, each (n,)."""
+        return _with_names(self).cells(self)
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -182,8 +186,12 @@ def join_lengths(parts: Sequence[Lengths]) -> Lengths:
 
 def format_lengths(lengths: Lengths) -> str:
     """Return the text of a ``*.lengths.csv`` file: positions with 6 decimals (1 nm), lengths with 7."""
+    return _with_names(lengths).format(lengths, lengths.metadata)
+
+
+def _with_names(lengths: Lengths) -> Schema:
     named = replace(LENGTHS.fields[0], encode=lambda station: [lengths.stations[k] for k in station])
-    return replace(LENGTHS, fields=(named, *LENGTHS.fields[1:])).format(lengths, lengths.metadata)
+    return replace(LENGTHS, fields=(named, *LENGTHS.fields[1:]))
 
 
 # Lists of commanded points (``*.points.csv``), with or without results.

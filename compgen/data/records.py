@@ -304,13 +304,17 @@ class Schema:
         decimals: Mapping[str, int] | None = None,
     ) -> str:
         """Return the text of a file with the record's fields, then ``others``; ``decimals`` override those of columns."""
-        columns: dict[str, Sequence[str] | FloatArray] = {}
         digits: dict[str, int] = {}
         for field in self.fields:
-            cells = field.cells(getattr(record, field.name))
-            columns |= cells
-            digits |= dict.fromkeys(cells, field.digits)
-        return format_csv({**columns, **(others or {})}, metadata, digits | dict(decimals or {}))
+            digits |= dict.fromkeys(field.cells(getattr(record, field.name)), field.digits)
+        return format_csv({**self.cells(record), **(others or {})}, metadata, digits | dict(decimals or {}))
+
+    def cells(self, record: Any) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of a file for a record, not rounded."""
+        columns: dict[str, Sequence[str] | FloatArray] = {}
+        for field in self.fields:
+            columns |= field.cells(getattr(record, field.name))
+        return columns
 
 
 def _readings(table: CsvTable) -> list[tuple[str, ...]]:

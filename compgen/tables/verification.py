@@ -20,7 +20,7 @@ from compgen.controls.shared.base import Monomial, Term
 from compgen.data.arguments import of_kind, paths_of, text_of
 from compgen.data.comparison import Difference, Residuals, residuals_twice, rms, small_motion
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, shortened
+from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.files import check_lines, read_bytes, sha256_of
 from compgen.data.lengths import Points
@@ -816,7 +816,7 @@ LEAST_DRAWN_UM = 1e-3
 
 
 @dataclass(frozen=True, repr=False)
-class Verification(Drawable):
+class Verification(Drawable, Tabular):
     """Result of :func:`verify`; residuals of the exact model over the same points before and after.
 
     ``reasons`` says why the tables are not accepted (empty: accepted). ``unrepresentable_um`` is the largest residual
@@ -867,6 +867,42 @@ class Verification(Drawable):
     remarks: tuple[str, ...] = ()
     proposed: Mapping[str, Any] = field(default_factory=dict)
     frame_shift_um: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def to_columns(self) -> dict[str, Sequence[str] | FloatArray]:
+        """Return the columns of ``volume.csv``: error of the tool tip before and after at every point, um, each (n,)."""
+        columns: dict[str, Sequence[str] | FloatArray] = {
+            f"{axis}_mm": self.position_mm[:, k] for k, axis in enumerate("xyz")
+        }
+        for prefix, values in (("before", self.error_before_mm), ("after", self.error_after_mm)):
+            columns |= {f"{prefix}_{axis}_um": values[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
+        return columns
+
+    def to_xarray(self) -> Any:
+        """Return the error before and after as an ``xarray.Dataset`` over ``x_mm``, ``y_mm``, ``z_mm``, um.
+
+        Points that fill no grid, or are listed once for each direction of travel, are over ``point``, with the positions as
+        coordinates.
+
+        Raises
+        ------
+        ImportError
+            if xarray is not installed.
+        """
+        xarray = package("xarray", "to_xarray()")
+        columns = {name: np.asarray(values) for name, values in self.to_columns().items()}
+        places = [columns.pop(f"{axis}_mm") for axis in "xyz"]
+        names, levels = ("x_mm", "y_mm", "z_mm"), [np.unique(place) for place in places]
+        shape, size = tuple(map(len, levels)), len(places[0])
+        if int(np.prod(shape)) == size == len(np.unique(np.column_stack(places), axis=0)):
+            order = np.lexsort(places[::-1])
+            columns = {name: values[order].reshape(shape) for name, values in columns.items()}
+            dimensions: tuple[str, ...] = names
+            coordinates: dict[str, Any] = dict(zip(names, levels, strict=True))
+        else:
+            dimensions = ("point",)
+            coordinates = {name: ("point", place) for name, place in zip(names, places, strict=True)}
+        made = {name: (dimensions, values, {"units": "um"}) for name, values in columns.items()}
+        return xarray.Dataset(made, coords=coordinates, attrs={"machine": self.machine, "controller": self.controller})
 
     @property
     def accepted(self) -> bool:
@@ -1381,8 +1417,6 @@ def format_volume(result: Verification) -> str:
 
     If a reversal is known, every point is listed twice, reached in positive and in negative direction.
     """
-    columns: dict[str, FloatArray] = {f"{axis}_mm": result.position_mm[:, k] for k, axis in enumerate("xyz")}
-    digits = dict.fromkeys(columns, POSITION_DECIMALS)
-    for prefix, values in (("before", result.error_before_mm), ("after", result.error_after_mm)):
-        columns |= {f"{prefix}_{axis}_um": values[:, k] / MM_PER_UM for k, axis in enumerate("xyz")}
-    return format_csv(columns, {"controller": result.controller}, {**dict.fromkeys(columns, ERROR_DECIMALS), **digits})
+    columns = result.to_columns()
+    digits = {name: POSITION_DECIMALS if name.endswith("_mm") else ERROR_DECIMALS for name in columns}
+    return format_csv(columns, {"controller": result.controller}, digits)

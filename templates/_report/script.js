@@ -11,7 +11,10 @@
   wanted.addEventListener("change", nameTheme);
   nameTheme();
 
-  document.getElementById("print").addEventListener("click", function () { window.print(); });
+  // a page of no origin, as the workbench shows it, cannot open a window to print
+  var print = document.getElementById("print");
+  print.addEventListener("click", function () { window.print(); });
+  print.hidden = window.location.protocol !== "file:" && window.origin === "null";
 
   // which control is shown, and printed
   var chooser = document.getElementById("control");

@@ -93,6 +93,8 @@ def every_kind():
         "recal": ([["recal", "add", "mill", "--machine", "01-machine/m.toml", "--inbox", "inbox", "--controller", "isg-csv",
                     out, "recalibration", "--measured-with", "bare", "--job", "recal.toml"]],
                   {"added": "[machines.mill]\n", "machine_there": "mill"}),
+        "certificate": ([["report", "08-identify", "--certificate=18-certificate/certificate.toml"]], {
+            "certificate": "18-certificate/certificate.toml", "stated": {"order": "A-7", "instruments": "XL-80; 9\nLevel; L7"}}),
     }  # fmt: skip
     steps = []
     for number, kind in enumerate([*list(shown)[:1], "measurement", *list(shown)[1:]], start=1):
@@ -500,4 +502,4 @@ def test_facts_that_no_command_wrote_are_said_not_a_fault_of_the_pages(site, con
 def test_steps_are_read_as_they_were_written(tmp_path):
     revision, steps = read_steps(json.dumps(every_kind()).encode(), Path("project.json"))
     assert revision == 17
-    assert [step.number for step in steps] == list(range(1, 18))
+    assert [step.number for step in steps] == list(range(1, 19))
