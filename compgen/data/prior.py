@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from compgen.data import toml_files
-from compgen.data.names import ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError, nearest
 
 #: Size of the errors of each class, relative to a machining centre within the tolerances of ISO 10791-2 and -4.
@@ -69,6 +70,21 @@ def _size(value: Any) -> float:
 
 
 _CHECK_SIZE = toml_files.accepts({"type": "number", "minimum": LEAST, "maximum": MOST})(_size)
+#: Largest amplitude of a cyclic error, um.
+MOST_CYCLIC_UM = 1e3
+
+
+def _amplitude(value: Any) -> float:
+    """Return an amplitude in um."""
+    number = toml_files.not_negative(value)
+    if number > MOST_CYCLIC_UM or 0.0 < number < LEAST:
+        raise ValueError(f"expected an amplitude in um from {LEAST:g} to {MOST_CYCLIC_UM:g}, or 0 for none")
+    return number
+
+
+_CHECK_AMPLITUDE = toml_files.accepts({"type": "number", "minimum": 0, "maximum": MOST_CYCLIC_UM})(_amplitude)
+#: The keys of cyclic errors of single axes.
+CYCLIC_KEYS = {f"cyclic_{axis}_um": axis for axis in AXES}
 #: The keys of single errors: ``EAX_urad``, ``EXY_um``.
 SINGLE_KEYS = {f"{name}_{error_named(name).unit}": name for name in ERROR_NAMES}
 
@@ -77,7 +93,8 @@ SINGLE_KEYS = {f"{name}_{error_named(name).unit}": name for name in ERROR_NAMES}
 class PriorSettings:
     """Section ``[prior]`` of a machine file: standard deviations of the errors before anything is measured.
 
-    ``class_name`` is None where the file states no class; ``single`` are sizes of single errors in um or urad, by name.
+    ``class_name`` is None where the file states no class; ``single`` are sizes of single errors in um or urad, by name,
+    ``cyclic`` amplitudes of cyclic errors of single axes in um, by letter.
     ``factor`` multiplies the sizes of the class, of curves and of squareness: above 1 where the readings show a machine
     that is worse than its class.
 
@@ -115,6 +132,12 @@ class PriorSettings:
         None,
         meaning="whether the readings change these sizes: up (larger only), both, no",
     )
+    cyclic_um: float | None = toml_files.setting(
+        _CHECK_AMPLITUDE,
+        None,
+        meaning="amplitude of positioning errors that repeat with every turn of the screw, um, between the readings",
+    )
+    cyclic: Mapping[str, float] = field(default_factory=dict)
     single: Mapping[str, float] = field(default_factory=dict)
     factor: tuple[float, float] = (1.0, 1.0)
 
@@ -168,6 +191,22 @@ class PriorSettings:
         stated = self._of_class("scale_um_per_m")
         return 1e-6 * (stated if shrunk is None else shrunk * _SIZES["scale_um_per_m"] * self.factor[0])
 
+    def cyclic_sd(self, name: str) -> float:
+        """Return the standard deviation of the cyclic part of a positioning error, mm: a sine of any phase."""
+        error = error_named(name)
+        if self.is_none or error.kind != "linear" or error.is_straightness:
+            return 0.0
+        amplitude_um = self.cyclic.get(AXES[error.axis], self.cyclic_um or 0.0)
+        return MM_PER_UM * amplitude_um / math.sqrt(2.0)
+
+    @property
+    def cyclic_text(self) -> str:
+        """What is assumed of cyclic errors, in words; empty without any."""
+        by_axis = {axis: self.cyclic.get(axis, self.cyclic_um or 0.0) for axis in AXES}
+        largest = max(by_axis.values())
+        which = "" if len(set(by_axis.values())) == 1 else f" ({', '.join(axis for axis in AXES if by_axis[axis])})"
+        return f"cyclic error of {largest:.3g} um amplitude{which}" if largest else ""
+
     def with_class(self, name: str) -> PriorSettings:
         """Return the prior of a class, without what the file states (``--prior``)."""
         if name not in (*CLASSES, NONE):
@@ -180,9 +219,11 @@ class PriorSettings:
 
     def stated(self) -> dict[str, Any]:
         """Return the keys of the section, with the factors that the readings raised; see :meth:`from_stated`."""
-        keys = {key: getattr(self, key) for key in ("class_name", *_SIZES, "learn")}
-        return {**{key: value for key, value in keys.items() if value is not None}, "single": dict(self.single),
-                "factor": list(self.factor)}  # fmt: skip
+        keys = {key: getattr(self, key) for key in ("class_name", *_SIZES, "learn", "cyclic_um")}
+        found = {key: value for key, value in keys.items() if value is not None}
+        if self.cyclic:
+            found["cyclic"] = dict(self.cyclic)
+        return {**found, "single": dict(self.single), "factor": list(self.factor)}
 
     @classmethod
     def from_stated(cls, keys: Mapping[str, Any]) -> PriorSettings:
@@ -203,6 +244,8 @@ class PriorSettings:
             "stated": self.class_name is not None,
             **sizes,
             **single,
+            **({} if self.cyclic_um is None else {"cyclic_um": self.cyclic_um}),
+            **{f"cyclic_{axis}_um": amplitude for axis, amplitude in self.cyclic.items()},
             "learn": self.learn,
             "raised_by": {"curves": self.factor[0], "squareness": self.factor[1]},
         }
@@ -211,10 +254,12 @@ class PriorSettings:
 def read_prior(section: toml_files.Section) -> PriorSettings:
     """Read the section ``[prior]`` of a machine file; InputError for an unknown key, or a size that is not positive."""
     single = {name: section.take(key, _CHECK_SIZE) for key, name in SINGLE_KEYS.items() if key in section}
-    settings = toml_files.take_settings(PriorSettings, section, single=single)
+    cyclic = {axis: section.take(key, _CHECK_AMPLITUDE) for key, axis in CYCLIC_KEYS.items() if key in section}
+    settings = toml_files.take_settings(PriorSettings, section, single=single, cyclic=cyclic)
     section.finish()
-    stated = [item.name for item in fields(PriorSettings) if item.name in _SIZES and getattr(settings, item.name)]
-    if settings.is_none and (stated or single):
+    sizes = (*_SIZES, "cyclic_um")
+    stated = [item.name for item in fields(PriorSettings) if item.name in sizes and getattr(settings, item.name)]
+    if settings.is_none and (stated or single or cyclic):
         raise section.fail(
             "class", "'none' assumes nothing, but the section also states sizes; give a class, or no sizes"
         )
@@ -223,4 +268,6 @@ def read_prior(section: toml_files.Section) -> PriorSettings:
 
 def prior_schema() -> dict[str, Any]:
     """Return what the section ``[prior]`` may hold, as a JSON schema."""
-    return toml_files.section_schema(PriorSettings, **dict.fromkeys(SINGLE_KEYS, toml_files.accepted(_CHECK_SIZE)))
+    amplitudes = dict.fromkeys(CYCLIC_KEYS, toml_files.accepted(_CHECK_AMPLITUDE))
+    sizes = dict.fromkeys(SINGLE_KEYS, toml_files.accepted(_CHECK_SIZE))
+    return toml_files.section_schema(PriorSettings, **sizes, **amplitudes)

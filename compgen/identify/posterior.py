@@ -66,6 +66,8 @@ WORSE_CURVE, WORSE_ALL = 2.2, 1.5
 FLAT = 10.0
 #: Factor by which the sizes of a class grow until the machine is no longer worse than it.
 RAISE = 3.0
+#: Pitch of a screw that the machine file does not state, mm.
+USUAL_PITCH_MM = 10.0
 #: Places of a square over which its mean is taken, where nobody said where it stood.
 _PLACES = 100
 
@@ -76,7 +78,8 @@ class Process:
 
     ``zero_mm`` are the positions at which the curve is zero: one for positioning and angles, two for straightness.
     ``slope`` per mm is that of a slope that was measured: about its size nothing is assumed, so that a curve is drawn
-    straight between two readings however steep it is; ``sd`` leaves it out.
+    straight between two readings however steep it is; ``sd`` leaves it out. ``cyclic`` (mm) is a sine over ``pitch_mm`` of
+    any phase: readings determine it where they are, and say nothing of it a quarter of a turn beside.
     """
 
     name: str
@@ -86,12 +89,19 @@ class Process:
     zero_mm: tuple[float, ...]
     rough: float = ROUGH
     slope: float = 0.0
+    cyclic: float = 0.0
+    pitch_mm: float = USUAL_PITCH_MM
 
     def _kernel(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        distance = np.abs(x[:, None] - y[None, :]) / self.travel_mm
+        apart_mm = np.abs(x[:, None] - y[None, :])
+        distance = apart_mm / self.travel_mm
         d = np.sqrt(5.0) * distance / SMOOTH_LENGTH
         matern = (1.0 + d + d * d / 3.0) * np.exp(-d)
-        return np.asarray(self.s**2 * (matern + self.rough**2 * np.exp(-distance / ROUGH_LENGTH)))
+        found = self.s**2 * (matern + self.rough**2 * np.exp(-distance / ROUGH_LENGTH))
+        if self.cyclic:
+            # curved at zero as cos(2 pi d / pitch) is, and forgotten after a turn: the phase drifts along a screw
+            found += self.cyclic**2 * np.exp(-0.5 * (2.0 * np.pi * apart_mm / self.pitch_mm) ** 2)
+        return np.asarray(found)
 
     def _gauge(self, x: FloatArray) -> FloatArray:
         """Weights (m, pins) of the values at the zeros that the gauge takes off at positions (m,)."""
@@ -127,7 +137,15 @@ def processes_of(machine: Machine, prior: PriorSettings, names: Sequence[str]) -
         error = error_named(name)
         axis = machine.axes[error.axis]
         zero = axis.range_mm if error.is_straightness else (machine.reference_point_mm[error.axis],)
-        found[name] = Process(name, prior.size(name), prior.scale(name), axis.length_mm, tuple(zero))
+        found[name] = Process(
+            name,
+            prior.size(name),
+            prior.scale(name),
+            axis.length_mm,
+            tuple(zero),
+            cyclic=prior.cyclic_sd(name),
+            pitch_mm=axis.screw_pitch_mm or USUAL_PITCH_MM,
+        )
     return found
 
 
@@ -888,6 +906,8 @@ def assumed_text(found: Posterior) -> str:
             kind, unit = words[_kind_of(name)], error_named(name).unit
             sizes[kind] = max(sizes.get(kind, (0.0, unit)), (2.0 * found.prior.size_um(name), unit))
     which = found.prior.class_text
+    if cyclic := found.prior.cyclic_text:
+        which = f"{cyclic} between the readings; {which}"
     if not sizes:
         return f"every error was measured; assumed between the readings: {which}"
     parts = [f"{kind} up to {size:.3g} {unit}" for kind, (size, unit) in sizes.items()]

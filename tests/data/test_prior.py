@@ -78,6 +78,14 @@ def test_none_assumes_nothing(tmp_path):
         ("EAX_urad = -1.0", "EAX_urad"),
         ('class = "none"\nangle_urad = 12.0', "'none' assumes nothing"),
         ('class = "none"\nEAX_urad = 12.0', "'none' assumes nothing"),
+        ('class = "none"\ncyclic_X_um = 1.0', "'none' assumes nothing"),
+        ("cyclic_um = -1.0", "not negative"),
+        ("cyclic_um = nan", "cyclic_um"),
+        ("cyclic_um = 0.0000002", "amplitude in um"),  # m
+        ("cyclic_um = 2000", "amplitude in um"),  # nm
+        ('cyclic_um = "2 um"', "cyclic_um"),
+        ("cyclic_X_mm = 1.0", "cyclic_X_um"),
+        ("cyclic_A_um = 1.0", "cyclic_"),
     ],
 )
 def test_what_is_no_size_is_refused_with_its_key(tmp_path, call, section, said):
@@ -101,5 +109,15 @@ def test_an_unknown_class_of_the_command_line_is_refused(tmp_path, call):
 def test_what_a_covariance_file_keeps_of_a_prior_is_read_back():
     prior = PriorSettings(class_name="large", angle_urad=9.0, learn="no", single={"EAX": 30.0}, factor=(3.0, 1.0))
     assert PriorSettings.from_stated(prior.stated()) == prior
+    prior = PriorSettings(cyclic_um=2.0, cyclic={"Z": 0.0})
+    assert PriorSettings.from_stated(prior.stated()) == prior
     with pytest.raises(ValueError, match="no key of a prior"):
         PriorSettings.from_stated({"angle": 1.0})
+
+
+def test_a_cyclic_error_is_stated_for_all_axes_or_one(tmp_path):
+    prior = loaded(tmp_path, "cyclic_um = 2.0\ncyclic_Z_um = 0").prior
+    assert [1e3 * prior.cyclic_sd(name) for name in ("EXX", "EYY", "EZZ", "EYX", "EAX")] == pytest.approx(
+        [2.0**0.5, 2.0**0.5, 0.0, 0.0, 0.0]
+    )
+    assert prior.cyclic_text == "cyclic error of 2 um amplitude (X, Y)"

@@ -36,7 +36,7 @@ from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify import identify
 from compgen.identify.axis_tests import identify_axis_runs
 from compgen.identify.covariance import joint_covariance, posterior_with
-from compgen.identify.posterior import not_measured, worse_text
+from compgen.identify.posterior import assumed_text, not_measured, worse_text
 from compgen.pipeline import identify_bare
 
 PATH = Path(__file__).resolve().parents[2] / "benchmarks" / "prior_coverage.py"
@@ -326,3 +326,48 @@ def test_a_stored_posterior_keeps_its_prior_and_another_one_is_said():
     with pytest.warns(CompgenWarning, match="identified with the prior of class 'general', which stays.*'router'"):
         kept = posterior_with(other, found.errors, stored)
     assert kept.processes == same.processes and kept.prior == same.prior
+
+
+# --- a screw whose turns the readings do not resolve ------------------------------------------------------------------
+
+
+def with_waves(shop, amplitude_mm, seed):
+    """A shop whose positioning has a wave for every turn of screws of 8 to 12 mm pitch."""
+    rng, curves = np.random.default_rng(seed), dict(shop.truth.curves)
+    for axis, name in enumerate(("EXX", "EYY", "EZZ")):
+        at, value = curves[name]
+        fine = np.linspace(at[0], at[-1], 4001)
+        turn = 2.0 * np.pi * fine / rng.uniform(8.0, 12.0) + rng.uniform(0.0, 6.3)
+        own = np.interp(fine, at, value) + amplitude_mm * np.sin(turn)
+        curves[name] = fine, own - np.interp(shop.machine.reference_point_mm[axis], fine, own)
+    return replace(shop, truth=replace(shop.truth, curves=curves))
+
+
+@pytest.mark.parametrize("take", ["runs", "lengths"])
+def test_a_declared_cyclic_error_is_in_u_between_the_readings(take):
+    """Without it, u is two to four times too small there (prior.md, section 7: it is invisible to the readings)."""
+    off = {0.0: [], 2.0: []}
+    for seed in range(3):
+        shop = with_waves(case(0, seed=seed, family="smooth", size=0.6), 2e-3, seed)
+        measured = getattr(shop, take)()
+        for declared, found in off.items():
+            posterior = identified(shop.machine, measured, class_name="general", cyclic_um=declared).posterior
+            for axis, name in enumerate(("EXX", "EYY", "EZZ")):
+                at = np.linspace(*shop.machine.axes[axis].range_mm, 402)[5:-5]
+                curve = posterior.curve(name, at)
+                known = curve.u > 1e-6  # not at the reference point
+                found.append((shop.truth.value(name, at) - curve.value)[known] / curve.u[known])
+    silent, declared = (np.concatenate(found) for found in off.values())
+    assert np.sqrt(np.mean(silent**2)) > 1.5
+    assert 0.7 < np.sqrt(np.mean(declared**2)) < 1.2
+    assert np.mean(np.abs(declared) < 2.0) > 0.93
+
+
+def test_a_cyclic_error_leaves_what_was_read_as_it_is():
+    shop = case(0, seed=4, family="smooth")
+    measured, values = shop.lengths(), {}
+    for amplitude in (0.0, 3.0):
+        values[amplitude] = identified(shop.machine, measured, class_name="general", cyclic_um=amplitude)
+    assert values[0.0].errors.curves["EXX"].value.tobytes() == values[3.0].errors.curves["EXX"].value.tobytes()
+    assert "cyclic error of 3 um amplitude between the readings" in assumed_text(values[3.0].posterior)
+    assert "cyclic" not in assumed_text(values[0.0].posterior)
