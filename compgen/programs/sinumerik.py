@@ -18,12 +18,14 @@ from typing import NoReturn
 import numpy as np
 
 from compgen.errors import InputError, visible_line
+from compgen.programs.dialects import VALUE
 from compgen.programs.subprograms import (
     DEEPEST,
     FUNCTIONS,
     MOST_BLOCKS,
     MOST_NESTED,
     NotKnown,
+    Turn,
     WrittenOut,
     file_of,
     mentions,
@@ -58,12 +60,21 @@ _ENDS = re.compile(r"(?<![A-Z0-9_])(?:M0*(?:17|2|30)(?![\d.=])|RET(?![A-Z_]))", 
 _COMPUTES = re.compile(
     rb"(?<![A-Z_0-9])R\s*+\d++\s*+=|=[ \t]*+[-+]?[ \t]*+(?:\(|R\d|[\d.]++[ \t]*+[-+*/]|(?:"
     + "|".join([*FUNCTIONS, "ATAN2", "POT", "TRUNC"]).encode()
-    + rb")[ \t]*+\()|(?<![A-Z_0-9])DEF\s",
+    + rb")[ \t]*+\()|(?<![A-Z_0-9])(?:DEF\s|A?ROT[ \t]++[A-Z])",
     re.IGNORECASE,
 )
 _BEGINS = re.compile(
     rb"^[ \t]*+(?:/\d?[ \t]*+)?(?:N[ \t]*+\d++[ \t]*+)?(L\d++|[A-Z_]{2}[A-Z_0-9]*+)", re.IGNORECASE | re.MULTILINE
 )
+
+
+#: Rotation about Z: in the plane G17 as RPL.
+_ROTATION = re.compile(rf"(A?ROT)(?:\s*RPL\s*=\s*({VALUE})|\s*Z\s*=?\s*({VALUE}))?")
+
+
+def _blanked(text: str) -> str:
+    """The text with blanks in place of comments."""
+    return _NOT_CODE.sub(lambda part: part[0] if part[0][0] == '"' else " " * len(part[0]), text)
 
 
 @dataclass
@@ -160,6 +171,7 @@ class _Program:
         self.used: dict[str, None] = {}
         self.called: dict[str, None] = {}
         self.changed = False
+        self.turn = Turn(self._fail_here, 5)
         self._main_line = 1
         self.at: tuple[Path, int] = (source, 1)
 
@@ -171,6 +183,9 @@ class _Program:
         """Refuse what is in the block that is followed."""
         shown = f" (block: {visible_line(text.strip())[:60]})" if text else ""
         raise InputError(message + shown, file=self.at[0], line=self.at[1])
+
+    def _fail_here(self, message: str) -> NoReturn:
+        self.fail(message)
 
     def follow(self, path: Path, lines: Sequence[str], depth: int) -> None:
         """Follow blocks of a file; of one that is called to its end."""
@@ -189,6 +204,7 @@ class _Program:
                 self.add(text)
             elif not self._call(code, start, text, depth, slash):
                 body = self._with_numbers(code, start, text, slash)
+                body = None if body is None else self._turned(body, start, slash)
                 ends = depth and _ENDS.search(code, start)
                 if body is not None:
                     self.add(self._without_end(body) if ends else body)
@@ -196,6 +212,34 @@ class _Program:
                     return
         if depth:
             self.fail("the subprogram ends without M17 or RET: it may have been cut; give all of it")
+
+    def _turned(self, text: str, start: int, slash: bool) -> str | None:
+        """The block without the rotation that is in force: ROT RPL=30, AROT Z45, to ROT or TRANS; None if it is that."""
+        code = _blanked(text)
+        bare = code[start:].strip().upper()
+        codes = self.turn.codes(code[start:])
+        found = _ROTATION.fullmatch(bare)
+        if found is None:
+            if re.match(r"TRANS\b", bare):
+                self.turn.end()
+            elif self.turn.on and re.match(r"(?:A?(?:ROT|SCALE|MIRROR)|ATRANS|ROTS|AROTS|CYCLE800)\b", bare):
+                self.fail("changes coordinates that are turned; end the turn by ROT before", text)
+            if self.turn.on:
+                self.changed = True
+                return self.turn.block(text, code, codes)
+            return text
+        if slash:
+            self.fail("turns coordinates in a block with /; post it without", text)
+        kind, number = found[1], found[2] or found[3]
+        if number is None and not self.turn.on and kind == "ROT":
+            return text
+        if kind == "ROT":  # ends the shift as well
+            self.turn.end()
+            self.add(f"TRANS{text[len(text.rstrip()) :]}")
+        if number is not None:
+            self.turn.begin(float(re.sub(r"\s", "", number)) + (self.turn.angle_deg if self.turn.on else 0.0), 0j)
+        self._comment(text)
+        return None
 
     @staticmethod
     def _without_end(text: str) -> str:

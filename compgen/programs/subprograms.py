@@ -31,7 +31,9 @@ from compgen.programs.path import IntArray
 #: Calls within calls, and blocks of a program that is written out.
 DEEPEST, MOST_BLOCKS = 10, 5_000_000
 _MENTIONED = re.compile(
-    rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]|G[ \t]*+0*+65(?![\d.])|[#\[]|O(?:\d++|<[^<>\n]*+>)[ \t]*+CALL", re.IGNORECASE
+    rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]|G[ \t]*+0*+65(?![\d.])|[#\[]|O(?:\d++|<[^<>\n]*+>)[ \t]*+CALL"
+    rb"|G[ \t]*+0*+68(?![\d.])",
+    re.IGNORECASE,
 )
 _WORD = re.compile(rb"([A-Z])[ \t]*+((?:[+-][ \t]*+)?(?:\d++(?:\.\d*+)?|\.\d++))", re.IGNORECASE)
 #: What is no code: comments, program names; of FANUC what follows a semicolon is another block, which is refused later.
@@ -367,6 +369,109 @@ class _Variables:
         return value
 
 
+# Coordinates that the program turns about the tool axis.
+
+_PLACE = re.compile(r"(?<![A-Z])([XYIJ])\s*+(=?)\s*+([-+]?\s*+(?:\d++\.?\d*+|\.\d++))(?![\d(])", re.IGNORECASE)
+_TURN_CODE = re.compile(r"(?<![A-Z])G\s*+0*+(\d++(?:\.\d++)?)", re.IGNORECASE)
+_SHIFTS_IN_TURN = frozenset(
+    (28.0, 30.0, 52.0, 53.0, 92.0, 153.0, 10.0, *map(float, range(54, 60)), 54.1, 20.0, 21.0, 70.0, 71.0)
+)
+
+
+@dataclass
+class Turn:
+    """Writes blocks without the rotation that is in force: X and Y, I and J are turned about ``centre``, in G17.
+
+    ``fail`` refuses a block. ``at`` is where the last block led in coordinates of the program, nan where that is not known.
+    """
+
+    fail: Callable[[str], NoReturn]
+    digits: int
+    pointed: bool = False
+    angle_deg: float = 0.0
+    centre: complex = 0.0
+    on: bool = False
+    absolute: bool = True
+    plane: float = 17.0
+    at: list[float] = field(default_factory=lambda: [math.nan, math.nan])
+
+    def begin(self, angle_deg: float, centre: complex) -> None:
+        """Turn from here on; X and Y have to be placed in absolute again."""
+        if self.plane != 17.0:
+            self.fail("turned coordinates outside the plane G17 are not followed; post the program without them")
+        self.angle_deg, self.centre, self.on, self.at = angle_deg, centre, True, [math.nan, math.nan]
+
+    def end(self) -> None:
+        """Turn no more."""
+        if self.on:
+            self.on, self.at = False, [math.nan, math.nan]
+
+    def codes(self, code: str) -> set[float]:
+        """Take over the modes of a block; returns its G codes."""
+        found = {float(value) for value in _TURN_CODE.findall(code)} if "G" in code or "g" in code else set()
+        self.absolute = (self.absolute and 91.0 not in found) or 90.0 in found
+        self.plane = next((k for k in (17.0, 18.0, 19.0) if k in found), self.plane)
+        return found
+
+    def block(self, text: str, code: str, codes: set[float]) -> str:
+        """Return the block with turned coordinates; ``code`` is its text with blanks in place of comments."""
+        words = {word[1].upper(): word for word in _PLACE.finditer(code)}
+        if not self.on:
+            return text
+        if codes & _SHIFTS_IN_TURN or self.plane != 17.0:
+            self.fail(
+                "changes offset, unit or plane, or leaves its coordinates, while they are turned; end the turn before"
+            )
+        if re.search(r"(?<![A-Z])[XYIJ]\s*=\s*[A-Z]", code, re.IGNORECASE):
+            self.fail("X, Y, I or J with AC or IC while coordinates are turned is not followed; post G90 or G91")
+        if 4.0 in codes or not words:
+            return text
+        if self.pointed and any("." not in word[3] and float(re.sub(r"\s", "", word[3])) for word in words.values()):
+            self.fail("a number without a decimal point while coordinates are turned; post it with one")
+        new: dict[str, float] = {}
+        if words.keys() & {"X", "Y"}:
+            new |= dict(zip("XY", self._place(words), strict=True))
+        if words.keys() & {"I", "J"}:
+            turned = complex(*(self._number(words, letter) for letter in "IJ")) * self._factor()
+            new |= {"I": turned.real, "J": turned.imag}
+        return self._written(text, words, new)
+
+    def _factor(self) -> complex:
+        return complex(math.cos(math.radians(self.angle_deg)), math.sin(math.radians(self.angle_deg)))
+
+    @staticmethod
+    def _number(words: dict[str, re.Match[str]], letter: str) -> float:
+        return float(re.sub(r"\s", "", words[letter][3])) if letter in words else 0.0
+
+    def _place(self, words: dict[str, re.Match[str]]) -> tuple[float, float]:
+        given = [self._number(words, letter) if letter in words else None for letter in "XY"]
+        if not self.absolute:
+            step = complex(given[0] or 0.0, given[1] or 0.0)
+            self.at = [self.at[0] + step.real, self.at[1] + step.imag]
+            if any(math.isnan(value) for value in self.at):
+                self.fail("an increment before X and Y have been placed in absolute since the turn; place both")
+            turned = step * self._factor()
+            return turned.real, turned.imag
+        self.at = [old if value is None else value for value, old in zip(given, self.at, strict=True)]
+        if any(math.isnan(value) for value in self.at):
+            self.fail("X or Y alone, before both have been placed since the coordinates were turned; place both")
+        turned = self.centre + (complex(*self.at) - self.centre) * self._factor()
+        return turned.real, turned.imag
+
+    def _written(self, text: str, words: dict[str, re.Match[str]], new: dict[str, float]) -> str:
+        def said(value: float) -> str:
+            number = f"{round(value, self.digits) + 0.0:.{self.digits}f}".rstrip("0")
+            return number if self.pointed else number.rstrip(".")
+
+        last = max(word.end() for word in words.values())
+        more = "".join(f" {letter}{said(value)}" for letter, value in new.items() if letter not in words)
+        text = text[:last] + more + text[last:]
+        for letter, word in sorted(words.items(), key=lambda item: -item[1].start()):
+            if letter in new:
+                text = text[: word.start(3)] + said(new[letter]) + text[word.end(3) :]
+        return text
+
+
 _ASSIGNMENT = re.compile(r"#(?=[^=]*=)")
 _COMPUTED = re.compile(
     r"(?<![A-Z#<])([A-Z])[ \t]*+(?=[-+]?[ \t]*+(?:[#\[]|(?:" + "|".join([*FUNCTIONS, "ATAN"]) + r")\[))", re.IGNORECASE
@@ -578,6 +683,8 @@ class _Program:
         self.called: dict[str, int] = {}
         self.variables = _Variables(dialect)
         self.resolved = self.inch = False
+        self.turn = Turn(functools.partial(self._fail_in, 0), 3, pointed=True)
+        self.after_turn: set[str] = set()
 
     def _subs(self) -> dict[str, range]:
         """Blocks of each ``o<name> sub`` to its ``endsub``."""
@@ -649,7 +756,7 @@ class _Program:
         target = self._target(k, block) if macro or block.has(97, 98) else None
         if target is None and not back:
             self._note_unit(block)
-            self._add(block.text, k)
+            self._add(self._turned(block, k) if self.haas else block.text, k)
             return
         if block.slash:
             what = "returns from" if back else "calls"
@@ -666,6 +773,54 @@ class _Program:
             self._write_rest(block, k, name, repeats)
         if target is not None:
             self._call(self._body(first, name, k), name.decode(), repeats, depth, k, arguments)
+
+    def _turned(self, block: _Block, k: int) -> bytes:
+        """The text of a block of FANUC without the rotation that is in force (G68 to G69)."""
+        code = block.code.decode("latin-1")
+        self.turn.fail = functools.partial(self._fail_in, k)
+        codes = self.turn.codes(code)
+        text = block.text.decode("latin-1")
+        if 68.0 in codes:
+            words = dict(block.words)
+            wrong = words.keys() & {b"I", b"J", b"K", b"Z", b"M"} or len(codes - {17.0, 90.0}) > 1
+            if wrong or self.turn.on or not self.turn.absolute or not {b"X", b"Y", b"R"} <= words.keys():
+                self.turn.fail(
+                    "turned coordinates: G68 is followed as G68 X Y R in a block of its own, in absolute, and not "
+                    "within another; post it so, or the program without it"
+                )
+            if any(
+                b"." not in word[2] and float(word[2])
+                for word in _WORD.finditer(block.code)
+                if word[1].upper() in b"XYR"
+            ):
+                self.turn.fail("a number without a decimal point beside G68; post it with one")
+            self.turn.digits = 3 + self.inch
+            self.turn.begin(words[b"R"], complex(words[b"X"], words[b"Y"]))
+        elif 69.0 in codes and self.turn.on:
+            self.turn.end()
+            self.after_turn = {"X", "Y"}
+            self.resolved = True
+            return re.sub(r"G\s*0*69(?!\d)", "G69", text, count=1, flags=re.IGNORECASE).encode("latin-1")
+        elif self.turn.on:
+            self.resolved = True
+            return self.turn.block(text, code, codes).encode("latin-1")
+        else:
+            self._first_after_turn(block)
+            return block.text
+        self.resolved = True
+        said = re.sub(r"[()]", " ", text).strip()
+        return f"({said})".encode("latin-1") + _end(block.text)
+
+    def _first_after_turn(self, block: _Block) -> None:
+        """Refuse X or Y alone after the end of a turn: where the other one then goes differs between controls."""
+        named = {letter.decode() for letter, _ in block.words} & {"X", "Y"}
+        if self.after_turn and named:
+            if named != {"X", "Y"} or not self.turn.absolute:
+                self.turn.fail("X or Y alone, or an increment, before both have been placed since G69; place both")
+            self.after_turn = set()
+
+    def _fail_in(self, k: int, message: str) -> NoReturn:
+        self._fail(f"{message} (block: {visible_line(self.blocks[k].text.decode('latin-1').strip())[:60]})", k)
 
     def _call(
         self, rows: range, name: str, repeats: int, depth: int, k: int, arguments: dict[int | str, float] | None

@@ -287,3 +287,69 @@ def test_what_is_not_known_of_klartext_is_refused_where_it_is(tmp_path, blocks, 
             setup,
         )
     assert (caught.value.file.name, caught.value.line) == (file, line)
+
+
+# --- coordinates that the program turns about Z -----------------------------------------------------------------------
+
+
+def turned(x, y, angle_deg, centre=(0.0, 0.0)):
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    u, v = x - centre[0], y - centre[1]
+    return [centre[0] + c * u - s * v, centre[1] + s * u + c * v]
+
+
+TURNED = {
+    "fanuc": (
+        "G68 X10. Y5. R30.\nG0 X20. Y5. Z1.\nG1 Z0. F100\nX30.\nG91 Y8.\nG90\nG2 X30. Y23. I5. J5.\nG69\nG0 X0. Y0.",
+        [(20, 5), (20, 5), (30, 5), (30, 13), (30, 23)], (10.0, 5.0),
+    ),
+    "siemens": (
+        "ROT RPL=20\nAROT Z10\nG0 X20 Y5 Z1\nG1 Z0 F100\nX=30\nG91 Y8\nG90\nG2 X30 Y23 I5 J5\nROT\nG0 X0 Y0",
+        [(20, 5), (20, 5), (30, 5), (30, 13), (30, 23)], (0.0, 0.0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dialect", TURNED)
+def test_turned_coordinates_are_written_out(tmp_path, dialect):
+    """30 degrees about the centre that the program states; the corrected program has no turn any more."""
+    blocks, expected, centre = TURNED[dialect]
+    head, last = (HEAD, "M30\n%\n") if dialect == "fanuc" else ("G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 Z0 F100\n", "M30\n")
+    program = tmp_path / "p.nc"
+    program.write_text(f"{head}{blocks}\n{last}")
+    found = np.array(ends(program, dialect, PLAIN))[2:-1, :2]
+    assert np.abs(found - [turned(x, y, 30.0, centre) for x, y in expected]).max() < 6e-4  # three decimals of FANUC
+    result = correct_program(
+        model_of(mill(), shift(x=10.0), None), program, tmp_path / "out", CorrectOptions(dialect), PLAIN
+    )
+    assert result.accepted
+    text = (tmp_path / "out/p.nc").read_text()
+    assert not re.search(r"^(N\d+ )?(G68|A?ROT)\b", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("dialect", "blocks", "words"),
+    [
+        ("fanuc", "G68 X0. Y0. R30.\nG0 X5.", "place both"),
+        ("fanuc", "G68 X0. Y0. R30.\nG91 X5.", "place both"),
+        ("fanuc", "G68 X0. Y0. R30.\nG0 X5. Y5.\nG69\nX9.", "place both"),
+        ("fanuc", "G68 X0. Y0. R30.\nG55", "end the turn"),
+        ("fanuc", "G68 X0. Y0. R30.\nG18", "plane"),
+        ("fanuc", "G68 X0. Y0. R30.\nG0 X5 Y5.", "decimal point"),
+        ("fanuc", "G68 X0. Y0. Z0. I1. J0. K0. R30.", "turned"),
+        ("fanuc", "G68 R30.", "turned"),
+        ("siemens", "ROT RPL=30\nG0 X5", "place both"),
+        ("siemens", "ROT RPL=30\nG0 X=IC(5) Y5", "IC"),
+        ("siemens", "ROT RPL=30\nATRANS X5", "end the turn"),
+        ("siemens", "ROT X30", "turned"),
+        ("siemens", "G18\nROT RPL=30", "plane G17"),
+    ],
+)
+def test_turns_that_are_not_clear_are_refused(tmp_path, dialect, blocks, words):
+    head, last = (HEAD, "M30\n%\n") if dialect == "fanuc" else ("G71 G90 G17 G54\nG0 X0 Y0 Z5\nG1 Z0 F100\n", "M30\n")
+    program = tmp_path / "p.nc"
+    program.write_text(f"{head}{blocks}\n{last}")
+    with pytest.raises(InputError, match=words):
+        correct_program(
+            model_of(mill(), shift(x=10.0), None), program, tmp_path / "out", CorrectOptions(dialect), PLAIN
+        )
