@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,6 +21,7 @@ from compgen.cli.shared_options import (
     stated_options,
 )
 from compgen.cli.terminal import progress, stdout
+from compgen.controls import ROTARY_TARGETS
 from compgen.data.error_table import SQUARENESS_APART, ErrorTable
 from compgen.data.files import OutputFolder, read_bytes
 from compgen.data.lengths import Lengths
@@ -46,6 +47,7 @@ from compgen.pipeline import (
 from compgen.report.terminal import advice_text, identification_table
 
 if TYPE_CHECKING:
+    from compgen.identify.rotary_runs import RotaryPositioning
     from compgen.identify.spheres import SphereIdentification
     from compgen.tables.active import ActiveTables
 
@@ -113,7 +115,8 @@ def identify_command(
     of --self-check.
 
     *.sphere.csv files contain centres of spheres at poses of a machine with rotary axes (chain such as WCAYFXZT): they give
-    the position errors of the rotary axes, and which of them the poses cannot tell apart.
+    the position errors of the rotary axes, and which of them the poses cannot tell apart. *.axis.csv files with position_deg
+    and deviation_arcsec give the positioning of rotary axes (ECC), alone or with spheres.
 
     \b
     Example:
@@ -122,7 +125,7 @@ def identify_command(
     if replicates is None and (workers > 1 or cluster is not None):
         raise InputError("--workers and --cluster need --self-check: they distribute its replicates")
     OutputFolder(out)
-    if any(detect_format(path) == "sphere" for path in measurements if path.suffix.lower() == ".csv"):
+    if any(_of_rotary_axes(path) for path in measurements):
         return _identify_spheres(machine, measurements, out, options, as_json)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
@@ -168,40 +171,78 @@ def _identify_spheres(
     machine: Machine, measurements: tuple[Path, ...], out: Path, options: IdentifyOptions, as_json: bool
 ) -> int:
     """Identify the position errors of rotary axes, and write them with what the poses leave open."""
-    from compgen.report.terminal import sphere_table
-
-    result, files = _sphere_files(machine, measurements, options)
+    placed, turned, summary, files = _rotary_files(machine, measurements, options)
     write_all(out, files)
     if as_json:
-        print_json(result.summary())
+        print_json(summary)
     else:
-        stdout.print(sphere_table(result))
+        _show_rotary(placed, turned)
         stdout.print(f"{out / 'identified.errors.csv'}, {out / 'identify.json'}")
-    return 0 if result.rank else 1
+    return 0 if placed is None or placed.rank else 1
 
 
-def _sphere_files(
+def _show_rotary(placed: SphereIdentification | None, turned: RotaryPositioning | None) -> None:
+    """Print what spheres and runs say."""
+    from compgen.report.terminal import sphere_table
+
+    if placed is not None:
+        stdout.print(sphere_table(placed))
+    if turned is not None:
+        for letter, own in turned.figures.items():
+            figures = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in own.items())
+            stdout.print(f"{letter}: positioning after ISO 230-2, arcsec: {figures}")
+        for note in turned.notes:
+            stdout.print(f"note: {note}")
+
+
+def _of_rotary_axes(path: Path) -> bool:
+    """Whether a file contains centres of spheres, or positioning runs of rotary axes."""
+    from compgen.data.rotary import is_rotary_runs
+
+    kind = detect_format(path) if path.suffix.lower() == ".csv" else "other"
+    return kind == "sphere" or (kind in (None, "axis") and is_rotary_runs(path))
+
+
+def _rotary_files(
     machine: Machine, measurements: tuple[Path, ...], options: IdentifyOptions
-) -> tuple[SphereIdentification, dict[str, str]]:
-    """Position errors of rotary axes, and the files that say so."""
+) -> tuple[SphereIdentification | None, RotaryPositioning | None, dict[str, Any], dict[str, str]]:
+    """Errors of rotary axes from spheres and from runs, their summary, and the files that say so."""
     import json
 
-    from compgen.data.rotary import format_machine_errors, read_spheres
+    from compgen.data.rotary import RotaryErrors, format_machine_errors, is_rotary_runs, read_rotary_runs, read_spheres
+    from compgen.identify.rotary_runs import identify_rotary_runs
     from compgen.identify.spheres import identify_spheres
 
-    others = [path for path in measurements if detect_format(path) != "sphere"]
+    others = [path for path in measurements if not _of_rotary_axes(path)]
     if others:
         raise InputError(
             "contains no centres of spheres; identify the linear axes and the rotary axes separately", file=others[0]
         )
-    result = identify_spheres(machine, read_spheres(machine, measurements), u_um=options.u_deviation_um)
-    provenance = provenance_of(machine.source, *measurements)
-    metadata = {"machine": machine.name, "source": "sphere centres"}
-    data = {**result.summary(), "provenance": dict(provenance.inputs)}
-    return result, {
-        "identified.errors.csv": format_machine_errors(ErrorTable(), result.errors, metadata),
-        "identify.json": json.dumps(data, indent=2) + "\n",
-    }
+    runs = [path for path in measurements if is_rotary_runs(path)]
+    centres = [path for path in measurements if path not in runs]
+    turned = identify_rotary_runs(machine, read_rotary_runs(machine, runs)) if runs else None
+    known = RotaryErrors() if turned is None else turned.errors
+    placed = None
+    if centres:
+        placed = identify_spheres(machine, read_spheres(machine, centres), u_um=options.u_deviation_um, known=known)
+    errors = RotaryErrors(known.curves, {} if placed is None else placed.errors.constants)
+    summary = turned.summary() if placed is None and turned is not None else {}
+    if placed is not None:
+        summary = {**placed.summary(), **({} if turned is None else {"rotary_axis": turned.summary()})}
+    sources = [
+        text for text, there in (("sphere centres", placed), ("positioning runs of rotary axes", turned)) if there
+    ]
+    metadata = {"machine": machine.name, "source": ", ".join(sources)}
+    data = {**summary, "provenance": dict(provenance_of(machine.source, *measurements).inputs)}
+    return (
+        placed,
+        turned,
+        summary,
+        {
+            "identified.errors.csv": format_machine_errors(ErrorTable(), errors, metadata),
+            "identify.json": json.dumps(data, indent=2) + "\n",
+        },
+    )
 
 
 def run_spheres(
@@ -213,21 +254,23 @@ def run_spheres(
     as_json: bool,
 ) -> int:
     """Identify the position errors of rotary axes, and write them as parameters of one control."""
-    from compgen.cli.rotary_commands import export_parameters
+    from compgen.cli.rotary_commands import export_parameters, export_tables
     from compgen.controls.rotary_parameters import target_of
-    from compgen.report.terminal import sphere_table
+    from compgen.controls.rotary_pitch import format_of
 
     if len(set(controllers)) > 1:
         raise InputError(
             f"one at a time, please: {controllers[0]} takes parameters of rotary axes", field="--controller"
         )
     OutputFolder(out)
-    target_of(machine, controllers[0])
-    result, files = _sphere_files(machine, measurements, options)
+    name = controllers[0]
+    _ = target_of(machine, name) if name in ROTARY_TARGETS else format_of(machine, name)
+    placed, turned, _, files = _rotary_files(machine, measurements, options)
     write_all(out, files)
     if not as_json:
-        stdout.print(sphere_table(result))
-    return export_parameters(machine, out / "identified.errors.csv", controllers[0], out, as_json)
+        _show_rotary(placed, turned)
+    written = export_parameters if name in ROTARY_TARGETS else export_tables
+    return written(machine, out / "identified.errors.csv", name, out, as_json)
 
 
 @click.command("fit")

@@ -19,7 +19,8 @@ from compgen.cli.common import PATH, json_option, option_name, options_of, print
 from compgen.cli.shared_options import open_machine
 from compgen.cli.terminal import answer, say, stdout
 from compgen.controls import CONTROLLERS
-from compgen.controls.rotary_parameters import ABOUT
+from compgen.controls.rotary_parameters import ABOUT as ABOUT_PARAMETERS
+from compgen.controls.rotary_pitch import ABOUT as ABOUT_PITCH
 from compgen.data.axis_runs import AxisRuns
 from compgen.data.deviations import Artefact, Deviations, Part
 from compgen.data.error_table import ErrorTable
@@ -39,6 +40,10 @@ from compgen.report.cards import card_summary, card_text, control_card, effect_c
 from compgen.tables import Format, load_format
 
 # ``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is available.
+
+
+#: What takes errors of rotary axes.
+ABOUT = {**ABOUT_PARAMETERS, **ABOUT_PITCH}
 
 
 @click.command("controllers")

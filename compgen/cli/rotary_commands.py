@@ -13,6 +13,7 @@ from rich.table import Table
 
 from compgen.cli.terminal import answer, complain, say, say_paths
 from compgen.controls.rotary_parameters import believed, lines_of, target_of
+from compgen.controls.rotary_pitch import format_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, read_text, write_file
@@ -23,6 +24,7 @@ from compgen.errors import InputError
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 from compgen.pipeline import provenance_of
 from compgen.tables.rotary_parameters import RotaryExport, export_rotary, judged
+from compgen.tables.rotary_pitch import PitchExport, export_pitch, judged_pitch
 
 
 def export_parameters(machine: Machine, errors: Path, controller: str, out: Path, as_json: bool) -> int:
@@ -149,6 +151,70 @@ def preflight(machine: Machine, result: RotaryExport) -> str:
             "",
         ]
     )
+
+
+def export_tables(machine: Machine, errors: Path, controller: str, out: Path, as_json: bool) -> int:
+    """Write the positioning tables of rotary axes, read back, emulated and judged."""
+    form = format_of(machine, controller)
+    result = export_pitch(form, read_machine_errors(errors)[1])
+    prefix = REJECTED_PREFIX if result.reasons else ""
+    output = OutputFolder(out)
+    for name, text in result.files.items():
+        output.add(prefix + name, text)
+    summary = {"machine": machine.name, **result.summary()}
+    output.add("result.json", json.dumps(summary, indent=2) + "\n")
+    files = [{"name": prefix + name, "sha256": digest} for name, digest in summary["files"].items()]
+    inputs = dict(provenance_of(machine.source, errors).inputs)
+    output.add(
+        "manifest.json", json.dumps({"controller": controller, "files": files, "inputs": inputs}, indent=2) + "\n"
+    )
+    rows = [f"# {form.title}", "", f"Machine {machine.name}. Angles in degrees.", "", *_said(result), ""]
+    turned = [
+        f"- {letter} of the control is minus {letter} of the machine file." for letter in form.settings.reversed_axes
+    ]
+    output.add("preflight.md", "\n".join([*rows, *(f"- {text}" for text in form.instructions()), *turned, ""]))
+    paths = output.commit()
+    for text in result.reasons:
+        complain(f"not acceptable: {text}", "red")
+    answer(as_json, {**summary, "paths": [str(path) for path in paths or ()]}, *_said(result))
+    if not as_json:
+        say_paths(out / name for name in (*(prefix + name for name in result.files), "result.json", "preflight.md"))
+    return 1 if result.reasons else 0
+
+
+def _said(result: PitchExport) -> list[str]:
+    """What the tables leave, in sentences."""
+    lines = [
+        f"{letter}: error of the angle {own['before_rms']:.2f} -> {own['after_rms']:.2f} arcsec rms, "
+        f"largest {own['before_max']:.2f} -> {own['after_max']:.2f} arcsec"
+        for letter, own in result.angle_arcsec.items()
+    ]
+    before, after = result.before, result.after
+    return [
+        *lines,
+        f"over travel, angles and tools of 0 to 200 mm, part set up: tip rms {before.rms_um:.2f} -> {after.rms_um:.2f} um, "
+        f"tool axis rms {before.rms_urad:.1f} -> {after.rms_urad:.1f} urad",
+    ]
+
+
+def verify_tables(
+    machine: Machine, tables: Sequence[Path], controller: str, errors: Path, out: Path, as_json: bool
+) -> int:
+    """Judge positioning tables of rotary axes against the errors."""
+    form = format_of(machine, controller)
+    endings = (".comp", ".ini")
+    paths = [file for path in tables for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    chosen = [path for path in paths if path.suffix.lower() in endings]
+    if not chosen:
+        raise InputError(f"has no file {' or '.join('*' + ending for ending in endings)}", file=tables[0])
+    result = judged_pitch(form, read_machine_errors(errors)[1], {path: read_text(path) for path in chosen})
+    output = OutputFolder(out)
+    output.add("result.json", json.dumps({"machine": machine.name, **result.summary()}, indent=2) + "\n")
+    output.commit()
+    for reason in result.reasons:
+        complain(f"not acceptable: {reason}", "red")
+    answer(as_json, result.summary(), *_said(result))
+    return 1 if result.reasons else 0
 
 
 def verify_parameters(

@@ -30,7 +30,7 @@ from compgen.cli.shared_options import (
     unverified_option,
 )
 from compgen.cli.terminal import progress, say, say_paths, stdout
-from compgen.controls import ROTARY_TARGETS
+from compgen.controls import ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
@@ -265,7 +265,7 @@ def run_command(
         from compgen.report.dcc.laboratory import read_certificate
 
         read_certificate(certificate, complete=False)
-    if any(name in ROTARY_TARGETS for name in controller):
+    if any(name in (*ROTARY_TARGETS, *ROTARY_PITCH) for name in controller):
         from compgen.cli.identify_commands import run_spheres
 
         return run_spheres(machine, measurements, controller, out, options, as_json)

@@ -29,7 +29,7 @@ from compgen.cli.shared_options import (
     unverified_option,
 )
 from compgen.cli.terminal import answer, complain, progress, say, say_paths, stdout
-from compgen.controls import CONTROLLERS, ROTARY_TARGETS
+from compgen.controls import CONTROLLERS, ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors, read_reversal
 from compgen.data.files import OutputFolder, write_file
@@ -188,7 +188,8 @@ def export_command(
     --active, ERRORS belong to the machine with its old tables; bare.errors.csv gets those without.
 
     Of a machine with rotary axes the controls linuxcnc-trt, linuxcnc-tdr, linuxcnc-5axis, siemens-toolcarrier and fanuc-5axis
-    get the parameters that say where its rotary axes are (mm).
+    get the parameters that say where its rotary axes are (mm); linuxcnc-rotary-comp and siemens-rotary-eec get tables over
+    the angle (degrees).
 
     \b
     Example:
@@ -199,6 +200,10 @@ def export_command(
         from compgen.cli.rotary_commands import export_parameters
 
         return export_parameters(machine, errors, controller, out, as_json)
+    if controller in ROTARY_PITCH:
+        from compgen.cli.rotary_commands import export_tables
+
+        return export_tables(machine, errors, controller, out, as_json)
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     known = None if active is not None else covariance_of(errors, table, None, independent=False)
@@ -335,6 +340,10 @@ def verify_command(
         from compgen.cli.rotary_commands import verify_parameters
 
         return verify_parameters(machine, tables, controller, errors, out, as_json)
+    if controller in ROTARY_PITCH:
+        from compgen.cli.rotary_commands import verify_tables
+
+        return verify_tables(machine, tables, controller, errors, out, as_json)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     parsed, table = read_tables(machine, tables, controller), open_errors(errors)

@@ -92,6 +92,9 @@ CONTROLLERS = Controls(
 #: Names of what takes parameters of rotary axes; :mod:`compgen.controls.rotary_parameters` makes them.
 ROTARY_TARGETS = ("linuxcnc-trt", "linuxcnc-tdr", "linuxcnc-5axis", "siemens-toolcarrier", "fanuc-5axis")
 
+#: Names of tables over the angle of rotary axes; :mod:`compgen.controls.rotary_pitch` makes them.
+ROTARY_PITCH = ("linuxcnc-rotary-comp", "siemens-rotary-eec")
+
 #: Controls that users request but whose file format is not published: what to use instead.
 NOT_PUBLIC = {
     "siemens-vcs": "the file format of the SINUMERIK volumetric compensation system is not public; export with another "
@@ -123,8 +126,8 @@ def controller_named(name: str) -> type[AnyController]:
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
-        if name in ROTARY_TARGETS:
-            raise InputError(f"{name} takes parameters of rotary axes; use it with export, verify, read or run")
+        if name in (*ROTARY_TARGETS, *ROTARY_PITCH):
+            raise InputError(f"{name} takes errors of rotary axes; use it with export, verify, read or run")
 
         # probable matches: controls with the word in their name, in the title of their card, or anywhere in the card
         folders = {known: control.templates or data_folder("templates") for known, control in CONTROLLERS.items()}

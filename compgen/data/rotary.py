@@ -28,6 +28,7 @@ from compgen.data.records import (
     TOOL_COLUMNS,
     ReadColumn,
     deviations_um,
+    directions,
     uncertainties,
     within,
 )
@@ -484,3 +485,75 @@ def format_poses(poses: Poses, results: Mapping[str, FloatArray], metadata: Mapp
     if poses.tool_mm is not None:
         columns |= {name: poses.tool_mm[:, k] for k, name in enumerate(TOOL_COLUMNS)}
     return format_csv({**columns, **results}, metadata)
+
+
+# Positioning runs of rotary axes (ISO 230-2): ``*.axis.csv`` with angles.
+
+
+#: Columns that tell runs of a rotary axis from those of a linear one.
+RUN_COLUMNS = ("position_deg", "deviation_arcsec")
+RAD_PER_ARCSEC = np.pi / 648000.0
+
+
+@dataclass(frozen=True)
+class RotaryRuns:
+    """Actual minus target angle of rotary axes: letters, targets (degrees), directions, runs, deviations (rad), each (n,)."""
+
+    letter: Sequence[str]
+    angle_deg: FloatArray
+    direction: NDArray[np.int64]
+    run: NDArray[np.int64]
+    deviation_rad: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return len(self.angle_deg)
+
+
+def is_rotary_runs(path: str | Path) -> bool:
+    """Whether a file contains positioning runs of rotary axes."""
+    return str(path).lower().endswith(".csv") and set(RUN_COLUMNS) <= names_in_header(read_text(path))
+
+
+def read_rotary_runs(machine: Machine, paths: Sequence[str | Path]) -> RotaryRuns:
+    """Read ``*.axis.csv`` files with ``axis``, ``position_deg``, ``direction``, ``run``, ``deviation_arcsec``.
+
+    Raises
+    ------
+    InputError
+        for an axis that the machine lacks, an angle outside its travel, a reading given twice, a deviation beyond a degree.
+    """
+    letters: list[str] = []
+    parts: list[tuple[FloatArray, ...]] = []
+    seen: dict[tuple[object, ...], str] = {}
+    for path in paths:
+        table = read_csv(path, ("axis", "direction", *RUN_COLUMNS), ("run", "time_s"), (TEMPERATURES,))
+        own = [text.strip().upper() for text in table.text("axis")]
+        angle, way = table.numbers("position_deg"), directions(table, "direction")
+        run = table.labels("run") if "run" in table.columns else np.ones(len(table), dtype=np.int64)
+        deviation = table.numbers("deviation_arcsec")
+        for row, letter in enumerate(own):
+            if letter not in machine.rotary:
+                known = ", ".join(machine.rotary) or "none"
+                raise table.fail(row, "axis", f"{letter!r} is no rotary axis of {machine.name} (it has {known})")
+            ends = machine.rotary[letter].range_deg
+            if ends is not None and not ends[0] - 1e-6 <= angle[row] <= ends[1] + 1e-6:
+                raise table.fail(
+                    row,
+                    "position_deg",
+                    f"{angle[row]:g} degrees is outside the travel {ends[0]:g} ... {ends[1]:g} of {letter}",
+                )
+            if abs(deviation[row]) > 3600.0:
+                raise table.fail(
+                    row, "deviation_arcsec", f"{deviation[row]:g} is more than a degree; is the unit arcsec?"
+                )
+            key, where = (letter, float(angle[row]), int(way[row]), int(run[row])), f"{path}:{table.lines[row]}"
+            if key in seen:
+                raise table.fail(
+                    row, "position_deg", f"{letter} at {angle[row]:g} already appears in {seen[key]}; number the runs"
+                )
+            seen[key] = where
+        letters += own
+        parts.append((angle, way.astype(float), run.astype(float), deviation * RAD_PER_ARCSEC))
+    joined = [np.concatenate(column) for column in zip(*parts, strict=True)]
+    return RotaryRuns(letters, joined[0], joined[1].astype(np.int64), joined[2].astype(np.int64), joined[3])

@@ -165,6 +165,7 @@ class _Model:
     joint_mm: FloatArray
     names: tuple[str, ...]
     size: FloatArray
+    known: RotaryErrors = field(default_factory=RotaryErrors)
 
     @property
     def errors(self) -> int:
@@ -179,7 +180,9 @@ class _Model:
             at = np.array(self.machine.axes[axis].range_mm)
             value = scale * (at - self.machine.reference_point_mm[axis])
             curves[f"E{AXES[axis]}{AXES[axis]}"] = Curve(at, value, np.zeros(2))
-        return ErrorTable(curves, squareness), RotaryErrors({}, _constants(self.names, x[:k], np.zeros(k)))
+        return ErrorTable(curves, squareness), RotaryErrors(
+            self.known.curves, _constants(self.names, x[:k], np.zeros(k))
+        )
 
     def tip(self, x: FloatArray) -> FloatArray:
         """Tip minus what an R-test read, (n, 3): where the sphere must be."""
@@ -207,7 +210,7 @@ def _constants(names: Sequence[str], values: FloatArray, u: FloatArray) -> dict[
     return {name: (float(value), float(own)) for name, value, own in zip(names, values, u, strict=True)}
 
 
-def _model(machine: Machine, spheres: SphereCentres, raised: float = 1.0) -> _Model:
+def _model(machine: Machine, spheres: SphereCentres, known: RotaryErrors, raised: float = 1.0) -> _Model:
     joints = spheres.found_mm
     if spheres.coordinates == TIP:
         joints = joints_of_tip(machine, joints, spheres.angle_deg, spheres.tool_mm)
@@ -220,7 +223,7 @@ def _model(machine: Machine, spheres: SphereCentres, raised: float = 1.0) -> _Mo
     usual = replace(prior, class_name=USUAL_CLASS) if prior.is_none else prior
     sizes = [factor * (OFFSET_UM if _unit(name)[0] == "um" else TILT_URAD) * _unit(name)[1] for name in names]
     linear = [*(usual.size(name) for name in SQUARENESS_NAMES), *(usual.scale(f"E{axis}{axis}") for axis in AXES)]
-    return _Model(machine, spheres, joints, names, np.array([*(raised * np.array(sizes)), *linear]))
+    return _Model(machine, spheres, joints, names, np.array([*(raised * np.array(sizes)), *linear]), known)
 
 
 @dataclass(frozen=True)
@@ -284,7 +287,12 @@ def _file_of(spheres: SphereCentres) -> str | None:
 
 
 def identify_spheres(
-    machine: Machine, spheres: SphereCentres, *, u_um: float | None = None, separate: bool = True
+    machine: Machine,
+    spheres: SphereCentres,
+    *,
+    u_um: float | None = None,
+    separate: bool = True,
+    known: RotaryErrors | None = None,
 ) -> SphereIdentification:
     """Identify the position errors of all rotary axes from sphere centres.
 
@@ -294,6 +302,7 @@ def identify_spheres(
     spheres : centres at poses, from :func:`compgen.data.rotary.read_spheres`.
     u_um : standard uncertainty of a coordinate where the file states none; None: from the residuals.
     separate : look for what would separate combinations that the readings cannot tell apart.
+    known : error motions that were measured otherwise, such as the positioning of an axis; taken as they are.
 
     Raises
     ------
@@ -307,7 +316,8 @@ def identify_spheres(
             f"{text}. Reverse the sign of its angles in the file, or find out which way it turns",
             file=_file_of(spheres),
         )
-    model, raised = _model(machine, spheres), 1.0
+    known = RotaryErrors() if known is None else known
+    model, raised = _model(machine, spheres, known), 1.0
     place, names = spheres.places
     for k, name in enumerate(names):
         if (place == k).sum() < 4:
@@ -322,7 +332,7 @@ def identify_spheres(
         worse = float(np.sqrt(np.mean((x[: model.errors] / model.size[: model.errors]) ** 2)))
         if worse > _WORSE:
             raised *= worse
-            model = _model(machine, spheres, raised)
+            model = _model(machine, spheres, known, raised)
         if estimated or wide > 1.02:
             u, scale = u * wide, scale * wide
         if worse <= _WORSE and abs(wide - 1.0) < 0.02 or (not estimated and wide <= 1.02 and worse <= _WORSE):
