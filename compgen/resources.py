@@ -36,8 +36,14 @@ def cache_folder(kind: str) -> Path:
     return (base if base.is_absolute() else usual) / "compgen" / kind
 
 
-#: Languages of pages and of lists for the machine; the first one is that of the program.
-LANGUAGES = ("en", "de")
+def _languages() -> tuple[str, ...]:
+    """Return English, the language of the program, and every language that has a compiled catalogue."""
+    catalogues = data_folder("templates") / "_language"
+    return ("en", *sorted(path.stem for path in catalogues.glob("*.mo")))
+
+
+#: Languages of pages and of lists for the machine; the first one is that of the program. A catalogue adds one, nothing else.
+LANGUAGES = _languages()
 
 #: The only place of the version: the metadata of the package and the documentation take it from here.
 VERSION = "0.1.0"

@@ -263,7 +263,9 @@ class Texts:
     def _named(self, english: str) -> str:
         """Return a cell of a table, a name and its value, or a message and its kind, in this language."""
         name, colon, value = english.partition(":")
-        if kind := self.messages.get(f"{name}: {{message}}"):  # of errors and warnings, also without a translation
+        if colon and (
+            kind := self.messages.get(f"{name}: {{message}}")
+        ):  # of errors and warnings, also without a translation
             return kind.replace("{message}", self.label(value.strip()))
         whole = self.label(english)
         known = self.messages.get(f"{LABEL}\x04{name.replace('_', ' ')}")

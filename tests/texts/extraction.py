@@ -30,7 +30,7 @@ MODULES = (
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
     "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
     "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py",
-    "programs/features.py", "programs/part.py", "report/cards.py", "report/html/*.py", "report/options_text.py",
+    "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py", "report/html/*.py", "report/pdf.py", "report/options_text.py",
     "report/part_page.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
@@ -70,6 +70,9 @@ WORDS = (
 )  # fmt: skip
 #: Headings and names of facts: they are no values, and where they are the name of a key they stay as they are.
 LABELS = (
+    # facts of a report that is handed over
+    "Order number", "Certificate number", "Machine maker", "Serial number of the machine", "Place", "Measured", "Received",
+    "Issued", "Issued in", "Control",
     "yes", "no",
     "why", "correlation", "partly", "reversal", "units", "passed", "Diagnosis", "Steps", "done", "progress", "volumetric",
     "pitch", "skew", "reference point", "tool offset",
@@ -305,10 +308,15 @@ def refusals():
     return found
 
 
+#: Languages whose catalogue lists every message; that of another one has its translations alone, the rest appears in English.
+WHOLE = ("de",)
+
+
 def update(language):
     """Write the catalogue of a language with all messages of now, and its compiled form; return what has no translation.
 
-    Translations of messages that are no longer used are removed: a wrong one would not be seen.
+    Translations of messages that are no longer used are removed: a wrong one would not be seen. A catalogue that is not
+    :data:`WHOLE` keeps what is translated.
     """
     from babel.messages.catalog import Catalog
     from babel.messages.mofile import write_mo
@@ -323,20 +331,24 @@ def update(language):
     catalogue = Catalog(language, header_comment="# Texts of pages and lists.", project="compgen", version=" ", fuzzy=False,
                         msgid_bugs_address=" ", creation_date=day, revision_date=day, last_translator=" ")  # fmt: skip
     refused = {key: files for key, files in refusals().items() if known.get(key)}
+    missing = []
     for (context, text), files in {**messages(), **refused}.items():
         string = known.get((context, text), "")
+        if not string and language not in WHOLE:
+            missing.append(text)
+            continue
         catalogue.add(text, string, locations=[(name, None) for name in files], context=context)
     with path.open("wb") as file:
         write_po(file, catalogue, width=120, omit_header=False)
     with path.with_suffix(".mo").open("wb") as file:
         write_mo(file, catalogue)
-    return [item.id for item in catalogue if item.id and not item.string]
+    return [*missing, *(item.id for item in catalogue if item.id and not item.string)]
 
 
 if __name__ == "__main__":
     for name in (path.stem for path in sorted(CATALOGUES.glob("*.po"))):
         missing = update(name)
         print(f"{name}: {len(missing)} texts without a translation")
-        for text in missing:
+        for text in missing if name in WHOLE else ():
             print(f"  {text}")
     sys.exit(0)

@@ -2,10 +2,12 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from collections import Counter
 from gettext import GNUTranslations
+from pathlib import Path
 
 import pytest
 from babel.messages.pofile import read_po
@@ -17,10 +19,12 @@ from compgen.controls import CONTROLLERS
 from compgen.data.language import Texts, parts, texts_of, wrapped
 from compgen.errors import InputError
 from compgen.report.html import build_report
+from compgen.resources import LANGUAGES
 from compgen.tables import check_files
 from compgen.tables.render import load_format
 
 ERRORS = "examples/zha-gantry.truth.errors.csv"
+ROOT = Path(__file__).resolve().parents[2]
 HOW_TO = "write their German texts into templates/_language/de.po and run `make texts` (CONTRIBUTING.md, Texts)"
 
 
@@ -33,6 +37,12 @@ def german():
 def catalogue():
     with (extraction.CATALOGUES / "de.po").open("rb") as file:
         return {(item.context, item.id): item.string for item in read_po(file) if item.id}
+
+
+def translated(language):
+    """The catalogue of a language as it is written: translations by context and message."""
+    with (extraction.CATALOGUES / f"{language}.po").open("rb") as file:
+        return {(item.context, item.id): item.string for item in read_po(file) if item.id and item.string}
 
 
 @pytest.fixture(scope="module")
@@ -285,3 +295,52 @@ measured_with = "bare"
     (tmp_path / "recal.toml").write_text(text + 'language = "fr"\n')
     with pytest.raises(InputError, match="language: expected one of 'en', 'de'"):
         read_job(tmp_path / "recal.toml")
+
+
+# A further language is one file, its catalogue; what it does not translate appears in English.
+
+FURTHER = [language for language in LANGUAGES[1:] if language not in extraction.WHOLE]
+
+
+def test_every_catalogue_is_a_language():
+    assert list(LANGUAGES) == ["en", *sorted(path.stem for path in extraction.CATALOGUES.glob("*.po"))]
+    assert FURTHER
+
+
+@pytest.mark.parametrize("language", FURTHER)
+def test_a_further_catalogue_is_compiled_and_its_translations_have_the_same_places_and_tags(language):
+    known = translated(language)
+    with (extraction.CATALOGUES / f"{language}.mo").open("rb") as file:
+        compiled = vars(GNUTranslations(file))["_catalog"]
+    assert {key: value for key, value in compiled.items() if key} == {
+        text if context is None else f"{context}\x04{text}": string for (context, text), string in known.items()
+    }, "run `make texts`"
+    kinds = (r"\{\{.*?\}\}|\{%.*?%\}", r"(?<!\{)\{\w+\}(?!\})", r"</?[a-z][^>]*>", r"`[^`]*`", r"\d+(?:\.\d+)?")
+    for (_, text), string in known.items():
+        for kind in kinds:
+            assert sorted(re.findall(kind, text)) == sorted(re.findall(kind, string)), text
+
+
+@pytest.mark.parametrize("language", FURTHER)
+def test_a_report_in_a_further_language_has_its_texts_and_the_same_numbers(language, ran):
+    english, page = (build_report(ran, name).files["report.html"] for name in ("en", language))
+    assert f'<html lang="{language}">' in page
+    texts = translated(language)
+    for heading in ("The identified errors", "The measurement", "What remains uncorrected, and why"):
+        assert f">{heading}</h" in english
+        assert f">{texts['part', heading]}</h" in page
+        assert f">{heading}</h" not in page
+    cells = [re.findall(r'<td class="n">([-+<]?\d[^<]*)</td>', text) for text in (english, page)]
+    assert cells[0] == cells[1]
+    assert len(cells[0]) > 100
+
+
+def test_a_catalogue_that_is_put_there_is_a_language_at_once(tmp_path):
+    """Nothing of the program names a language: a copy of it with one more file speaks it."""
+    (tmp_path / "templates" / "_language").mkdir(parents=True)
+    (tmp_path / "compgen").mkdir()
+    shutil.copy(extraction.CATALOGUES / "es.mo", tmp_path / "templates" / "_language" / "xx.mo")
+    shutil.copy(ROOT / "compgen" / "resources.py", tmp_path / "compgen" / "resources.py")
+    code = "import runpy, sys; print(runpy.run_path('compgen/resources.py')['LANGUAGES'])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert "'xx'" in done.stdout, done.stderr
