@@ -30,7 +30,8 @@ MODULES = (
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
     "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
     "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py",
-    "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py", "report/html/*.py", "report/pdf.py", "report/options_text.py",
+    "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py",
+    "report/html/*.py", "report/pdf.py", "report/options_text.py",
     "report/part_page.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
