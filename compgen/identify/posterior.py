@@ -905,11 +905,11 @@ def assumed_text(found: Posterior) -> str:
         if name not in found.determined:
             kind, unit = words[_kind_of(name)], error_named(name).unit
             sizes[kind] = max(sizes.get(kind, (0.0, unit)), (2.0 * found.prior.size_um(name), unit))
-    which = found.prior.class_text
-    if cyclic := found.prior.cyclic_text:
-        which = f"{cyclic} between the readings; {which}"
+    which, cyclic = found.prior.class_text, found.prior.cyclic_text
     if not sizes:
-        return f"every error was measured; assumed between the readings: {which}"
+        return f"every error was measured; assumed between the readings: {f'{cyclic}, ' if cyclic else ''}{which}"
+    if cyclic:
+        which = f"{cyclic} between the readings; {which}"
     parts = [f"{kind} up to {size:.3g} {unit}" for kind, (size, unit) in sizes.items()]
     return f"assumed for what was not measured: {', '.join(parts)} (k = 2; {which})"
 
