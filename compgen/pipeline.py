@@ -289,12 +289,13 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
     provenance: Provenance | None = None,
     reversal: ReversalCurves | None = None,
     limits: SafetyLimits | None = None,
+    known: covariance.Covariance | None = None,
 ) -> ControllerResult:
     """Export, write to a temporary folder, read the bytes back from there, verify, and only then write to ``folder``.
 
     The verification moves the exact model with the ``identified`` errors, not with the fitted ones that made the
     tables. Files that are not accepted are written as ``NOT-ACCEPTED-...``; what the export itself could not express
-    (an active limit) is a reason, too.
+    (an active limit) is a reason, too. ``known`` is the covariance of the identified errors.
     """
     OutputFolder(folder)
     exported = tables.export(
@@ -306,9 +307,9 @@ def export_and_verify(  # noqa: PLR0913  (options by keyword)
         provenance=provenance,
         reversal=reversal,
     )
-    read, verification = verified_export(machine, exported, identified, reversal, limits)
+    read, verification = verified_export(machine, exported, identified, reversal, limits, known)
     exported = tables.with_known(exported, verification.known_lines)
-    extra_files = tables.check_files(machine, exported, identified, templates, reversal, read=read)
+    extra_files = tables.check_files(machine, exported, identified, templates, reversal, read=read, covariance=known)
     return _write_results(OutputFolder(folder), {"": (exported, read, verification, extra_files)})[0][0]
 
 

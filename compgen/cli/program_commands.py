@@ -264,12 +264,12 @@ def correct_command(
     named NOT-ACCEPTED-... (exit code 1). Variables, subprograms of other files, cutter radius compensation, turned coordinates
     and rotary axes that turn are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may
     be corrected twice: tables that are active while the program runs are given with --active, unless ERRORS were measured with
-    them on. With --watch, in place of PROGRAM, every program that is put into a folder is corrected.
+    them on. With --watch posted/, in place of PROGRAM, every program that is put into this
+    folder is corrected.
 
     \b
     Example:
       volcomp correct zha-gantry part.nc --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350 --out corrected/
-      volcomp correct zha-gantry --watch posted/ --errors fitted.errors.csv --dialect fanuc --wcs G54=-400,-300,-350
     """
     if bool(active) != (active_controller is not None):
         raise InputError("--active and --active-controller belong together; give both")

@@ -52,6 +52,7 @@ from compgen.report.terminal import crash_table, difference_table, merge_text, v
 from compgen.tables import REJECTED_PREFIX, Provenance, export, read_tables, residuals, verify, with_known
 from compgen.tables.active import (
     ActiveTables,
+    bare_covariance,
     bare_errors,
     difference,
     keeping_others,
@@ -206,9 +207,11 @@ def export_command(
         return export_tables(machine, errors, controller, out, as_json)
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
-    known = None if active is not None else covariance_of(errors, table, None, independent=False)
+    known = covariance_of(errors, table, None, independent=False)
     if active is not None:
-        table, lost_um = bare_errors(machine, table, active)
+        measured = table
+        table, lost_um = bare_errors(machine, measured, active)
+        known = bare_covariance(machine, measured, known, table)
         extra_files["bare.errors.csv"] = format_errors(
             table, {"active_tables_removed": active.names, "lost_um": lost_um}
         )
@@ -465,9 +468,10 @@ def merge_command(
     machine = keeping_others(machine, [controller], active)
     measured = open_errors(errors)
     bare, lost_um = merged_errors(machine, measured, active)
+    known = bare_covariance(machine, measured, covariance_of(errors, measured, None, independent=False), bare)
     provenance: Provenance = provenance_of(machine.source, errors, *active.paths)
     done = export_and_verify(
-        machine, bare, bare, controller, out, limits=limits, templates=templates, provenance=provenance
+        machine, bare, bare, controller, out, limits=limits, templates=templates, provenance=provenance, known=known
     )
     merged = read_tables(machine, done.paths, controller)
     report = merge_report(machine, measured, active, merged, lost_um)

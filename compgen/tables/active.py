@@ -23,6 +23,7 @@ from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, ConvergenceError, InputError
 from compgen.identify.adjust.unknowns import check_travel
+from compgen.identify.covariance import Covariance, covariance_of_values, covariance_or_independent, posterior_with
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, modelled_errors, observable_errors
 from compgen.kinematics.many_points import volume_grid
@@ -268,6 +269,32 @@ def _table(machine: Machine, errors: ErrorTable, solver: Projector, values: Floa
         u = np.full(len(numbers), np.nan) if old is None else np.interp(term.nodes_mm, old.position_mm, old.u)
         curves[term.name] = Curve(term.nodes_mm, numbers, u)
     return ErrorTable(curves, squareness, errors.metadata)
+
+
+def bare_covariance(
+    machine: Machine, errors: ErrorTable, known: Covariance | None, bare: ErrorTable
+) -> Covariance | None:
+    """Return what is known of the ``bare`` errors: as much as of those measured with the tables, whose numbers are exact.
+
+    ``known`` is the joint covariance of the measured ``errors``; without it their values are independent. None if an
+    uncertainty is unknown.
+    """
+    measured = covariance_or_independent(errors, known, machine.name)
+    if measured is None:
+        return None
+    names, position_mm = bare.labels()
+    rows = errors.rows()
+    shares = np.zeros((len(names), len(measured.error)))
+    for k, (name, at_mm) in enumerate(zip(names, position_mm.tolist(), strict=True)):
+        if name in errors.squareness:
+            shares[k, rows[name]] = 1.0
+        elif name in errors.curves:
+            nodes_mm = errors.curves[name].position_mm
+            shares[k, rows[name]] = [np.interp(at_mm, nodes_mm, one) for one in np.eye(len(nodes_mm))]
+    found = covariance_of_values(bare, shares @ measured.errors_factor, machine.name)
+    posterior = posterior_with(machine, errors, known)
+    # its mean is that of the machine with its tables, in another gauge than the bare errors
+    return found if posterior is None else replace(found, posterior=replace(posterior.stored(), follows_table=False))
 
 
 # One table instead of two: an old table that was active, and the errors measured with it.

@@ -13,9 +13,18 @@ from compgen.cli.common import run_command
 from compgen.data import toml_files
 from compgen.data.error_table import Curve
 from compgen.data.names import SQUARENESS_NAMES, error_named
+from compgen.identify.covariance import covariance_of_values, covariance_or_independent, posterior_with
 from compgen.kinematics.exact_chain import exact_error
 from compgen.tables import export, read_tables
-from compgen.tables.active import ActiveTables, bare_errors, difference, merge_report, merged_errors, total_correction
+from compgen.tables.active import (
+    ActiveTables,
+    bare_covariance,
+    bare_errors,
+    difference,
+    merge_report,
+    merged_errors,
+    total_correction,
+)
 from compgen.tables.signs import exported_tables
 
 NANOMETRE = 1e-6
@@ -313,3 +322,36 @@ def test_the_command_writes_one_accepted_set(small_machine_file, small_machine, 
     assert run_command(cli, [*words, "--out", str(tmp_path / "tight"), "--max-step-um", "1", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["accepted"] is False
     assert (tmp_path / "tight" / "NOT-ACCEPTED-NC_CEC.INI").is_file()
+
+
+def test_of_merged_tables_as_much_is_known_as_of_the_measurement_with_the_old_ones(small_machine, small_errors):
+    """Old tables are exact numbers: they take nothing from the uncertainty of what was not measured, and add nothing."""
+    old = ActiveTables(exported_tables(small_machine, small_errors, "isg-csv"))
+    rng = np.random.default_rng(2)
+    pitch = Curve(np.linspace(-300.0, 200.0, 6), rng.normal(0.0, 2e-3, 6), np.full(6, 3e-4))
+    measured = compgen.ErrorTable({"EXX": pitch}, {})
+    for known in (None, covariance_of_values(measured, 3e-4 * rng.normal(size=(6, 3)), small_machine.name)):
+        bare, _ = merged_errors(small_machine, measured, old)
+        found = bare_covariance(small_machine, measured, known, bare)
+        position = rng.uniform(small_machine.lower_mm, small_machine.upper_mm, (30, 3))
+        alone = posterior_with(small_machine, measured, known).field(position).variance
+        merged = posterior_with(small_machine, bare, found).field(position).variance
+        assert np.allclose(merged, alone, rtol=1e-9)
+        factor = covariance_or_independent(measured, known).errors_factor
+        at_nodes = [found.errors_factor[k] for k, name in enumerate(found.error) if name == "EXX"]
+        ends = np.array(at_nodes)[[0, -1]]
+        assert np.allclose(ends @ ends.T, (factor @ factor.T)[np.ix_([0, -1], [0, -1])])
+
+
+def test_a_pitch_run_beside_old_tables_says_what_it_did_not_measure(
+    small_machine_file, small_machine, small_errors, tmp_path, capsys
+):
+    old = files_of(small_machine, small_errors, "siemens-cec", tmp_path / "old")
+    pitch = Curve(np.linspace(-300.0, 200.0, 6), np.zeros(6), np.full(6, 3e-4))
+    (tmp_path / "x.errors.csv").write_text(compgen.format_errors(compgen.ErrorTable({"EXX": pitch}, {})))
+    words = ["merge", str(small_machine_file), str(old[0]), "--controller", "siemens-cec", "--json"]
+    run_command(cli, [*words, "--errors", str(tmp_path / "x.errors.csv"), "--out", str(tmp_path / "o")])
+    found = json.loads(capsys.readouterr().out)
+    assert found["probable"]["after_rms_um"]["high"] > 5.0  # angles and squareness that nobody measured
+    assert found["measured"]["errors"] == ["EXX"]
+    assert found["verdict"] != "accepted"
