@@ -1252,7 +1252,13 @@ class KlartextFollower(Follower):
                 centre, sweep = here + 1j * self.way * radius, 2.0 * half_turn
         straight = not sweep
         fast = straight and re.search(r"F ?MAX", text) is not None
-        if self.corner and straight:
+        if self.corner and self.rows and (sweep or self.rows[-1][3]) and self.corner[0] == "RND":
+            self._round_corner(there, centre, math.copysign(1.0, sweep) if sweep else 0.0)
+            if sweep:
+                begin = complex(self.at[0], self.at[1]) - centre
+                sweep = self._turn_between(begin, there - centre, sweep > 0)
+            here = complex(self.at[0], self.at[1])
+        elif self.corner and straight:
             self._cut_corner(end)
             here = complex(self.at[0], self.at[1])
         if straight:
@@ -1272,6 +1278,62 @@ class KlartextFollower(Follower):
         if abs(second - first) < 1e-9 or turn == 0.0:
             return 2.0 * math.pi if left else -2.0 * math.pi
         return turn % (2.0 * math.pi) if left else -((-turn) % (2.0 * math.pi))
+
+    def _round_corner(self, there: complex, centre: complex, sense: float) -> None:
+        """Round a corner beside an arc: Newton's method for how far from it the arc begins and ends, both from its centre."""
+        assert self.corner is not None
+        (_, size, number), self.corner = self.corner, None
+        last = self.rows[-1]
+        begin, corner = complex(*last[4:6]), complex(*self.at[:2])
+        turned, about = last[3], complex(*last[10:12])
+
+        def arriving(way: float) -> tuple[complex, complex]:
+            if not turned:
+                along = (corner - begin) / abs(corner - begin)
+                return corner - way * along, along
+            arm = (corner - about) * cmath.exp(-1j * math.copysign(1.0, turned) * way / abs(corner - about))
+            return about + arm, 1j * math.copysign(1.0, turned) * arm / abs(arm)
+
+        def leaving(way: float) -> tuple[complex, complex]:
+            if not sense:
+                along = (there - corner) / abs(there - corner)
+                return corner + way * along, along
+            arm = (corner - centre) * cmath.exp(1j * sense * way / abs(corner - centre))
+            return centre + arm, 1j * sense * arm / abs(arm)
+
+        left = (arriving(0.0)[1].conjugate() * leaving(0.0)[1]).imag > 0
+        if abs((arriving(0.0)[1].conjugate() * leaving(0.0)[1]).imag) < 1e-9:
+            return
+        offset = 1j * size * (1.0 if left else -1.0)
+
+        def apart(u: float, v: float) -> complex:
+            (one, way), (other, out) = arriving(u), leaving(v)
+            return one + offset * way - other - offset * out
+
+        u = v = 0.0
+        for _ in range(60):
+            gap, step = apart(u, v), 1e-6
+            by_u, by_v = (apart(u + step, v) - gap) / step, (apart(u, v + step) - gap) / step
+            det = by_u.real * by_v.imag - by_u.imag * by_v.real
+            du = -(gap.real * by_v.imag - gap.imag * by_v.real) / det
+            dv = -(by_u.real * gap.imag - by_u.imag * gap.real) / det
+            u, v = u + du, v + dv
+            if abs(du) + abs(dv) < 1e-11:
+                break
+        (first, way), (second, _) = arriving(u), leaving(v)
+        row = list(last)
+        row[7:9] = [first.real, first.imag]
+        if turned:
+            row[3] = self._turn_between(begin - about, first - about, turned > 0)
+        self.rows[-1] = tuple(row)
+        middle = first + offset * way
+        self.number, now = number, self.number
+        self.at = [first.real, first.imag, self.at[2]]
+        sweep = self._turn_between(first - middle, second - middle, left)
+        self._to(
+            CCW if left else CW, [second.real, second.imag, self.at[2]], [middle.real, middle.imag, math.nan], sweep
+        )
+        self.number = now
 
     def _cut_corner(self, end: Place) -> None:
         """Shorten the last move, and go round the corner or across it."""

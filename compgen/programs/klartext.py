@@ -466,6 +466,74 @@ class _Element:
     place: int
     tail: str
     line: int
+    #: Of an arc in X and Y its centre, and 1 if it turns to the left (DR+), -1 to the right.
+    centre: complex = 0j
+    sense: float = 0.0
+
+    def offset(self, side: float, radius: float) -> tuple[complex, complex, float]:
+        """The curve ``radius`` to the left (``side`` 1) or right: (a point, the direction, 0) of a line, (centre, 0, radius)."""
+        begin, end = complex(*self.start[:2]), complex(*self.end[:2])
+        if not self.sense:
+            along = (end - begin) / abs(end - begin)
+            return begin + 1j * side * radius * along, along, 0.0
+        return self.centre, 0j, abs(end - self.centre) - side * self.sense * radius
+
+    def along(self, place: complex) -> complex:
+        """Direction of the tool at a place."""
+        if not self.sense:
+            way = complex(*self.end[:2]) - complex(*self.start[:2])
+            return way / abs(way)
+        way = 1j * self.sense * (place - self.centre)
+        return way / abs(way)
+
+    def foot(self, place: complex) -> complex:
+        """The nearest point of its line or circle."""
+        begin, end = complex(*self.start[:2]), complex(*self.end[:2])
+        if not self.sense:
+            along = (end - begin) / abs(end - begin)
+            return begin + ((place - begin) * along.conjugate()).real * along
+        return self.centre + abs(end - self.centre) * (place - self.centre) / abs(place - self.centre)
+
+    def length_to(self, place: complex, *, backward: bool) -> float:
+        """How far it is from its end back to a place (``backward``), or from its start on to it."""
+        begin, end = complex(*self.start[:2]), complex(*self.end[:2])
+        first, last = (place, end) if backward else (begin, place)
+        if not self.sense:
+            return ((last - first) * self.along(end).conjugate()).real
+        turn = cmath.phase((last - self.centre) / (first - self.centre)) * self.sense
+        return abs(end - self.centre) * (turn if turn > -1e-9 else turn + 2.0 * math.pi)
+
+    def length(self) -> float:
+        """Length of its path."""
+        begin, end = complex(*self.start[:2]), complex(*self.end[:2])
+        if not self.sense:
+            return abs(end - begin)
+        turn = cmath.phase((end - self.centre) / (begin - self.centre)) * self.sense
+        return abs(end - self.centre) * (turn if turn > 1e-9 else turn + 2.0 * math.pi)
+
+
+def _crossings(one: tuple[complex, complex, float], other: tuple[complex, complex, float]) -> list[complex]:
+    """Where two curves cross, each a line (point, direction, 0) or a circle (centre, 0, radius)."""
+    if one[1] and other[1]:
+        across = (one[1].conjugate() * other[1]).imag
+        if abs(across) < 1e-12:
+            return []
+        return [one[0] + one[1] * ((other[0] - one[0]).conjugate() * other[1]).imag / across]
+    if one[1] or other[1]:
+        line, circle = (one, other) if one[1] else (other, one)
+        foot = line[0] + line[1] * ((circle[0] - line[0]) * line[1].conjugate()).real
+        square = circle[2] ** 2 - abs(foot - circle[0]) ** 2
+        return [] if square < 0.0 else [foot + line[1] * side * math.sqrt(square) for side in (1.0, -1.0)]
+    apart = other[0] - one[0]
+    if abs(apart) < 1e-12:
+        return []
+    reach = (abs(apart) ** 2 + one[2] ** 2 - other[2] ** 2) / (2.0 * abs(apart))
+    square = one[2] ** 2 - reach**2
+    return (
+        []
+        if square < 0.0
+        else [one[0] + apart / abs(apart) * complex(reach, side * math.sqrt(square)) for side in (1, -1)]
+    )
 
 
 @dataclass
@@ -837,8 +905,9 @@ class _Program:
             a, b = (2, 0) if named == [0, 2] else (1, 2) if named == [1, 2] else (0, 1) if kind != "CTP" else (a, b)
         start = list(self.at)
         straight = kind in ("L", "LP")
+        around, sense = self._centre_of(kind, start, end, words, code, (a, b))
         if self.corner:
-            self._round(item, kind, end)
+            self._round(item, kind, end, around, sense)
             start = list(self.at)
         tail = " ".join(re.sub(r"\s+", "", word) for word in _TAIL.findall(code))
         if re.search(r"(?<![A-Z])R[LR](?![A-Z])", code):
@@ -861,11 +930,24 @@ class _Program:
             said = f" ;{comment[2].rstrip()}" if comment[1] else ""
             self._put(f"{number[0] if number else ''}{text}{said}", item)
             self.tangent = self._direction(start, end)
+        elif rounded:
+            self._comment(item)
+            for text in self._arc_lines(around, end, sense, tail):
+                self._put(text, item)
+            place = len(self.out) - 2 if len(self.out) > place + 2 else place
+            way = 1j * sense * (complex(*end[:2]) - around)
+            self.tangent = way / abs(way)
         else:
             self._keep(item)
             self.tangent = self._tangent_after(kind, start, end, words, code, (a, b))
         tested = straight and not machine and "M99" not in code and self.corner is None
-        self.element = _Element(start, end, straight, place, tail, item.first) if tested else None
+        flat = start[2] == end[2] and kind in ("C", "CR", "CP") and not machine and not cmath.isnan(around) and sense
+        whole = tested or flat
+        self.element = (
+            _Element(start, end, straight, place, tail, item.first, around, 0.0 if straight else sense)
+            if whole
+            else None
+        )
         self.at = end
         if re.search(r"(?<![A-Z])M(?:99|89)(?!\d)", code) and self.cycle:
             self.at[2] = math.nan
@@ -912,25 +994,40 @@ class _Program:
             self._fail(item, f"{kind} from a position that is not known; post it in absolute")
         end[a], end[b], self.polar = there.real, there.imag, radius
 
+    def _centre_of(
+        self, kind: str, start: list[float], end: list[float], words: dict[str, float], code: str, axes: tuple[int, int]
+    ) -> tuple[complex, float]:
+        """Centre and sense of an arc in X and Y; nan and 0 of any other move."""
+        if kind not in ("C", "CR", "CP") or axes != (0, 1):
+            return complex(math.nan, math.nan), 0.0
+        sense = 1.0 if "DR+" in re.sub(r"\s", "", code) else -1.0
+        if kind != "CR":
+            return complex(*self.pole[:2]), sense
+        here, there, radius = complex(*start[:2]), complex(*end[:2]), words.get("R", math.nan)
+        chord = there - here
+        height = math.sqrt(max(radius * radius - 0.25 * abs(chord) ** 2, 0.0))
+        side = sense if radius > 0 else -sense
+        return 0.5 * (here + there) + 1j * side * height * chord / (abs(chord) or 1.0), sense
+
+    def _arc_lines(self, centre: complex, end: list[float], sense: float, tail: str) -> list[str]:
+        """An arc about its own centre, and the pole of the program again."""
+        lines = [f"CC {self._word(0, centre.real)} {self._word(1, centre.imag)}"]
+        direction = "DR+" if sense > 0 else "DR-"
+        lines.append(f"C {self._word(0, end[0])} {self._word(1, end[1])} {direction} {tail}".rstrip())
+        if not any(math.isnan(value) for value in self.pole[:2]):
+            lines.append(f"CC {self._word(0, self.pole[0])} {self._word(1, self.pole[1])}")
+        return lines
+
     def _tangent_after(
         self, kind: str, start: list[float], end: list[float], words: dict[str, float], code: str, axes: tuple[int, int]
     ) -> complex | None:
         """Direction of the tool in XY at the end of a move that stays as it is."""
         if kind == "L":
             return self._direction(start, end)
-        if axes != (0, 1):
-            return None
-        here, there = complex(*start[:2]), complex(*end[:2])
-        sense = 1.0 if "DR+" in re.sub(r"\s", "", code) else -1.0
-        if kind == "CR":
-            radius, chord = words.get("R", math.nan), there - here
-            height = math.sqrt(max(radius * radius - 0.25 * abs(chord) ** 2, 0.0))
-            side = sense if radius > 0 else -sense
-            centre = 0.5 * (here + there) + 1j * side * height * chord / (abs(chord) or 1.0)
-        else:
-            centre = complex(*self.pole[:2])
+        there = complex(*end[:2])
+        centre, sense = self._centre_of(kind, start, end, words, code, axes)
         way = 1j * sense * (there - centre)
-        return None if cmath.isnan(way) or way == 0 else way / abs(way)
+        return None if cmath.isnan(way) or abs(way) < 1e-9 else way / abs(way)
 
     def _tangent_arc(
         self, item: _Statement, start: list[float], end: list[float], axes: tuple[int, int], tail: str
@@ -968,14 +1065,14 @@ class _Program:
             self._fail(item, f"{kind} without a {'radius' if kind == 'RND' else 'length'} above 0")
         if self.element is None or any(math.isnan(value) for value in (*self.element.start[:2], *self.element.end[:2])):
             self._fail(
-                item, f"{kind} is followed between two straight moves from known positions; post its lines and arcs"
+                item, f"{kind} is followed between moves in X and Y from known positions; post its lines and arcs"
             )
         if self.corner:
             self._fail(item, f"{kind} after {self.corner[0]} without a move between them")
         self.corner = kind, size, item.first
         self._comment(item)
 
-    def _round(self, item: _Statement, kind: str, end: list[float]) -> None:
+    def _round(self, item: _Statement, kind: str, end: list[float], around: complex, sense: float) -> None:
         """Shorten the move before a corner, and write the arc or chamfer in its place."""
         assert self.corner is not None
         assert self.element is not None
@@ -984,8 +1081,14 @@ class _Program:
         self.corner, self.rounded = None, True
         here, corner, there = complex(*before.start[:2]), complex(*before.end[:2]), complex(*end[:2])
         flat = before.start[2] == before.end[2] == end[2]
-        if kind not in ("L", "LP") or cmath.isnan(there) or not flat:
-            self._fail(item, f"{what} is followed between two straight moves in X and Y only; post its lines and arcs")
+        if (before.sense or sense) and what == "RND" and flat and not cmath.isnan(there):
+            self._round_arcs(item, size, before, _Element(before.end, end, not sense, 0, "", item.first, around, sense))
+            return
+        if kind not in ("L", "LP") or before.sense or cmath.isnan(there) or not flat:
+            self._fail(
+                item,
+                f"{what} is followed between two straight moves in X and Y (RND beside arcs, too); post its lines and arcs",
+            )
         back, on = here - corner, there - corner
         if not (back and on):
             self._fail(item, f"{what} beside a move that leads nowhere")
@@ -1020,6 +1123,39 @@ class _Program:
             self._put(f"CR {' '.join(words)}", marker)
         else:
             self._put(f"L {self._word(0, second.real)} {self._word(1, second.imag)}", marker)
+        self.at = [second.real, second.imag, before.end[2]]
+
+    def _round_arcs(self, item: _Statement, radius: float, before: _Element, after: _Element) -> None:
+        """Round a corner beside an arc: the circle that touches both curves, nearest to the corner."""
+        corner = complex(*before.end[:2])
+        turn = (before.along(corner).conjugate() * after.along(corner)).imag
+        if abs(turn) < 1e-9:
+            if (before.along(corner).conjugate() * after.along(corner)).real > 0.0:
+                return  # it goes on without a corner
+            self._fail(item, "RND where the contour turns back")
+        side = 1.0 if turn > 0 else -1.0
+        centres = _crossings(before.offset(side, radius), after.offset(side, radius))
+        if not centres:
+            self._fail(item, "RND: no arc of this radius touches both moves; the control refuses it as well")
+        centre = min(centres, key=lambda place: abs(place - corner))
+        first, second = before.foot(centre), after.foot(centre)
+        fits = before.length_to(first, backward=True) < before.length() + 1e-9
+        fits = fits and after.length_to(second, backward=False) < after.length() + 1e-9
+        touches = all(abs(abs(place - centre) - radius) < 1e-6 for place in (first, second))
+        if not (fits and touches):
+            self._fail(item, "RND needs more of a move than there is; the control refuses it as well")
+        number = re.match(r"\s*\d+\s+", self.out[before.place][0])
+        text = self.out[before.place][0]
+        end = text[len(text.rstrip("\r\n")) :] or "\n"
+        if before.sense:
+            lines = self._arc_lines(before.centre, [first.real, first.imag], before.sense, before.tail)
+        else:
+            lines = [f"L {self._word(0, first.real)} {self._word(1, first.imag)} {before.tail}".rstrip()]
+        lines[0] = (number[0] if number else "") + lines[0]
+        self.out[before.place : before.place + 1] = [(line + end, before.line) for line in lines]
+        direction = "DR+" if side > 0 else "DR-"
+        words = [self._word(0, second.real), self._word(1, second.imag), f"R{radius:+.{CALCULATED}f}", direction]
+        self._put(f"CR {' '.join(words)}", item)
         self.at = [second.real, second.imag, before.end[2]]
 
 

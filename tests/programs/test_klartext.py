@@ -346,3 +346,85 @@ def test_a_cut_program_is_refused(tmp_path):
 def test_a_label_without_end_of_calls_is_refused(tmp_path):
     with pytest.raises(InputError, match="depth"):
         moves_of(tmp_path, program("LBL 1\nL IX+1 F9\nCALL LBL 1\n"))
+
+
+#: A rounding beside arcs: what leads to the corner in (20, 0), its radius, and what leads away; all in X and Y.
+BESIDE_ARCS = {
+    "line, arc": ("L X+20 Y+0 F9", 2, "CC X+30 Y+0\nC X+30 Y+10 DR-"),
+    "line, arc to the right": ("L X+20 Y+0 F9", 1, "CC X+28 Y-6\nC X+38 Y-6 DR+"),
+    "arc, line": ("CC X+10 Y+0\nC X+20 Y+0 DR- F9", 1.5, "L X+30 Y+5"),
+    "arc, arc": ("CC X+10 Y+0\nC X+20 Y+0 DR+ F9", 2, "CC X+32 Y+9\nC X+32 Y+24 DR-"),
+    "by radius": ("CR X+20 Y+0 R+15 DR- F9", 2, "CR X+40 Y+0 R+12 DR-"),
+    "by radius, the long way": ("CR X+20 Y+0 R-15 DR+ F9", 2, "CR X+40 Y+0 R-12 DR+"),
+    "polar": ("CC X+10 Y+0\nCP PA+0 DR- F9", 1, "CC X+20 Y+8\nCP IPA+90 DR+"),
+    "inside": ("CC X+10 Y+0\nC X+20 Y+0 DR- F9", 1, "L X+0 Y-3"),
+}  # fmt: skip
+
+
+def directions(moves, k):
+    """Direction of the tool at the start and at the end of a move in X and Y."""
+    start, end, centre = (complex(*place[k, :2]) for place in (moves.start_mm, moves.end_mm, moves.centre_mm))
+    sweep = moves.sweep_rad[k]
+    ways = [1j * np.sign(sweep) * (place - centre) if sweep else end - start for place in (start, end)]
+    return [way / abs(way) for way in ways]
+
+
+@pytest.mark.parametrize("case", BESIDE_ARCS)
+@pytest.mark.parametrize("unit", ["MM", "INCH"])
+def test_a_rounding_beside_an_arc_touches_both(tmp_path, case, unit):
+    """The arc has the radius, no move has a kink, and both moves stay on their curves; reader and follower agree."""
+    first, radius, last = BESIDE_ARCS[case]
+    scale = 25.4 if unit == "INCH" else 1.0
+    setup = Setup({"PRESET": ZERO}, {"1": ZERO})
+    machine_text = program(f"{first}\nRND R{radius}\n{last}\n", unit)
+    if unit == "INCH":  # within the travel
+        machine_text = re.sub(r"([XYR])([+-]?)(\d[\d.]*)", lambda w: f"{w[1]}{w[2]}{float(w[3]) / 10:g}", machine_text)
+        machine_text, scale = machine_text.replace("R0 FMAX", "FMAX"), 2.54
+    sharp = moves_of(tmp_path, re.sub(r"RND.*\n", "", machine_text), setup)
+    moves = moves_of(tmp_path, machine_text, setup)
+    a, corner, b = len(moves) - 3, len(moves) - 2, len(moves) - 1
+    assert abs(abs(complex(*(moves.start_mm - moves.centre_mm)[corner, :2])) - radius * scale) < 1e-6
+    for one, two in ((a, corner), (corner, b)):
+        assert abs(directions(moves, one)[1] - directions(moves, two)[0]) < 1e-6
+    for k, own in ((a, len(sharp) - 2), (b, len(sharp) - 1)):
+        assert np.allclose(moves.centre_mm[k], sharp.centre_mm[own], atol=1e-6, equal_nan=True)
+        assert abs(moves.sweep_rad[k]) <= abs(sharp.sweep_rad[own]) + 1e-9
+    assert np.allclose(moves.start_mm[a], sharp.start_mm[-2], atol=1e-6)
+    assert np.allclose(moves.end_mm[b], sharp.end_mm[-1], atol=1e-6)
+
+
+def test_a_rounding_between_a_line_and_an_arc_by_hand(tmp_path):
+    """Its centre is 2 above the line and 12 from the centre of the arc: X 30 - sqrt(140)."""
+    x = 30 - math.sqrt(140)
+    found = places(moves_of(tmp_path, program("L X+20 F9\nRND R2\nCC X+30 Y+0\nC X+30 Y+10 DR-\n")))
+    assert np.allclose(found, [[x, 0, 0], [30 - math.sqrt(140) * 10 / 12, 20 / 12, 0], [30, 10, 0]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("L X+20 F9\nRND R60\nCC X+30 Y+0\nC X+30 Y+10 DR-\n", "than there is|no arc"),
+        ("L X+20 F9\nCHF 2\nCC X+30 Y+0\nC X+30 Y+10 DR-\n", "two straight moves"),
+        ("L X+20 F9\nRND R2\nCC X+30 Y+0\nCP IPA-90 IZ+5 DR-\n", "X and Y"),
+        ("L X+20 F9\nRND R2\nCC X+20 Y-10\nC X+10 Y-10 DR+\n", "turns back"),
+    ],
+)
+def test_a_rounding_that_does_not_fit_is_refused(tmp_path, body, words):
+    with pytest.raises(InputError, match=words):
+        moves_of(tmp_path, program(body))
+
+
+def test_a_program_with_roundings_beside_arcs_is_corrected(tmp_path):
+    """10 um in X: every X is 0.01 less, with the roundings as arcs of the same radius; comments and blocks stay in order."""
+    body = "4 L X+20 Y+0 F9\n5 RND R2 ;corner\nCC X+30 Y+0\n6 C X+30 Y+10 DR- F12\n7 RND R1\n8 L X+60 Y+12 ;out\n"
+    result, text = run(tmp_path, program(body), shift(x=10.0), KLARTEXT, SETUP)
+    assert result.accepted
+    assert result.after.worst_mm < 2e-4
+    assert (
+        text.index("RND R2 ;corner")
+        < text.index("CR X")
+        < text.index("; C X+30")
+        < text.index("RND R1")
+        < text.index(";out")
+    )
+    assert "F12" in text
