@@ -495,25 +495,35 @@ def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with
     import numpy as np
 
     from compgen.data.rotary import format_poses, read_machine_errors, read_poses
+    from compgen.identify.rotary_covariance import known_covariance, pose_uncertainty
     from compgen.kinematics.rotary_chain import pose_error
 
-    if with_u:
-        raise InputError("--uncertainty does not work with rotary axes yet; identify.json contains the covariance")
     poses = read_poses(machine, points)
     table, rotary = read_machine_errors(errors)
     error_mm, error_rad = pose_error(machine, table, rotary, poses.position_mm, poses.angle_deg, poses.tool_mm)
     columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
     columns |= {f"e{axis}_urad": error_rad[:, k] * 1e6 for k, axis in enumerate("abc")}
+    extra: dict[str, float] = {}
+    if with_u:
+        u_mm, u_rad = pose_uncertainty(machine, table, rotary, poses, known_covariance(errors, rotary))
+        columns |= {f"u_{axis}_um": u_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
+        columns |= {f"u_{axis}_urad": u_rad[:, k] * 1e6 for k, axis in enumerate("abc")}
+        extra = {"u_max_um": float(u_mm.max() * 1e3), "u_max_urad": float(u_rad.max() * 1e6)}
     write_file(out, format_poses(poses, columns, {"machine": machine.name, "model": "exact"}))
     figures, turned = residuals(error_mm), float(np.linalg.norm(error_rad, axis=1).max() * 1e6)
     if as_json:
-        angular = {"max_urad": turned}
+        angular = {"max_urad": turned, **extra}
         print_json({"points": len(error_mm), "model": "exact", **figures.as_dict(), **angular, "file": str(out)})
     else:
         say(
             f"{len(error_mm)} points, exact: max {figures.max_um:.2f} um, rms {figures.rms_um:.2f} um, orientation max "
             f"{turned:.1f} urad -> {out}"
         )
+        if extra:
+            say(
+                f"largest standard uncertainty of a coordinate {extra['u_max_um']:.2f} um, of an angle "
+                f"{extra['u_max_urad']:.1f} urad; errors of linear axes that ERRORS does not list are not in it"
+            )
     return 0
 
 

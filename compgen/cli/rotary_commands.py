@@ -14,13 +14,13 @@ from rich.table import Table
 from compgen.cli.terminal import answer, complain, say, say_paths
 from compgen.controls.rotary_parameters import believed, lines_of, target_of
 from compgen.controls.rotary_pitch import format_of
-from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, read_text, write_file
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM
-from compgen.data.rotary import RotaryErrors, format_poses, read_machine_errors, read_poses, si_per_unit
+from compgen.data.rotary import RotaryErrors, format_poses, read_machine_errors, read_poses
 from compgen.errors import InputError
+from compgen.identify.rotary_covariance import constant_covariance
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 from compgen.pipeline import provenance_of
 from compgen.tables.rotary_parameters import RotaryExport, export_rotary, judged
@@ -31,7 +31,7 @@ def export_parameters(machine: Machine, errors: Path, controller: str, out: Path
     """Write the parameters of a control for errors of rotary axes, read back, emulated and judged."""
     target = target_of(machine, controller)
     _, rotary = read_machine_errors(errors)
-    result = export_rotary(machine, target, _some(rotary, errors), _covariance(errors, rotary))
+    result = export_rotary(machine, target, _some(rotary, errors), constant_covariance(errors, rotary))
     output = OutputFolder(out)
     prefix = REJECTED_PREFIX if result.reasons else ""
     output.add(prefix + target.file, result.text)
@@ -56,26 +56,6 @@ def _some(rotary: RotaryErrors, path: Path) -> RotaryErrors:
     if not rotary.names:
         raise InputError("contains no errors of rotary axes; identify them from *.sphere.csv files first", file=path)
     return rotary
-
-
-def _covariance(errors: Path, rotary: RotaryErrors) -> tuple[tuple[str, ...], FloatArray] | None:
-    """Covariance of the constants, mm and rad: of the identification beside the file if it is that of its errors."""
-    found, names = errors.parent / "identify.json", tuple(rotary.constants)
-    try:
-        data = json.loads(read_text(found)) if found.is_file() else {}
-    except ValueError:
-        data = {}
-    stated = data.get("errors", {})
-    same = isinstance(stated, dict) and set(names) <= set(stated) and data.get("kind") == "sphere"
-    units = np.array([si_per_unit(name) for name in names])
-    if same and all(
-        abs(stated[name]["value"] * unit - rotary.constants[name][0]) < 1e-5 * unit
-        for name, unit in zip(names, units, strict=True)
-    ):
-        order = [list(stated).index(name) for name in names]
-        return names, np.array(data["covariance"])[np.ix_(order, order)] * np.outer(units, units)
-    u = np.array([rotary.constants[name][1] for name in names])
-    return None if np.isnan(u).any() or not len(u) else (names, np.diag(u**2))
 
 
 def parameters_table(result: RotaryExport) -> Table:
@@ -172,7 +152,10 @@ def export_tables(machine: Machine, errors: Path, controller: str, out: Path, as
     turned = [
         f"- {letter} of the control is minus {letter} of the machine file." for letter in form.settings.reversed_axes
     ]
-    output.add("preflight.md", "\n".join([*rows, *(f"- {text}" for text in form.instructions()), *turned, ""]))
+    output.add(
+        "preflight.md",
+        "\n".join([*rows, *(f"- {text}" for text in form.instructions(result.angle_arcsec)), *turned, ""]),
+    )
     paths = output.commit()
     for text in result.reasons:
         complain(f"not acceptable: {text}", "red")
@@ -186,7 +169,8 @@ def _said(result: PitchExport) -> list[str]:
     """What the tables leave, in sentences."""
     lines = [
         f"{letter}: error of the angle {own['before_rms']:.2f} -> {own['after_rms']:.2f} arcsec rms, "
-        f"largest {own['before_max']:.2f} -> {own['after_max']:.2f} arcsec"
+        f"largest {own['before_max']:.2f} -> {own['after_max']:.2f} arcsec; "
+        f"standard uncertainty of the measured error {own['u_after']:.2f} arcsec, between its angles unknown"
         for letter, own in result.angle_arcsec.items()
     ]
     before, after = result.before, result.after

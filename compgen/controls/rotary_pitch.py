@@ -7,8 +7,8 @@ then angles and values of its table have the opposite sign.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -98,8 +98,8 @@ class PitchFormat:
             return table
         return AngleTable(-table.angle_deg[::-1], -table.added_deg[::-1])
 
-    def instructions(self) -> list[str]:
-        """What has to be done with the files, and what is known of their signs."""
+    def instructions(self, letters: Iterable[str]) -> list[str]:
+        """What has to be done with the files of these axes, and what is known of their signs."""
         raise NotImplementedError
 
 
@@ -137,7 +137,7 @@ class LinuxcncRotary(PitchFormat):
             found[letter] = self.turned(letter, AngleTable(rows.nominal, rows.forward))
         return found
 
-    def instructions(self) -> list[str]:
+    def instructions(self, letters: Iterable[str]) -> list[str]:
         """COMP_FILE lines."""
         joints = "XYZABC"
         return [
@@ -145,7 +145,7 @@ class LinuxcncRotary(PitchFormat):
             *(
                 f"[JOINT_{joints.index(letter)}] (or the number of joint {letter}): COMP_FILE = rotary-{letter.lower()}.comp, "
                 "COMP_FILE_TYPE = 1"
-                for letter in self.machine.rotary
+                for letter in letters
             ),
             "A reversal of the axis belongs into BACKLASH of its joint, or into both columns.",
             "A joint that turns on beyond the table keeps its last value: home it again, or unwind it.",
@@ -226,7 +226,7 @@ class SiemensRotary(PitchFormat):
             )
         return self.turned(letter, AngleTable(angle, -np.array([rows[k] for k in range(len(rows))])))
 
-    def instructions(self) -> list[str]:
+    def instructions(self, letters: Iterable[str]) -> list[str]:
         """Machine data."""
         return [
             "Documented: the value is the measured error; the control adds it to the actual position: the axis moves against it.",
@@ -262,10 +262,28 @@ def format_of(machine: Machine, name: str) -> PitchFormat:
     unknown = [letter for letter in settings.reversed_axes if letter not in machine.rotary]
     if unknown:
         raise machine.controller_settings(name).fail("reversed_axes", f"the machine has no axis {', '.join(unknown)}")
+    if name == "linuxcnc-rotary-comp":
+        settings = _as_kinematics(machine, settings)
     found = kind(name, title, machine, settings)
     if isinstance(found, SiemensRotary):
         _ = found.names
     return found
+
+
+def _as_kinematics(machine: Machine, settings: PitchSettings) -> PitchSettings:
+    """Senses of LinuxCNC as the section of its kinematics states them; InputError if both sections disagree."""
+    if "linuxcnc-trt" not in machine.controllers:
+        return settings
+    from compgen.controls.rotary_parameters import target_of
+
+    against = {letter for letter, sense in target_of(machine, "linuxcnc-trt").sense.items() if sense < 0.0}
+    section = machine.controller_settings("linuxcnc-rotary-comp")
+    if "reversed_axes" in section.data and set(settings.reversed_axes) != against:
+        raise section.fail(
+            "reversed_axes",
+            f"is {list(settings.reversed_axes)}; [controllers.linuxcnc-trt] conventional_directions says {sorted(against)}",
+        )
+    return replace(settings, reversed_axes=tuple(sorted(against)))
 
 
 #: What each format is, for lists.

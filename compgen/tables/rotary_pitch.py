@@ -68,7 +68,7 @@ class PitchExport:
             "before": self.before.as_dict(),
             "after": self.after.as_dict(),
             "reversed_axes": list(self.form.settings.reversed_axes),
-            "instructions": self.form.instructions(),
+            "instructions": self.form.instructions(self.angle_arcsec),
             "files": {name: hashlib.sha256(text.encode()).hexdigest() for name, text in self.files.items()},
         }
 
@@ -93,6 +93,9 @@ def judged_pitch(form: PitchFormat, rotary: RotaryErrors, contents: Mapping[Path
             "before_rms": _arcsec(np.sqrt(np.mean(before**2))),
             "after_max": _arcsec(np.abs(after).max()),
             "after_rms": _arcsec(np.sqrt(np.mean(after**2))),
+            "u_after": float(np.sqrt(np.mean(rotary.curves[f"E{letter}{letter}"].u ** 2)) / RAD_PER_ARCSEC)
+            if f"E{letter}{letter}" in rotary.curves
+            else np.nan,
         }
     poses = wanted(machine)
     first, last = (figures(poses, _left(machine, rotary, own, poses)) for own in ({}, tables))

@@ -190,3 +190,13 @@ def test_other_wrong_use_is_refused(folder, call):
     Path("five.toml").write_text(MACHINE.replace(', C = "AX5"', ""))
     code, out, err = call("check", "five.toml")
     assert code == 2 and "axis_names" in out
+
+
+def test_senses_follow_the_kinematics_of_linuxcnc():
+    trt = "[controllers.linuxcnc-trt]\nconventional_directions = {}\n"
+    name = "linuxcnc-rotary-comp"
+    assert format_of(machine_of(trt.format("false")), name).settings.reversed_axes == ("A", "C")
+    assert format_of(machine_of(trt.format("true")), name).settings.reversed_axes == ()
+    both = trt.format("false") + f'[controllers.{name}]\nreversed_axes = ["C"]\n'
+    with pytest.raises(InputError, match=r"conventional_directions says \['A', 'C'\]"):
+        format_of(machine_of(both), name)

@@ -293,3 +293,33 @@ def test_poses_that_do_not_tell_say_so(folder, call):
     Path("one.sphere.csv").write_text("\n".join(lines[: start + 2]) + "\n")
     code, out, err = call("check", "five.toml", "--spheres", "one.sphere.csv")
     assert code == 2 and "two poses of one sphere" in " ".join(err.split())
+
+
+def test_predict_with_uncertainty_holds_the_joint_covariance(folder, call):
+    """Monte Carlo over the covariance of identify.json; and the truth within it."""
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    assert call("identify", "five.toml", "sim/trunnion.sphere.csv", "--out", "found")[0] == 0
+    Path("p.points.csv").write_text("x_mm,y_mm,z_mm,a_deg,c_deg\n10,20,130,-45,90\n0,0,200,0,200\n-100,50,10,20,300\n")
+    words = ["predict", "five.toml", "found/identified.errors.csv", "--points", "p.points.csv", "--out", "p.csv"]
+    code, out, err = call(*words, "--uncertainty")
+    assert code == 0 and "largest standard uncertainty" in out, err
+    rows = [line.split(",") for line in Path("p.csv").read_text().splitlines() if not line.startswith("#")]
+    u = np.array([[float(row[rows[0].index(f"u_{axis}_um")]) for axis in "xyz"] for row in rows[1:]])
+    from compgen.data.machine import read_machine
+    from compgen.data.rotary import read_poses
+    from compgen.kinematics.rotary_chain import pose_error
+
+    machine, summary = read_machine("five.toml"), json.loads(Path("found/identify.json").read_text())
+    poses = read_poses(machine, "p.points.csv")
+    names, rng = list(summary["errors"]), np.random.default_rng(0)
+    units = np.array([1e-3 if summary["errors"][name]["unit"] == "um" else 1e-6 for name in names])
+    mean = np.array([summary["errors"][name]["value"] for name in names])
+    drawn = [
+        pose_error(machine, ErrorTable(), RotaryErrors({}, {n: (v, 0.0) for n, v in zip(names, row, strict=True)}),
+                   poses.position_mm, poses.angle_deg)[0]
+        for row in rng.multivariate_normal(mean, np.array(summary["covariance"]), 400) * units
+    ]  # fmt: skip
+    assert u == pytest.approx(1e3 * np.std(drawn, axis=0), rel=0.12)
+    Path("bare.errors.csv").write_text("error,position_mm,value\nEX0C,,5\n")
+    code, out, err = call(*words[:2], "bare.errors.csv", *words[3:], "--uncertainty")
+    assert code == 2 and "states no uncertainty of EX0C" in " ".join(err.split())
