@@ -273,6 +273,8 @@ class ProgramWriter:
             values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
             self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
             self._note_peck(block)
+        if block.kind == "tap":
+            return [self._tapped(block, batch, pieces, rows, offset)]
         if block.kind not in ("line", "arc", "cycle", "hole"):
             if any(word[0] in ("I", "J", "K") for word in block.words):
                 self.pole_mm = [np.nan] * 3  # the pole is again that of the program
@@ -315,6 +317,16 @@ class ProgramWriter:
         self.added += max(count - 1, 0)
         self.changed += texts[0] != block.text
         return texts
+
+    def _tapped(self, block: SingleBlock, batch: Batch, pieces: Pieces, rows: slice, offset: FloatArray) -> str:
+        """Rewrite G33.1: its end is corrected, and the tool comes back to where it was."""
+        move = batch.moves.part(slice(block.first, block.first + 1))
+        written, target = np.array(self.written_mm), np.array(self.target_mm)
+        part = _Piece(pieces.command_mm[rows.start], pieces.centre_mm[rows.start], 0.0, 1.0, 0, 1)
+        text = self._piece(block, move, part, offset)
+        self.written_mm, self.target_mm = written, target
+        self.changed += text != block.text
+        return text
 
     def _piece(self, block: SingleBlock, move: Moves, part: _Piece, offset: FloatArray) -> str:
         """Text of one piece of a move: the block with other numbers, or a new one with what differs."""
@@ -1291,7 +1303,7 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
                         by_radius[rows] = ~np.isnan(batch.words.value[segment.row, R_WORD])
                     elif segment.kind == "arc":
                         by_radius[segment.first] = any(word[0] in ("R", "CR") for word in segment.words)
-                    elif segment.kind in ("cycle", "hole"):
+                    elif segment.kind in ("cycle", "hole", "tap"):
                         drilled[segment.first : segment.first + segment.count] = True
                 pieces = corrector.pieces(batch.moves, by_radius, drilled)
                 try:

@@ -38,7 +38,7 @@ _LINUXCNC = {
     **_CYCLES,
     **_LENGTH,
     **{"G90.1": "centre absolute", "G92.2": "no preset", "G43.1": "tool offset", "G8": "nothing"},
-    **{"G52": "preset shift"},
+    **{"G52": "preset shift", "G33.1": "tap"},
     **dict.fromkeys(("G59.1", "G59.2", "G59.3"), "work offset"),
     **dict.fromkeys(("G61.1",), "nothing"),
 }

@@ -193,6 +193,7 @@ _TABLES: dict[str, _Does] = {
         **_CYCLES,
         **_each("no preset", 92.2),
         **_each("offset", 52),
+        **_each("tap", 33.1),
         **{"G90.1": ("centre", 1.0), "G91.1": ("centre", 0.0)},
         **_each("fixture", 59.1, 59.2, 59.3),
     },
@@ -700,6 +701,10 @@ class Follower:
             self._go_home(words, axes)
         elif "preset" in kinds:
             self._take_as(axes)
+        elif "tap" in kinds:
+            back = list(self.at)
+            self._to(FEED, self._reached(words, axes))
+            self._to(FEED, back)
         elif "hole" in kinds or ("define" in kinds and words.call is not None) or (self.modally and moving):
             self._drill_there(words, axes, moving)
             self.modally = self.modally and "M99" not in words.codes

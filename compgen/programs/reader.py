@@ -1290,6 +1290,8 @@ class Reader:
             return self._hole(axes, single, moving)
         if "machine coordinates" in single:
             return self._machine_move(axes)
+        if "tap" in single:
+            return self._tap(axes, values)
         self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
         if motion.startswith("cycle") or (self.cycle is not None and (moving or "R" in values)):
             return self._cycle(motion, axes, values)
@@ -1367,6 +1369,17 @@ class Reader:
             if place is not None and not low - self.travel_slack_mm <= place <= high + self.travel_slack_mm:
                 text = f"{letter} can go to {place:g} mm of the machine, outside its travel {low:g} to {high:g} mm"
                 self.assumed.setdefault(f"{text}, as the move in machine coordinates asks", None)
+
+    def _tap(self, axes: list[float | None], values: dict[str, float]) -> str:
+        """G33.1: to the end and back in step with the spindle, as one block."""
+        if "K" not in values or not any(axis is not None for axis in axes):
+            self._fail("G33.1 needs a place and its pitch K")
+        self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
+        start = list(self.position)
+        self._move(FEED, self._target(axes))
+        self._move(FEED, start)
+        self.motion = None
+        return "tap"
 
     def _home(self, axes: list[float | None], home: list[float] | None) -> str:
         """Go through an intermediate point to the reference point ``home``: that of the machine, or one that was stored."""

@@ -30,6 +30,8 @@ from compgen.programs.path import IntArray
 
 #: Calls within calls, and blocks of a program that is written out.
 DEEPEST, MOST_BLOCKS = 10, 5_000_000
+#: Turns of all loops of a program.
+MOST_TURNS = 300_000
 _MENTIONED = re.compile(
     rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]|G[ \t]*+0*+65(?![\d.])|[#\[]|O(?:\d++|<[^<>\n]*+>)[ \t]*+CALL"
     rb"|G[ \t]*+0*+68(?![\d.])",
@@ -732,11 +734,8 @@ class _Program:
 
     def _follow(self, rows: range, depth: int) -> bool:
         """Follow blocks; returns whether one of them has returned from the subprogram."""
-        k, steps = rows.start, 0
+        k = rows.start
         while k < rows.stop:
-            steps += 1
-            if steps > MOST_BLOCKS:
-                self._fail("a loop does not end within 5e6 blocks; post its blocks", k)
             found = self._structure(k, rows, depth)
             if found is not None:
                 if found < 0:
@@ -979,8 +978,8 @@ class _Program:
 
     def _steps(self, k: int) -> None:
         self._loops += 1
-        if self._loops > MOST_BLOCKS:
-            self._fail("loops do not end within 5e6 turns; post their blocks", k)
+        if self._loops > MOST_TURNS:
+            self._fail(f"loops do not end within {MOST_TURNS} turns; post their blocks", k)
 
     def _calculated(self, read: Callable[[], float], k: int) -> float:
         """Return what ``read`` finds in block ``k``; refused if that is not known before the program runs."""

@@ -167,6 +167,24 @@ def test_work_offsets_that_the_program_writes(tmp_path, make_errors):
     assert sum("as the program writes it (G10)" in text for text in result.assumed) == 5
 
 
+def test_rigid_tapping_ends_where_the_interpreter_says_and_comes_back(tmp_path, make_errors):
+    """G33.1 is one block: its end is corrected, the tool comes back to where it was, and is there for an increment."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "%\nG21 G90 G17 G54\nT1 M6\nG43 H1\nG0 X10 Y20 Z3\nS100 M3\nG33.1 Z-12 K1.25\nG0 X30\nG91\nG33.1 Z-8 K1\nG1 X5 F100\n"
+        "G90\nG0 Z9\nM2\n%\n"
+    )
+    taps = re.findall(r"RIGID_TAP\(([-\d.]+), ([-\d.]+), ([-\d.]+)", interpreted(program, tmp_path))
+    feed = [end.round(9).tolist() for fed, end, _ in ours(program) if fed]
+    assert [[float(part) for part in tap] for tap in taps] == [feed[0], feed[2]] == [[10, 20, -12], [30, 20, -5]]
+    assert (feed[1], feed[3], feed[4]) == ([10, 20, 3], [30, 20, 3], [35, 20, 3])
+    model = model_of(mill(), make_errors(mill(), 3), None)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions(), SETUP)
+    assert result.accepted
+    assert len(re.findall("^G33.1", (tmp_path / "out/p.ngc").read_text(), re.MULTILINE)) == 2
+    assert result.after.ends_mm < 2e-5
+
+
 def test_calls_of_subprograms_in_the_same_file_are_written_out_as_the_interpreter_executes_them(tmp_path, make_errors):
     """Nested, repeated, in absolute and in incremental; the corrected program has no calls and moves alike."""
     program = tmp_path / "p.ngc"

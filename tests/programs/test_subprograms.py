@@ -142,7 +142,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("dialect", "blocks", "line", "file", "words"), REFUSED)
 def test_what_is_not_known_is_refused_where_it_is(tmp_path, monkeypatch, dialect, blocks, line, file, words):
-    monkeypatch.setattr("compgen.programs.subprograms.MOST_BLOCKS", 1000)
+    monkeypatch.setattr("compgen.programs.subprograms.MOST_TURNS", 1000)
     for name, text in {
         "O30.nc": "O30\nG1 X1.\nG12 I5.\nM99\n", "O31.nc": "%\nO31\nG1 X1.\n%\n", "O32.nc": "%\nO33\nM99\n%\n",
         "O34.nc": "M99\n", "0034.txt": "M99\n", "O35.nc": "O35\nM98 P35\nM99\n", "O9812.nc": "O9812\nX#24\nM99\n",
