@@ -80,10 +80,70 @@ _UNITS_LINE = re.compile(
 )
 _LOCATION = re.compile(r"(?i)(?:location|position|lage)\s+(?:of|von)\s+\w+\s+([^\s,]+)")
 _DIMENSION = re.compile(r"(?i)^\W*dim(?:ension)?\s+([^\s=,]+)\s*=?")
+#: A number with decimals in a line of words: whole numbers count features, cycles and tolerance classes there.
+_IN_WORDS = re.compile(r"(?<![\w.,])[-+]?\d{1,7}+[.,]\d{1,9}+(?![\w.,]*\d)")
+#: What begins the name of a number in a line of words, and the results of HEIDENHAIN's measuring cycles (421 and its like).
+_PHRASE = re.compile(r"(?i)\b(?:soll|ist|nom|act|meas|dev|diff|abw|q\d{2,3}\b)")
+_Q_RESULTS = {"q151": "Ist X", "q152": "Ist Y", "q161": "Abw X", "q162": "Abw Y", "q273": "Soll X", "q274": "Soll Y"}
+_Q = re.compile(r"(?i)\bq\d{2,3}\b")
+#: A log in words has at least this many features, and numbers in each line; shares of its lines have the same names.
+_LEAST_LINES, _LEAST_NUMBERS, _ALIKE = 3, 3, 0.5
 #: Nominal and measured coordinates of one frame that are further apart are not those of one feature, mm.
 MOST_APART_MM = 20.0
 #: A feature is data only if it has this many neighbours.
 LEAST_FEATURES = 3
+
+
+def grid_of_phrases(source: Text) -> CellGrid | None:
+    """Return a log in words as a table, of lines ``H1: Sollwert X 50.000 Istwert X 50.002``; None for anything else.
+
+    A name without an axis is of the axis named before it; Q151, Q152, Q161, Q162 and Q273, Q274 are results and nominal values
+    of HEIDENHAIN's cycles, in the plane XY.
+    """
+    found = [(number, _phrases(line)) for number, line in enumerate(source.text.split("\n"), start=1)]
+    named = Counter(tuple(cells) for _, (_, cells) in found if len(cells) >= _LEAST_NUMBERS)
+    if not named:
+        return None
+    ((names, count),) = named.most_common(1)
+    lines = sum(bool(line.strip()) for line in source.text.split("\n"))
+    roles = {word for name in names for word in _PHRASE.findall(name.lower())}
+    if count < max(_LEAST_LINES, _ALIKE * lines) or len(roles) < 2:
+        return None
+    others = [number for number, (_, cells) in found if cells and tuple(cells) != names]
+    if others:
+        raise source.fail(
+            f"does not name the same numbers as the other lines, each with its number: {', '.join(names)}", others[0]
+        )
+    rows = [(number, [feature, *cells.values()]) for number, (feature, cells) in found if tuple(cells) == names]
+    note = f"each line names its numbers: {', '.join(names)}"
+    if _Q.search(source.text):
+        note += "; results of cycles (Q151 ...) were read as those of the plane XY"
+    return CellGrid(
+        source.path, [["Feature", *names], *(row for _, row in rows)], [rows[0][0], *(n for n, _ in rows)], (note,)
+    )
+
+
+def _phrases(line: str) -> tuple[str, dict[str, str]]:
+    """Return the feature that a line of words begins with, and its numbers by their names."""
+    feature, cells, end, axis = "", dict[str, str](), 0, ""
+    for number in _IN_WORDS.finditer(line):
+        words = line[end : number.start()].strip(" \t=:;,|()")
+        end = number.end()
+        begin = _PHRASE.search(words)
+        if begin is None:
+            return "", {}
+        named = [word.lower() for word in _PHRASE.findall(words)]
+        of_cycles = sum(word.startswith("q") for word in named)
+        if of_cycles > 1 or len(named) - of_cycles > 1:
+            return "", {"": words}  # a name whose number is missing: the next one is not its own
+        if not cells:
+            feature = words[: begin.start()].strip(" \t=:;,|-")
+        q = _Q.search(words)
+        name = _Q_RESULTS.get(q[0].lower(), q[0]) if q else " ".join(words[begin.start() :].split())
+        letters = re.findall(r"\b[XYZxyz]\b", name)
+        axis = letters[-1].upper() if letters else axis
+        cells.setdefault(name if letters or not axis else f"{name} {axis}", number[0])
+    return feature, cells
 
 
 @dataclass(frozen=True)

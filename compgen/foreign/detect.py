@@ -24,6 +24,7 @@ from compgen.foreign.answers import TABLE_SIGNS, ImportOptions
 from compgen.foreign.cells import CellGrid, chosen_sheet, grid_of_text, holds_readings, read_sheets
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, check_field
 from compgen.foreign.coordinate_reports import (
+    grid_of_phrases,
     imported_features,
     is_dmis,
     is_qif,
@@ -390,9 +391,7 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
             raise InputError("give linear= or angle= for this format", file=source, field=f"--unit {key}")
         if key not in ("value", "linear", "angle"):
             check_field(key, "--unit")
-    item = (
-        _of_grid(grid_of_text(read_source(source)), chosen, form) if form == "table" else READERS[form](source, chosen)
-    )
+    item = _of_text(source, chosen) if form == "table" else READERS[form](source, chosen)
     if chosen.sign not in (None, *TABLE_SIGNS) and "sign_of_squareness" not in str(item.understood):
         raise InputError(f"{chosen.sign} applies to squareness, and there is none", file=source, field="--sign")
     base_mm = chosen.base_length_mm
@@ -409,6 +408,18 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     if chosen.kind is not None and item.kind != chosen.kind:
         raise InputError(f"contains {item.kind}, not {chosen.kind}", file=source, field="--kind")
     return item
+
+
+def _of_text(path: Path, options: ImportOptions) -> Imported:
+    """Import a table, or a log whose lines name their numbers, which is none."""
+    text = read_source(path)
+    try:
+        return _of_grid(grid_of_text(text), options, "table")
+    except InputError:
+        phrases = grid_of_phrases(text)
+        if phrases is None:
+            raise
+    return _of_grid(phrases, options, "table")
 
 
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:

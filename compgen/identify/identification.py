@@ -319,10 +319,14 @@ def determines_all(machine: Machine, result: Identification) -> bool:
     return all(bool((u < largest[name]).all()) for name, u in values)
 
 
+#: Share of an assumed uncertainty that residuals of zero leave: numbers that fit exactly are rounded, not exact.
+LEAST_SHARE = 0.01
+
+
 def uncertainty_scale(reduced_chi_square: float, u_source: str) -> float:
     """Factor of all standard uncertainties: an assumed one follows the residuals, a stated one only if they exceed it."""
     root = float(np.sqrt(reduced_chi_square))
-    return root if u_source == "assumed" else max(1.0, root)
+    return max(LEAST_SHARE, root) if u_source == "assumed" else max(1.0, root)
 
 
 def worst_uncertainty(errors: ErrorTable) -> dict[str, tuple[float, str]]:

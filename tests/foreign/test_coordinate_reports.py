@@ -1,6 +1,7 @@
 """Prints of measuring machines, probe logs, DMIS and QIF in the manner of shops, written from a hidden truth of the model."""
 
 import functools
+import re
 import warnings
 
 import numpy as np
@@ -313,3 +314,80 @@ def test_set_ups_on_the_sheets_of_a_workbook(tmp_path):
     assert (item.doubts, sorted(set(item.data.setup))) == ((), [1, 2])
     both = item.data.deviations().deviation_mm[:, :2].reshape(2, len(GRID), 2)
     assert np.allclose(both[0], both[1], atol=1e-4)  # each set-up has its own pose
+
+
+# Logs in words: each line names its numbers, as print commands of measuring cycles write them.
+
+PLATE = {f"H{i}{j}": (50.0 + 100.0 * i, 40.0 + 90.0 * j) for i in range(4) for j in range(3)}
+
+
+def as_measured(x, y):
+    """A machine that travels 40 um/m too far in X and 25 um/m too little in Y made the part: the part is that."""
+    return x * (1 + 40e-6), y * (1 - 25e-6)
+
+
+def line_of_cycle(name, x, y):
+    a, b = as_measured(x, y)
+    return f"MESSUNG {name}  Q151 = {a:+.4f}  Q152 = {b:+.4f}  SOLL Q273 = {x:.4f} Q274 = {y:.4f}"
+
+
+def line_of_words(name, x, y):
+    a, b = as_measured(x, y)
+    parts = (
+        f"{k} {value:.4f}".replace(".", ",") for k, value in (("Sollwert X", x), ("Istwert X", a), ("Differenz", a - x))
+    )
+    other = (
+        f"{k} {value:.4f}".replace(".", ",") for k, value in (("Sollwert Y", y), ("Istwert Y", b), ("Differenz", b - y))
+    )
+    return f"{name}: {' '.join(parts)}; {' '.join(other)}"
+
+
+def line_in_english(name, x, y):
+    a, b = as_measured(x, y)
+    return f"{name} | Nominal X = {x:.4f} | Actual X = {a:.4f} | Nominal Y = {y:.4f} | Actual Y = {b:.4f}"
+
+
+LOGS = (line_of_cycle, line_of_words, line_in_english)
+
+
+@pytest.mark.parametrize("write", LOGS)
+def test_a_log_in_words_is_the_part_that_its_numbers_say(write, tmp_path):
+    path = tmp_path / "log.txt"
+    path.write_text("\n".join(write(name, *place) for name, place in PLATE.items()) + "\n", encoding="utf-8")
+    data = import_file(path, ImportOptions(kind="part", origin="0,0,0")).data
+    assert list(data.feature) == [name if write is not line_of_cycle else f"MESSUNG {name}" for name in PLATE]
+    places = np.array(list(PLATE.values()))
+    assert np.allclose(data.nominal_mm[:, :2], places)
+    assert np.allclose(data.measured_mm[:, :2], np.column_stack(as_measured(*places.T)), atol=6e-5)
+
+
+@pytest.mark.parametrize("write", LOGS)
+@pytest.mark.parametrize("row", [0, 5, 11])
+def test_a_line_of_a_log_whose_number_is_missing_is_named(write, row, tmp_path):
+    """Otherwise the next number would be taken for that of another coordinate."""
+    lines = [write(name, *place) for name, place in PLATE.items()]
+    numbers = list(re.finditer(r"[-+]?\d+[.,]\d{4}", lines[row]))
+    lines[row] = lines[row][: numbers[1].start()] + "n.a." + lines[row][numbers[1].end() :]
+    path = tmp_path / "log.txt"
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError) as caught:
+        import_file(path, ImportOptions(kind="part", origin="0,0,0"))
+    assert caught.value.line == row + 1
+
+
+@pytest.mark.parametrize("kind", ["part", "artefact"])
+def test_coordinates_that_fit_exactly_are_identified_with_the_sign_of_their_kind(kind, tmp_path):
+    """Neat numbers, as of a made example: their residuals are zero, which leaves the uncertainty of what is assumed of them."""
+    path = tmp_path / "log.txt"
+    places = [(50.0 + 70.0 * i, 40.0 + 40.0 * j) for i in range(8) for j in range(9)]
+    path.write_text("\n".join(line_in_english(f"H{k}", *place) for k, place in enumerate(places)) + "\n")
+    machine = compgen.load_machine("moving-table-mill")
+    answers = ImportOptions(kind=kind, origin="0,0,0", calibrated="yes" if kind == "artefact" else None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CompgenWarning)
+        found = identify_measurement(machine, open_measurement([path], answers=answers))
+    curve = found.errors.curves["EXX"]
+    rise_mm = float(curve.at(np.array([540.0]))[0] - curve.at(np.array([60.0]))[0])
+    # the part has the error of the machine that made it; a probe reads what the machine should have travelled
+    assert rise_mm == pytest.approx((1 if kind == "part" else -1) * 40e-6 * 480.0, rel=0.05)
+    assert (curve.u[1:] > 1e-6).any()
