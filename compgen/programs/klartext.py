@@ -22,6 +22,7 @@ import numpy as np
 
 from compgen.errors import InputError, visible_line
 from compgen.programs.dialects import VALUE
+from compgen.programs.runs import RADIUS_TOLERANCE_MM
 from compgen.programs.subprograms import DEEPEST, Linked, WrittenOut, file_of
 
 #: Numbers that are calculated here have so many decimals; the writer gives them those of the dialect.
@@ -1075,14 +1076,19 @@ class _Program:
     def _round(self, item: _Statement, kind: str, end: list[float], around: complex, sense: float) -> None:
         """Shorten the move before a corner, and write the arc or chamfer in its place."""
         assert self.corner is not None
-        assert self.element is not None
+        if self.element is None:
+            self._fail(item, f"{self.corner[0]} with something else than a move after it; post the move behind it")
         (what, size, line), before = self.corner, self.element
         item = _Statement(line, [self.lines[line], *item.lines[:1]])
         self.corner, self.rounded = None, True
         here, corner, there = complex(*before.start[:2]), complex(*before.end[:2]), complex(*end[:2])
         flat = before.start[2] == before.end[2] == end[2]
         if (before.sense or sense) and what == "RND" and flat and not cmath.isnan(there):
-            self._round_arcs(item, size, before, _Element(before.end, end, not sense, 0, "", item.first, around, sense))
+            after = _Element(before.end, end, not sense, 0, "", item.first, around, sense)
+            try:
+                self._round_arcs(item, size, before, after)
+            except ArithmeticError:
+                self._fail(item, "RND beside a move that leads nowhere, or about the place where the tool is")
             return
         if kind not in ("L", "LP") or before.sense or cmath.isnan(there) or not flat:
             self._fail(
@@ -1128,6 +1134,12 @@ class _Program:
     def _round_arcs(self, item: _Statement, radius: float, before: _Element, after: _Element) -> None:
         """Round a corner beside an arc: the circle that touches both curves, nearest to the corner."""
         corner = complex(*before.end[:2])
+        for arc in (before, after):
+            radii = [abs(complex(*place[:2]) - arc.centre) for place in (arc.start, arc.end)]
+            if arc.sense and abs(radii[0] - radii[1]) > RADIUS_TOLERANCE_MM:
+                self._fail(
+                    item, f"RND beside an arc whose start and end are {radii[0]:.4f} and {radii[1]:.4f} from its centre"
+                )
         turn = (before.along(corner).conjugate() * after.along(corner)).imag
         if abs(turn) < 1e-9:
             if (before.along(corner).conjugate() * after.along(corner)).real > 0.0:

@@ -31,7 +31,7 @@ from compgen.programs.path import IntArray
 #: Calls within calls, and blocks of a program that is written out.
 DEEPEST, MOST_BLOCKS = 10, 5_000_000
 #: Turns of all loops of a program.
-MOST_TURNS = 300_000
+MOST_TURNS = 100_000
 _MENTIONED = re.compile(
     rb"M[ \t]*+(?:\+[ \t]*+)?0*+9[78]|G[ \t]*+0*+65(?![\d.])|[#\[]|O(?:\d++|<[^<>\n]*+>)[ \t]*+CALL"
     rb"|G[ \t]*+0*+68(?![\d.])",
