@@ -407,7 +407,7 @@ def test_a_rounding_between_a_line_and_an_arc_by_hand(tmp_path):
         ("L X+20 F9\nCHF 2\nCC X+30 Y+0\nC X+30 Y+10 DR-\n", "two straight moves"),
         ("L X+20 F9\nRND R2\nCC X+30 Y+0\nCP IPA-90 IZ+5 DR-\n", "X and Y"),
         ("L X+0 F9\nRND R2\nCC X+30 Y+0\nC X+60 Y+0 DR-\n", "leads nowhere"),
-        ("L X+20 F9\nRND R2\nCC X+20 Y+0\nC X+30 Y+0 DR-\n", "leads nowhere"),
+        ("L X+20 F9\nRND R2\nCC X+20 Y+0\nC X+30 Y+0 DR-\n", "0.0000 and 10.0000 from"),
         ("L X+20 F9\nRND R2\nCC X+30 Y+0\nC X+30 Y+11 DR-\n", "10.0000 and 11.0000 from"),
         ("L X+20 F9\nRND R2\nTCH PROBE 410\nL X+30\n", "else than a move"),
         ("L X+20 F9\nRND R2\nCC X+20 Y-10\nC X+10 Y-10 DR+\n", "turns back"),
