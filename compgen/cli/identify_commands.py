@@ -225,7 +225,8 @@ def _rotary_files(
     placed = None
     if centres:
         placed = identify_spheres(machine, read_spheres(machine, centres), u_um=options.u_deviation_um, known=known)
-    errors = RotaryErrors(known.curves, {} if placed is None else placed.errors.constants)
+    own = RotaryErrors() if placed is None else placed.errors
+    errors = RotaryErrors({**own.curves, **known.curves}, own.constants)
     summary = turned.summary() if placed is None and turned is not None else {}
     if placed is not None:
         summary = {**placed.summary(), **({} if turned is None else {"rotary_axis": turned.summary()})}

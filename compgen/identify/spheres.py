@@ -29,6 +29,7 @@ from compgen.data.rotary import (
     JOINTS,
     SPINDLE,
     TIP,
+    RotaryCurve,
     RotaryErrors,
     SphereCentres,
     position_names,
@@ -94,6 +95,7 @@ class SphereIdentification(Displayed):
     sphere_mm: Mapping[str, tuple[float, float, float]]
     notes: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
+    motions_not_told: tuple[str, ...] = ()
 
     @property
     def u(self) -> FloatArray:
@@ -134,6 +136,16 @@ class SphereIdentification(Displayed):
             "u_from_residuals": self.u_from_residuals,
             "spheres_mm": {name: list(place) for name, place in self.sphere_mm.items()},
             "notes": list(self.notes),
+            "motions": {
+                name: {
+                    "position_deg": curve.angle_deg.tolist(),
+                    "value": (curve.value / _unit(name)[1]).tolist(),
+                    "u": (curve.u / _unit(name)[1]).tolist(),
+                    "unit": _unit(name)[0],
+                }
+                for name, curve in self.errors.curves.items()
+            },
+            "motions_not_told_apart": list(self.motions_not_told),
         }
 
     def overview(self) -> Overview:
@@ -357,7 +369,7 @@ def identify_spheres(
             f"The readings scatter {scale:.1f} times as much as they state; their uncertainty is widened. Something that no "
             "position error explains is in them."
         )
-    return SphereIdentification(
+    found = SphereIdentification(
         errors=RotaryErrors({}, _constants(model.names, x[:k], np.sqrt(np.diag(own)))),
         names=model.names,
         values=x[:k],
@@ -376,6 +388,71 @@ def identify_spheres(
         sphere_mm={name: tuple(x[k + 6 + 3 * j : k + 9 + 3 * j].tolist()) for j, name in enumerate(names)},
         notes=tuple(notes),
         metadata=spheres.metadata,
+    )
+    if not (estimated or scale > _MISFIT) or len(spheres) < _MANY:
+        return found
+    return _with_motions(model, found, x, u, stated if not estimated else u)
+
+
+#: Residuals of this many times what is stated, of this many poses, are looked at for error motions.
+_MISFIT, _MANY = 1.3, 20
+
+
+def _with_motions(
+    model: _Model, found: SphereIdentification, x: FloatArray, u_mm: FloatArray, stated_mm: FloatArray
+) -> SphereIdentification:
+    """The result with error motions over the angle, if the readings are far more probable with them."""
+    from compgen.identify.rotary_motions import find_motions
+
+    m, k, places = len(model.size), model.errors, model.places()
+    columns = np.hstack([model.columns(x[:m]), places])
+
+    def tip_with(curves: Mapping[str, RotaryCurve]) -> FloatArray:
+        return replace(model, known=RotaryErrors({**model.known.curves, **curves})).tip(x[:m])
+
+    motions = find_motions(
+        model.machine,
+        model.spheres.angle_deg,
+        lambda curves: -tip_with(curves),
+        -columns,
+        model.tip(x[:m]).ravel() + places @ x[m:] - columns @ x,
+        np.concatenate([model.size**2, np.full(places.shape[1], np.inf)]),
+        u_mm,
+        free_noise=True,
+    )
+    if motions is None:
+        return found
+    value, own = motions.values, motions.covariance[:k, :k]
+    after = np.linalg.norm(motions.residual_mm, axis=1) / MM_PER_UM
+    plain = found.left_out_um[1]
+    note = (
+        f"Position errors alone do not explain the poses; with error motions over the angle (about "
+        f"{1e3 * motions.size_mm:.0f} um for one period a turn) poses left out of the fit are "
+        f"{motions.left_out_mm / MM_PER_UM:.1f} um off instead of {plain:.1f} um. "
+        f"Determined: {', '.join(motions.curves) or 'none by itself'}; not told apart: {', '.join(motions.not_told) or 'none'}."
+    )
+    kept = [text for text in found.notes if "Something that no position error explains" not in text]
+    if motions.noise_mm > 3.0 * float(np.median(stated_mm)) and not found.u_from_residuals:
+        kept.append("The readings still scatter more than they state.")
+    return replace(
+        found,
+        errors=RotaryErrors(motions.curves, _constants(model.names, value[:k], np.sqrt(np.diag(own)))),
+        values=value[:k],
+        covariance=own,
+        determined=tuple((np.sqrt(np.diag(own)) <= DETERMINED * model.size[:k]).tolist()),
+        residual_um={
+            **found.residual_um,
+            "after_rms": float(np.sqrt(np.mean(after**2))),
+            "after_max": float(after.max()),
+        },
+        left_out_um=(found.left_out_um[0], motions.left_out_mm / MM_PER_UM),
+        u_um=motions.noise_mm / MM_PER_UM,
+        u_from_residuals=True,
+        sphere_mm={
+            name: tuple(value[m + 3 * j : m + 3 + 3 * j].tolist()) for j, name in enumerate(model.spheres.places[1])
+        },
+        notes=(*kept, note),
+        motions_not_told=motions.not_told,
     )
 
 

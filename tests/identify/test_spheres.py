@@ -323,3 +323,32 @@ def test_predict_with_uncertainty_holds_the_joint_covariance(folder, call):
     Path("bare.errors.csv").write_text("error,position_mm,value\nEX0C,,5\n")
     code, out, err = call(*words[:2], "bare.errors.csv", *words[3:], "--uncertainty")
     assert code == 2 and "states no uncertainty of EX0C" in " ".join(err.split())
+
+
+@pytest.mark.parametrize("kind", ["table-table", "head-head"])
+def test_error_motions_over_the_angle_are_found_where_position_errors_do_not_explain_the_poses(kind):
+    machine, rng = machine_of(KINDS[kind]), np.random.default_rng(11)
+    probe = SphereProbe(((60.0, 40.0, 20.0),), (120.0, 220.0), 60, 2.0, motion_um=25.0, motion_urad=60.0)
+    truth = probe.truth(machine, rng)
+    found = identify_spheres(machine, probe.measure(machine, ErrorTable(), truth, rng), separate=False)
+    note = next(note for note in found.notes if "error motions over the angle" in note)
+    assert found.errors.curves and set(found.errors.curves) | set(found.motions_not_told) == set(truth.curves)
+    assert all(name in note for name in found.errors.curves)
+    assert found.left_out_um[1] < 6.0 < found.left_out_um[0]  # noise of 2 um in three coordinates is 3.5 um
+    for name, curve in found.errors.curves.items():
+        axis = machine.rotary[name[-1]]
+        true = truth.curves[name].at(curve.angle_deg, axis.modulo_deg) - truth.curves[name].at(
+            np.array([axis.reference_deg]), axis.modulo_deg
+        )
+        known = curve.u > 0.0
+        assert np.sqrt(np.mean(((curve.value - true)[known] / curve.u[known]) ** 2)) < 2.5, name
+
+
+def test_noise_that_is_understated_is_not_taken_for_motions():
+    from dataclasses import replace
+
+    machine = machine_of(KINDS["head-table"])
+    spheres, _ = measured(machine, np.random.default_rng(12), (120.0,), noise_um=6.0, poses=60)
+    found = identify_spheres(machine, replace(spheres, u_mm=np.full(60, 1e-3)), separate=False)
+    assert not found.errors.curves and not found.motions_not_told
+    assert any("Something that no position error explains" in note for note in found.notes)
