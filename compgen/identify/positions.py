@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import MEASURED_COLUMNS
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
-from compgen.identify.adjust.determined import FAINT, SHOWS, Determined, Observations, least_squares
+from compgen.identify.adjust.determined import FAINTER, SHOWS, Determined, Observations, least_squares
 from compgen.identify.adjust.problem import SeparationProblem
 from compgen.identify.adjust.propagation import Adjustment
 from compgen.identify.adjust.residual_tests import residual_series
@@ -372,13 +374,20 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
         if no error is determined.
     """
     layout = error_parameters(machine, modelled_errors(machine))
-    around = np.zeros(layout.size)
-    for _ in range(2):  # repeat about the first result, to keep second-order terms out
-        observations, count, source = artefact_observations(machine, layout, artefact, options, around)
-        # what a calibrated plate shows only because it lies a little tilted is not determined
-        least = FAINT if artefact.calibrated.all() else SHOWS
-        solution, accepted = _robust(layout, observations, count, least, reject=options.reject)
-        around = solution.on(layout)
+    # what a calibrated plate shows only because it lies a little tilted is not determined
+    faint = FAINTER if artefact.calibrated.all() else (SHOWS,)
+
+    def adjusted_with(least: float) -> tuple[Observations, int, str, Determined, NDArray[np.bool_]]:
+        around = np.zeros(layout.size)
+        for _ in range(2):  # repeat about the first result, to keep second-order terms out
+            observations, count, source = artefact_observations(machine, layout, artefact, options, around)
+            begin = _not_gross(artefact)
+            solution, accepted = _robust(layout, observations, count, least, begin, reject=options.reject)
+            around = solution.on(layout)
+        plausible_errors(machine, layout, artefact, around)
+        return observations, count, source, solution, accepted
+
+    observations, count, source, solution, accepted = without_faint(adjusted_with, faint)
     standardised = solution.residual / observations.sigma
     adjusted = AdjustedReadings(
         -solution.residual[:count], observations.sigma[:count], accepted, source, solution.rank, solution.freedom,
@@ -414,6 +423,11 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
     )
 
 
+T = TypeVar("T")
+#: A coordinate is a gross error beyond so many times the median residual of its set-up, which must have a few touches.
+_GROSS, _FEW_TOUCHES, _REWEIGHTED = 20.0, 8, 15
+
+
 def _open_scale(machine: Machine) -> str:
     """What becomes of a scale that no reading shows."""
     if machine.prior.is_none:
@@ -423,7 +437,13 @@ def _open_scale(machine: Machine) -> str:
 
 
 def _robust(
-    layout: ErrorParameters, observations: Observations, count: int, least: float, *, reject: bool
+    layout: ErrorParameters,
+    observations: Observations,
+    count: int,
+    least: float,
+    begin: NDArray[np.bool_],
+    *,
+    reject: bool,
 ) -> tuple[Determined, NDArray[np.bool_]]:
     """The adjustment without outliers among the probed coordinates, the first ``count`` readings; and which fit."""
 
@@ -437,7 +457,70 @@ def _robust(
         count,
         "probed coordinates do not fit the model; check which feature is which, the set-ups, axes, signs and units,",
         reject=reject,
+        begin=begin,
     )
+
+
+class HardlySeparated(UndeterminedError):
+    """Readings whose noise the adjustment enlarges to errors that no machine has."""
+
+
+def without_faint(adjust: Callable[[float], T], leasts: Sequence[float]) -> T:
+    """Adjust with the smallest share from which a direction counts as shown that gives errors of a machine."""
+    for least in leasts[:-1]:
+        with suppress(HardlySeparated):
+            return adjust(least)
+    return adjust(leasts[-1])
+
+
+def _not_gross(artefact: Artefact) -> NDArray[np.bool_]:
+    """Which probed coordinates are no gross errors, in the order of the readings.
+
+    One touch that missed would bend weakly determined errors by millimetres before its residual tells. A machine bends a
+    plate little beside an affine map of it: the least sum of absolute residuals (iterated weights) of each set-up shows it.
+    """
+    seen = np.isfinite(artefact.measured_mm)
+    kept = np.ones(seen.shape, dtype=bool)
+    for setup in np.unique(artefact.setup):
+        own = artefact.setup == setup
+        for component in np.flatnonzero(seen[own].any(axis=0)):
+            rows = np.flatnonzero(own & seen[:, component])
+            place = artefact.nominal_mm[rows] - artefact.nominal_mm[rows].mean(axis=0)
+            design = np.column_stack([np.ones(len(rows)), place / max(float(np.abs(place).max()), 1.0)])
+            if len(rows) < _FEW_TOUCHES:
+                continue
+            value, weight = artefact.measured_mm[rows, component], np.ones(len(rows))
+            for _ in range(_REWEIGHTED):
+                fit = np.linalg.lstsq(design * weight[:, None], value * weight, rcond=1e-9)[0]
+                rest = np.abs(value - design @ fit)
+                weight = 1.0 / np.sqrt(np.maximum(rest, MM_PER_UM))
+            usual = max(float(np.median(rest)), MM_PER_UM)
+            kept[rows, component] = rest <= _GROSS * usual
+    return kept[seen]
+
+
+def plausible_errors(
+    machine: Machine, layout: ErrorParameters, artefact: Artefact, around: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return where the features were probed, with which tool, and what errors of a layout (size,) do there, (n, 3) each.
+
+    Raises
+    ------
+    HardlySeparated
+        for errors that no machine has.
+    """
+    tool_mm = np.broadcast_to(tool_of(machine, artefact.tool_mm), artefact.measured_mm.shape)
+    position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
+    check_travel(machine, position_mm, artefact.origin, MEASURED_COLUMNS)
+    expected_mm = layout.tips(around, position_mm, tool_mm) - tool_mm - position_mm
+    largest_mm = float(np.abs(expected_mm).max())
+    if largest_mm > FAR_MM:  # no machine: noise, enlarged by directions that the set-ups hardly determine
+        raise HardlySeparated(
+            f"the set-ups hardly separate the errors of the machine from the artefact (errors of {largest_mm:.3g} mm would fit): "
+            "measure the artefact turned by 180 degrees and shifted, too, or give the machine fewer nodes or errors",
+            [],
+        )
+    return position_mm, tool_mm, expected_mm
 
 
 def artefact_observations(
@@ -448,17 +531,7 @@ def artefact_observations(
     Also their number, and whether their uncertainty is "stated" or "assumed". ``around`` are approximate errors of the
     layout (size,); poses and errors count from there.
     """
-    tool_mm = np.broadcast_to(tool_of(machine, artefact.tool_mm), artefact.measured_mm.shape)
-    position_mm = np.where(np.isnan(artefact.measured_mm), artefact.nominal_mm, artefact.measured_mm)
-    check_travel(machine, position_mm, artefact.origin, MEASURED_COLUMNS)
-    expected_mm = layout.tips(around, position_mm, tool_mm) - tool_mm - position_mm
-    largest_mm = float(np.abs(expected_mm).max())
-    if largest_mm > FAR_MM:  # no machine: noise, enlarged by directions that the set-ups hardly determine
-        raise UndeterminedError(
-            f"the set-ups hardly separate the errors of the machine from the artefact (errors of {largest_mm:.3g} mm would fit): "
-            "measure the artefact turned by 180 degrees and shifted, too, or give the machine fewer nodes or errors",
-            [],
-        )
+    position_mm, tool_mm, expected_mm = plausible_errors(machine, layout, artefact, around)
     found_mm = artefact.measured_mm + expected_mm
     lying = aligned(Deviations(artefact.nominal_mm, found_mm - artefact.nominal_mm, labels={"setup": artefact.setup}))
     poses = [lying.poses[setup] for setup in artefact.setup.tolist()]

@@ -28,6 +28,7 @@ from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, e
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identify.adjust.determined import (
     FAINT,
+    FAINTER,
     SHOWS,
     Determined,
     Observations,
@@ -58,7 +59,7 @@ from compgen.identify.identification import (
     worst_uncertainty,
 )
 from compgen.identify.options import IdentifyOptions
-from compgen.identify.positions import artefact_observations, position_observations
+from compgen.identify.positions import artefact_observations, plausible_errors, position_observations, without_faint
 from compgen.identify.posterior import (
     MOST_LEVELS,
     Information,
@@ -517,21 +518,27 @@ def solve_together(
     Raises UndeterminedError if no error is determined. Positions in a frame of unknown pose and lengths from unknown
     stations are linear around approximate errors only: those of a first solution.
     """
-    around = None
     plates = [part.measurement for part in parts if isinstance(part.measurement, Artefact)]
     few = any(part.new_lengths for part in parts) or any(plate.calibrated.all() for plate in plates)
-    least = FAINT if few else SHOWS
     posed = any(isinstance(part.measurement, Deviations | Artefact | Lengths) for part in parts)
-    for _ in range(2 if posed else 1):
-        found = [part.observed(machine, layout, options, around) for part in parts]
-        found = [
-            _with_known_curves(layout, found, k) if isinstance(part.measurement, Circles) else found[k]
-            for k, part in enumerate(parts)
-        ]
-        everything = stacked(found)
-        accepted = np.ones(len(everything), dtype=bool)
-        solution = least_squares(layout, everything, accepted, least)
-        around = solution.on(layout)
+
+    def adjusted_with(least: float) -> tuple[float, list[Observations], Observations, Determined]:
+        around: FloatArray | None = None
+        for _ in range(2 if posed else 1):
+            found = [part.observed(machine, layout, options, around) for part in parts]
+            found = [
+                _with_known_curves(layout, found, k) if isinstance(part.measurement, Circles) else found[k]
+                for k, part in enumerate(parts)
+            ]
+            everything = stacked(found)
+            solution = least_squares(layout, everything, np.ones(len(everything), dtype=bool), least)
+            around = solution.on(layout)
+            for plate in plates:
+                plausible_errors(machine, layout, plate, around)
+        return least, found, everything, solution
+
+    least, found, everything, solution = without_faint(adjusted_with, FAINTER if few else (SHOWS,))
+    accepted = np.ones(len(everything), dtype=bool)
     # lengths that were not adjusted alone contain their gross errors
     new = np.concatenate([np.arange(len(item)) < part.new_lengths for item, part in zip(found, parts, strict=True)])
 

@@ -371,3 +371,34 @@ def test_a_cyclic_error_leaves_what_was_read_as_it_is():
     assert values[0.0].errors.curves["EXX"].value.tobytes() == values[3.0].errors.curves["EXX"].value.tobytes()
     assert "cyclic error of 3 um amplitude" in assumed_text(values[3.0].posterior)
     assert "cyclic" not in assumed_text(values[0.0].posterior)
+
+
+# --- one touch that missed --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gross_mm", [0.05, 0.3, 5.0])
+@pytest.mark.parametrize(("take", "field"), [("plate", "measured_mm"), ("part", "deviation_mm")])
+@pytest.mark.parametrize("beside", [False, True])
+def test_one_gross_error_of_a_plate_or_part_is_rejected_and_changes_nothing(take, field, gross_mm, beside):
+    shop = case(1, seed=1, family="smooth")
+    clean, runs = getattr(shop, take)(), shop.runs("XYZ")
+    values = getattr(clean, field).copy()
+    values[7, 0] += gross_mm
+    found = []
+    for item in (clean, replace(clean, **{field: values})):
+        measured = together(runs, item) if beside else item
+        found.append(identified(shop.machine, measured, class_name="general"))
+    good, bad = found
+    assert np.count_nonzero(~bad.accepted) == 1
+    (value, u), (other, _) = good.errors.squareness["EC0Y"], bad.errors.squareness["EC0Y"]
+    assert abs(value - other) < 0.2 * u
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_tilted_plate_on_any_machine_is_adjusted_without_what_its_tilt_hardly_shows(beside):
+    """What the tilt shows of errors along Z was taken as shown, and its noise for errors of 17 mm: the plate was refused."""
+    shop = case(2, seed=2, family="smooth")
+    plate = shop.plate()
+    measured = together(shop.runs("XYZ"), plate) if beside else plate
+    value, u = identified(shop.machine, measured, class_name="general").errors.squareness["EC0Y"]
+    assert abs(value - shop.truth.squareness["EC0Y"]) < 2.5 * u < 1e-4

@@ -26,6 +26,8 @@ SHOWS, RCOND = 1e-6, 1e-9
 #: Lengths of few stations and a plate that lies a little tilted show many errors by terms of second order only: directions
 #: below this share, which they determine about a hundred times worse than their readings, count as not determined.
 FAINT = 1e-3
+#: The same where noise in the faintest of them would be errors that no machine has.
+FAINTER = (FAINT, 3.0 * FAINT, 1e-2, 3e-2)
 #: Angles are expressed in mm at this lever, comparable to translations.
 LEVER_MM = 1000.0
 #: Nodes with less than this share of the readings of the median node are tied to their neighbours.

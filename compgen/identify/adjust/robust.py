@@ -383,6 +383,7 @@ def fit_accepted(
     advice: str,
     *,
     reject: bool,
+    begin: NDArray[np.bool_] | None = None,
 ) -> tuple[S, NDArray[np.bool_]]:
     """Fit, reject what is beyond the robust limit, and repeat until the set of kept readings is stable.
 
@@ -391,13 +392,14 @@ def fit_accepted(
     fit : solves with the accepted readings (count,), from the previous solution (None at first).
     standardised : residuals of a solution over their standard uncertainty, (count,).
     advice : end of the message "n of count ...".
+    begin : readings (count,) to begin with; the others come back where they fit. Default: all.
 
     Raises
     ------
     ConvergenceError
         if more than ``MOST_REJECTED`` of the readings do not fit.
     """
-    accepted = np.ones(count, dtype=bool)
+    accepted = np.ones(count, dtype=bool) if begin is None or not reject else begin
     solution = fit(accepted, None)
     for _ in range(MOST_ROUNDS if reject else 0):
         keep = accepted_readings(standardised(solution))
