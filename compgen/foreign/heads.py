@@ -21,7 +21,7 @@ _NUMBER = re.compile(r"(?<![\w.:/-])[+\-\u2212]?\d+(?:[.,]\d+)?(?:[eE][+-]?\d+)?
 _LETTERS = re.compile(r"[^\W\d_]{2,}")
 _WORD = re.compile(r"[^\W\d_]{3,}")
 _GAP = re.compile(r"\s*\t\s*|\s{2,}|\s*;[;\s]*")
-_APART, _COUNTED = re.compile(r";? : ?"), re.compile(r"\w+\[[\d, ]+\]")
+_APART, _COUNTED = re.compile(r";? : ?"), re.compile(r"\w{1,40}\[[\d, ]{1,40}\]")
 _CELLS = re.compile(r"\s*[;\t|]\s*|\s{2,}|,(?=\S)")
 #: A number without a colon, as in "Auftrag Nr. 12345".
 _NUMBERED = re.compile(r"(.*?\b(?:Nr|No|N\u00b0|Number|Nummer)\b)(\.?\s*)([\w/.-]*\d[\w/.-]*)", re.IGNORECASE)
