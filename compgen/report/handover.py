@@ -127,7 +127,7 @@ def _stated_instruments(certificate: Certificate | None) -> Iterator[dict[str, s
         yield {
             "name": _joined(thing.manufacturer, thing.name, thing.model),
             "serial_number": thing.serial_number,
-            "certificate": thing.certificate_number,
+            "certificate": _joined(thing.certificate_number, thing.certificate_by),
             "file": "",
         }
 

@@ -1,5 +1,6 @@
 """A report that can be handed over: what files and certificate.toml name is on it, what nobody stated is listed, not invented."""
 
+import hashlib
 import json
 import re
 
@@ -9,8 +10,9 @@ import pytest
 from compgen.cli import cli
 from compgen.errors import InputError
 from compgen.foreign.heads import heads_of
+from compgen.report.dcc import read_certificate, read_dcc
 from compgen.report.handover import handed_over
-from compgen.report.html.write import css_string, running_text
+from compgen.report.html.write import certificate_copies, css_string, running_text
 from compgen.report.pdf import browser, pdf_of
 
 # a foreign file is said to be read as what it is, with a warning
@@ -170,3 +172,94 @@ def test_no_text_ends_the_style_that_it_is_written_into():
 def test_the_page_is_printed_with_numbered_pages(ran):
     made = pdf_of(ran / "report.html")
     assert made.startswith(b"%PDF")
+
+
+# The DCC of an instrument, as its laboratory issued it.
+
+LASER = """<?xml version="1.0" encoding="UTF-8"?>
+<dcc:digitalCalibrationCertificate xmlns:dcc="https://ptb.de/dcc" xmlns:si="https://ptb.de/si" schemaVersion="3.2.1">
+<dcc:administrativeData><dcc:coreData><dcc:uniqueIdentifier>D-K-15142-01-00 2026-03</dcc:uniqueIdentifier>
+<dcc:beginPerformanceDate>2026-02-27</dcc:beginPerformanceDate>
+<dcc:endPerformanceDate>2026-03-02</dcc:endPerformanceDate></dcc:coreData>
+<dcc:items><dcc:item><dcc:name><dcc:content>Laser</dcc:content></dcc:name><dcc:identifications><dcc:identification>
+<dcc:issuer>manufacturer</dcc:issuer><dcc:value>99AZ12</dcc:value></dcc:identification></dcc:identifications></dcc:item></dcc:items>
+<dcc:calibrationLaboratory><dcc:contact><dcc:name><dcc:content>Kalibrierlabor Nord</dcc:content></dcc:name></dcc:contact>
+</dcc:calibrationLaboratory></dcc:administrativeData>
+<dcc:measurementResults><dcc:measurementResult><dcc:results><dcc:result><dcc:data><dcc:list>
+<dcc:quantity><si:realListXMLList><si:valueXMLList>0 500 1000</si:valueXMLList><si:unitXMLList>\\milli\\metre</si:unitXMLList>
+</si:realListXMLList></dcc:quantity>
+<dcc:quantity><si:realListXMLList><si:valueXMLList>0.0 0.2 -0.1</si:valueXMLList><si:unitXMLList>\\micro\\metre</si:unitXMLList>
+<si:expandedUncXMLList><si:uncertaintyXMLList>0.1 0.2 0.3</si:uncertaintyXMLList>
+<si:coverageFactorXMLList>2</si:coverageFactorXMLList>
+</si:expandedUncXMLList></si:realListXMLList></dcc:quantity></dcc:list></dcc:data></dcc:result></dcc:results></dcc:measurementResult>
+</dcc:measurementResults></dcc:digitalCalibrationCertificate>
+"""
+
+
+def with_laser(folder, text=LASER, **stated):
+    (folder / "laser.xml").write_text(text)
+    lines = [
+        f'{key} = "{value}"' for key, value in {"name": "XL-80", "certificate_file": "laser.xml", **stated}.items()
+    ]
+    path = folder / "certificate.toml"
+    path.write_text("[[equipment]]\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def test_the_dcc_of_an_instrument_gives_number_laboratory_and_day(tmp_path):
+    path = with_laser(tmp_path, serial_number="99AZ12")
+    (thing,) = read_certificate(path, complete=False).equipment
+    assert (thing.certificate_number, thing.certificate_by) == (
+        "D-K-15142-01-00 2026-03",
+        "Kalibrierlabor Nord, measured 2026-03-02",
+    )
+    assert thing.certificate_sha256 == hashlib.sha256((tmp_path / "laser.xml").read_bytes()).hexdigest()
+    assert set(certificate_copies(path)) == {"certificate.toml", "laser.xml"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("0.1 0.2 0.3", "0.1 0.2", "3 values, but 2 of uncertaintyXMLList"),
+        ("0.1 0.2 0.3", "0.1 -0.2 0.3", "below 0"),
+        (">2<", ">0.5<", "below 1"),
+        ("0 500 1000", "0 500", "lists of one table have 2, 3 values"),
+        ("0.0 0.2 -0.1", "0.0 0,2 -0.1", "no number"),
+        ("2026-03-02<", "2026-02-02<", "before it begins"),
+        ("2026-03-02<", "soon<", "is not a date"),
+        ("D-K-15142-01-00 2026-03", " ", "is missing"),
+        ("dcc:digitalCalibrationCertificate", "dcc:other", "no Digital Calibration Certificate"),
+        ("</dcc:measurementResults>", "", "not complete XML"),
+        ("<dcc:administrativeData>", "<!DOCTYPE x><dcc:administrativeData>", "entities"),
+    ],
+)
+def test_a_dcc_that_contradicts_itself_is_refused(old, new, message, tmp_path):
+    assert old in LASER
+    (tmp_path / "x.xml").write_text(LASER.replace(old, new))
+    with pytest.raises(InputError, match=message):
+        read_dcc(tmp_path / "x.xml")
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"serial_number": "4711"}, "serial_number.*99AZ12|99AZ12.*serial_number|4711 is not in laser.xml"),
+        ({"certificate_number": "other"}, "other is stated, but laser.xml has D-K-15142"),
+        (
+            {"certificate_sha256": "0" * 64, "certificate_number": "D-K-15142-01-00 2026-03"},
+            "is stated, but laser.xml has",
+        ),
+        ({"certificate_file": "none.xml"}, "none.xml"),
+    ],
+)
+def test_the_dcc_of_another_instrument_or_a_changed_one_is_refused(stated, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        read_certificate(with_laser(tmp_path, **stated), complete=False)
+
+
+def test_our_own_dcc_is_read_back(ran, tmp_path):
+    call("report", ran, "--dcc", "examples/certificate.toml", "--out", tmp_path)
+    found = read_dcc(tmp_path / "dcc.xml")
+    assert found.number == "EX-2026-0117"
+    assert "0001" in found.numbers
+    assert found.laboratory == "Example Measuring Service"

@@ -52,6 +52,8 @@ class Thing:
     software_version: str = ""
     certificate_number: str = ""
     certificate_sha256: str = ""
+    certificate_by: str = ""
+    certificate_file: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -222,11 +224,35 @@ def _values(section: Section, kind: str, *, complete: bool = True) -> dict[str, 
         empty = None if check is flag else ""
         optional = entry.endswith("?") or not complete
         found[key] = section.take(key, check, empty) if optional else section.take(key, check)
+    if kind == "equipment" and (file := section.file("certificate_file")) is not None:
+        found |= _by_reference(section, found, file)
     if found.get("certificate_sha256") and not found["certificate_number"]:
         raise section.fail(
             "certificate_sha256", "needs certificate_number, the number of the certificate with this hash"
         )
     return found
+
+
+def _by_reference(section: Section, stated: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Return what the DCC of an instrument says of its calibration; InputError where it is that of another one."""
+    from compgen.report.dcc.reading import read_dcc
+
+    read = read_dcc(file)
+    for key, own in (("certificate_number", read.number), ("certificate_sha256", read.sha256)):
+        if stated[key] and stated[key] != own:
+            raise section.fail(key, f"{stated[key]} is stated, but {file.name} has {own}")
+    if stated["serial_number"] and stated["serial_number"] not in read.numbers:
+        known = ", ".join(read.numbers) or "none"
+        raise section.fail(
+            "serial_number", f"{stated['serial_number']} is not in {file.name}, which identifies its items by {known}"
+        )
+    said = ", ".join(part for part in (read.laboratory, f"measured {read.end}") if part)
+    return {
+        "certificate_number": read.number,
+        "certificate_sha256": read.sha256,
+        "certificate_by": said,
+        "certificate_file": file,
+    }
 
 
 def _closed(section: Section, kind: str, *, complete: bool = True) -> dict[str, Any]:

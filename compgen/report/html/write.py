@@ -22,7 +22,7 @@ from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_
 from compgen.accuracy.field import ErrorSource, Figure, error_source, volume_figures
 from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.error_table import ErrorTable
-from compgen.data.files import OutputFolder, json_text, json_values, read_text
+from compgen.data.files import OutputFolder, json_text, json_values, read_bytes, read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError, number_text, one_line, um_text
@@ -1001,12 +1001,25 @@ def write_report(
     report = build_report(folder, language, known, certificate)
     documents = also(report.data) if also is not None else {}
     if certificate is not None:
-        target.add(CERTIFICATE, read_text(Path(certificate)))
+        for name, text in certificate_copies(Path(certificate)).items():
+            target.add(name, text)
     for name, text in report.files.items():
         target.add(name, text)
     for name, document in documents.items():
         target.add(name, document)
     return report, target.commit()
+
+
+def certificate_copies(path: Path) -> dict[str, str | bytes]:
+    """Return ``certificate.toml`` and the certificates of instruments that it names beside itself, by name in the folder."""
+    from compgen.report.dcc.laboratory import read_certificate
+
+    text, found = read_text(path), dict[str, str | bytes]()
+    for thing in read_certificate(path, complete=False).equipment:
+        file = thing.certificate_file
+        if file is not None and file.resolve().is_relative_to(path.resolve().parent):
+            found[file.resolve().relative_to(path.resolve().parent).as_posix()] = read_bytes(file)
+    return {CERTIFICATE: text, **found}
 
 
 def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Picture]]:
