@@ -43,6 +43,7 @@ class ImportOptions:
     origin : machine coordinates, mm, of the zero from which the coordinates of a part or artefact count ("X,Y,Z").
     calibrated : whether the nominal places of an artefact are those of a calibration ("yes") or of a drawing ("no").
     mounted : body on which a level was.
+    line : machine coordinates, mm, of the axes that stood while an axis was measured ("Y=-250,Z=-100").
     clamping : several tables of one report are features of "one" set-up, or "each" has its own.
     """
 
@@ -119,6 +120,30 @@ class ImportOptions:
     mounted: Literal["spindle", "table"] | None = option(
         None, "Body on which a level was: on the spindle side, or on the table; the signs are opposite."
     )
+
+    line: str | None = option(
+        None,
+        "Where the laser was: machine coordinates (mm) of the axes that stood while an axis moved, such as Y=-250,Z=-100. Not "
+        "stated, the run may have been anywhere in the travel, and angles add to its uncertainty.",
+        metavar="Y=MM,Z=MM",
+    )
+
+    def line_mm(self) -> dict[str, float]:
+        """Return where axes stood, by their letters; empty if it was not given."""
+        found: dict[str, float] = {}
+        for word in filter(None, (self.line or "").replace(";", ",").split(",")):
+            letter, _, text = (part.strip() for part in word.partition("="))
+            try:
+                place = float(text)
+            except ValueError:
+                place = float("nan")
+            if letter.upper() not in AXES or letter.upper() in found or not abs(place) < 1e5:
+                message = (
+                    f"{self.line!r} is not the place of a run: give each axis that stood once, in mm: Y=-250,Z=-100"
+                )
+                raise InputError(message, field="--line")
+            found[letter.upper()] = place
+        return found
 
     def origin_mm(self) -> tuple[float, float, float] | None:
         """Return the origin as three numbers; None if it was not given."""

@@ -328,8 +328,9 @@ _FLAGS = {
     "zero_runs": "--zero-runs",
     "ignore": "--ignore",
     "base_length_mm": "--base-length",
+    "line": "--line",
 }
-_ONE_AXIS = ("axis", "error", "sign", "directions", "dates")
+_ONE_AXIS = ("axis", "error", "sign", "directions", "line", "dates")
 #: What each format leaves open to the user.
 _TAKES: dict[str, tuple[str, ...]] = {
     "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
@@ -369,6 +370,34 @@ def form_of(path: Path) -> str:
     return "table"
 
 
+def _with_line(item: Imported, options: ImportOptions) -> Imported:
+    """Return axis runs with where the other axes stood, as the user says; a note where that stays open."""
+    given = options.line_mm()
+    if not isinstance(item.data, AxisRuns):
+        if given:
+            raise InputError(
+                "states where a positioning run was, and the file contains none", file=item.path, field="--line"
+            )
+        return item
+    runs = item.data
+    moved = {AXES[axis] for axis in runs.axes}
+    if unused := set(given) & moved if len(moved) == 1 else set():
+        raise InputError(
+            f"{''.join(unused)} is the axis that moved; give where the others stood", file=item.path, field="--line"
+        )
+    stated = {f"line_{axis.lower()}_mm": np.full(len(runs), place) for axis, place in given.items()}
+    if twice := stated.keys() & runs.covariates.keys():
+        raise InputError(f"the file has {', '.join(sorted(twice))} already", file=item.path, field="--line")
+    runs = replace(runs, covariates={**runs.covariates, **stated})
+    open_ = [AXES[axis] for axis in np.flatnonzero(np.isnan(runs.line_mm()).any(axis=0)).tolist()]
+    note = (
+        f"where {' and '.join(open_)} stood during the runs is not stated: give --line "
+        f"{','.join(f'{axis}=MM' for axis in open_)}; without it the runs count as anywhere in the travel, and angles add to "
+        "the uncertainty"
+    )
+    return replace(item, data=runs, notes=(*item.notes, note) if open_ else item.notes)
+
+
 def import_file(path: str | Path, options: ImportOptions | None = None) -> Imported:
     """Import any supported foreign file.
 
@@ -398,6 +427,7 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
     if base_mm is not None and not (0 < base_mm < np.inf and "base_length_mm" in str(item.understood)):
         text = f"{base_mm:g} mm does not apply: expected a length above zero, and a column of straightness in words"
         raise InputError(f"{text} (Straightness Z [um/m]), or --map EZX=COLUMN", file=source, field="--base-length")
+    item = _with_line(item, chosen)
     if not item.doubts and isinstance(item.data, AxisRuns | Deviations):
         check_largest(item.data.deviation_mm, item.data.origin)
     # refuse a name after --ignore that is neither a column nor a sheet: it would hide what the user meant

@@ -581,3 +581,28 @@ def test_a_zip_archive_that_is_no_workbook_may_be_a_backup(tmp_path):
         archive.writestr("a.ini", "$AN_CEC[0,0]=0.001\n")
     with pytest.raises(InputError, match="--active"):
         import_file(tmp_path / "backup.zip")
+
+
+LINE_TABLE = "Position [mm];Deviation [um]\n0;0.0\n100;1.2\n200;2.1\n300;3.3\n"
+
+
+def test_where_the_other_axes_stood_is_asked_and_kept(tmp_path):
+    path = tmp_path / "x.csv"
+    path.write_text(LINE_TABLE, encoding="utf-8")
+    silent = import_file(path, ImportOptions(axis="X", sign="error"))
+    assert any("where Y and Z stood" in note and "--line Y=MM,Z=MM" in note for note in silent.notes)
+    half = import_file(path, ImportOptions(axis="X", sign="error", line="y = -250"))
+    assert any("where Z stood" in note for note in half.notes)
+    stated = import_file(path, ImportOptions(axis="X", sign="error", line="Y=-250, Z=-100.5"))
+    assert not any("stood" in note for note in stated.notes)
+    (text,) = stated.files().values()
+    (tmp_path / "x.axis.csv").write_text(text, encoding="utf-8")
+    assert read_axis_runs(tmp_path / "x.axis.csv").line_mm()[1].tolist() == [100.0, -250.0, -100.5]
+
+
+@pytest.mark.parametrize("line", ["X=3", "Y=a", "Y=1,Y=2", "A=3", "Y", "Y=nan", "Y=1e9"])
+def test_a_place_of_a_run_that_is_none_is_refused(tmp_path, line):
+    path = tmp_path / "x.csv"
+    path.write_text(LINE_TABLE, encoding="utf-8")
+    with pytest.raises(InputError, match="--line"):
+        import_file(path, ImportOptions(axis="X", sign="error", line=line))
