@@ -33,6 +33,11 @@ MADE = {
     "runs.__init__": _DIALECTS,
     "follower._runs": [(block_runs(name), "match") for name in DIALECTS],
     "follower.__init__": [(re.compile(comments), "sub") for comments in (*_COMMENTS.values(), _OTHER_COMMENTS)],
+    "subprograms.file_of": [
+        (re.compile(r"O?0*1001(?:\.[^.]*)?"), "fullmatch"),
+        (re.compile(r"(?:_N_)?A(?:[._](?:SPF|MPF))?"), "fullmatch"),
+    ],
+    "subprograms._while": [(re.compile(r"\s*(?:N\s*\d+\s*)?END\s*1(?!\d)"), "match")],
     "subprograms.number": [(re.compile(r"\s*(?:N\s*\d+\s*)?[O:]\s*0*(\d+)(?!\d)"), "match")],
     "correct._hole": [(re.compile(r"^(\s*)\d+\s+"), "sub"), (re.compile(r"^(\s*)N\d+\s*", re.IGNORECASE), "sub")],
     "klartext._said": [(re.compile(pattern), "match") for pattern, _ in klartext._REFUSED],

@@ -332,7 +332,7 @@ def lowered(source: Path, program: Linked | None, *, skip_deleted: bool = False)
     return _Program(program, lines, skip_deleted).written()
 
 
-_PGM = re.compile(r"(\s*\d*\s*)CALL\s+PGM\s+(\"[^\"]+\"|\S+)\s*(;.*)?$", re.IGNORECASE | re.DOTALL)
+_PGM = re.compile(r"(\s*+\d*+\s*+)CALL\s++PGM\s++(\"[^\"]++\"|[^\s;]++)\s*+(;.*)?$", re.IGNORECASE | re.DOTALL)
 _ANY_LABEL = re.compile(r"((?:CALL\s*)?LBL\s*)(\"[^\"]+\"|\d+)", re.IGNORECASE)
 
 
@@ -361,7 +361,7 @@ class _Linker:
         """Change calls to those of labels, and put the programs before END PGM."""
         lines, places = self.lines, self.program.places
         end = next(
-            (k for k, line in enumerate(lines) if re.match(r"\s*\d*\s*END\s+PGM", line, re.IGNORECASE)), len(lines)
+            (k for k, line in enumerate(lines) if re.match(r"\s*+\d*+\s*+END\s++PGM", line, re.IGNORECASE)), len(lines)
         )
         unit = self._unit(lines)
         for k in range(end):
@@ -377,7 +377,7 @@ class _Linker:
 
     @staticmethod
     def _unit(lines: list[str]) -> str:
-        first = next((line for line in lines if re.match(r"\s*\d*\s*BEGIN\s+PGM", line, re.IGNORECASE)), "")
+        first = next((line for line in lines if re.match(r"\s*+\d*+\s*+BEGIN\s++PGM", line, re.IGNORECASE)), "")
         return "INCH" if first.rstrip().upper().endswith("INCH") else "MM"
 
     def _called(self, line: str, place: tuple[Path, int], main: int, unit: str, depth: int) -> str:
@@ -408,12 +408,12 @@ class _Linker:
         ended = False
         for k, line in enumerate(lines, 1):
             code = line.partition(";")[0]
-            ended = ended or re.match(r"\s*\d*\s*END\s+PGM", code, re.IGNORECASE) is not None
+            ended = ended or re.match(r"\s*+\d*+\s*+END\s++PGM", code, re.IGNORECASE) is not None
             if _Program.ends(code):
                 raise InputError(
                     "ends the program by M2 or M30, and is called by another; post it without", file=path, line=k
                 )
-            if re.match(r"\s*\d*\s*(?:BEGIN|END)\s+PGM", code, re.IGNORECASE):
+            if re.match(r"\s*+\d*+\s*+(?:BEGIN|END)\s++PGM", code, re.IGNORECASE):
                 continue
             line = self._called(line, (path, k), main, unit, depth + 1)
             if not re.search(r'LBL\s*"PGM ', line):

@@ -69,7 +69,7 @@ _BEGINS = re.compile(
 
 
 #: Rotation about Z: in the plane G17 as RPL.
-_ROTATION = re.compile(rf"(A?ROT)(?:\s*RPL\s*=\s*({VALUE})|\s*Z\s*=?\s*({VALUE}))?")
+_ROTATION = re.compile(rf"(A?ROT)(?:\s*+RPL\s*+=\s*+({VALUE})|\s*+Z\s*+=?\s*+({VALUE}))?")
 
 
 def _blanked(text: str) -> str:
@@ -415,7 +415,7 @@ class _Program:
             formula = _Formula(code, begin + (mode.end() if mode and inside else 0), self._known)
             first = formula.at
             value = self._read(formula, text)
-            if re.fullmatch(r"\s*[-+]?\s*[\d.]+\s*", code[first : formula.at]):
+            if re.fullmatch(r"\s*+[-+]?\s*+[\d.]++\s*+", code[first : formula.at]):
                 continue
             self.changed = True
             pieces += [text[at:first], self._said(value)]

@@ -474,7 +474,6 @@ class Turn:
         return text
 
 
-_ASSIGNMENT = re.compile(r"#(?=[^=]*=)")
 _COMPUTED = re.compile(
     r"(?<![A-Z#<])([A-Z])[ \t]*+(?=[-+]?[ \t]*+(?:[#\[]|(?:" + "|".join([*FUNCTIONS, "ATAN"]) + r")\[))", re.IGNORECASE
 )
@@ -536,7 +535,6 @@ class Linked:
 
 
 _PROGRAM_NUMBER = re.compile(rb"\s*+(?:N\s*+\d++\s*+)?[O:]\s*+0*+(\d++)", re.IGNORECASE)
-_CALLED_NUMBER = re.compile(rb"(?:M[ \t]*+0*+98|G[ \t]*+0*+65)(?![\d.]).*?P[ \t]*+0*+(\d++)(?![\d.])", re.IGNORECASE)
 _CALLED_NAME = re.compile(rb"\s*+(?:N\s*+\d++\s*+)?O\s*+(?:<([^<>\n]++)>|(\d++))\s*+CALL\b", re.IGNORECASE)
 _DEFINED_NAME = re.compile(rb"\s*+(?:N\s*+\d++\s*+)?O\s*+(?:<([^<>\n]++)>|(\d++))\s*+SUB\b", re.IGNORECASE)
 #: Ends of names of files that are no programs.
@@ -588,9 +586,9 @@ def linked(source: Path, dialect: str, folders: Sequence[Path]) -> Linked:
     at = 0
     while at < len(lines):
         code = _LATER[dialect].sub(b"", lines[at])
-        for call in _CALLED_NUMBER.finditer(code):
-            short = call[1][-4:].lstrip(b"0") if len(call[1]) > 4 else call[1]
-            if not {call[1], short} & numbers:
+        for number in _called_numbers(code):
+            short = number[-4:].lstrip(b"0") if len(number) > 4 else number
+            if not {number, short} & numbers:
                 _link_number(found, short, folders, found.places[at])
                 numbers.add(short)
         named = _CALLED_NAME.match(code) if dialect == "linuxcnc" else None
@@ -601,6 +599,15 @@ def linked(source: Path, dialect: str, folders: Sequence[Path]) -> Linked:
     lines += rest
     found.places += [(source, last + k + 1) for k in range(len(rest))]
     return found
+
+
+def _called_numbers(code: bytes) -> list[bytes]:
+    """Numbers of the programs that a block calls by M98 or G65."""
+    if b"98" not in code and b"65" not in code:
+        return []
+    words = [(word[1].upper(), word[2]) for word in _WORD.finditer(code)]
+    calls = {(letter, text.lstrip(b"0 \t")) for letter, text in words} & {(b"M", b"98"), (b"G", b"65")}
+    return [text.lstrip(b"0") for letter, text in words if letter == b"P" and text.isdigit()] if calls else []
 
 
 def _o_name(found: re.Match[bytes]) -> str:
