@@ -20,6 +20,7 @@ from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_diagonals, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
 from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option
+from compgen.cli.identify_commands import of_rotary_axes
 from compgen.cli.shared_options import instrument_option, machine_argument, prior_option
 from compgen.cli.terminal import answer, progress
 from compgen.data.files import OutputFolder, json_text
@@ -151,6 +152,8 @@ def accuracy_command(
     options = _completed(options, machine, budget, rigid=remove_rigid_motion)
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
+        if of_rotary_axes(file):
+            raise InputError("is of rotary axes; volcomp identify gives its figures (ISO 230-2, arcsec)", file=file)
         side = read_side(machine, file, instrument, u_deviation_um, _reader(axis, file))
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, options.edition, options.budgets)

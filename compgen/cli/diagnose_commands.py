@@ -18,6 +18,7 @@ from compgen.cli.common import (
     out_option,
     print_json,
 )
+from compgen.cli.identify_commands import diagnose_rotary, of_rotary_axes
 from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument
 from compgen.cli.terminal import progress, say
 from compgen.controls.isg_kernel import read_error_file
@@ -150,6 +151,9 @@ def diagnose_command(
     machine with the effects that were found, to be used as MACHINE in the next command. For axis runs (ISO 230-2) also
     removed.csv: what was subtracted from each reading.
 
+    *.sphere.csv, and *.axis.csv with angles, of a machine with rotary axes: diagnosis.json and diagnosis.md say what they
+    betray of the probe, of the sense of an axis and of misfit, and what they cannot tell apart.
+
     --each diagnoses every file separately; --workers and --cluster distribute them.
 
     Exit code 1: not decidable, or the misfit does not shrink on lines that were left out.
@@ -159,6 +163,8 @@ def diagnose_command(
       volcomp diagnose zha-gantry lengths.csv --out diagnosis/
     """
     OutputFolder(out)
+    if any(of_rotary_axes(path) for path in measurements):
+        return diagnose_rotary(machine, measurements, out, as_json)
     request = DiagnoseRequest(machine, options, instrument)
     if each:
         return diagnose_each(request, measurements, out, (workers, cluster), language, as_json=as_json)

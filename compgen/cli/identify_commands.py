@@ -125,7 +125,7 @@ def identify_command(
     if replicates is None and (workers > 1 or cluster is not None):
         raise InputError("--workers and --cluster need --self-check: they distribute its replicates")
     OutputFolder(out)
-    if any(_of_rotary_axes(path) for path in measurements):
+    if any(of_rotary_axes(path) for path in measurements):
         return _identify_spheres(machine, measurements, out, options, as_json)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
@@ -181,6 +181,24 @@ def _identify_spheres(
     return 0 if placed is None or placed.rank else 1
 
 
+def diagnose_rotary(machine: Machine, measurements: tuple[Path, ...], out: Path, as_json: bool) -> int:
+    """What spheres and runs betray before any table: the probe, a reversed axis, misfit, what cannot be told apart."""
+    import json
+
+    placed, turned, summary, _ = _rotary_files(machine, measurements, IdentifyOptions())
+    findings = [*(() if placed is None else placed.notes[1:]), *(() if turned is None else turned.notes)]
+    apart = [] if placed is None else [f"cannot be told apart: {words}; {cure}" for words, cure in placed.inseparable]
+    data = {"kind": summary["kind"], "findings": findings, "not_told_apart": apart, "evidence": summary}
+    rows = [f"# {machine.name}: what the rotary axes show", "", *(f"- {text}" for text in [*findings, *apart]), ""]
+    write_all(out, {"diagnosis.json": json.dumps(data, indent=2) + "\n", "diagnosis.md": "\n".join(rows)})
+    if as_json:
+        print_json(data)
+    else:
+        _show_rotary(placed, turned)
+        stdout.print(f"{out / 'diagnosis.json'}, {out / 'diagnosis.md'}")
+    return 0
+
+
 def _show_rotary(placed: SphereIdentification | None, turned: RotaryPositioning | None) -> None:
     """Print what spheres and runs say."""
     from compgen.report.terminal import sphere_table
@@ -195,7 +213,7 @@ def _show_rotary(placed: SphereIdentification | None, turned: RotaryPositioning 
             stdout.print(f"note: {note}")
 
 
-def _of_rotary_axes(path: Path) -> bool:
+def of_rotary_axes(path: Path) -> bool:
     """Whether a file contains centres of spheres, or positioning runs of rotary axes."""
     from compgen.data.rotary import is_rotary_runs
 
@@ -213,7 +231,7 @@ def _rotary_files(
     from compgen.identify.rotary_runs import identify_rotary_runs
     from compgen.identify.spheres import identify_spheres
 
-    others = [path for path in measurements if not _of_rotary_axes(path)]
+    others = [path for path in measurements if not of_rotary_axes(path)]
     if others:
         raise InputError(
             "contains no centres of spheres; identify the linear axes and the rotary axes separately", file=others[0]
@@ -267,6 +285,11 @@ def run_spheres(
     name = controllers[0]
     _ = target_of(machine, name) if name in ROTARY_TARGETS else format_of(machine, name)
     placed, turned, _, files = _rotary_files(machine, measurements, options)
+    if turned is None and name not in ROTARY_TARGETS:
+        raise InputError(
+            f"contains no positioning of a rotary axis, which {name} takes; give runs (*.axis.csv)",
+            file=measurements[0],
+        )
     write_all(out, files)
     if not as_json:
         _show_rotary(placed, turned)

@@ -44,6 +44,10 @@ K = TypeVar("K", bound=Hashable)
 ERROR_COLUMNS = ("error", "position_mm", "value")
 
 
+#: Names of errors of rotary axes, which :mod:`compgen.data.rotary` reads.
+_OF_ROTARY_AXES = re.compile(r"E[XYZABC]0?[ABC]|T[XYZ]")
+
+
 @dataclass(frozen=True, repr=False)
 class Curve(Displayed):
     """One error over its axis: ``position_mm`` ascending, ``value`` and standard uncertainty ``u`` in mm or rad.
@@ -411,7 +415,10 @@ def errors_of_table(table: CsvTable) -> ErrorTable:
     squareness: dict[str, tuple[float, float]] = {}
     for row, name in enumerate(names):
         if name not in ERROR_INDEX:
-            raise table.fail(row, "error", f"{name!r} is not an error of ISO 230-1 here; {nearest(name, ERROR_NAMES)}")
+            known = nearest(name, ERROR_NAMES)
+            if _OF_ROTARY_AXES.fullmatch(name):
+                known += ". It is an error of a rotary axis; here are those of X, Y and Z only (docs/five-axis.md)"
+            raise table.fail(row, "error", f"{name!r} is not an error of ISO 230-1 here; {known}")
     for name, rows in _grouped(names).items():
         unit = error_named(name).si_per_unit
         if name in SQUARENESS_NAMES:

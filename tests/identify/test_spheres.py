@@ -352,3 +352,19 @@ def test_noise_that_is_understated_is_not_taken_for_motions():
     found = identify_spheres(machine, replace(spheres, u_mm=np.full(60, 1e-3)), separate=False)
     assert not found.errors.curves and not found.motions_not_told
     assert any("Something that no position error explains" in note for note in found.notes)
+
+
+def test_other_commands_say_what_they_do_with_rotary_axes(folder, call):
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    code, out, err = call("diagnose", "five.toml", "sim/trunnion.sphere.csv", "--out", "d", "--json")
+    data = json.loads(out)
+    assert code == 0 and data["kind"] == "sphere" and len(data["not_told_apart"]) == 2, err
+    assert "cannot be told apart" in Path("d/diagnosis.md").read_text()
+    call("identify", "five.toml", "sim/trunnion.sphere.csv", "--out", "found")
+    code, out, err = call("fit", "five.toml", "found/identified.errors.csv", "--out", "x")
+    assert code == 2 and "It is an error of a rotary axis" in " ".join(err.split())
+    code, out, err = call("accuracy", "five.toml", "sim/trunnion.sphere.csv", "--out", "x")
+    assert code == 2 and "volcomp identify gives its figures" in " ".join(err.split())
+    words = ["run", "five.toml", "sim/trunnion.sphere.csv", "--controller", "linuxcnc-rotary-comp", "--out", "x"]
+    code, out, err = call(*words)
+    assert code == 2 and "contains no positioning" in " ".join(err.split()) and not Path("x").exists()
