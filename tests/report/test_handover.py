@@ -1,5 +1,6 @@
 """A report that can be handed over: what files and certificate.toml name is on it, what nobody stated is listed, not invented."""
 
+import base64
 import hashlib
 import json
 import re
@@ -11,6 +12,7 @@ from compgen.cli import cli
 from compgen.errors import InputError
 from compgen.foreign.heads import heads_of
 from compgen.report.dcc import read_certificate, read_dcc
+from compgen.report.dcc.reading import is_unchanged
 from compgen.report.handover import handed_over
 from compgen.report.html.write import certificate_copies, css_string, running_text
 from compgen.report.pdf import browser, pdf_of
@@ -255,6 +257,51 @@ def test_a_dcc_that_contradicts_itself_is_refused(old, new, message, tmp_path):
 def test_the_dcc_of_another_instrument_or_a_changed_one_is_refused(stated, message, tmp_path):
     with pytest.raises(InputError, match=message):
         read_certificate(with_laser(tmp_path, **stated), complete=False)
+
+
+def signed(change=lambda text: text):
+    """The certificate with an enveloped signature; its canonical form is written here by hand, its file in another form."""
+    canonical = LASER.partition("?>\n")[2].rstrip("\n")
+    digest = base64.b64encode(hashlib.sha256(canonical.encode()).digest()).decode()
+    space = "http://www.w3.org/2000/09/xmldsig#"
+    signature = (
+        f'<ds:Signature xmlns:ds="{space}"><ds:SignedInfo><ds:Reference URI=""><ds:Transforms>'
+        f'<ds:Transform Algorithm="{space}enveloped-signature"/><ds:Transform Algorithm="http://www.w3.org/2006/12/xml-c14n11"/>'
+        '</ds:Transforms><ds:DigestMethod Algorithm="http://www.w3.org/2001/04/xmlenc#sha256"/>'
+        f"<ds:DigestValue>\n{digest}\n</ds:DigestValue></ds:Reference></ds:SignedInfo></ds:Signature>"
+    )
+    end = "</dcc:digitalCalibrationCertificate>"
+    namespaces = ' xmlns:dcc="https://ptb.de/dcc" xmlns:si="https://ptb.de/si" schemaVersion="3.2.1">'
+    assert namespaces in canonical
+    other = "  schemaVersion='3.2.1' xmlns:si='https://ptb.de/si'\n xmlns:dcc='https://ptb.de/dcc' ><!-- a note -->"
+    text = change(canonical.replace(namespaces, other)).replace(end, f"{signature}{end}")
+    return f'<?xml version="1.0" encoding="UTF-8" standalone="no"?>\n{text}\n'
+
+
+def test_a_signed_dcc_is_read_and_one_that_was_changed_since_is_refused(tmp_path):
+    path = tmp_path / "x.xml"
+    path.write_text(signed())
+    assert is_unchanged(path.read_bytes()) is True
+    assert read_dcc(path).numbers == ("99AZ12",)
+    for old, new in (("0.0 0.2 -0.1", "0.0 0.1 -0.1"), ("Kalibrierlabor Nord", "Kalibrierlabor Sued"), (">2<", "> 2<")):
+        path.write_text(signed(lambda text, old=old, new=new: text.replace(old, new)))
+        with pytest.raises(InputError, match="was changed after it was signed"):
+            read_dcc(path)
+    assert is_unchanged(LASER.encode()) is None
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"x", LASER.replace("utf-8", "utf-16").encode("utf-16"), b"\x00\xff" * 50,
+        LASER.replace("<dcc:items>", "<!DOCTYPE x [<!ENTITY a 'b'>]>").encode("utf-16"),
+        signed(lambda text: text.replace("<dcc:items>", "<dcc:items>" + "<a>" * 5000 + "</a>" * 5000)).encode(),
+    ],
+)  # fmt: skip
+def test_what_is_no_certificate_is_refused_whatever_it_is(content, tmp_path):
+    (tmp_path / "x.xml").write_bytes(content)
+    with pytest.raises(InputError):
+        read_dcc(tmp_path / "x.xml")
 
 
 def test_our_own_dcc_is_read_back(ran, tmp_path):
