@@ -57,11 +57,15 @@ _CALL = re.compile(
 _PROCEDURE = re.compile(r"PROC\s++([A-Z_][A-Z_0-9]*+)\s*+(?:\(([^()\n]*+)\))?\s*+(.*)", re.IGNORECASE)
 _ENDS = re.compile(r"(?<![A-Z0-9_])(?:M0*(?:17|2|30)(?![\d.=])|RET(?![A-Z_]))", re.IGNORECASE)
 #: What makes a program one that is followed here: variables, formulas, and names that begin a block.
-_COMPUTES = re.compile(
-    rb"(?<![A-Z_0-9])R\s*+\d++\s*+=|=[ \t]*+[-+]?[ \t]*+(?:\(|R\d|[\d.]++[ \t]*+[-+*/]|(?:"
-    + "|".join([*FUNCTIONS, "ATAN2", "POT", "TRUNC"]).encode()
-    + rb")[ \t]*+\()|(?<![A-Z_0-9])(?:DEF\s|A?ROT[ \t]++[A-Z])",
-    re.IGNORECASE,
+_COMPUTES = (
+    re.compile(rb"R\s*+\d++\s*+="),
+    re.compile(
+        rb"=[ \t]*+[-+]?[ \t]*+(?:\(|R\d|[\d.]++[ \t]*+[-+*/]|(?:"
+        + "|".join([*FUNCTIONS, "ATAN2", "POT", "TRUNC"]).encode()
+        + rb")[ \t]*+\()"
+    ),
+    re.compile(rb"DEF\s"),
+    re.compile(rb"ROT[ \t]++[A-Z]"),
 )
 _BEGINS = re.compile(
     rb"^[ \t]*+(?:/\d?[ \t]*+)?(?:N[ \t]*+\d++[ \t]*+)?(L\d++|[A-Z_]{2}[A-Z_0-9]*+)", re.IGNORECASE | re.MULTILINE
