@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from container_steps import steps
+
 ROOT = Path(__file__).resolve().parents[1]
 #: Modules of the standard library that Windows does not have.
 ONLY_POSIX = frozenset(
@@ -138,3 +140,14 @@ def test_every_module_is_loaded_and_a_run_works_without_what_only_posix_has(tmp_
     assert said[-1] in ("exit 0", "exit 1"), said[-5:]
     assert (tmp_path / "out" / "report.html").is_file()
     assert not list((tmp_path / "out").glob(".*tmp*"))
+
+
+def test_the_container_file_installs_pinned_packages_and_starts_the_program():
+    """Its steps are run whole by tests/container_steps.py, which needs the network; here they are read."""
+    said = steps()
+    runs = [rest for word, rest in said if word == "RUN"]
+    installs = [rest for rest in runs if "pip install" in rest]
+    assert all("--require-hashes" in rest or "--no-index" in rest for rest in installs)
+    assert said[-1] == ("ENTRYPOINT", '["volcomp"]')
+    assert ("USER", "volcomp") in said  # not as root
+    assert [rest.split()[0] for word, rest in said if word == "FROM"] == ["docker.io/library/python:3.12-slim"] * 2
