@@ -1,7 +1,7 @@
 """The steps of the Containerfile without a container: each stage in a folder of its own with a fresh Python environment.
 
-``python tests/container_steps.py FOLDER`` copies what the file copies, runs what it runs (but for the making of a user), and
-starts its entry point. It needs the network or a mirror of the packages, and a minute; ``tests/test_portable.py`` reads the steps.
+``python tests/container_steps.py FOLDER`` copies what the file copies, runs what it runs (but for making a user), and
+starts its entry point. It needs the network or a mirror, and a minute; ``tests/test_portable.py`` reads the steps.
 """
 
 import json
