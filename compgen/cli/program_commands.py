@@ -54,15 +54,16 @@ def _wcs(given: tuple[str, ...]) -> dict[str, Vector3]:
     found: dict[str, Vector3] = {}
     for text in given:
         name, _, numbers = text.partition("=")
+        name = "".join(name.split()).upper()  # G54.1 P3 is G54.1P3
         try:
             x, y, z = (float(part) for part in numbers.split(","))
         except ValueError:
             x = y = z = float("nan")
         if not name or not all(abs(part) < 1e6 for part in (x, y, z)):
             raise InputError(f"{text[:60]!r} is no work offset; expected e.g. G54=-400,150,-220 (mm)", field="--wcs")
-        if name.upper() in found:
+        if name in found:
             raise InputError(f"{name} is given twice; give it once", field="--wcs")
-        found[name.strip().upper()] = (x, y, z)
+        found[name] = (x, y, z)
     return found
 
 

@@ -660,6 +660,7 @@ def test_a_result_that_is_not_smaller_is_named_so(shop, call):
     [
         (["--wcs", "G54=1,2"], "expected e.g. G54="),
         (["--wcs", "G54=1,2,3", "--wcs", "g54=1,2,3"], "given twice"),
+        (["--wcs", "G54.1 P3=1,2,3", "--wcs", "g54.1p3 =1,2,3"], "G54.1P3 is given twice"),
         (["--only", "X,Q"], "does not name axes"),
         (["--tolerance-um", "0"], "above 0"),
         (["--dialect", "mazak"], "mazak"),
