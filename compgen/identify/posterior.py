@@ -878,7 +878,11 @@ def _worse(ratios: Mapping[str, float]) -> dict[str, float]:
 
 
 def _raises(ratios: Mapping[str, float]) -> tuple[float, float]:
-    """Factors of the sizes of curves and of squareness with which the machine is no longer worse than its class."""
+    """Factors of the sizes of curves and of squareness with which the machine is no longer worse than its class.
+
+    Curves that are worse raise the class, and squareness with it: who built them bent did not assemble them better. A
+    squareness alone may come from transport or a crash.
+    """
     worse, factors = _worse(ratios), []
     for is_squareness in (False, True):
         largest = max(
@@ -886,7 +890,7 @@ def _raises(ratios: Mapping[str, float]) -> tuple[float, float]:
         )
         steps = np.ceil(np.log(largest / WORSE_CURVE) / np.log(RAISE)) if largest > WORSE_CURVE else float(largest > 0)
         factors.append(float(RAISE**steps))
-    return factors[0], factors[1]
+    return factors[0], max(factors)
 
 
 # --- words ----------------------------------------------------------------------------------------------------------
