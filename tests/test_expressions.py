@@ -13,6 +13,7 @@ from expression_steps import Expression
 from programs.test_correct import PLAIN, moves_of
 
 import compgen
+from compgen.controls import rotary_parameters
 from compgen.controls.shared.scanner import number_pattern
 from compgen.errors import InputError
 from compgen.programs import klartext
@@ -42,6 +43,10 @@ MADE = {
     "correct._hole": [(re.compile(r"^(\s*)\d+\s+"), "sub"), (re.compile(r"^(\s*)N\d+\s*", re.IGNORECASE), "sub")],
     "klartext._said": [(re.compile(pattern), "match") for pattern, _ in klartext._REFUSED],
     "klartext._corner": [(re.compile(rf"{kind}\s*({klartext.VALUE})"), "match") for kind in ("RND", "CHF")],
+    "rotary_parameters.parse": [
+        (re.compile(pattern), "fullmatch")
+        for pattern in (rotary_parameters.SETP, rotary_parameters.CARRIER, rotary_parameters.PARAMETER)
+    ],
     "scanner.number_pattern": [(number_pattern(exponent=3), "fullmatch"), (number_pattern(), "fullmatch")],
     "cells.plain_decimals": [
         (re.compile(rf"[+-]?(\d*|[1-9]\d{{0,2}}([{a}]\d{{3}})+)([{b}]\d*)?([eE][+-]?\d+)?"), "fullmatch")

@@ -60,6 +60,12 @@ def _vector(values: FloatArray) -> Vector3:
     return x, y, z
 
 
+#: A number as each kind of control writes it: a pin of LinuxCNC, a datum of a toolholder, a parameter of FANUC.
+SETP = r"setp\s++(?P<name>[\w.-]++)\s++(?P<value>\S++)"
+CARRIER = r"(?P<name>\$TC_CARR\d++\[\d++\])\s*+=\s*+(?P<value>\S++)"
+PARAMETER = r"(?P<name>N\d{5})\s*+(?:Q1\s*+)?+(?:L1\s*+)?+P(?P<value>\S++)"
+
+
 @dataclass(frozen=True)
 class Target:
     """Parameters of one control for machines of one kind.
@@ -224,7 +230,7 @@ def _linuxcnc_trt(machine: Machine) -> Target:
         lines=lines,
         free=(("C", "point", 0), ("C", "point", 1), (tilting, "point", across), (tilting, "point", 2)),
         line="setp {name} {value}",
-        pattern=r"setp\s+(?P<name>[\w.-]+)\s+(?P<value>\S+)",
+        pattern=SETP,
         digits=6,
         stated=(
             (
@@ -279,7 +285,7 @@ def _linuxcnc_tdr(machine: Machine) -> Target:
         lines=lines,
         free=(("B", "point", 0), ("B", "point", 2), ("A", "point", 1), ("A", "point", 2)),
         line="setp {name} {value}",
-        pattern=r"setp\s+(?P<name>[\w.-]+)\s+(?P<value>\S+)",
+        pattern=SETP,
         digits=6,
         stated=(("documented", "source of LinuxCNC (xyzab_tdr_kins.comp), compared with its own module by calling it: A and B "
                  "turn as in ISO 841"),),
@@ -309,7 +315,7 @@ def _linuxcnc_5axis(machine: Machine) -> Target:
         },
         free=(("B", "point", 2),),
         line="setp {name} {value}",
-        pattern=r"setp\s+(?P<name>[\w.-]+)\s+(?P<value>\S+)",
+        pattern=SETP,
         digits=6,
         stated=(
             (
@@ -402,7 +408,7 @@ def _siemens_toolcarrier(machine: Machine) -> Target:
         lines=lines,
         free=_across(order, lines_of(machine), ("point", "direction")),
         line="{name}={value}",
-        pattern=r"(?P<name>\$TC_CARR\d+\[\d+\])\s*=\s*(?P<value>\S+)",
+        pattern=CARRIER,
         digits=6,
         stated=(
             ("documented", f"which vector is which, type {kind}, closed chain, and that V of a table axis is reversed "
@@ -462,7 +468,7 @@ def _fanuc_5axis(machine: Machine) -> Target:
         lines=lines,
         free=_across(order, lines_of(machine), ("point",)),
         line="{name}P{value}",
-        pattern=r"(?P<name>N\d{5})\s*(?:Q1)?\s*(?:L1)?\s*P(?P<value>\S+)",
+        pattern=PARAMETER,
         digits=3 if machine.units == "mm" else 4,
         stated=(
             ("documented", "from which point to which each vector leads (additional manual of the 30i, tool center point "

@@ -537,11 +537,12 @@ def read_rotary_runs(machine: Machine, paths: Sequence[str | Path]) -> RotaryRun
                 known = ", ".join(machine.rotary) or "none"
                 raise table.fail(row, "axis", f"{letter!r} is no rotary axis of {machine.name} (it has {known})")
             ends = machine.rotary[letter].range_deg
-            if ends is not None and not ends[0] - 1e-6 <= angle[row] <= ends[1] + 1e-6:
+            low, high = (-np.inf, np.inf) if ends is None else ends
+            if not low - 1e-6 <= angle[row] <= high + 1e-6:
                 raise table.fail(
                     row,
                     "position_deg",
-                    f"{angle[row]:g} degrees is outside the travel {ends[0]:g} ... {ends[1]:g} of {letter}",
+                    f"{angle[row]:g} degrees is outside the travel {low:g} ... {high:g} of {letter}",
                 )
             if abs(deviation[row]) > 3600.0:
                 raise table.fail(

@@ -911,7 +911,8 @@ def assumed_text(found: Posterior) -> str:
             sizes[kind] = max(sizes.get(kind, (0.0, unit)), (2.0 * found.prior.size_um(name), unit))
     which, cyclic = found.prior.class_text, found.prior.cyclic_text
     if not sizes:
-        return f"every error was measured; assumed between the readings: {f'{cyclic}, ' if cyclic else ''}{which}"
+        class_text = f"{cyclic}, {which}" if cyclic else which
+        return f"every error was measured; assumed between the readings: {class_text}"
     if cyclic:
         which = f"{cyclic} between the readings; {which}"
     parts = [f"{kind} up to {size:.3g} {unit}" for kind, (size, unit) in sizes.items()]
