@@ -629,8 +629,8 @@ def running_text(data: Mapping[str, Any]) -> str:
 def css_string(text: str) -> Markup:
     r"""Return a text as the inside of a CSS string, which no character of it can end.
 
-    >>> print(css_string('a"</style>'))
-    a\22 \3c \2f style\3e
+    >>> str(css_string('a"</style>'))
+    'a\\22 \\3c \\2f style\\3e '
     """
     return Markup("".join(char if char.isalnum() or char == " " else f"\\{ord(char):x} " for char in text[:120]))
 
