@@ -55,6 +55,8 @@ LEAST_FREEDOM, LEAST_REPEATS = 20, 8
 REVERSAL_P = 1.5e-3
 #: A reversal within this many standard uncertainties of zero at an end of the axis is taken to start from zero there.
 ZERO_AT_END = 2.5
+#: The same within this share of its largest value: the law of a worn screw is no exact parabola.
+ZERO_SHARE = 0.08
 #: The smooth part must explain this share of a varying reversal; otherwise its law is unknown.
 SMOOTH_SHARE = 0.7
 #: Names whose criterion is within this of the best are reported as alternatives (99 %).
@@ -266,7 +268,7 @@ def _findings(
     if repeated:
         static = [_instead(changes, item) if item.name.startswith("backlash") else item for item in static]
     # a reversal is doubtful if it changes with time; a small one also if anything else is unnamed
-    if any({"time", "approach"} <= set(other.covariates) for other in unknown):
+    if any("approach" in other.covariates and {"time", "run"} & set(other.covariates) for other in unknown):
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
         least = LEAST_WITH_UNKNOWN_RUNS if any("run" in other.covariates for other in unknown) else LEAST_WITH_UNKNOWN
@@ -879,7 +881,8 @@ class _Reversal:
         ends = np.polynomial.legendre.legvander(np.array([-1.0, 1.0]), len(smooth) - 1)
         at = ends @ smooth
         u = np.sqrt(np.einsum("ij,jk,ik->i", ends, covariance, ends))
-        return bool(np.all(np.abs(at) > ZERO_AT_END * u))
+        largest = float(np.abs(self._shapes(len(smooth) - 1) @ smooth).max())
+        return bool(np.all(np.abs(at) > np.maximum(ZERO_AT_END * u, ZERO_SHARE * largest)))
 
     def _backlash(
         self, name: str, mean: FloatArray, covariance: FloatArray, gain: float, reasons: tuple[str, ...]

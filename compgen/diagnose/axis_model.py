@@ -59,6 +59,8 @@ OF_RUNS = ("bad_run", "step_between_runs")
 MORE_NAMES = 4.0
 #: What readings with a separate value each must gain in addition to what a common offset must.
 FREE_HANDICAP = 6.0
+#: Readings of one run that may be off by themselves, at most, before the whole run counts as bad.
+MOST_OFF = 3
 
 
 @dataclass(frozen=True)
@@ -423,6 +425,31 @@ class Search:
             for k in self._runs(RUN_STARTS):
                 keep(self._grown([k], self._named, most))
         _, members, self._lambda = _first_of(results)
+        return self._single(members)
+
+    def _single(self, members: list[int]) -> list[int]:
+        """Members with a run whose readings have separate values exchanged for the few readings that are off, if they tell more.
+
+        Two outliers in one run together look like a bad run to a search that adds one candidate at a time.
+        """
+        for member in members:
+            run = self.candidates[member]
+            if not run.free or run.last - run.first < MOST_OFF:
+                continue
+            rest, chosen = [k for k in members if k != member], list[int]()
+            inside = [
+                k for k, c in enumerate(self.candidates)
+                if not c.free and c.first == c.last >= 0 and run.first <= c.first <= run.last and k not in rest
+            ]  # fmt: skip
+            while inside and len(chosen) < MOST_OFF:
+                criteria = self.criteria([*rest, *chosen])[1]
+                best = max(inside, key=lambda k: float(criteria[k]))  # noqa: B023 - used at once
+                if criteria[best] < LEAST_GAIN:
+                    break
+                chosen.append(best)
+                inside.remove(best)
+            if chosen and self.total([*rest, *chosen]) > self.total([*rest, member]):
+                members = [*rest, *chosen]
         return members
 
     def _runs(self, most: int) -> list[int]:

