@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import math
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -32,7 +34,7 @@ from compgen.errors import InputError, number_text, visible
 from compgen.foreign import open_errors
 from compgen.identify.covariance import covariance_or_independent, posterior_with
 from compgen.identify.posterior import assumed_text, worse_text
-from compgen.programs import CorrectOptions, FolderWatch, Setup, correct_program, model_of, read_tools
+from compgen.programs import CorrectOptions, FolderWatch, Setup, correct_program, model_of, read_radii, read_tools
 from compgen.resources import program_version
 
 if TYPE_CHECKING:
@@ -43,7 +45,8 @@ WCS_HELP = (
     "Work offset: machine position of its zero in mm, e.g. G54=-400,150,-220 (several times for several offsets)."
 )
 TOOLS_HELP = (
-    "Tool lengths: CSV with tool, length_mm and optionally x_mm, y_mm; or a tool table of LinuxCNC, in machine_units of "
+    "Tool lengths: CSV with tool, length_mm and optionally x_mm, y_mm, radius_mm, diameter_mm; or a tool table of "
+    "LinuxCNC, in machine_units of "
     "the machine file (mm)."
 )
 #: A watched program is taken when it has not changed for this long, s; the folder is looked at at least so often, s.
@@ -80,6 +83,29 @@ def _integers(
     return integers, increment_mm
 
 
+def _tool_radii(given: tuple[str, ...]) -> dict[str, float]:
+    """Radii by D or tool: ``5`` is that of all, ``D3=5`` and ``3=5`` that of one."""
+    found: dict[str, float] = {}
+    for text in given:
+        name, _, number = text.rpartition("=")
+        try:
+            radius = float(number)
+        except ValueError:
+            radius = math.nan
+        if not 0.0 <= radius < 1e3:
+            raise InputError(
+                f"{text[:60]!r} is no radius; expected mm, e.g. 5, or D3=5 for one D (tool), 0 if the control has the wear alone",
+                field="--tool-radius",
+            )
+        key = name.strip().upper()
+        key = key[1:] if re.fullmatch(r"[DT]\d+", key) else key
+        key = f"{int(key)}" if key.isdigit() else key
+        if key in found:
+            raise InputError(f"the radius of {name or 'all tools'} is given twice; give it once", field="--tool-radius")
+        found[key] = radius
+    return found
+
+
 def program_options(command: Command) -> Command:
     """Add what a program needs to be read; the command receives ``setup`` (of a machine), ``errors`` and ``reversal``."""
 
@@ -94,6 +120,7 @@ def program_options(command: Command) -> Command:
         integers: str | None,
         increment_mm: float | None,
         subprograms: tuple[Path, ...],
+        tool_radius: tuple[str, ...],
         **options: Any,
     ) -> Any:
         codes = frozenset(code.strip().upper() for text in keep_unknown for code in text.split(",") if code.strip())
@@ -107,11 +134,18 @@ def program_options(command: Command) -> Command:
                     "is no folder; --subprograms needs one that exists", file=missing, field="--subprograms"
                 )
             gauge_mm = tool_offset("--gauge", gauge)
-            return Setup(_wcs(wcs), lengths, block_delete, codes, gauge_mm, *numbers, subprograms)
+            radii = read_radii(tools, MM_PER_UNIT[machine.units]) if tools else {}
+            stated = _tool_radii(tool_radius)
+            return Setup(_wcs(wcs), lengths, block_delete, codes, gauge_mm, *numbers, subprograms, radii, stated)
 
         return command(*args, setup=setup, **options)
 
     decorated: Any = wrapper
+    text = (
+        "Radius of the tool for G41/G42, RL/RR (mm): 5 for all, D3=5 for one D or tool (several times); 0 where the contour is "
+        "the path of the tool centre and the control has the wear alone. Default: radius_mm or diameter_mm of --tools."
+    )
+    decorated = click.option("--tool-radius", multiple=True, metavar="[D=]MM", help=text)(decorated)
     text = (
         "Folder with files that the program calls; each call is written out and corrected (may be given several times; the "
         "first that has the file counts)."

@@ -6,7 +6,7 @@ from compgen.resources import load_on_first_use
 
 if TYPE_CHECKING:
     from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program, model_of
-    from compgen.programs.dialects import DIALECTS, read_tools
+    from compgen.programs.dialects import DIALECTS, read_radii, read_tools
     from compgen.programs.features import Quantity
     from compgen.programs.part import Feature, PartMachine, PartPrediction, predict_part, rank_machines
     from compgen.programs.reader import Reader, Setup
@@ -28,6 +28,7 @@ __all__ = [
     "model_of",
     "predict_part",
     "rank_machines",
+    "read_radii",
     "read_tools",
 ]
 

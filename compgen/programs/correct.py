@@ -20,11 +20,13 @@ from compgen.data.machine import MM_PER_UNIT, Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.errors import InputError
+from compgen.programs.compensation import CentrePath, centre_path, unknown_radius
 from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.follower import Follower, difference, read_twice
 from compgen.programs.klartext import CALCULATED, arc_text
 from compgen.programs.path import (
+    PLAIN,
     PLANE_AXES,
     RAPID,
     Corrector,
@@ -125,6 +127,8 @@ class ProgramCorrection:
     #: How many blocks lead beyond the travel, and those that do by most.
     blocks_beyond: int = 0
     beyond: tuple[BeyondTravel, ...] = ()
+    #: Radii of radius compensation by the D or tool that they are of, mm; inf: not known, and of no matter.
+    radii_mm: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
@@ -146,6 +150,7 @@ class ProgramCorrection:
             **self.counts,
             "work_offsets_mm": {name: list(value) for name, value in self.work_offsets_mm.items()},
             "tools_mm": {name: list(value) for name, value in self.tools_mm.items()},
+            "tool_radii_mm": {name: value if np.isfinite(value) else None for name, value in self.radii_mm.items()},
             "machine_units": self.machine_units,
             "offsets_not_checked": list(self.unchecked),
             "beyond_travel": {"blocks": self.blocks_beyond, "largest": [asdict(item) for item in self.beyond]},
@@ -1032,8 +1037,12 @@ class _ReadBack:
             line, how = found
             self._break(int(origins[line - self.lines - 1]), f"what was written can be read in two ways: {how}")
         origin = origins[read.line - self.lines - 1]
-        self.travel.add(wanted, expected, origins[expected.line - self.lines - 1], text, self.lines + 1)
+        path = self._path(wanted, wanted.line)
+        expected_path = centre_path(expected)
+        expected_origin = origins[expected.line - self.lines - 1]
+        self.travel.add(path.moves, expected_path.moves, expected_origin, text, self.lines + 1)
         self.lines += len(origins)
+        contour, wanted = wanted, path.moves
         ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
         directions = np.vstack([self.direction, ended[:-1]])[: len(wanted)], ended
         if len(wanted):
@@ -1041,19 +1050,50 @@ class _ReadBack:
         rows = np.flatnonzero(wanted.cutting)
         zero, one = np.zeros(len(rows)), np.ones(len(rows))
         self._add(self.before, wanted, rows, wanted.part(rows), (zero, one), directions)
-        self._note_unplaced(wanted)
-        self._hold_places(wanted, read, origin, pieces)
+        self._note_unplaced(contour)
+        self._hold_places(contour, read, origin, pieces)
         back = np.flatnonzero(read.cutting)
         self.cuts += len(back)
-        owner, low, high = self._owners(wanted, rows, read.part(back), origin[back])
+        driven = self._path(read, origin, pieces)
+        owner, low, high = self._owners(wanted, rows, driven.moves.part(back), origin[back])
         if owner is not None:
             meant = np.flatnonzero(wanted.cutting[pieces.move])
             if np.array_equal(pieces.move[meant], owner):  # else shares by length, which slack makes longer
-                low, high = pieces.begins()[meant], pieces.share[meant]
-                self._hold_ends(wanted, read.part(back), owner, pieces.command_mm[meant], drilled)
-            self._add(self.after, wanted, owner, read.part(back), (low, high), directions)
+                beside = contour.phase[owner] != PLAIN  # corners shorten the path of the tool centre
+                low = np.where(beside, low, pieces.begins()[meant])
+                high = np.where(beside, high, pieces.share[meant])
+                self._hold_ends(contour, read.part(back), owner, pieces.command_mm[meant], drilled)
+            self._add(self.after, wanted, owner, driven.moves.part(back), (low, high), directions)
+            self._add_corners(path, driven, back, owner)
             if self.follow is not None:
                 self.follow(wanted, owner, read.part(back), low, high)
+
+    def _path(self, moves: Moves, origin: IntArray, pieces: Pieces | None = None) -> CentrePath:
+        """The path of the tool centre; InputError with the line of the program for a contour that has none."""
+        owner = None
+        if pieces is not None and len(pieces.move) == len(moves):
+            owner = pieces.move
+        path = centre_path(moves, owner)
+        if path.problem:
+            row, why = path.problem
+            what = "" if pieces is None else "as corrected, "
+            raise InputError(f"radius compensation: {what}{why}", line=int(origin[row]))
+        return path
+
+    def _add_corners(self, path: CentrePath, driven: CentrePath, back: IntArray, owner: IntArray) -> None:
+        """Add the arcs about outer corners; ``owner`` is for each corrected move at feed ``back`` that of the program."""
+        if not len(path.corners):
+            return
+        own = dict(zip(back.tolist(), owner.tolist(), strict=True))
+        known = {own[row]: k for k, row in enumerate(driven.after.tolist()) if row in own}  # the last piece counts
+        both = [(k, known[row]) for k, row in enumerate(path.after.tolist()) if row in known]
+        if not both:
+            return
+        before, after = (np.array(column, dtype=np.int64) for column in zip(*both, strict=True))
+        wanted, arcs, rows = path.corners.part(before), driven.corners.part(after), np.arange(len(both))
+        shares, still = (np.zeros(len(both)), np.ones(len(both))), np.zeros((len(both), 3))
+        self._add(self.before, wanted, rows, wanted, shares, (still, still))
+        self._add(self.after, wanted, rows, arcs, shares, (still, still))
 
     def _note_unplaced(self, wanted: Moves) -> None:
         ends = wanted.cutting & (wanted.at_mm == wanted.end_mm).all(axis=1)
@@ -1162,6 +1202,11 @@ def header_lines(dialect: Dialect, result: ProgramCorrection, end: str) -> list[
         f"ERRORS {result.errors[0]} SHA256 {result.errors[1][:16]}",
         *_offsets_said(result.work_offsets_mm, result.machine_units),
         *_listed("TOOL LENGTHS MM", [f"{name} = {z:.4f}" for name, (_, _, z) in result.tools_mm.items()]),
+        *(
+            _listed("TOOL RADII MM", [f"{name} = {radius_text(r)}" for name, r in result.radii_mm.items()])
+            if result.radii_mm
+            else ()
+        ),
         f"TOLERANCE UM {result.tolerance_um:g}",
         *(_listed("NOT CHECKED BY THIS PROGRAM", result.unchecked) if result.unchecked else ()),
         "ONLY FOR THIS MACHINE AND THIS CLAMPING POSITION",
@@ -1305,6 +1350,8 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
                         by_radius[segment.first] = any(word[0] in ("R", "CR") for word in segment.words)
                     elif segment.kind in ("cycle", "hole", "tap"):
                         drilled[segment.first : segment.first + segment.count] = True
+                if unknown := unknown_radius(model, batch.moves, options.tolerance_um * MM_PER_UM):
+                    raise InputError(unknown.message, file=source, line=reader.in_file(unknown.line or 0))
                 pieces = corrector.pieces(batch.moves, by_radius, drilled)
                 try:
                     text, origins = writer.rewrite(batch, pieces, pieces.share - pieces.begins())
@@ -1312,7 +1359,12 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
                     raise InputError(error.message, file=source, line=reader.in_file(error.line or 0)) from error
                 corrected = text.encode("latin-1")
                 target.write(corrected)
-                check.add(batch.moves, corrected, origins, pieces, drilled)
+                try:
+                    check.add(batch.moves, corrected, origins, pieces, drilled)
+                except InputError as error:
+                    if not error.message.startswith("radius compensation: "):
+                        raise
+                    raise InputError(error.message, file=source, line=reader.in_file(error.line or 0)) from error
                 if check.after.normal_line > blocks:  # the farthest so far is in this batch
                     in_cycle = bool(drilled[batch.moves.line == check.after.normal_line].any())
                 blocks += len(batch.words.start) - 1
@@ -1371,6 +1423,7 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
             tuple(name for name in reader.used_offsets if not dialect.check or dialect.register(name) is None),
             check.travel.count,
             tuple(check.travel.found),
+            reader.used_radii,
         )
         final = work / "program"
         with source.open("rb") as stream:
@@ -1404,6 +1457,7 @@ def preflight(result: ProgramCorrection) -> str:
         f"Work offsets at the control are those of the correction: {'; '.join(offsets) or 'none was used'}.",
         *_checks_said(result),
         f"Tool lengths at the control are those of the correction: {'; '.join(tools) or 'none was used'}.",
+        *_radii_said(result),
         "Tables of the control that correct the same errors are switched off, were active during the measurement, or were "
         "given with --active.",
         "The machine is warm, as it was during the measurement.",
@@ -1419,6 +1473,25 @@ def preflight(result: ProgramCorrection) -> str:
         f"{after['ends_max_um']:.2f} um."
     )
     return "\n".join([f"# Before you run {result.file}", "", figures, "", *(f"- [ ] {text}" for text in points), ""])
+
+
+def radius_text(radius_mm: float) -> str:
+    """Say a radius of radius compensation."""
+    return f"{radius_mm:g}" if np.isfinite(radius_mm) else "not stated"
+
+
+def _radii_said(result: ProgramCorrection) -> list[str]:
+    """Say which radii the correction assumes, and what follows from others."""
+    if not result.radii_mm:
+        return []
+    named = "; ".join(
+        f"{name}: {radius_text(radius)} mm".replace("stated mm", "stated") for name, radius in result.radii_mm.items()
+    )
+    return [
+        "Radius compensation stays with the control. The correction is that of a tool centre beside the contour by the radius: "
+        f"{named} (0: the contour is the path of the tool centre, and the control has the wear alone). Wear of some 0.1 mm does "
+        "not matter; with a tool of another radius the correction is that of another place. Outer corners are judged with an arc."
+    ]
 
 
 def _beyond_said(result: ProgramCorrection) -> list[str]:

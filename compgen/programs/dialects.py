@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from compgen.data.csv_files import csv_table
 from compgen.data.files import read_text
 from compgen.data.machine import Vector3
@@ -21,8 +23,10 @@ _COMMON = {
     **{"G20": "inch", "G21": "mm", "G90": "absolute", "G91": "incremental"},
     **{"G94": "feed minute", "G95": "feed turn"},
     **{f"G{k}": "work offset" for k in range(54, 60)},
-    **dict.fromkeys(("G9", "G40", "G61", "G64", "G97"), "nothing"),
+    **dict.fromkeys(("G9", "G61", "G64", "G97"), "nothing"),
+    "G40": "compensation 0",
 }
+_SIDES = {"G41": "compensation 1", "G42": "compensation -1"}
 _CYCLES = {f"G{k}": f"cycle {k}" for k in (81, 82, 83, 85, 86, 89)}
 _GRBL = {
     **_COMMON,
@@ -35,6 +39,8 @@ _GRBL = {
 _LENGTH = {"G43": "tool", "G49": "no tool", "G98": "initial level", "G99": "R level", "G73": "cycle 73"}
 _LINUXCNC = {
     **_GRBL,
+    **_SIDES,
+    **{"G41.1": "compensation 1", "G42.1": "compensation -1"},
     **_CYCLES,
     **_LENGTH,
     **{"G90.1": "centre absolute", "G92.2": "no preset", "G43.1": "tool offset", "G8": "nothing"},
@@ -44,6 +50,7 @@ _LINUXCNC = {
 }
 _FANUC = {
     **_COMMON,
+    **_SIDES,
     **_CYCLES,
     **_LENGTH,
     **{"G28": "home", "G30": "home", "G53": "machine coordinates", "G80": "no motion", "G93": "feed inverse"},
@@ -61,6 +68,7 @@ _FANUC = {
 }
 _SIEMENS = {
     **_COMMON,
+    **_SIDES,
     **{"G70": "inch", "G700": "inch", "G71": "mm", "G710": "mm", "G500": "no work offset", "G93": "feed inverse"},
     **{"G53": "machine coordinates", "G153": "machine coordinates", "SUPA": "machine coordinates"},
     **{"G74": "unknown position", "G75": "unknown position", "TRANS": "shift all", "ATRANS": "shift more"},
@@ -84,6 +92,7 @@ for _code in ("G20", "G21"):
     del _SIEMENS[_code]
 _HEIDENHAIN = {
     **_COMMON,
+    **_SIDES,
     **{"G70": "inch", "G71": "mm", "G29": "pole here", "G30": "blank", "G31": "blank", "G99": "tool definition"},
     **{"G5": "last arc", "G54": "shift", "G98": "label", "FMAX": "rapid once"},
     # a cycle is defined by its block and executed by G79, M99, or by all positions after M89
@@ -97,6 +106,7 @@ _HEIDENHAIN = {
 _KLARTEXT = {
     **{"L": "motion 1", "DR-": "motion 2", "DR+": "motion 3", "FMAX": "rapid once"},
     **dict.fromkeys(("C", "CR", "CC"), "nothing"),
+    **{"R0": "compensation 0", "RL": "compensation 1", "RR": "compensation -1"},
     **{"CC here": "pole here", "CP": "helix", "CYCL CALL": "drill here", "M99": "drill here", "M89": "calls"},
     **{"M91": "machine coordinates", "M92": "unknown position", "M140": "lost height"},
 }
@@ -118,7 +128,8 @@ _TURNING = "belongs to turning; correct programs for milling"
 _TABLES = "writes offsets that the correction does not follow; set them at the control"
 #: Why a code is refused, and what to do; the same in all dialects unless a dialect gives the code a meaning.
 REFUSED = {
-    **dict.fromkeys(("G41", "G42", "G41.1", "G42.1"), f"cutter radius compensation is not followed; {_CAM}"),
+    **dict.fromkeys(("G41", "G42"), f"the control has no cutter radius compensation; {_CAM}"),
+    **dict.fromkeys(("G41.1", "G42.1"), f"a direction that is kept normal to the contour is not followed; {_CAM}"),
     **dict.fromkeys(("G68", "G68.2", "G51", "G51.1", "G24"), _TURNED),
     ",": _ROUNDED,
     "G52": "shifts of coordinates are not known in this dialect; post the program without them",
@@ -145,7 +156,7 @@ REFUSED = {
 _HEIDENHAIN_REFUSED = {
     **dict.fromkeys(("G10", "G11", "G12", "G13", "G15", "G16"), _POLAR),
     **dict.fromkeys(("G24", "G25"), _ROUNDED),
-    **dict.fromkeys(("G26", "G27"), "an approach on a tangent arc needs cutter radius compensation; post its lines and arcs"),
+    **dict.fromkeys(("G26", "G27"), "approaches on a tangent arc are not followed; post their lines and arcs"),
     **dict.fromkeys(("G43", "G44"), f"compensation along an axis is not followed; {_CAM}"),
     **dict.fromkeys(("G28", "G72", "G73", "G80"), _TURNED),
     "G6": "an arc on a tangent has no centre; post G2 or G3",
@@ -462,27 +473,43 @@ def read_tools(path: str | Path, mm_per_unit: float = 1.0) -> dict[str, Vector3]
     A CSV file with the columns ``tool, length_mm`` and, if the tool is off-centre, ``x_mm, y_mm``; or a tool table of
     LinuxCNC (``T1 P1 X0 Y0 Z101.5 D6``), whose numbers are in units of its machine of ``mm_per_unit``.
     """
+    return {key: offsets for key, (offsets, _) in _tools_of(path, mm_per_unit).items()}
+
+
+def read_radii(path: str | Path, mm_per_unit: float = 1.0) -> dict[str, float]:
+    """Read the radii of a tool table that has them, mm: ``radius_mm`` or ``diameter_mm``, or D (the diameter) of LinuxCNC."""
+    return {key: radius for key, (_, radius) in _tools_of(path, mm_per_unit).items() if radius == radius}
+
+
+def _tools_of(path: str | Path, mm_per_unit: float) -> dict[str, tuple[Vector3, float]]:
+    """Offsets and radius of each tool; nan where the table has no radius."""
     text = read_text(path)
     first = next((line for line in text.splitlines() if line.strip() and line.strip()[0] not in "#;"), "")
     if re.match(r"\s*[TP]\d", first):
         return _tools_of_linuxcnc(Path(path), text, mm_per_unit)
-    table = csv_table(Path(path), text, required=("tool", "length_mm"), optional=("x_mm", "y_mm"))
+    optional = ("x_mm", "y_mm", "radius_mm", "diameter_mm")
+    table = csv_table(Path(path), text, required=("tool", "length_mm"), optional=optional)
     names, columns = table.text("tool"), [table.numbers("length_mm")]
     columns += [table.numbers(name) if name in table.columns else 0.0 * columns[0] for name in ("x_mm", "y_mm")]
-    found: dict[str, Vector3] = {}
+    radius = np.full(len(names), np.nan)
+    for column, part in (("diameter_mm", 0.5), ("radius_mm", 1.0)):
+        if column in table.columns:
+            given = part * table.numbers(column, empty=np.nan)
+            radius = np.where(np.isnan(given), radius, given)
+    found: dict[str, tuple[Vector3, float]] = {}
     for row, name in enumerate(names):
         if len(name) > _LONGEST_NAME:
             raise table.fail(row, "tool", f"expected a number or a name of at most {_LONGEST_NAME} characters")
         key = str(int(name)) if name.isascii() and name.isdigit() else name.upper()
         if key in found:
             raise table.fail(row, "tool", f"tool {name} appears twice")
-        found[key] = (float(columns[1][row]), float(columns[2][row]), float(columns[0][row]))
+        found[key] = (float(columns[1][row]), float(columns[2][row]), float(columns[0][row])), float(radius[row])
     return found
 
 
-def _tools_of_linuxcnc(path: Path, text: str, mm_per_unit: float) -> dict[str, Vector3]:
+def _tools_of_linuxcnc(path: Path, text: str, mm_per_unit: float) -> dict[str, tuple[Vector3, float]]:
     """Read lines such as ``T1 P1 X0 Y0 Z101.5 D6 ;comment``: words in any order, each a letter with its number."""
-    tools: dict[str, Vector3] = {}
+    tools: dict[str, tuple[Vector3, float]] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words: dict[str, float] = {}
         for word in line.partition(";")[0].upper().split():
@@ -501,5 +528,5 @@ def _tools_of_linuxcnc(path: Path, text: str, mm_per_unit: float) -> dict[str, V
             if key in tools:
                 raise InputError(f"tool {key} appears twice", file=path, line=number)
             x, y, z = (words.get(letter, 0.0) * mm_per_unit for letter in "XYZ")
-            tools[key] = (x, y, z)
+            tools[key] = (x, y, z), 0.5 * words["D"] * mm_per_unit if "D" in words else np.nan
     return tools

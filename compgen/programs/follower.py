@@ -22,11 +22,15 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError
-from compgen.programs.path import CCW, CW, FEED, RAPID, IntArray, Moves
+from compgen.programs.path import CCW, CONTOUR, CW, ENTRY, EXIT, FEED, PLAIN, RAPID, STILL, IntArray, Moves
 from compgen.programs.reader import Batch, Reader, Setup
 
 Place = list[float]
 _NOWHERE = (math.nan,) * 3
+#: X and Y with radius compensation: where the program says, on the way to the contour, beside it, on the way from it.
+_FREE, _COMING, _BESIDE, _GOING = range(4)
+#: A move along X and Y of less than that is none, mm.
+_RESTS_MM = 1e-7
 #: Heights that differ by less are one, mm: sums of the same numbers in another order.
 _ROUNDED_MM = 1e-7
 #: Dialects that begin a program in mm, whatever the unit of the machine is.
@@ -160,6 +164,7 @@ _EVERYWHERE: _Does = {
     **{f"G{k}": ("go", float(k)) for k in range(4)},
     **{"G17": ("plane", 2.0), "G18": ("plane", 1.0), "G19": ("plane", 0.0)},
     **{"G90": ("relative", 0.0), "G91": ("relative", 1.0), "G4": ("dwell", 0.0)},
+    **{"G40": ("side", 0.0), "G41": ("side", 1.0), "G42": ("side", -1.0)},
 }
 _COMMON: _Does = {
     **_EVERYWHERE,
@@ -194,6 +199,7 @@ _TABLES: dict[str, _Does] = {
         **_each("no preset", 92.2),
         **_each("offset", 52),
         **_each("tap", 33.1),
+        **{"G41.1": ("side", 1.0), "G42.1": ("side", -1.0)},
         **{"G90.1": ("centre", 1.0), "G91.1": ("centre", 0.0)},
         **_each("fixture", 59.1, 59.2, 59.3),
     },
@@ -343,6 +349,10 @@ class Follower:
         self.zeros: list[tuple[float, ...]] = []
         self.zero_changed = True
         self.plans: dict[tuple[str, ...], _Plan] = {}
+        #: Radius compensation: its side, how far to the left the tool is, where X and Y are with it, and D or the tool it is of.
+        self.side, self.aside_mm, self.beside = 0, 0.0, _FREE
+        self.d_word, self.tool_called, self.wider_mm = "", "", 0.0
+        self.own_radii: dict[str, float] = {}
 
     def follow(self, text: str, numbers: Sequence[int]) -> Moves:
         """Follow blocks, each with its number; returns their moves."""
@@ -381,14 +391,15 @@ class Follower:
 
     def _taken(self) -> Moves:
         """Moves of the rows since the last call."""
-        data = np.array(self.rows).reshape(len(self.rows), 14)
+        data = np.array(self.rows).reshape(len(self.rows), 16)
         known = np.array(self.zeros).reshape(len(self.zeros), 6)
         self.rows, self.zeros = [], []
         zero, tool = np.split(known[data[:, 13].astype(np.int64)], 2, axis=1)
         start, end, centre = (data[:, k : k + 3] for k in (4, 7, 10))
         number, kind, plane = data[:, :3].astype(np.int64).T
         every = np.ones((len(data), 3), dtype=bool)
-        return Moves(number, kind, start, end, centre, plane, data[:, 3], zero, tool, end, every)
+        phase, aside = data[:, 14].astype(np.int64), data[:, 15]
+        return Moves(number, kind, start, end, centre, plane, data[:, 3], zero, tool, end, every, phase, aside)
 
     # Where the zero of the program is, and moves from where the machine is.
 
@@ -406,8 +417,41 @@ class Follower:
             self.zeros.append((self._zero(0), self._zero(1), self._zero(2), *self._tool()))
             self.zero_changed = False
         place = len(self.zeros) - 1
-        self.rows.append((self.number, kind, self.plane, sweep, *self.at, *end, *centre, place))
+        phase = self._phase(end, sweep)
+        self.rows.append((self.number, kind, self.plane, sweep, *self.at, *end, *centre, place, *phase))
         self.at, self.moved = list(end), True
+
+    def _phase(self, end: Sequence[float], sweep: float) -> tuple[int, float]:
+        """What a move is to radius compensation, and how far beside its end the tool is."""
+        if self.beside == _FREE:
+            return PLAIN, 0.0
+        far = [abs(b - a) for a, b in zip(self.at[:2], end[:2], strict=True) if not math.isnan(b)]
+        if not sweep and all(way <= _RESTS_MM for way in far):
+            return STILL, 0.0 if self.beside == _COMING else self.aside_mm
+        phase = {_COMING: ENTRY, _BESIDE: CONTOUR, _GOING: EXIT}[self.beside]
+        self.beside = _FREE if phase == EXIT else _BESIDE
+        return phase, 0.0 if phase == EXIT else self.aside_mm
+
+    def _turn_aside(self, side: int, code: str, numbers: dict[str, float]) -> None:
+        """Begin radius compensation to one side, or end it."""
+        if side and not self.side:
+            self.beside, self.aside_mm = _COMING, side * self._radius(code, numbers)
+        elif not side and self.side:
+            self.beside = _FREE if self.beside == _COMING else _GOING
+        self.side = side
+
+    def _radius(self, code: str, numbers: dict[str, float]) -> float:
+        if self.dialect == "fanuc":
+            return self.setup.radius_mm(self.d_word, 0.0 if self.d_word == "0" else None)
+        if self.linuxcnc and code.endswith(".1"):
+            return self.setup.radius_mm("", numbers.get("D", math.nan) / 2.0 * self.unit)
+        if self.linuxcnc:
+            return self.setup.radius_mm(f"{numbers['D']:g}" if "D" in numbers else self.spindle)
+        if self.dialect == "siemens":
+            tool = self.spindle or self.chosen
+            edge = "" if self.d_word in ("", "1") else f"D{self.d_word}"
+            return self.setup.radius_mm(tool + edge, 0.0 if edge == "D0" else None)
+        return self.setup.radius_mm(self.tool_called, self.own_radii.get(self.tool_called), self.wider_mm)
 
     def _reached(self, words: _Words, axes: Sequence[float | None]) -> Place:
         """Where axis words lead."""
@@ -486,6 +530,13 @@ class Follower:
             self._state(code, kind, number, words)
         if self.zero_changed and not (self.heidenhain and plan.kinds & {"quiet", "tool"}):
             self._call_length(words)
+        if "D" in words.number and not self.heidenhain:
+            self.d_word = f"{words.number['D']:g}"
+        elif self.dialect == "siemens" and "M6" in words.codes and self.spindle:
+            self.d_word = "1"
+        for code, kind, number in plan.does:
+            if kind == "side":
+                self._turn_aside(int(number), code, words.number)
         if plan.executes:
             self._execute(words, plan.kinds)
         self.done = self.done or plan.ends
@@ -585,6 +636,8 @@ class Follower:
     def _set_hole(self, code: str, kind: str, words: _Words) -> None:
         if kind == "tool":
             self.lengths[f"{words.number.get('T', 0.0):g}"] = (0.0, 0.0, words.number.get("L", 0.0) * self.unit)
+            if "R" in words.number:
+                self.own_radii[f"{words.number.get('T', 0.0):g}"] = words.number["R"] * self.unit
         elif kind == "modally":
             self.modally = self.heidenhain or words.call is not None
         else:
@@ -605,6 +658,7 @@ class Follower:
             tool = f"{numbers['T']:g}" if "T" in numbers else words.name
             if tool:
                 self._lengthen(tool, numbers.get("DL", 0.0) * self.unit)
+                self.tool_called, self.wider_mm = tool, numbers.get("DR", 0.0) * self.unit
         elif self.dialect == "siemens":
             tool, edge = self.spindle or self.chosen, numbers.get("D")
             if edge is not None:
@@ -627,6 +681,7 @@ class Follower:
         """Follow many blocks that have nothing but numbers of places and G0 to G3; None if that cannot be done now."""
         at, zero, before = np.array(self.at), np.array([self._zero(k) for k in range(3)]), self.motion
         blocked = self.series is not None or self.modally or self.done or before is None
+        blocked = blocked or self.beside not in (_FREE, _BESIDE)
         if blocked or before is None or np.isnan([at, zero]).any() or (self.heidenhain and before > FEED):
             return None
         if "(" in text or ";" in text:
@@ -659,6 +714,9 @@ class Follower:
         turned = motion[own >= CW]
         self.turned = int(turned[-1]) if len(turned) else self.turned
         same = [np.broadcast_to(np.array(one), end.shape) for one in (zero, self._tool(), np.ones(3, dtype=bool))]
+        phase = np.zeros(len(rows), dtype=np.int64)
+        if self.beside == _BESIDE:
+            phase[:] = np.where((sweep != 0) | (np.abs(end - start)[:, :2] > _RESTS_MM).any(axis=1), CONTOUR, STILL)
         return Moves(
             numbers[rows],
             motion[rows],
@@ -671,6 +729,8 @@ class Follower:
             same[1],
             end,
             same[2],
+            phase,
+            np.where(phase > 0, self.aside_mm, 0.0),
         )
 
     def _turns(
@@ -995,6 +1055,8 @@ class KlartextFollower(Follower):
         self.spots: list[tuple[complex, float]] = []
         self.arm = math.nan
         self.corner: tuple[str, float, int] | None = None
+        #: The side that a sentence asks for, until it is taken.
+        self.new_side: int | None = None
         self.around = (0, 1)
 
     def follow(self, text: str, numbers: Sequence[int]) -> Moves:
@@ -1162,9 +1224,13 @@ class KlartextFollower(Follower):
         if text.startswith("TOOL DEF"):
             if length := re.search(r"(?<!D)L ?([-+]? ?[\d.]+)", rest):
                 self.lengths[tool] = (0.0, 0.0, float(length[1].replace(" ", "")) * self.unit)
+            if radius := re.search(r"(?<![A-Z])R(?!2) ?([-+]? ?[\d.]+)", rest):
+                self.own_radii[tool] = float(radius[1].replace(" ", "")) * self.unit
             return
         longer = re.search(r"DL ?([-+]? ?[\d.]+)", rest)
         self._lengthen(tool, float(longer[1].replace(" ", "")) * self.unit if longer else 0.0)
+        wider = re.search(r"DR(?!2) ?([-+]? ?[\d.]+)", rest)
+        self.tool_called, self.wider_mm = tool, float(wider[1].replace(" ", "")) * self.unit if wider else 0.0
         self.zero_changed = True
 
     def _hole_here(self) -> None:
@@ -1190,6 +1256,10 @@ class KlartextFollower(Follower):
             self._zero(k) + n[letter] * self.unit if letter in n else self.at[k] + n.get("I" + letter, 0.0) * self.unit
             for k, letter in enumerate("XYZ")
         ]
+        turn = re.search(r"(?<![A-Z])R([LR0])(?![\w.])", text) if kind not in ("RND", "CHF", "CC") else None
+        self.new_side = None if turn is None else "R0L".index(turn[1]) - 1
+        if not self.corner:  # else its arc comes before
+            self._take_side()
         if kind in ("RND", "CHF"):
             size = n.get("R", math.nan)
             bare = re.match(r" ?([-+]? ?\d*\.?\d+)", text)
@@ -1210,6 +1280,11 @@ class KlartextFollower(Follower):
             if self.cycle_name and (99 in codes or (self.modally and kind in ("L", "LP") and n.keys() & set("XYZ"))):
                 self._hole_here()
                 self.modally = self.modally and 99 not in codes
+
+    def _take_side(self) -> None:
+        if self.new_side is not None:
+            self._turn_aside(self.new_side, "", {})
+        self.new_side = None
 
     def _take_pole(self, n: dict[str, float]) -> None:
         named = {name[-1] for name in n}
@@ -1266,6 +1341,7 @@ class KlartextFollower(Follower):
         elif self.corner and straight:
             self._cut_corner(end)
             here = complex(self.at[0], self.at[1])
+        self._take_side()
         if straight:
             self._to(RAPID if fast else FEED, end)
             moved = there - here
@@ -1351,6 +1427,7 @@ class KlartextFollower(Follower):
         reach = size if kind == "CHF" else size * abs(math.tan(bend / 2))
         first, second = corner - reach * arriving, corner + reach * leaving
         self.at = last[4:7]
+        self.beside = _COMING if last[14] == ENTRY else self.beside
         own, self.number = self.number, int(last[0])
         self._to(int(last[1]), [first.real, first.imag, last[9]])
         self.number = number
@@ -1470,6 +1547,7 @@ def difference(read: Moves, followed: Moves) -> tuple[int, str] | None:
     )
     arcs = a.sweep_rad != b.sweep_rad
     radius_mm = np.nanmax(np.abs(a.start_mm - a.centre_mm), axis=1, initial=0.0)
+    wrong |= (a.phase != b.phase) | ~np.isclose(a.aside_mm, b.aside_mm, rtol=0.0, atol=_SAME_MM)
     wrong |= arcs & (np.abs(a.sweep_rad - b.sweep_rad) * radius_mm > _SAME_MM)
     if wrong.any():
         k = int(np.argmax(wrong))

@@ -55,7 +55,7 @@ _PATTERN = re.compile(r"(POS|ROW|PAT|FRAME|CIRC|PITCHCIRC)\d+\s*\(([^()]*)\)", r
 _MOVE_WORD = re.compile(
     rf"\s*+(?:(?P<machine>M\s*140)\s*+(?:MB\s*+(?:MAX|{VALUE}))?"
     rf"|(?P<inc>I)?(?P<axis>[XYZABCUVW])\s*+(?P<value>{VALUE})|(?P<polar>I?P[AR])\s*+(?P<angle>{VALUE})"
-    rf"|(?P<turn>DR\s*[+-])|(?P<comp>R[LR])(?![A-Z])|R0(?![.\d])|R\s*+(?P<radius>{VALUE})|(?P<max>F\s*+MAX)|F\s*+AUTO"
+    rf"|(?P<turn>DR\s*[+-])|(?P<side>R[LR](?![A-Z])|R0(?![.\d]))|R\s*+(?P<radius>{VALUE})|(?P<max>F\s*+MAX)|F\s*+AUTO"
     rf"|F[ZU]?\s*+(?:{VALUE}|[+-]?Q[LR]?\d+)|M\s*+(?P<m>\d+)|(?P<bare>R[+-](?=\s|$)))",
     re.IGNORECASE,
 )
@@ -69,7 +69,7 @@ _STILL, _TURNED = (9, 13, 32), (8, 10, 11, 19, 26)
 _REFUSED = (
     (
         r"APPR|DEP",
-        "approaches and departures need cutter radius compensation, which is not followed; post lines and arcs with R0",
+        "approaches and departures are not followed; post their lines and arcs, with RL, RR or R0",
     ),
     (r"F(?:POL|L|LT|C|CT|SELECT)\b", "free contours (FK) are not followed; post lines and arcs"),
     (
@@ -220,12 +220,14 @@ class Sentences:
         )
         if name:
             found.words.append(("T", name[1], at + name.start(1), at + name.end(1)))
-        if not name and re.search(r"(?<![A-Z])DL", text, re.IGNORECASE):
+        if not name and re.search(r"(?<![A-Z])D[LR](?!2)", text, re.IGNORECASE):
             return Sentence(
                 "refused",
-                number="TOOL CALL with DL and without a tool is not followed; post it with the number of the tool",
+                number="TOOL CALL with DL or DR and without a tool is not followed; post it with the number of the tool",
             )
-        for word in re.finditer(rf"\b(DL|L)\s*({VALUE})", text[name.end() if name else 0 :], re.IGNORECASE):
+        for word in re.finditer(
+            rf"\b(DL|DR(?!2)|L|R(?!2))\s*({VALUE})", text[name.end() if name else 0 :], re.IGNORECASE
+        ):
             found.words.append((word[1].upper(), word[2], at, at))
         return found
 
@@ -242,13 +244,15 @@ class Sentences:
                     number=f"{code[at:].strip()[:20]!r} cannot be read; expected words such as X+10.5, R0, F500 or M3",
                 )
             part, at = word.groupdict(), word.end()
-            if part["comp"] or part["bare"]:
+            if part["bare"]:
                 return Sentence(
                     "refused",
-                    number=f"{word[0].strip()}: cutter radius compensation is not followed; post the path of the tool "
+                    number=f"{word[0].strip()}: radius compensation along an axis is not followed; post the path of the tool "
                     "centre from CAM (R0)",
                 )
-            if part["axis"]:
+            if part["side"]:
+                found.words.append((part["side"].upper(), "", *word.span("side")))
+            elif part["axis"]:
                 letter = part["axis"].upper()
                 letter = "IJK"["XYZ".index(letter)] if kind == "CC" and letter in "XYZ" else letter
                 found.words.append((letter, part["value"], *word.span("value")))
@@ -911,11 +915,6 @@ class _Program:
             self._round(item, kind, end, around, sense)
             start = list(self.at)
         tail = " ".join(re.sub(r"\s+", "", word) for word in _TAIL.findall(code))
-        if re.search(r"(?<![A-Z])R[LR](?![A-Z])", code):
-            self._fail(
-                item,
-                "RL and RR: cutter radius compensation is not followed; post the path of the tool centre from CAM (R0)",
-            )
         rounded = self.rounded
         self.rounded = False
         place = len(self.out)

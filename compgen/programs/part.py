@@ -335,6 +335,13 @@ def _on_machines(
         if reader.unknown:
             continue  # it is refused at its end, with all that is not known
         moves = reader.numbered_as_in_file(batch.moves)
+        if moves.phase.any():
+            line = int(moves.line[int(np.argmax(moves.phase > 0))])
+            raise InputError(
+                "radius compensation is followed by `volcomp correct` only; post the path of the tool centre",
+                file=source,
+                line=line,
+            )
         ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
         directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended
         direction = ended[-1] if len(moves) else direction

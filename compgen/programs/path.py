@@ -18,6 +18,9 @@ from compgen.kinematics import exact_error
 
 IntArray = NDArray[np.int64]
 RAPID, FEED, CW, CCW = range(4)
+#: What a move is to radius compensation: none, the move that leads to the contour, one of the contour, one that leaves X and Y
+#: where they are, and the move that leads away.
+PLAIN, ENTRY, CONTOUR, STILL, EXIT = range(5)
 #: Axes that span the plane of an arc, by the axis normal to it: a turn from the first to the second is positive.
 PLANE_AXES = ((1, 2), (2, 0), (0, 1))
 #: The inverse is repeated until commands would change by less, mm.
@@ -33,6 +36,8 @@ class Moves:
     ``kind`` is RAPID, FEED, CW or CCW; ``sweep_rad`` the signed angle of an arc about ``centre_mm`` in the plane normal to
     axis ``plane``. ``offset_mm`` is machine position minus program position, ``tool_mm`` the tool vector of the model.
     The end of a move is corrected along the axes ``corrected`` by what the model says at ``at_mm``.
+    ``phase`` says what a move is to radius compensation, ``aside_mm`` how far to the left of the contour the tool centre is
+    then, inf or -inf where the radius is not known.
     """
 
     line: IntArray
@@ -46,6 +51,13 @@ class Moves:
     tool_mm: FloatArray
     at_mm: FloatArray
     corrected: NDArray[np.bool_]
+    phase: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    aside_mm: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if np.shape(self.phase) != np.shape(self.line):
+            object.__setattr__(self, "phase", np.zeros(np.shape(self.line), dtype=np.int64))
+            object.__setattr__(self, "aside_mm", np.zeros(np.shape(self.line)))
 
     def __len__(self) -> int:
         return len(self.line)
@@ -69,13 +81,12 @@ class Moves:
 
     @staticmethod
     def of_rows(rows: Sequence[tuple[float, ...]] | FloatArray) -> Moves:
-        """Return the moves of rows with line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected."""
-        data = np.array(rows, dtype=np.float64).reshape(len(rows), 25)
-        whole = data[:, :3].astype(np.int64)
+        """Return the moves of rows: line, kind, plane, sweep, start, end, centre, offset, tool, at, corrected, phase, aside."""
+        data = np.array(rows, dtype=np.float64).reshape(len(rows), 27)
+        whole, phase = data[:, :3].astype(np.int64), data[:, 25].astype(np.int64)
         start, end, centre, offset, tool, at, corrected = (data[:, k : k + 3] for k in range(4, 25, 3))
-        return Moves(
-            whole[:, 0], whole[:, 1], start, end, centre, whole[:, 2], data[:, 3], offset, tool, at, corrected > 0
-        )
+        head = (whole[:, 0], whole[:, 1], start, end, centre, whole[:, 2], data[:, 3])
+        return Moves(*head, offset, tool, at, corrected > 0, phase, data[:, 26])
 
 
 @dataclass(frozen=True)
@@ -181,6 +192,33 @@ def points_of(moves: Moves, fraction: FloatArray, own: IntArray | None = None) -
         at[share == 0.0] = arcs.start_mm[share == 0.0]
         points[rows] = at
     return points
+
+
+def _leftwards(moves: Moves, points_mm: FloatArray) -> FloatArray:
+    """Unit vectors (n, 3) in XY to the left of the direction of travel, at one point of each move."""
+    way = (moves.end_mm - moves.start_mm)[:, :2]
+    arcs = np.flatnonzero(moves.sweep_rad)
+    radial = points_mm[arcs, :2] - moves.centre_mm[arcs, :2]
+    way[arcs] = np.stack([-radial[:, 1], radial[:, 0]], axis=1) * np.sign(moves.sweep_rad[arcs])[:, None]
+    length = np.hypot(way[:, 0], way[:, 1])
+    way = way / np.where(length > 0, length, 1.0)[:, None]
+    return np.stack([-way[:, 1], way[:, 0], np.zeros(len(way))], axis=1)
+
+
+def tool_centres(moves: Moves, points_mm: FloatArray, own: IntArray | None = None) -> FloatArray:
+    """Return where the tool centre is at points (n, 3) of moves: beside those of a contour with radius compensation."""
+    phase = moves.phase if own is None else moves.phase.take(own)
+    rows = np.flatnonzero(phase == CONTOUR)
+    if not len(rows):
+        return points_mm
+    part, found = moves.part(rows if own is None else own[rows]), np.array(points_mm)
+    found[rows] += _known(part.aside_mm)[:, None] * _leftwards(part, points_mm[rows])
+    return found
+
+
+def _known(aside_mm: FloatArray) -> FloatArray:
+    """A radius that is not known counts as 0."""
+    return np.where(np.isfinite(aside_mm), aside_mm, 0.0)
 
 
 def reach_of(moves: Moves) -> tuple[FloatArray, FloatArray]:
@@ -291,6 +329,8 @@ class Corrector:
     shortest_mm: float
     resolution_mm: float
     direction: FloatArray = field(default_factory=lambda: np.zeros(3))
+    #: The command at the end of the last move.
+    command_mm: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
 
     def __post_init__(self) -> None:
         bend = self.model.bend()
@@ -308,19 +348,24 @@ class Corrector:
         before = np.vstack([self.direction, ended[:-1]])
         if len(moves):
             self.direction = ended[-1]
-        correction = self.model.command(moves.at_mm, moves.tool_mm, ended) - moves.at_mm
-        command = moves.end_mm + np.where(moves.corrected, correction, 0.0)
+        compensated = moves.phase != PLAIN
+        # slack that is taken up by short pieces would be a step in the contour
+        ended = np.where(compensated[:, None], 0.0, ended)
+        command = self._ends(moves, ended)
+        begin = np.vstack([self.command_mm, command[:-1]])[: len(moves)]
+        self.command_mm = command[-1] if len(moves) else self.command_mm
         divisible = ~drilled & moves.cutting & moves.corrected.any(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
+        divisible &= ~compensated | (moves.phase == CONTOUR)
         turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
-            turned = np.asarray(((began * before) < 0).any(axis=1))
+            turned = np.asarray(((began * before) < 0).any(axis=1)) & ~compensated
         lines = np.flatnonzero(divisible & (moves.sweep_rad == 0))
         samples = np.ceil(lengths_of(moves.part(lines)) / self.step_mm).astype(np.int64) + 1
-        inner = [self._straight(moves, lines[part], ended, turned) for part in _portions(samples)]
+        inner = [self._straight(moves, lines[part], ended, turned, (begin, command)) for part in _portions(samples)]
         arcs = np.flatnonzero(divisible & (moves.sweep_rad != 0))
         centre = np.array(moves.centre_mm)
         if len(arcs):
-            found = self._arcs(moves, arcs, by_radius, (before, ended), turned)
+            found = self._arcs(moves, arcs, by_radius, (before, ended), turned, (begin, command))
             last = found.share == 1.0
             centre[found.move[last]] = found.centre_mm[last]
             inner.append(Pieces(*(getattr(found, name)[~last] for name in Pieces.__dataclass_fields__)))
@@ -330,15 +375,69 @@ class Corrector:
         order = np.lexsort((joined[1], joined[0]))
         return Pieces(*(item[order] for item in joined))
 
-    def _straight(self, moves: Moves, rows: IntArray, ended: FloatArray, turned: NDArray[np.bool_]) -> Pieces:
-        """Inner ends of the pieces of straight moves, by Ramer's method: divide where the correction is off its chord most."""
+    def _ends(self, moves: Moves, direction: FloatArray) -> FloatArray:
+        """Commands for the ends of moves (n, 3); of contours with radius compensation so that the tool centre is right.
+
+        A corner goes to where both lines that the tool centre follows beside it are right. Where X and Y rest they keep their
+        command, since the control would take a step of a few um for a piece of the contour.
+        """
+        contour = np.flatnonzero(moves.phase == CONTOUR)
+        beside, normal = np.zeros((len(moves), 3)), np.zeros((2, len(moves), 3))
+        if len(contour):
+            part = moves.part(contour)
+            for side, points in enumerate((part.start_mm, part.end_mm)):
+                normal[side, contour] = _leftwards(part, points)
+            beside[contour] = _known(part.aside_mm)[:, None] * normal[1, contour]
+        first, then = _joints(moves.phase)
+        enters = moves.phase[first] == ENTRY
+        beside[first[enters]] = _known(moves.aside_mm[then[enters]])[:, None] * normal[0, then[enters]]
+        for k in np.flatnonzero((moves.phase == STILL) & (moves.aside_mm != 0)).tolist():
+            beside[k] = beside[k - 1] if k else 0.0
+        at = moves.at_mm + beside
+        shift = self.model.command(at, moves.tool_mm, direction) - at
+        if len(first):
+            begins = moves.start_mm[then] + _known(moves.aside_mm[then])[:, None] * normal[0, then]
+            shift_then = self.model.command(begins, moves.tool_mm[then], direction[then]) - begins
+            shift[first] = _corner_shifts(shift[first], shift_then, normal[1, first], normal[0, then], then - first > 1)
+        command = np.asarray(moves.end_mm + np.where(moves.corrected, shift, 0.0))
+        for k in np.flatnonzero((moves.phase == STILL) & moves.corrected[:, :2].all(axis=1)).tolist():
+            command[k, :2] = command[k - 1, :2] if k else self.command_mm[:2]
+        return command
+
+    def _commands(self, moves: Moves, owner: IntArray, wanted_mm: FloatArray, direction: FloatArray) -> FloatArray:
+        """Commands (n, 3) for points of the moves ``owner``; points of a contour go by as much as the tool centre beside them."""
+        centre = tool_centres(moves, wanted_mm, owner)
+        command = self.model.command(centre, moves.tool_mm.take(owner, axis=0), direction)
+        command = command if centre is wanted_mm else wanted_mm + (command - centre)
+        return np.asarray(np.where(moves.corrected.take(owner, axis=0), command, wanted_mm))
+
+    def _shortest(self, moves: Moves) -> FloatArray:
+        """The shortest pieces of moves, mm: those of contours so long that a rounded end turns the tool by a few mrad only.
+
+        The tool centre moves by the radius times that angle: more than a part of the piece, and it would vanish at an inner bend.
+        """
+        radius = np.abs(_known(moves.aside_mm))
+        return np.asarray(np.maximum(self.shortest_mm, 6.4 * np.sqrt(radius * self.resolution_mm)))
+
+    def _straight(
+        self,
+        moves: Moves,
+        rows: IntArray,
+        ended: FloatArray,
+        turned: NDArray[np.bool_],
+        ends: tuple[FloatArray, FloatArray],
+    ) -> Pieces:
+        """Inner ends of the pieces of straight moves, by Ramer's method: divide where the correction is off its chord most.
+
+        ``ends`` are the commands (n, 3) where moves of contours begin and end.
+        """
         length = lengths_of(moves.part(rows))
         # shorter moves cannot bend by more than the tolerance
         rows = rows[(length > 4.0 * self.step_mm) | (turned[rows] & (length > 2.0 * self.shortest_mm))]
         if not len(rows):
             return Pieces(rows, np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3)))
         length = lengths_of(moves.part(rows))
-        most = np.floor(length / self.shortest_mm)
+        most = np.floor(length / self._shortest(moves.part(rows)))
         count = np.clip(np.ceil(length / self.step_mm), np.where(turned[rows], 2.0, 1.0), np.maximum(most, 1.0))
         count = count.astype(np.int64) + 1
         first = np.cumsum(count) - count
@@ -351,14 +450,21 @@ class Corrector:
         breaks[first[takes_up] + 1] = True
         owner = rows[own]
         wanted = points_of(moves, share, owner)
-        command = self.model.command(wanted, moves.tool_mm.take(owner, axis=0), ended.take(owner, axis=0))
-        target = np.where(moves.corrected.take(owner, axis=0), command, wanted)
+        target = self._commands(moves, owner, wanted, ended.take(owner, axis=0))
+        contour = np.flatnonzero(moves.phase[rows] == CONTOUR)
+        if len(contour):
+            target[first[contour]] = ends[0][rows[contour]]
+            target[first[contour] + count[contour] - 1] = ends[1][rows[contour]]
+        along = _along(moves.part(rows))[own]
         while True:
             at, part = np.flatnonzero(breaks), np.cumsum(breaks) - 1
             left, right = at[part], at[np.minimum(part + 1, len(at) - 1)]
             width = np.where(breaks, 1.0, share[right] - share[left])
             chord = target[left] + ((share - share[left]) / width)[:, None] * (target[right] - target[left])
-            off = np.where(breaks, 0.0, np.linalg.norm(target - chord, axis=1))
+            across = target - chord
+            # the corner of a contour may be farther along its lines than what is right within them
+            across -= np.einsum("ij,ij->i", across, along)[:, None] * along
+            off = np.where(breaks, 0.0, np.linalg.norm(across, axis=1))
             new = (off > 0.7 * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
             if not new.any():
                 break
@@ -373,10 +479,12 @@ class Corrector:
         by_radius: NDArray[np.bool_],
         directions: tuple[FloatArray, FloatArray],
         turned: NDArray[np.bool_],
+        ends: tuple[FloatArray, FloatArray],
     ) -> Pieces:
         """Pieces of arcs: one arc where that follows the correction, otherwise halves, and halves of these.
 
-        ``directions`` are the signs of travel (n, 3) before each move and at its end.
+        ``directions`` are the signs of travel (n, 3) before each move and at its end, ``ends`` the commands (n, 3) where moves of
+        contours begin and end.
         """
         done: list[tuple[Any, ...]] = []
         length, work = lengths_of(moves), self._cuts(moves, rows, turned)
@@ -391,7 +499,9 @@ class Corrector:
                 for some in _portions(steps[steps == count]):
                     part = work[steps == count][some]
                     move, low, high = part[:, 0].astype(np.int64), part[:, 1], part[:, 2]
-                    end, centre, fine = self._fit_arcs(moves, (move, low, high), count, by_radius, directions, length)
+                    end, centre, fine = self._fit_arcs(
+                        moves, (move, low, high), count, by_radius, directions, length, ends
+                    )
                     done.append((move[fine], high[fine], end[fine], centre[fine]))
                     rest, half = ~fine, 0.5 * (low + high)
                     again += [np.stack([move, low, half], axis=1)[rest], np.stack([move, half, high], axis=1)[rest]]
@@ -406,6 +516,7 @@ class Corrector:
         by_radius: NDArray[np.bool_],
         directions: tuple[FloatArray, FloatArray],
         length: FloatArray,
+        ends: tuple[FloatArray, FloatArray],
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Ends and centres, (n, 3), of corrected parts of arcs, and which follow; ``parts``: move, shares of begin and end."""
         move, low, high = parts
@@ -415,12 +526,16 @@ class Corrector:
         many = np.repeat(move, steps + 1)
         wanted = points_of(moves, share.ravel(), many)
         middle = directions_at(moves.part(move), 0.5 * (low + high))
-        direction = np.repeat(np.where(middle != 0, middle, ended[move]), steps + 1, axis=0)
-        command = self.model.command(wanted, moves.tool_mm.take(many, axis=0), direction)
-        target = np.where(moves.corrected.take(many, axis=0), command, wanted)
-        still = np.abs(target - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
+        contour = moves.phase[move] == CONTOUR
+        known = (middle != 0) | contour[:, None]
+        direction = np.where(known, np.where(contour[:, None], 0.0, middle), ended[move])
+        target = self._commands(moves, many, wanted, np.repeat(direction, steps + 1, axis=0))
         sweep = (high - low) * moves.sweep_rad[move]
         target = target.reshape(len(move), steps + 1, 3)
+        for side, share_there, there in ((0, low == 0.0, ends[0]), (-1, high == 1.0, ends[1])):
+            own = np.flatnonzero(contour & share_there)
+            target[own, side] = there[move[own]]
+        still = np.abs(target.reshape(-1, 3) - wanted).reshape(len(move), -1).max(axis=1) < 0.25 * self.resolution_mm
         centre, off = _fitted_arcs(target, moves.plane[move], sweep)
         centre[still] = moves.centre_mm[move[still]]
         # an arc by its radius is well defined up to a third of a circle; one that nearly closes could become a full one
@@ -430,7 +545,7 @@ class Corrector:
         gap = np.where(is_closed(sweep), chord, 0.0)
         wide |= gap > max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
         wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
-        short = (high - low) * length[move] < 2.0 * self.shortest_mm
+        short = (high - low) * length[move] < 2.0 * self._shortest(moves.part(move))
         fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
         if self.model.reversal is not None:
             # the slack of an axis that has turned is taken up within a short arc, from where the piece before it ended
@@ -441,6 +556,7 @@ class Corrector:
             start = self.model.command(wanted[:: steps + 1], arcs.tool_mm, came)
             start = np.where(arcs.corrected, start, wanted[:: steps + 1])
             slack = np.hypot(*(start[index, k] - target[index, 0, k] for k in (a, b))) > self.resolution_mm
+            slack &= ~contour
             around = _arc_centre(start, target[:, -1], arcs, sweep)
             centre[slack], fine[slack] = around[slack], short[slack]
         # only the block as a whole says how many turns it has
@@ -462,7 +578,7 @@ class Corrector:
         own = np.repeat(np.arange(len(rows)), count)
         rank = np.arange(len(own)) - np.repeat(np.cumsum(count) - count, count)
         share = np.abs((quarter * (first[own] + rank) - start[own]) / sweep[own])
-        inside = (share > 1e-9) & (share < 1 - 1e-9)
+        inside = (share > 1e-9) & (share < 1 - 1e-9) & (arcs.phase[own] == PLAIN)
         own, share = own[inside], share[inside]
         every, short, at_begin = np.arange(len(rows)), self.shortest_mm / lengths_of(arcs), np.flatnonzero(turned[rows])
         owners = np.concatenate([every, every, own, own, at_begin])
@@ -475,6 +591,44 @@ class Corrector:
         known = known[~np.concatenate([[False], near]), :2]
         parts = np.concatenate([known[:-1], known[1:, 1:]], axis=1)[known[1:, 0] == known[:-1, 0]]
         return np.column_stack([rows[parts[:, 0].astype(np.int64)], parts[:, 1:]])
+
+
+def _joints(phase: IntArray) -> tuple[IntArray, IntArray]:
+    """Moves that end where a contour goes on, and the moves with which it does; what leaves X and Y may stand between."""
+    every = np.flatnonzero((phase == ENTRY) | (phase == CONTOUR))
+    follows = phase[every[1:]] == CONTOUR
+    return every[:-1][follows], every[1:][follows]
+
+
+def _along(moves: Moves) -> FloatArray:
+    """Unit vectors (n, 3) along straight moves of contours, 0 for others."""
+    way = np.where((moves.phase == CONTOUR)[:, None], moves.end_mm - moves.start_mm, 0.0)
+    length = np.linalg.norm(way, axis=1)
+    return np.asarray(way / np.where(length > 0, length, 1.0)[:, None])
+
+
+def _corner_shifts(
+    before: FloatArray, then: FloatArray, normal: FloatArray, normal_then: FloatArray, apart: NDArray[np.bool_]
+) -> FloatArray:
+    """How far corners of contours go, (n, 3): along both normals as far as the tool centre beside them has to.
+
+    ``before`` and ``then`` are the shifts of the tool centre at the end of one side and where the next begins, ``apart`` whether
+    a move along Z stands between. After the move that leads to the contour (normal 0) only the next side counts.
+    """
+    enters = ~normal.any(axis=1)
+    half, found = 0.5 * (before - then), 0.5 * (before + then)
+    found[enters, :2] = then[enters, :2]
+    found[apart | enters, 2] = before[apart | enters, 2]
+    for across, other, least in (
+        (normal - normal_then, normal + normal_then, 1e-4),
+        (normal + normal_then, normal - normal_then, 1e-2),
+    ):
+        square = np.einsum("ij,ij->i", across, across)
+        # nearly one direction, or back on itself: the tool centres are nearly one, or no corner does it
+        good = ~(enters | apart) & (square > least)
+        size = np.einsum("ij,ij->i", other, half) / np.where(good, square, 1.0)
+        found[good, :2] += (size[:, None] * across)[good, :2]
+    return found
 
 
 def _arc_centre(start_mm: FloatArray, end_mm: FloatArray, arcs: Moves, sweep: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
-from typing import BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,24 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs import klartext, sinumerik
+from compgen.programs.compensation import centre_path
 from compgen.programs.cycles import DrillingCycle, defines_hole
 from compgen.programs.dialects import MARK, REFUSED, Dialect, codes_that_stay, written_offset
-from compgen.programs.path import CCW, CW, FEED, PLANE_AXES, RAPID, IntArray, Moves, reach_of
+from compgen.programs.path import (
+    CCW,
+    CONTOUR,
+    CW,
+    ENTRY,
+    EXIT,
+    FEED,
+    PLAIN,
+    PLANE_AXES,
+    RAPID,
+    STILL,
+    IntArray,
+    Moves,
+    reach_of,
+)
 from compgen.programs.runs import (
     LONGEST_BLOCK,
     MOST_TURNS,
@@ -52,6 +67,10 @@ _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 MOST_LINES = 30
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
+#: X and Y that differ by less are one place, mm: such a move is none of a contour.
+SAME_PLACE_MM = 1e-7
+#: Where X and Y are with radius compensation: not at all, before the move to the contour, on it, before the move away from it.
+_OUTSIDE, _ENTERING, _ON, _LEAVING = range(4)
 #: A rest of a hole below which no further peck is made: the rounding of sums, mm.
 PECK_REST_MM = 1e-9
 
@@ -64,6 +83,8 @@ class Setup:
     ``integers`` says what a number without a decimal point is where controls differ (FANUC): mm, or increments of
     ``increment_mm``.
     ``subprograms`` are the folders in which files that the program calls are looked for.
+    ``radii_mm`` are those that radius compensation takes, by the number of D or of the tool; ``stated_radii_mm`` go before them,
+    that of ``""`` for all.
     ``gauge_mm`` is the tool offset of the model for a tool of length 0: from the origin of the tool carriage to the gauge point.
     """
 
@@ -75,6 +96,15 @@ class Setup:
     integers: str | None = None
     increment_mm: float | None = None
     subprograms: tuple[Path, ...] = ()
+    radii_mm: Mapping[str, float] = field(default_factory=dict)
+    stated_radii_mm: Mapping[str, float] = field(default_factory=dict)
+
+    def radius_mm(self, key: str, in_program_mm: float | None = None, more_mm: float = 0.0) -> float:
+        """Return the radius of D or of a tool: as stated, or of program or table with ``more_mm`` (DR); inf if unknown."""
+        stated = self.stated_radii_mm.get(key, self.stated_radii_mm.get(""))
+        if stated is not None:
+            return stated
+        return (self.radii_mm.get(key, math.inf) if in_program_mm is None else in_program_mm) + more_mm
 
 
 @dataclass(frozen=True)
@@ -118,6 +148,27 @@ class Batch:
 def number_of(text: str) -> float:
     """Return the value of a word; blanks between its sign and its digits do not count."""
     return float(text.replace(" ", "").replace("\t", ""))
+
+
+_SIDE = re.compile(rb"(?<![A-Z])G[ \t]*0*4(0|[12](?:\.1)?)(?![\d.])", re.IGNORECASE)
+_SIDE_KLARTEXT = re.compile(rb"(?<![A-Z0-9])R(0|[LR])(?![\w.+-])", re.IGNORECASE)
+
+
+def _whole_lines(content: bytes) -> tuple[bytes, bytes]:
+    """Whole lines, and the rest."""
+    whole = content.rfind(b"\n") + 1
+    return content[:whole], content[whole:]
+
+
+def _within_contour(content: bytes, dialect: Dialect, inside: bool) -> bool:
+    """Whether radius compensation is active after some lines, before which it is if ``inside``."""
+    pattern = _SIDE_KLARTEXT if dialect.klartext else _SIDE
+    if not inside and not any(found[1] != b"0" for found in pattern.finditer(content)):
+        return False
+    code = re.sub(dialect.comments.encode(), b" ", content, flags=re.IGNORECASE)
+    for found in pattern.finditer(code):
+        inside = found[1] != b"0"
+    return inside
 
 
 class Reader:
@@ -181,6 +232,15 @@ class Reader:
         self.probed: dict[str, dict[int, None]] = {}
         #: M codes that are not known, with their lines: all are said at the end.
         self.unknown: dict[str, dict[int, None]] = {}
+        #: Radius compensation: side (1 left, -1 right, 0 off), radius (inf: not known), where X and Y are, how it is named.
+        self.side, self.radius_mm, self.contour, self.side_code = 0, 0.0, _OUTSIDE, ""
+        self.used_radii: dict[str, float] = {}
+        self._left_aside_mm = 0.0
+        self._turned: tuple[str, int] | None = None
+        self._d_number = self._tool_key = ""
+        #: Radii of tools that the program defines, and what it adds to that of the tool (DR), mm.
+        self._defined_radii: dict[str, float] = {}
+        self._more_radius_mm = 0.0
         self.ended = self.seen_percent = self.started = False
         self.closed_by_percent = False
         self._line, self._text = 0, ""
@@ -250,12 +310,22 @@ class Reader:
 
     def batches(self, stream: BinaryIO | Pointed) -> Iterator[Batch]:
         """Yield the batches of a program; the last one is followed by the check that the program was whole."""
-        number, rest = 1, b""
+        number, rest, inside = 1, b"", False
         while chunk := stream.read(BATCH_BYTES):
-            content = rest + chunk
-            whole = content.rfind(b"\n") + 1
-            content, rest = content[:whole], content[whole:]
+            content, rest = _whole_lines(rest + chunk)
+            parts, inside = [content], _within_contour(content, self.dialect, inside)
+            # a contour with radius compensation is corrected as a whole: each corner depends on the move after it
+            while inside and (chunk := stream.read(BATCH_BYTES)):
+                content, rest = _whole_lines(rest + chunk)
+                parts.append(content)
+                inside = _within_contour(content, self.dialect, inside)
+            content = b"".join(parts)
             if content:
+                if self.contour == _ON and not self.ended:
+                    self._line, self._text = number, ""
+                    self._fail(
+                        f"{self.side_code} is hidden from the search for the end of its contour; post it in its own block"
+                    )
                 yield self.batch(content, number)
                 number += content.count(b"\n")
             if len(rest) > LONGEST_BLOCK:
@@ -355,6 +425,7 @@ class Reader:
         """Whether blocks of plain words are now moves and nothing else, from a known position."""
         known = not any(math.isnan(value) for value in self.position) and all(self.named) and bool(self.offset_name)
         modal = self.cycle is None and not self.calling and self.feed != "inverse" and self._unit_known
+        modal = modal and self.contour in (_OUTSIDE, _ON)
         return known and modal and not (self.ended or self.closed_by_percent)
 
     def _run(self, words: Words, lines: range, first_line: int, first: int) -> tuple[Run, Moves] | None:
@@ -365,6 +436,8 @@ class Reader:
         motion = carried(words.motion[rows], -1 if self.motion is None else self.motion)
         absolute = carried(words.absolute[rows], int(self.absolute)) > 0
         plane = carried(words.plane[rows], self.plane)
+        if self.contour == _ON and (plane != 2).any():
+            return None  # it is refused block by block
         moving = named.any(axis=1)
         arc = (motion >= CW) & (moving if pole else moving | given.any(axis=1))
         at = self._places(named, value[:, :3] * self.scale, absolute, offset)
@@ -420,6 +493,7 @@ class Reader:
             tool_mm=np.broadcast_to(tool, (n, 3)),
             at_mm=at[row + 1],
             corrected=np.ones((n, 3), dtype=bool),
+            **self._phases(at[row], at[row + 1], sweeps),
         )
         self.position, self.motion = at[-1].tolist(), int(motion[-1]) if motion[-1] >= 0 else None
         turning = motion[motion >= CW]
@@ -454,7 +528,7 @@ class Reader:
         """Read blocks from ``line`` on that place holes of the active cycle, as :meth:`_cycle` does; None if they do more."""
         linuxcnc = self.dialect.name == "linuxcnc"
         modal = self.absolute and self.plane == 2 and self.feed != "inverse" and all(self.named)
-        modal = modal and not (self.ended or self.closed_by_percent)
+        modal = modal and not (self.ended or self.closed_by_percent) and self.contour == _OUTSIDE
         offset = np.array(self._offset())
         zero, initial = float(offset[2]), self._initial_level(float(offset[2]))
         known = not any(math.isnan(value) for value in (*self.position, self.cycle_z, self.cycle_r, initial))
@@ -526,12 +600,17 @@ class Reader:
 
     def _block(self, number: int, text: str, first: int) -> SingleBlock:
         self._line, self._text = number, text
-        self._modes, self._begins_series = {}, False
+        self._modes, self._begins_series, self._turned = {}, False, None
+        inside, state = self.contour in (_ENTERING, _ON), (self._offset(), self._tool(), self.scale)
         before, words = len(self._rows), self._words(text)
         if parts := self._holes_in_absolute(number, text, words, first):
             count = sum(part.count for part in parts)
             return replace(parts[0], text=text, words=words, count=count, parts=parts)
         kind = self._act(words) if words else "keep"
+        if inside and self.side and state != (self._offset(), self._tool(), self.scale):
+            self._fail(
+                f"changes zero, tool or unit while {self.side_code} is active; end the compensation before (G40, R0)"
+            )
         return SingleBlock(
             number,
             text,
@@ -724,6 +803,8 @@ class Reader:
         elif what == "tool definition":
             numbers = {letter: value for letter, value, *_ in words}
             self._tools[numbers.get("T", "0")] = (0.0, 0.0, number_of(numbers.get("L", "0")) * self.scale)
+            if "R" in numbers:
+                self._defined_radii[numbers.get("T", "0")] = number_of(numbers["R"]) * self.scale
         elif what == "tool":
             return words
         elif what == "move":
@@ -956,6 +1037,8 @@ class Reader:
                 self._fail(
                     f"{setting[0]} and a move are in one block, so that the words are ambiguous; divide the block"
                 )
+            if self._turned and self._turned[1] != self.side:
+                self._fail(f"{setting[0]} and {self._turned[0]} are in one block; divide the block")
             if motions:
                 self.motion = motions[0]
                 self._end_cycle()
@@ -965,6 +1048,7 @@ class Reader:
         self._tool_words(values, codes, name)
         if "R" in values and dialect.name == "siemens":
             self._fail("R is a variable; write a radius as CR=")
+        self._compensate(values)
         return self._execute(actions, [values.get(letter) for letter in "XYZ"], values)
 
     def _ask_integers(self, letter: str, text: str) -> NoReturn:
@@ -1029,6 +1113,8 @@ class Reader:
         what, _, argument = meaning.partition(" ")
         if what == "plane":
             self.plane = int(argument)
+        elif what == "compensation":
+            self._turned = code, int(argument)
         elif meaning in ("inch", "mm"):
             self.scale, self._unit_known = (MM_PER_INCH if meaning == "inch" else 1.0), True
         elif meaning in ("absolute", "incremental"):
@@ -1102,6 +1188,8 @@ class Reader:
             self._end_cycle()
         elif meaning == "tool definition":
             self._tools[f"{values.get('T', 0):g}"] = (0.0, 0.0, values.get("L", 0.0) * self.scale)
+            if "R" in values:
+                self._defined_radii[f"{values.get('T', 0):g}"] = values["R"] * self.scale
             actions.append("done")
         elif meaning == "home":
             actions.append(f"home {code}")
@@ -1166,10 +1254,13 @@ class Reader:
         elif self.dialect.pole:
             if number and "G99" not in codes:
                 self._use_tool(number, values.get("DL", 0.0) * self.scale)
+                self._tool_key, self._more_radius_mm = number, values.get("DR", 0.0) * self.scale
         elif "D" in values and values["D"] != 1.0:
+            self._d_number = f"{values['D']:g}"
             key = f"{self.loaded or self.selected}D{values['D']:g}"
             self._use_tool("0" if values["D"] == 0.0 else key)
         elif "D" in values or ("M6" in codes and self.loaded):
+            self._d_number = "1"
             self._use_tool(self.loaded or self.selected)
 
     def _use_tool(self, key: str, longer_mm: float = 0.0) -> None:
@@ -1249,6 +1340,92 @@ class Reader:
         x, y, z = (a - b for a, b in zip(self.setup.gauge_mm, self.length, strict=True))
         return x, y, z
 
+    # Radius compensation.
+
+    def _compensate(self, values: Mapping[str, float]) -> None:
+        """Begin or end radius compensation, once the block has named its tool and its D."""
+        code, side = self._turned or ("", self.side)
+        if "D" in values and self.dialect.name == "fanuc":
+            if self.side and side and f"{values['D']:g}" != self._d_number:
+                self._fail(f"D changes while {self.side_code} is active; end the compensation by G40 before")
+            self._d_number = f"{values['D']:g}"
+        if not self._turned or (side == self.side and not (side and self.dialect.name == "linuxcnc")):
+            return
+        if side and self.side:
+            self._fail(
+                f"{code} while {self.side_code} is active: the side within a contour does not change; post G40 before"
+            )
+        if not side:
+            self.contour = _OUTSIDE if self.contour == _ENTERING else _LEAVING
+        elif self.contour == _LEAVING:
+            self._fail(f"{code} before a move in X and Y that ends the compensation before; post that move")
+        elif self.plane != 2 or self.cycle is not None or self.calling:
+            self._fail(
+                f"{code} is followed in the plane XY (G17), outside of drilling cycles; post the path of the tool centre"
+            )
+        else:
+            self.contour, self.side_code = _ENTERING, code
+            self.radius_mm = self._radius(code, values)
+        self.side = side
+
+    def _radius(self, code: str, values: Mapping[str, float]) -> float:
+        """Radius that the control takes for the compensation, mm; inf if it is not known."""
+        name, given = self.dialect.name, None
+        if name == "fanuc":
+            key, said = self._d_number, f"D{self._d_number}"
+            given = 0.0 if key == "0" else None
+        elif name == "linuxcnc":
+            if code in ("G41.1", "G42.1"):
+                if "D" not in values:
+                    self._fail(f"{code} needs the diameter of the tool: D")
+                given = 0.5 * values["D"] * self.scale
+            elif values.get("D") == 0.0:
+                self._fail(f"{code} D0 is another radius with each kind of tool changer; post the number of the tool")
+            key = "" if given is not None else f"{values['D']:g}" if "D" in values else self.loaded
+            said = f"{code} in line {self.in_file(self._line)}" if given is not None else f"tool {key}"
+        elif name == "siemens":
+            key = self.loaded or self.selected
+            key += "" if self._d_number in ("", "1") else f"D{self._d_number}"
+            given, said = (0.0 if self._d_number == "0" else None), f"tool {key}"
+        else:
+            key, said = self._tool_key, f"tool {self._tool_key}"
+            given = self._defined_radii.get(key)
+        radius = self.setup.radius_mm(key, given, self._more_radius_mm)
+        if radius < 0.0:
+            self._fail(
+                f"the radius of {said} is {radius:g} mm, which changes the side; state it as 0 if the control has the wear alone"
+            )
+        self.used_radii[said] = radius
+        return radius
+
+    def _phase_of(self, end: list[float], sweep: float) -> tuple[int, float]:
+        """What the next move is to the compensation, and how far the tool centre is beside the contour at its end."""
+        if self.contour == _OUTSIDE:
+            return PLAIN, 0.0
+        aside = self.side * self.radius_mm if self.side else self._left_aside_mm
+        ways = [there - here for there, here in zip(end[:2], self.position[:2], strict=True) if there == there]
+        planar = sweep != 0.0 or not all(abs(way) <= SAME_PLACE_MM for way in ways)
+        if not planar:
+            return STILL, 0.0 if self.contour == _ENTERING else aside
+        if self.contour == _ON:
+            self._left_aside_mm = aside
+            return CONTOUR, aside
+        if sweep:
+            self._fail(
+                "radius compensation begins or ends on an arc, which controls refuse; post a line before or after it"
+            )
+        enters = self.contour == _ENTERING
+        self.contour, self._left_aside_mm = (_ON, aside) if enters else (_OUTSIDE, 0.0)
+        return (ENTRY, aside) if enters else (EXIT, 0.0)
+
+    def _phases(self, start: FloatArray, end: FloatArray, sweep: FloatArray) -> dict[str, Any]:
+        """The same of moves that are read together, as columns of :class:`Moves`."""
+        if self.contour == _OUTSIDE:
+            return {}
+        planar = (sweep != 0) | (np.abs(end - start)[:, :2] > SAME_PLACE_MM).any(axis=1)
+        aside = np.full(len(sweep), self.side * self.radius_mm)
+        return {"phase": np.where(planar, CONTOUR, STILL), "aside_mm": aside}
+
     # Moves of a block.
 
     def _execute(self, actions: list[str], axes: list[float | None], values: dict[str, float]) -> str:
@@ -1279,6 +1456,8 @@ class Reader:
             self._fail(f"L{values['L']:g}: {self.dialect.refused['M98']}")
         if "no preset" in single:
             return "no preset"
+        if self.contour in (_ENTERING, _ON):
+            self._hold_contour(motion, single, moving)
         for action in single:
             if action.startswith("home ") or action == "unknown position":
                 return self._home(axes, self.home.get(action[5:]))
@@ -1315,6 +1494,16 @@ class Reader:
         self._move(RAPID if "rapid once" in single else self.motion, end)
         return "line"
 
+    def _hold_contour(self, motion: str, single: list[str], moving: bool) -> None:
+        """Refuse what controls do not do, or each in its way, while radius compensation is active."""
+        refused = ("home", "unknown", "preset", "lost", "drill", "machine", "tap", "no preset")
+        wrong = motion.startswith("cycle") or any(action.startswith(refused) for action in single) or self.calling
+        if wrong or self.plane != 2 or (self.cycle is not None and moving):
+            self._fail(
+                f"only lines and arcs in the plane XY are followed while {self.side_code} is active; end the compensation before "
+                "(G40, R0)"
+            )
+
     def _target(self, axes: list[float | None]) -> list[float]:
         """Machine position that axis words ask for."""
         offset, end = self._offset(), list(self.position)
@@ -1347,7 +1536,10 @@ class Reader:
         if corrected == (0, 0, 0):
             pairs = zip(self.named, self.position, end, strict=True)
             self.named = [known and there == here for known, there, here in pairs]
-        self._rows.append((*head, *self.position, *end, *arc, *self._offset(), *self._tool(), *(at or end), *allowed))
+        phase = self._phase_of(end, sweep)
+        self._rows.append(
+            (*head, *self.position, *end, *arc, *self._offset(), *self._tool(), *(at or end), *allowed, *phase)
+        )
         self.position = list(end)
         self.started = True
 
@@ -1657,6 +1849,8 @@ class Reader:
 
     def _check(self, moves: Moves) -> None:
         """Refuse positions outside the travel, at ends of moves and along arcs: usually the work offset is wrong."""
+        path = centre_path(moves)
+        moves = Moves.joined([path.moves, path.corners]) if len(path.corners) else path.moves
         least, most = reach_of(moves)
         found = np.vstack([self.reached_mm, least, most])
         self.reached_mm = np.stack([np.fmin.reduce(found), np.fmax.reduce(found)])
