@@ -20,6 +20,7 @@ from compgen.programs import klartext
 from compgen.programs.dialects import DIALECTS
 from compgen.programs.follower import _COMMENTS, _OTHER_COMMENTS
 from compgen.programs.follower import _runs as block_runs
+from compgen.programs.reader import _SIDE, _SIDE_KLARTEXT
 
 ROOMS = ("programs", "controls", "foreign")
 FOLDER = Path(compgen.__file__).parent
@@ -34,6 +35,13 @@ MADE = {
     "runs.__init__": _DIALECTS,
     "follower._runs": [(block_runs(name), "match") for name in DIALECTS],
     "follower.__init__": [(re.compile(comments), "sub") for comments in (*_COMMENTS.values(), _OTHER_COMMENTS)],
+    "reader._within_contour": [
+        *(
+            (re.compile(pattern.pattern.decode(), pattern.flags & ~re.UNICODE), "sub")
+            for pattern in (_SIDE, _SIDE_KLARTEXT)
+        ),
+        *((re.compile(dialect.comments, re.IGNORECASE), "sub") for dialect in DIALECTS.values()),
+    ],
     "subprograms.file_of": [
         (re.compile(r"O?0*1001(?:\.[^.]*)?"), "fullmatch"),
         (re.compile(r"(?:_N_)?A(?:[._](?:SPF|MPF))?"), "fullmatch"),

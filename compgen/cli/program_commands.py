@@ -296,7 +296,7 @@ def correct_command(
     For controls without tables. Every coordinate is replaced by the command at which the exact model of the machine brings
     the tool where the program wants it. Moves are divided where the correction bends by more than the tolerance. The
     corrected program is read again and compared with the path of the original; if that is not closer to it, the file is
-    named NOT-ACCEPTED-... (exit code 1). Variables, subprograms of other files, cutter radius compensation, turned coordinates
+    named NOT-ACCEPTED-... (exit code 1). Variables, turned coordinates
     and rotary axes that turn are refused with their line. DIR gets the program, correction.json and preflight.md. Nothing may
     be corrected twice: tables that are active while the program runs are given with --active, unless ERRORS were measured with
     them on. With --watch posted/, in place of PROGRAM, every program that is put into this

@@ -254,7 +254,7 @@ def _centred(moves: Moves, sides: dict[int, _Side]) -> Moves:
     none = np.zeros(len(moves), dtype=np.int64)
     at = np.where(whole, end, moves.at_mm)
     return replace(
-        moves, start_mm=start, end_mm=end, sweep_rad=sweep, at_mm=at, phase=none, aside_mm=0.0 * moves.aside_mm
+        moves, start_mm=start, end_mm=end, sweep_rad=sweep, at_mm=at, phase=none, aside_mm=np.zeros(len(moves))
     )
 
 

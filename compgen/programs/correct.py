@@ -1485,7 +1485,8 @@ def _radii_said(result: ProgramCorrection) -> list[str]:
     if not result.radii_mm:
         return []
     named = "; ".join(
-        f"{name}: {radius_text(radius)} mm".replace("stated mm", "stated") for name, radius in result.radii_mm.items()
+        f"{name}: {radius:g} mm" if np.isfinite(radius) else f"{name}: not stated"
+        for name, radius in result.radii_mm.items()
     )
     return [
         "Radius compensation stays with the control. The correction is that of a tool centre beside the contour by the radius: "

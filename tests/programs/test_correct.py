@@ -2,6 +2,7 @@
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -442,7 +443,7 @@ def test_siemens_and_linuxcnc_stop_where_the_work_offset_is_another(tmp_path):
 
 START = "G21 G90 G17 G54\nG0 X0. Y0. Z0.\n"
 REFUSED = [
-    ("linuxcnc", START + "G41 D1\nM2\n", 3, "cutter radius compensation"),
+    ("grbl", "G21 G90\nG0 X0 Y0 Z0\nG41 D1\n", 3, "cutter radius compensation"),
     ("linuxcnc", START + "#1=#5420\nM2\n", 3, "#5420 is not known before the program runs: variables"),
     ("linuxcnc", START + "G1 X[1+#2] F9\nM2\n", 3, "variables and expressions"),
     ("linuxcnc", START + "o100 call\nM2\n", 3, "subprograms"),
@@ -718,3 +719,76 @@ def test_a_program_corrects_only_what_the_active_table_leaves(
     assert "ACTIVE TABLES OF LINUXCNC-COMP" in (tmp_path / f"out{len(active)}" / "p.ngc").read_text().upper()
     code, _, err = call(*words, *active[:2], "--out", tmp_path / "no")
     assert code == 2 and "--active-controller" in err
+
+
+# --- radius compensation -------------------------------------------------------------------------------------------------
+
+#: A line along Y at X 50, beside it the tool: to it, along it, away from it.
+BESIDE = {
+    "linuxcnc": (START + "G1 {} D1 X50. Y0. F500\nY40.\nG40 X60. Y50.\nM2\n", "G41", "G42"),
+    "fanuc": (START + "G1 {} D1 X50. Y0. F500\nY40.\nG40 X60. Y50.\nM30\n", "G41", "G42"),
+    "siemens": ("G71 G90 G54\nG0 X0 Y0 Z0\nG1 {} X50 Y0 F500\nY40\nG40 X60 Y50\nM30\n", "G41", "G42"),
+    "heidenhain-iso": (
+        "%A G71 *\nG00 G90 X+0 Y+0 Z+0*\nG01 {} X+50 Y+0 F500*\nY+40*\nG40 X+60 Y+50*\nN9 %A G71 *\n", "G41", "G42",
+    ),
+    "heidenhain-klartext": (
+        "BEGIN PGM P MM\nTOOL CALL 1 Z S900\nL X+0 Y+0 Z+0 R0 FMAX\nL X+50 Y+0 {} F500\nL Y+40\nL X+60 Y+50 R0\n"
+        "M30\nEND PGM P MM\n", "RL", "RR",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("radius_mm", [0.0, 5.0])
+@pytest.mark.parametrize("left", [True, False])
+@pytest.mark.parametrize("dialect", BESIDE)
+def test_a_contour_is_corrected_where_the_tool_is(tmp_path, dialect, left, radius_mm):
+    """By hand: X is 1 um/mm too long, the tool at 45 (left) or 55 mm (right): command 45 / 1.001, contour 5 mm beside.
+
+    With the radius 0 (the path of the tool centre, wear alone) the tool is at 50 mm on both sides.
+    """
+    text, *sides = BESIDE[dialect]
+    word = sides[0 if left else 1]
+    setup = replace(PLAIN, stated_radii_mm={"": radius_mm})
+    result, found = run(tmp_path, text.replace("{}", word), shift(slope=1.0), dialect, setup)
+    assert result.accepted, result.reasons
+    aside = -radius_mm if left else radius_mm
+    contour = (50.0 + aside) / 1.001 - aside
+    block = next(
+        line for line in found.splitlines() if re.search(rf"\b{word}\b", line) and "X" in line and "(" not in line
+    )
+    assert abs(float(re.search(r"X=?([-+.\d]+)", block)[1]) - contour) < 6e-4, block
+    leaves = next(
+        line for line in found.splitlines() if re.search(r"Y=?\+?50", line) and re.search(r"\b(G40|R0)\b", line)
+    )
+    assert abs(float(re.search(r"X=?([-+.\d]+)", leaves)[1]) - 60.0 / 1.001) < 6e-4, leaves
+    assert result.after.largest_mm < 0.02 * result.before.largest_mm
+
+
+ENTRY_LINE = "G1 G41 D1 X0. Y10. F500\n"
+NO_PATH = [
+    (ENTRY_LINE + "Y40.\nG3 X-6. Y40. I-3. J0.\nG1 Y0.\nG40 X-20.\n", 5, "too large for the inner side of the arc"),
+    (ENTRY_LINE + "Y40.\nX-4.\nY10.\nG40 X-20.\n", 5, "nothing is left of the move"),
+    (ENTRY_LINE + "Y40.\nY10.\nG40 X-20.\n", 5, "goes back on itself"),
+    ("G41 D1\nG3 X20. Y0. I10. J0. F500\nG1 Y9.\nG40 X40.\n", 4, "begins or ends on an arc"),
+    (ENTRY_LINE + "Y40.\nG42 D1 X-30.\nG40 X-40.\n", 5, "while G41 is active"),
+    ("G18\n" + ENTRY_LINE + "X40.\nG40 X60.\n", 4, "plane XY"),
+    (ENTRY_LINE + "Y40.\nD2 X-30.\nG40 X-40.\n", 5, "D changes while G41 is active"),
+    (ENTRY_LINE + "Y40.\nG55 X-30.\nG40 X-40.\n", 5, "G41"),
+    (ENTRY_LINE + "Y40.\nG91 G28 Z0.\nG90 X-40.\nG40 X-60.\n", 5, "G41"),
+]
+
+
+@pytest.mark.parametrize(("blocks", "line", "words"), NO_PATH, ids=[f"{k}" for k in range(len(NO_PATH))])
+def test_contours_that_a_control_would_stop_at_are_refused(tmp_path, blocks, line, words):
+    setup = replace(PLAIN, stated_radii_mm={"": 5.0}, work_offsets_mm={**PLAIN.work_offsets_mm, "G55": (1.0, 0.0, 0.0)})
+    with pytest.raises(InputError, match=words) as caught:
+        run(tmp_path, START + blocks + "M30\n", shift(x=10.0), "fanuc", setup)
+    assert caught.value.line == line
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_radius_is_asked_for_only_where_it_matters(tmp_path):
+    text = BESIDE["fanuc"][0].replace("{}", "G41")
+    with pytest.raises(InputError, match=r"radius of the tool is not known, .*--tool-radius 5"):
+        run(tmp_path, text, shift(slope=1.0), "fanuc", PLAIN)
+    assert run(tmp_path, text, shift(x=10.0), "fanuc", PLAIN)[0].accepted

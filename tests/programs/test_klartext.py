@@ -292,8 +292,8 @@ def test_patterns_and_calls_are_written_out(tmp_path):
 
 
 REFUSED = [
-    ("L X+10 RL F100", 4, "compensation"),
-    ("L X+10 RR F100", 4, "compensation"),
+    ("X+10 R+ F100", 4, "is not known in Klartext"),
+    ("X+10 R- F100", 4, "is not known in Klartext"),
     ("L X+1\nAPPR LT X+1 Y+1 LEN5 RL", 5, "APPR"),
     ("CYCL DEF 251 POCKET ~\n Q215=0", 4, "cycle 251"),
     ("CYCL DEF 204 BACK ~\n Q200=2", 4, "cycle 204"),

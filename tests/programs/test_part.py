@@ -462,7 +462,7 @@ def test_the_command_ranks_machines_and_evaluates_tables(tmp_path, small_machine
 def test_a_program_that_cannot_be_followed_is_refused(tmp_path):
     program = tmp_path / "p.nc"
     program.write_text(PART.replace("X80.", "G41 X80."))
-    with pytest.raises(InputError, match="cutter radius") as caught:
+    with pytest.raises(InputError, match="radius compensation is followed by `volcomp correct` only") as caught:
         predict_part(model_of(mill(), ErrorTable(), None), program, "fanuc", SETUP)
     assert caught.value.line == 12
 

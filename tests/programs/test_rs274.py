@@ -1,6 +1,8 @@
 """LinuxCNC's own interpreter (``rs274``) reads programs, original and corrected: its moves are ours, to its last decimal."""
 
+import dataclasses
 import os
+import pathlib
 import re
 import shutil
 import subprocess
@@ -378,3 +380,92 @@ def test_the_length_of_the_tool_that_the_same_block_changes(tmp_path):
         found, _ = our_machine_moves(program.read_text())
         truth = machine_moves(program, tmp_path)
         assert found[-1][1] == pytest.approx(truth[-1][1], abs=2e-4), block
+
+
+# --- radius compensation: the interpreter's own tool centre ----------------------------------------------------------
+
+
+def contour(seed):
+    """A closed contour with outer and inner corners and tangent arcs, cut on its left or right side; what is beside it."""
+    r = np.random.default_rng(seed)
+    radius = float(np.round(r.uniform(2.0, 6.0), 1))
+    w, h, big = (float(np.round(v, 2)) for v in r.uniform((60.0, 50.0, 15.0), (90.0, 70.0, 20.0)))
+    notch = float(np.round(r.uniform(6.0, 9.0), 2))
+    points = [
+        f"G1 X0.0 Y{h - big:.2f}",
+        f"G2 X{big:.2f} Y{h:.2f} I{big:.2f} J0.0",
+        f"G1 X{w / 2 - 15:.2f} Y{h:.2f}",
+        f"X{w / 2:.2f} Y{h - notch:.2f}",  # an inner corner between two outer ones
+        f"X{w / 2 + 15:.2f} Y{h:.2f}",
+        f"X{w:.2f} Y{h:.2f}",
+        f"X{w:.2f} Y{big:.2f}",
+        f"G2 X{w - big:.2f} Y0.0 I{-big:.2f} J0.0",
+        "G1 X-20.0 Y0.0",
+    ]
+    start, lead, leave = "X-30.0 Y-30.0", "G1 X0.0 Y-15.0", "X-40.0 Y-25.0"
+    side = "G41"
+    if r.random() < 0.5:  # the mirror image: the same contour on the right side
+        side = "G42"
+        flip = {"G2": "G3", "G3": "G2"}
+        mirrored = []
+        for line in [start, lead, *points, leave]:
+            words = [flip.get(word, word) for word in line.split()]
+            mirrored.append(" ".join(f"{w[0]}{-float(w[1:])}" if w[0] in "XI" else w for w in words))
+        start, lead, *points, leave = mirrored
+    text = ["%", "G21 G90 G17 G54 G94 G40 G49", "T1 M6", "G43 H1", f"G0 {start} Z20.0", "G1 Z-2.0 F500"]
+    text += [f"{side} D1 {lead}", *points, f"G40 {leave}", "G0 Z20.0", "M2", "%", ""]
+    return "\n".join(text), radius
+
+
+def with_radius(monkeypatch, radius_mm):
+    """The interpreter's tool table has the diameter of tool 1 (in inch, as all of its numbers here)."""
+    write = pathlib.Path.write_text
+
+    def written(path, text, *args, **more):
+        if path.name == "tool.tbl":
+            text = text.replace(" D0", f" D{2 * radius_mm / 25.4:.8f}")
+        return write(path, text, *args, **more)
+
+    monkeypatch.setattr(pathlib.Path, "write_text", written)
+
+
+@pytest.mark.parametrize("wear", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_contours_beside_which_the_interpreter_goes(tmp_path, seed, wear, make_errors, monkeypatch):
+    """G41 and G42 stay: the interpreter's own tool centre, by the exact errors, is where the program has it without errors.
+
+    With wear alone the control's radius is 0, and the tool is still wanted where the contour is.
+    """
+    text, radius = contour(seed)
+    radius = 0.0 if wear else radius
+    with_radius(monkeypatch, radius)
+    program = tmp_path / "p.ngc"
+    program.write_text(text)
+    wanted = machine_moves(program, tmp_path)
+    setup = dataclasses.replace(SETUP, stated_radii_mm={"1": radius})
+    model = model_of(mill(), make_errors(mill(), seed, (900e-6, -600e-6, 700e-6)), None)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions("linuxcnc"), setup)
+    assert result.accepted, result.reasons
+    written = (tmp_path / "out" / result.file).read_text()
+    side = "G41" if "G41" in text else "G42"
+    assert written.count(side) == 1 and written.count("G40") == text.count("G40")
+    body = tmp_path / "body.ngc"
+    body.write_text(without_header(written))
+    driven = machine_moves(body, tmp_path)
+    tool = Reader(mill(), DIALECTS["linuxcnc"], setup, "p").batch(text.encode(), 1).moves.tool_mm[-3:-2]
+
+    def tips(moves):
+        ends = np.array([end for feed, end in moves if feed])
+        return ends + model.error(ends, np.repeat(tool, len(ends), axis=0), np.zeros_like(ends))
+
+    there = np.array([end for feed, end in wanted if feed])
+    reached = tips(driven)
+    before = np.abs(tips(wanted) - there).max()
+    # every place where the interpreter ends a move without errors is reached with them, in this order
+    nearest, row = [], 0
+    for place in there:
+        apart = np.abs(reached[row:] - place).max(axis=1)
+        nearest.append(apart.min())
+        row += int(apart.argmin())
+    assert before > 5 * PRINTED_MM
+    assert max(nearest) < PRINTED_MM, (max(nearest), before)

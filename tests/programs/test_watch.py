@@ -21,7 +21,7 @@ ERRORS = Path(__file__).parents[2] / "examples/zha-gantry.truth.errors.csv"
 HEAD = "%\nO1\nG21 G90 G17 G54\nG0 X-10. Y-5. Z-2.\n"
 PROGRAM = f"{HEAD}G1 X-20. F500\nM30\n%\n"
 OTHER = f"{HEAD}G1 X-30. F500\nM30\n%\n"
-REFUSED = f"{HEAD}G41 D1\nG1 X-20. F500\nM30\n%\n"
+REFUSED = f"{HEAD}G41.3 D1\nG1 X-20. F500\nM30\n%\n"
 MODEL = model_of(mill(), shift(x=10.0), None)
 
 
@@ -102,9 +102,9 @@ def test_a_refused_program_leaves_a_text_and_the_next_one_is_corrected(posted):
     (posted / "b.nc").write_text(PROGRAM)
     first, second = watch_of(posted, 0.0).look(0.0)
     assert (first.state, second.state) == ("refused", "accepted")
-    assert first.reasons[0].startswith("a.nc:5: G41: ")
+    assert first.reasons[0].startswith("a.nc:5: G41.3")
     assert names(posted / "corrected/a.nc") == ["REFUSED.txt"]
-    assert "a.nc:5: G41: " in first.file.read_text()
+    assert "a.nc:5: G41.3" in first.file.read_text()
 
 
 def test_an_internal_error_does_not_end_the_watch(posted):
@@ -162,7 +162,7 @@ def test_a_second_watch_does_not_do_again_what_has_not_changed(posted):
     assert found == {"a.nc": done, "b.nc": ("refused", True), "c.nc": again, "d.nc": again, "e.nc": again}
     assert {path: path.stat().st_mtime_ns for path in before} == before
     (item,) = [item for item in watch_of(posted, 0.0).look(0.0) if item.name == "b.nc"]
-    assert item.reasons[0].startswith("b.nc:5: G41: ")
+    assert item.reasons[0].startswith("b.nc:5: G41.3")
     other = [item.before for item in watch_of(posted, 0.0, conditions=lambda: "other errors").look(0.0)]
     assert other == [False] * 5
 
@@ -302,7 +302,7 @@ def test_once_says_what_became_of_each_program(call, posted):
         ("bad.nc", "refused"),
         ("good.nc", "accepted"),
     ]
-    assert "bad.nc: refused: bad.nc:5: G41" in error.replace("\n", "")
+    assert "bad.nc: refused: bad.nc:5: G41.3" in error.replace("\n", "")
     assert call(*words(posted, "--once", "--match", "g*"))[0] == 0
 
 
