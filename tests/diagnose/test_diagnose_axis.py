@@ -648,3 +648,14 @@ def test_a_reversal_worn_in_the_middle_has_no_backlash(gantry):
     )
     found = diagnose(gantry, runs).axes[0]
     assert [item.name for item in found.effects] == ["lost_motion_X"]
+
+
+@pytest.mark.parametrize(("kind", "seed", "right"), [("null", 8012, "none"), ("warmup", 8004, "warmup_drift")])
+def test_a_weak_change_that_many_names_explain_has_none(tmp_path, kind, seed, right):
+    """Whatever is confirmed has fewer than four names that explain it as well, or explains a lot."""
+    path, out = make(kind, seed).write(tmp_path), tmp_path / "out"
+    cli.main(["diagnose", "zha-gantry", str(path), "--json", "--out", str(out)], standalone_mode=False)
+    found = json.loads((out / "diagnosis.json").read_text())
+    sure = [item for item in found["effects"] if item["grade"] != "tentative"]
+    assert [item["name"] for item in sure] == ([] if right == "none" else [right])
+    assert all(len(item["alias_set"]) < 4 or item["chi2"] > 25.0 for item in sure)
