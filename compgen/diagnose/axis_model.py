@@ -636,6 +636,8 @@ MOST_WINDOWS = 800
 MOST_LOGGED_SCANS = 6
 #: Readings before and after a step within a run, at least.
 LEAST_OF_STEP = 5
+#: A step within a run is charged as this many scan positions each: outliers next to the end of a run are more common.
+RARE = 8.0
 #: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
@@ -686,7 +688,7 @@ def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]
         if not between and min(k, len(session) - k) < LEAST_OF_STEP:
             continue  # a few readings at an end that are off are disturbed, not a step
         where = session.window(k, end) if between else session.place(k)
-        scans = _runs(session) if between else float(len(session))
+        scans = _runs(session) if between else RARE * float(len(session))
         found.append(_candidate(session, step.at(float(k)), scans, f"step before {where}"))
     return [item for item in found if item is not None]
 
