@@ -244,7 +244,7 @@ def _rotary_files(
     if centres:
         placed = identify_spheres(machine, read_spheres(machine, centres), u_um=options.u_deviation_um, known=known)
     own = RotaryErrors() if placed is None else placed.errors
-    errors = RotaryErrors({**own.curves, **known.curves}, own.constants)
+    errors = RotaryErrors({**own.curves, **known.curves}, own.constants, known.reversal)
     summary = turned.summary() if placed is None and turned is not None else {}
     if placed is not None:
         summary = {**placed.summary(), **({} if turned is None else {"rotary_axis": turned.summary()})}
@@ -271,11 +271,11 @@ def run_spheres(
     out: Path,
     options: IdentifyOptions,
     as_json: bool,
+    allow_unverified: bool = False,
 ) -> int:
-    """Identify the position errors of rotary axes, and write them as parameters of one control."""
-    from compgen.cli.rotary_commands import export_parameters, export_tables
+    """Identify the errors of rotary axes, and write them as parameters or tables of one control."""
+    from compgen.cli.rotary_commands import export_parameters, export_tables, pitch_format
     from compgen.controls.rotary_parameters import target_of
-    from compgen.controls.rotary_pitch import format_of
 
     if len(set(controllers)) > 1:
         raise InputError(
@@ -283,7 +283,7 @@ def run_spheres(
         )
     OutputFolder(out)
     name = controllers[0]
-    _ = target_of(machine, name) if name in ROTARY_TARGETS else format_of(machine, name)
+    _ = target_of(machine, name) if name in ROTARY_TARGETS else pitch_format(machine, name, allow_unverified)
     placed, turned, _, files = _rotary_files(machine, measurements, options)
     if turned is None and name not in ROTARY_TARGETS:
         raise InputError(
@@ -293,8 +293,10 @@ def run_spheres(
     write_all(out, files)
     if not as_json:
         _show_rotary(placed, turned)
-    written = export_parameters if name in ROTARY_TARGETS else export_tables
-    return written(machine, out / "identified.errors.csv", name, out, as_json)
+    errors = out / "identified.errors.csv"
+    if name in ROTARY_TARGETS:
+        return export_parameters(machine, errors, name, out, as_json)
+    return export_tables(machine, errors, name, out, as_json, allow_unverified)
 
 
 @click.command("fit")

@@ -13,7 +13,8 @@ from rich.table import Table
 
 from compgen.cli.terminal import answer, complain, say, say_paths
 from compgen.controls.rotary_parameters import believed, lines_of, target_of
-from compgen.controls.rotary_pitch import format_of
+from compgen.controls.rotary_pitch import ABOUT, PitchFormat, format_of
+from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, read_text, write_file
 from compgen.data.machine import Machine
@@ -133,9 +134,22 @@ def preflight(machine: Machine, result: RotaryExport) -> str:
     )
 
 
-def export_tables(machine: Machine, errors: Path, controller: str, out: Path, as_json: bool) -> int:
-    """Write the positioning tables of rotary axes, read back, emulated and judged."""
+def pitch_format(machine: Machine, controller: str, allow_unverified: bool) -> PitchFormat:
+    """The format of a table over the angle; InputError if no document describes it and that was not allowed."""
     form = format_of(machine, controller)
+    if ABOUT[controller]["evidence"] == "unverified" and not allow_unverified:
+        raise InputError(
+            f"the format {controller!r} is unverified ({' '.join(form.instructions(()))}) "
+            "Add --allow-unverified if you accept that"
+        )
+    return form
+
+
+def export_tables(
+    machine: Machine, errors: Path, controller: str, out: Path, as_json: bool, allow_unverified: bool
+) -> int:
+    """Write the positioning tables of rotary axes, read back, emulated and judged."""
+    form = pitch_format(machine, controller, allow_unverified)
     result = export_pitch(form, read_machine_errors(errors)[1])
     prefix = REJECTED_PREFIX if result.reasons else ""
     output = OutputFolder(out)
@@ -154,7 +168,7 @@ def export_tables(machine: Machine, errors: Path, controller: str, out: Path, as
     ]
     output.add(
         "preflight.md",
-        "\n".join([*rows, *(f"- {text}" for text in form.instructions(result.angle_arcsec)), *turned, ""]),
+        "\n".join([*rows, *(f"- {text}" for text in result.instructions), *turned, ""]),
     )
     paths = output.commit()
     for text in result.reasons:
@@ -171,14 +185,51 @@ def _said(result: PitchExport) -> list[str]:
         f"{letter}: error of the angle {own['before_rms']:.2f} -> {own['after_rms']:.2f} arcsec rms, "
         f"largest {own['before_max']:.2f} -> {own['after_max']:.2f} arcsec; "
         f"standard uncertainty of the measured error {own['u_after']:.2f} arcsec, between its angles unknown"
+        + (
+            f"; reversal {own['reversal_before']:+.2f} -> {own['reversal_after']:+.2f} arcsec"
+            if "reversal_before" in own
+            else ""
+        )
         for letter, own in result.angle_arcsec.items()
     ]
     before, after = result.before, result.after
     return [
         *lines,
+        *result.backlash,
         f"over travel, angles and tools of 0 to 200 mm, part set up: tip rms {before.rms_um:.2f} -> {after.rms_um:.2f} um, "
         f"tool axis rms {before.rms_urad:.1f} -> {after.rms_urad:.1f} urad",
     ]
+
+
+def pitch_contents(form: PitchFormat, tables: Sequence[Path]) -> dict[Path, str]:
+    """Text of the files that can be tables of this control: those given, and those in folders that are given."""
+    paths = [file for path in tables for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    chosen = [path for path in paths if path.suffix.lower() in form.endings]
+    if not chosen:
+        raise InputError(f"has no file {' or '.join('*' + ending for ending in form.endings)}", file=tables[0])
+    return {path: read_text(path) for path in chosen}
+
+
+def read_pitch(
+    machine: Machine, tables: Sequence[Path], controller: str, points: Path, out: Path, as_json: bool
+) -> int:
+    """What the control adds to the commands of the rotary axes at poses, by direction of travel where it matters."""
+    form = format_of(machine, controller)
+    found, poses = form.parse(pitch_contents(form, tables)), read_poses(machine, points)
+    columns: dict[str, FloatArray] = {}
+    for letter, table in found.items():
+        for way, name in ((1, ""), (-1, "_negative")):
+            if way > 0 or table.negative_deg is not None:
+                columns[f"c{letter.lower()}{name}_arcsec"] = 3600.0 * table.emulated(poses.angle_deg[letter], way)
+    write_file(out, format_poses(poses, columns, {"machine": machine.name, "controller": controller}))
+    largest = {name: float(np.abs(values).max(initial=0.0)) for name, values in columns.items()}
+    faults = [text for table in found.values() for text in table.faults]
+    data = {"points": len(poses.position_mm), "controller": controller, "max_arcsec": largest, "file": str(out)}
+    for text in faults:
+        complain(f"warning: {text}")
+    said = ", ".join(f"{name} up to {value:.2f}" for name, value in largest.items())
+    answer(as_json, {**data, "remarks": faults}, f"{data['points']} poses: {said} -> {out}")
+    return 0
 
 
 def verify_tables(
@@ -186,12 +237,7 @@ def verify_tables(
 ) -> int:
     """Judge positioning tables of rotary axes against the errors."""
     form = format_of(machine, controller)
-    endings = (".comp", ".ini")
-    paths = [file for path in tables for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
-    chosen = [path for path in paths if path.suffix.lower() in endings]
-    if not chosen:
-        raise InputError(f"has no file {' or '.join('*' + ending for ending in endings)}", file=tables[0])
-    result = judged_pitch(form, read_machine_errors(errors)[1], {path: read_text(path) for path in chosen})
+    result = judged_pitch(form, read_machine_errors(errors)[1], pitch_contents(form, tables))
     output = OutputFolder(out)
     output.add("result.json", json.dumps({"machine": machine.name, **result.summary()}, indent=2) + "\n")
     output.commit()

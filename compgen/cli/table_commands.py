@@ -189,8 +189,8 @@ def export_command(
     --active, ERRORS belong to the machine with its old tables; bare.errors.csv gets those without.
 
     Of a machine with rotary axes the controls linuxcnc-trt, linuxcnc-tdr, linuxcnc-5axis, siemens-toolcarrier and fanuc-5axis
-    get the parameters that say where its rotary axes are (mm); linuxcnc-rotary-comp and siemens-rotary-eec get tables over
-    the angle (degrees).
+    get the parameters that say where its rotary axes are (mm); linuxcnc-rotary-comp, siemens-rotary-eec, siemens-rotary-cec,
+    fanuc-rotary-pitch, heidenhain-rotary-com, twincat-rotary-list and aerotech-rotary get tables over the angle (degrees).
 
     \b
     Example:
@@ -204,7 +204,7 @@ def export_command(
     if controller in ROTARY_PITCH:
         from compgen.cli.rotary_commands import export_tables
 
-        return export_tables(machine, errors, controller, out, as_json)
+        return export_tables(machine, errors, controller, out, as_json, allow_unverified)
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     known = covariance_of(errors, table, None, independent=False)
@@ -272,7 +272,9 @@ def read_command(
 ) -> int:
     """Read controller files, emulate the control, and write the correction at each point.
 
-    FILE gets the points plus cx_um, cy_um, cz_um: what the control adds to the command.
+    FILE gets the points plus cx_um, cy_um, cz_um: what the control adds to the command. Of a table over the angle of rotary
+    axes it gets ca_arcsec, cb_arcsec, cc_arcsec at a_deg, b_deg, c_deg, and where tables act by direction of travel also
+    ca_negative_arcsec ... for negative travel.
 
     \b
     Example:
@@ -282,6 +284,10 @@ def read_command(
         from compgen.cli.rotary_commands import read_parameters
 
         return read_parameters(machine, tables, controller, points, out, as_json)
+    if controller in ROTARY_PITCH:
+        from compgen.cli.rotary_commands import read_pitch
+
+        return read_pitch(machine, tables, controller, points, out, as_json)
     where = read_points(points)
     parsed = read_tables(machine, tables, controller, foreign=True)
     for text in parsed.contradictions:

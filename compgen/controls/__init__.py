@@ -93,7 +93,15 @@ CONTROLLERS = Controls(
 ROTARY_TARGETS = ("linuxcnc-trt", "linuxcnc-tdr", "linuxcnc-5axis", "siemens-toolcarrier", "fanuc-5axis")
 
 #: Names of tables over the angle of rotary axes; :mod:`compgen.controls.rotary_pitch` makes them.
-ROTARY_PITCH = ("linuxcnc-rotary-comp", "siemens-rotary-eec")
+ROTARY_PITCH = (
+    "linuxcnc-rotary-comp",
+    "siemens-rotary-eec",
+    "siemens-rotary-cec",
+    "fanuc-rotary-pitch",
+    "heidenhain-rotary-com",
+    "twincat-rotary-list",
+    "aerotech-rotary",
+)
 
 #: Controls that users request but whose file format is not published: what to use instead.
 NOT_PUBLIC = {

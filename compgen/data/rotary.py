@@ -77,6 +77,10 @@ def unit_of(name: str) -> str:
 
 # Errors.
 
+RAD_PER_ARCSEC = np.pi / 648000.0
+#: Comment of an errors file with the reversal of an axis.
+_REVERSAL = "reversal_{}_arcsec"
+
 
 @dataclass(frozen=True)
 class RotaryCurve:
@@ -100,10 +104,14 @@ class RotaryCurve:
 
 @dataclass(frozen=True, repr=False)
 class RotaryErrors(Displayed):
-    """Errors of rotary axes, mm and rad; one that is absent is zero. ``constants`` by name as (value, uncertainty)."""
+    """Errors of rotary axes, mm and rad; one that is absent is zero. ``constants`` by name as (value, uncertainty).
+
+    ``reversal`` by letter: mean angle reached in positive travel minus that in negative travel, rad; absent: not known.
+    """
 
     curves: Mapping[str, RotaryCurve] = field(default_factory=dict)
     constants: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    reversal: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for names, constant in ((self.curves, False), (self.constants, True)):
@@ -204,7 +212,28 @@ def _rotary_of(table: CsvTable) -> RotaryErrors:
             if angle[first] == angle[second]:
                 raise table.fail(second, "position_deg", f"{name} has two values at {angle[second]:g} degrees")
         curves[name] = RotaryCurve(angle[own], values[own] * unit, u[own] * unit)
-    return RotaryErrors(curves, constants)
+    return RotaryErrors(curves, constants, _reversals(table))
+
+
+def _reversals(table: CsvTable) -> dict[str, float]:
+    """Reversal of rotary axes by letter, rad, from comments such as ``# reversal_c_arcsec = 2.0``."""
+    found = {}
+    for letter in ROTARY:
+        key = _REVERSAL.format(letter.lower())
+        if key not in table.metadata:
+            continue
+        try:
+            value = float(table.metadata[key])
+        except ValueError:
+            value = np.nan
+        if not abs(value) <= 3600.0:
+            raise InputError(
+                f"{table.metadata[key][:40]!r} is no reversal; expected arcsec, at most 3600 in size",
+                file=table.path,
+                field=key,
+            )
+        found[letter] = value * RAD_PER_ARCSEC
+    return found
 
 
 def format_machine_errors(table: ErrorTable, rotary: RotaryErrors, metadata: Mapping[str, object]) -> str:
@@ -238,7 +267,8 @@ def format_machine_errors(table: ErrorTable, rotary: RotaryErrors, metadata: Map
         "value": [f"{row[3]:.6f}" for row in rows],
         "u_value": ["" if np.isnan(row[4]) else f"{row[4]:.6f}" for row in rows],
     }
-    return format_csv(columns, metadata)
+    turned = {_REVERSAL.format(a.lower()): f"{value / RAD_PER_ARCSEC:.4f}" for a, value in rotary.reversal.items()}
+    return format_csv(columns, {**metadata, **turned})
 
 
 # Centres of spheres found at poses: ``*.sphere.csv``.
@@ -492,7 +522,6 @@ def format_poses(poses: Poses, results: Mapping[str, FloatArray], metadata: Mapp
 
 #: Columns that tell runs of a rotary axis from those of a linear one.
 RUN_COLUMNS = ("position_deg", "deviation_arcsec")
-RAD_PER_ARCSEC = np.pi / 648000.0
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def identify_rotary_runs(machine: Machine, runs: RotaryRuns) -> RotaryPositionin
     InputError
         for an axis with fewer than three targets.
     """
-    curves, figures, notes = {}, {}, []
+    curves, figures, notes, reversal = {}, {}, [], {}
     letters = np.array(runs.letter)
     for letter in dict.fromkeys(runs.letter):
         own = letters == letter
@@ -57,6 +57,8 @@ def identify_rotary_runs(machine: Machine, runs: RotaryRuns) -> RotaryPositionin
             raise InputError(f"{letter} was measured at {len(target)} angles; at least 3 are needed")
         mean, scatter, count = _statistics(runs, own, target)
         both = np.nanmean(mean, axis=0)
+        if not np.isnan(mean).any():
+            reversal[letter] = float(np.mean(mean[0] - mean[1]))
         axis, name = machine.rotary[letter], f"E{letter}{letter}"
         figures[letter] = _figures(mean, scatter)
         one_way = bool(np.isnan(mean).all(axis=1).any())
@@ -88,7 +90,7 @@ def identify_rotary_runs(machine: Machine, runs: RotaryRuns) -> RotaryPositionin
             )
         zero = np.interp(axis.reference_deg, at, value, period=axis.modulo_deg)
         curves[name] = RotaryCurve(at, value - zero, u)
-    return RotaryPositioning(RotaryErrors(curves, {}), figures, tuple(notes))
+    return RotaryPositioning(RotaryErrors(curves, {}, reversal), figures, tuple(notes))
 
 
 def _statistics(runs: RotaryRuns, own: FloatArray, target: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -183,6 +183,8 @@ def test_other_wrong_use_is_refused(folder, call):
         lambda text: text.replace("$AA_ENC_COMP_STEP[0,AX5]=30.000000\n", ""),
         lambda text: text.replace("$AA_ENC_COMP_MAX[0,AX5]=360.000000", "$AA_ENC_COMP_MAX[0,AX5]=350.000000"),
         lambda text: text.replace("AX5", "AX6"),
+        lambda text: text.replace("$AA_ENC_COMP[0,3,AX5]", "$AA_ENC_COMP[0,x,AX5]"),
+        lambda text: text.replace("STEP[0,AX5]=30.0", "STEP[0,AX5]=-30.0").replace("=360.0", "=-360.0"),
         lambda text: text.replace("=30.000000", "=x"),
     ):
         with pytest.raises(InputError):
