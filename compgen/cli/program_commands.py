@@ -38,6 +38,7 @@ from compgen.programs import CorrectOptions, FolderWatch, Setup, correct_program
 from compgen.resources import program_version
 
 if TYPE_CHECKING:
+    from compgen.heat import Growth
     from compgen.programs import Feature, PartMachine, PartPrediction, ProgramCorrection, WatchedProgram
     from compgen.programs.path import ExactModel
 
@@ -180,11 +181,91 @@ def program_options(command: Command) -> Command:
     )(decorated)
 
 
-def _model(machine: Machine, errors: Path | None, reversal: Path | None, only: str | None = None) -> ExactModel:
+@dataclass(frozen=True)
+class _Heat:
+    """What the options say of the temperatures at which a program runs."""
+
+    model: Path | None
+    temperatures: str | None
+    at: str | None
+    zero: str | None
+
+    def growth(self, machine: Machine) -> Growth | None:
+        """Return the growth of a machine, None if no temperatures were stated."""
+        if self.temperatures is None:
+            if self.model or self.at or self.zero:
+                raise InputError(
+                    "--heat, --heat-at and --heat-zero say how --temperatures act; add --temperatures with a file or with values"
+                )
+            return None
+        from compgen.heat import growth_at, read_heat
+
+        file = self._file(machine)
+        model = read_heat(file)
+        if model.machine != machine.name:
+            raise InputError(f"is the model of heat of {visible(model.machine)}, not of {machine.name}", file=file)
+        return growth_at(model, self.temperatures, self.at, self.zero)
+
+    def files(self, machine: Machine) -> list[Path]:
+        """Return the files that decide the growth."""
+        if self.temperatures is None:
+            return []
+        stated = Path(self.temperatures)
+        return [self._file(machine), *([stated] if stated.exists() else [])]
+
+    def _file(self, machine: Machine) -> Path:
+        if self.model is not None:
+            return self.model
+        beside = None if machine.source is None else Path(machine.source).with_name(f"{machine.name}.heat.toml")
+        if beside is None or not beside.exists():
+            raise InputError(
+                f"--temperatures need the model of heat that `volcomp heat` writes: {machine.name}.heat.toml; it is not "
+                "beside the machine file, name it with --heat"
+            )
+        return beside
+
+
+def heat_options(command: Command) -> Command:
+    """Add the temperatures at which a program runs; the command receives ``heat``."""
+
+    @functools.wraps(command)
+    def wrapper(
+        *args: Any,
+        heat: Path | None,
+        temperatures: str | None,
+        heat_at: str | None,
+        heat_zero: str | None,
+        **options: Any,
+    ) -> Any:
+        return command(*args, heat=_Heat(heat, temperatures, heat_at, heat_zero), **options)
+
+    decorated: Any = wrapper
+    text = (
+        "Moment or temperatures from which growth counts, when the work offset was probed: time_s or ISO time of the file "
+        "(default: its first reading), or values, e.g. spindle=20,bed=20."
+    )
+    decorated = click.option("--heat-zero", metavar="TIME|VALUES", help=text)(decorated)
+    text = (
+        "Moment of the file of temperatures at which the program runs: time_s or ISO time (default: its last reading)."
+    )
+    decorated = click.option("--heat-at", metavar="TIME", help=text)(decorated)
+    text = (
+        "Temperatures while the program runs, degC: a *.temperatures.csv, or values of a machine that has settled, e.g. "
+        "spindle=28.5,bed=22. What heat has moved is then part of the error."
+    )
+    decorated = click.option("--temperatures", metavar="FILE|VALUES", help=text)(decorated)
+    text = "Model of heat of `volcomp heat` (default: NAME.heat.toml beside the machine file): for --temperatures."
+    return path_option("--heat", text)(decorated)  # type: ignore[no-any-return]
+
+
+def _model(
+    machine: Machine, errors: Path | None, reversal: Path | None, only: str | None = None, heat: _Heat | None = None
+) -> ExactModel:
     if errors is None:
         raise click.UsageError("Missing option '--errors'.")
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
-    return model_of(machine, open_errors(errors), both, only)
+    found = model_of(machine, open_errors(errors), both, only)
+    return found if heat is None else replace(found, growth=heat.growth(machine))
 
 
 def _not_measured(model: ExactModel, errors: Path) -> list[str]:
@@ -266,6 +347,7 @@ def watch_options(command: Command) -> Command:
 @prior_option
 @watch_options
 @program_options
+@heat_options
 @options_of(CorrectOptions, "options")
 @click.option("--only", metavar="AXES", help="Correct only these axes, e.g. X,Y; the others stay as they are.")
 @path_option(
@@ -284,6 +366,7 @@ def correct_command(
     only: str | None,
     program: Path,
     watching: _Watching | None,
+    heat: _Heat,
     options: CorrectOptions,
     active: tuple[Path, ...],
     active_controller: str | None,
@@ -311,7 +394,7 @@ def correct_command(
     options.check()
 
     def model() -> _Known:
-        return _known(_model(machine, errors, reversal, only), errors, active, active_controller)
+        return _known(_model(machine, errors, reversal, only, heat), errors, active, active_controller)
 
     def correct(known: _Known, source: Path, folder: Path) -> ProgramCorrection:
         with progress(quiet=as_json) as show:
@@ -330,7 +413,7 @@ def correct_command(
     if watching is not None:
         setup(machine)
         given = click.get_current_context().params
-        files = [path for path in (errors, reversal, *active) if path is not None]
+        files = [path for path in (errors, reversal, *active, *heat.files(machine)) if path is not None]
         fixed = [repr((name, str(given[name]))) for name in sorted(given.keys() - _OF_THE_WATCH)]
         fixed += [program_version(), sha256_of_file(machine.source) if machine.source else repr(machine)]
         read = [path for path in (given["tools"],) if path is not None]
@@ -351,12 +434,14 @@ class _Known:
 def _known(model: ExactModel, errors: Path, active: tuple[Path, ...], active_controller: str | None) -> _Known:
     remarks = _not_measured(model, errors)
     name = errors.name
+    if model.growth is not None:
+        name += f" and heat of {model.growth.model[0]}"
     if active:
         from compgen.programs.part import CompensatedModel
         from compgen.tables import read_tables
 
         tables = read_tables(model.machine, active, str(active_controller), foreign=True)
-        model = CompensatedModel(model.machine, model.errors, model.reversal, model.only, tables)
+        model = CompensatedModel(model.machine, model.errors, model.reversal, model.only, model.growth, tables)
         name += f" with the active tables of {active_controller}"
     return _Known(model, (name, sha256_of_file(errors)), remarks)
 
@@ -554,6 +639,7 @@ def _of_fleet(file: Path, name: str) -> tuple[PartMachine, list[PartMachine], li
 @click.argument("machine", metavar="MACHINE")
 @click.argument("program", type=PATH)
 @program_options
+@heat_options
 @options_of(CorrectOptions, "options", only=("dialect",))
 @click.option("--uncertainty", is_flag=True, help="Require the uncertainty: exit code 2 if the errors have none.")
 @path_option("--tables", "Table of a control (several times): also evaluate the part with it active.", multiple=True)
@@ -577,6 +663,7 @@ def part_command(
     errors: Path | None,
     reversal: Path | None,
     program: Path,
+    heat: _Heat,
     options: CorrectOptions,
     uncertainty: bool,
     tables: tuple[Path, ...],
@@ -610,6 +697,8 @@ def part_command(
         raise InputError(
             "--fleet takes errors and active tables from the store; leave out --errors, --reversal, --tables and --also"
         )
+    if heat.temperatures is not None and (fleet is not None or also):
+        raise InputError("--temperatures are those of one machine; leave out --also and --fleet, or --temperatures")
     folder = OutputFolder(out) if out is not None else None
     notes: list[str] = []
     if fleet is not None:
@@ -617,7 +706,7 @@ def part_command(
         notes += [f"no identified errors in the store: {', '.join(missing)}"] if missing else []
     else:
         own_machine = with_prior_class(open_machine(machine, machines, used=(controller,)), prior)
-        model, others = _model(own_machine, errors, reversal), _also(also)
+        model, others = _model(own_machine, errors, reversal, heat=heat), _also(also)
         covariance = covariance_of(Path(str(errors)), model.errors, None, independent=False)
         read = None
         if tables:

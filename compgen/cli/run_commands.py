@@ -268,7 +268,7 @@ def run_command(
     if any(name in (*ROTARY_TARGETS, *ROTARY_PITCH) for name in controller):
         from compgen.cli.identify_commands import run_spheres
 
-        return run_spheres(machine, measurements, controller, out, options, as_json)
+        return run_spheres(machine, measurements, controller, out, options, as_json, allow_unverified)
     with progress(quiet=as_json) as show:
         result = run(
             machine,

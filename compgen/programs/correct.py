@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from compgen.programs.compensation import CentrePath, centre_path, unknown_radiu
 from compgen.programs.cycles import DrillingCycle
 from compgen.programs.dialects import AT_THE_END, MARK, Dialect, dialect_named
 from compgen.programs.follower import Follower, difference, read_twice
-from compgen.programs.klartext import CALCULATED, arc_text
+from compgen.programs.klartext import CALCULATED, arc_text, skips
 from compgen.programs.path import (
     PLAIN,
     PLANE_AXES,
@@ -42,9 +42,12 @@ from compgen.programs.path import (
     path_deviations,
     reach_of,
 )
-from compgen.programs.reader import MM_PER_INCH, PECK_REST_MM, Batch, Reader, Setup, SingleBlock
+from compgen.programs.reader import MM_PER_INCH, PECK_REST_MM, Batch, Reader, Setup, SingleBlock, number_of
 from compgen.programs.runs import LONGEST_BLOCK, P_WORD, R_WORD, Run
 from compgen.resources import LANGUAGES, program_version
+
+if TYPE_CHECKING:
+    from compgen.heat import Growth
 
 #: G codes of drilling cycles.
 _CYCLE_CODES = frozenset((73.0, 74.0, 76.0, *map(float, range(81, 90))))
@@ -129,6 +132,8 @@ class ProgramCorrection:
     beyond: tuple[BeyondTravel, ...] = ()
     #: Radii of radius compensation by the D or tool that they are of, mm; inf: not known, and of no matter.
     radii_mm: Mapping[str, float] = field(default_factory=dict)
+    #: What heat has moved, which is corrected, too.
+    growth: Growth | None = None
 
     @property
     def accepted(self) -> bool:
@@ -157,6 +162,7 @@ class ProgramCorrection:
             "assumed": list(self.assumed),
             "notes": list(self.notes),
             "tolerance_um": self.tolerance_um,
+            **({} if self.growth is None else {"heat": self.growth.as_dict()}),
             "file": self.file,
         }
 
@@ -165,7 +171,7 @@ class ProgramCorrection:
 
 
 class _Piece(NamedTuple):
-    """Piece ``number`` (from 0) ``of`` those into which a move is divided; ``share`` is the part of the move that it is."""
+    """Piece ``number`` (from 0) ``of`` those into which a move is divided; ``share`` is the part of its time that it takes."""
 
     command_mm: FloatArray
     centre_mm: FloatArray
@@ -225,7 +231,29 @@ class ProgramWriter:
                     added[line] = len(texts) - 1
             if segment.count:
                 self.wanted_mm = batch.moves.end_mm[segment.first + segment.count - 1]
-        return edits.applied(batch.text), np.repeat(batch.first_line + np.arange(len(added)), 1 + added)
+        text, origins = edits.applied(batch.text), np.repeat(batch.first_line + np.arange(len(added)), 1 + added)
+        self._hold_length(batch, text, origins)
+        return text, origins
+
+    def _hold_length(self, batch: Batch, text: str, origins: IntArray) -> None:
+        """Refuse a block that the correction has made longer than the control takes."""
+        most = self.dialect.longest_block
+        if most is None or not re.search(rf"^[^\n]{{{most + 1}}}", text, re.MULTILINE):
+            return
+        own = batch.text.split("\n")
+        for line, number in zip(text.split("\n"), origins.tolist(), strict=False):
+            length = self.dialect.length_of(line)
+            if length > max(most, self.dialect.length_of(own[number - batch.first_line])):
+                raise InputError(
+                    f"the block is {length} characters long when it is corrected, and the control takes {most}; shorten its "
+                    "comment, or divide the block",
+                    line=number,
+                )
+
+    def held(self, value: float, digits: int) -> int:
+        """Return the decimals that a number can have, ``digits`` or fewer, so that the control reads all its digits."""
+        whole = len(str(int(abs(value)))) if abs(value) >= 1.0 else 0
+        return max(min(digits, self.dialect.most_digits - whole), 0)
 
     def line_end(self, text: str) -> str:
         """Return the end of line of a block, with the * of HEIDENHAIN."""
@@ -273,10 +301,12 @@ class ProgramWriter:
             self.shift_mm = np.zeros(3)
         if block.begins_series:
             self.depth = self.level = np.nan
-            self.lift_mm = float(self.written_mm[2] - self.wanted_mm[2] - self.shift_mm[2])
+            k = block.plane
+            self.lift_mm = float(self.written_mm[k] - self.wanted_mm[k] - self.shift_mm[k])
         if block.kind == "store":
-            values = {letter: float(text) for letter, text, *_ in block.words if letter in "ZR"}
-            self.depth, self.level = values.get("Z", self.depth), values.get("R", self.level)
+            deep = AXES[block.plane]
+            values = {letter: number_of(text) for letter, text, *_ in block.words if letter in (deep, "R")}
+            self.depth, self.level = values.get(deep, self.depth), values.get("R", self.level)
             self._note_peck(block)
         if block.kind == "tap":
             return [self._tapped(block, batch, pieces, rows, offset)]
@@ -288,6 +318,9 @@ class ProgramWriter:
             if block.count:
                 # axes that a move in machine coordinates does not name stay where they were written to go
                 letters = {word[0][0] for word in block.words if word[0] in (*AXES, *(f"{axis}1" for axis in AXES))}
+                codes = {word[0] for word in block.words}
+                # M140 leads along Z alone, DEP in X and Y
+                letters |= {"Z"} if "M140" in codes else {"X", "Y"} if "DEP" in codes else set()
                 there = np.array([not letters or axis in letters for axis in AXES])
                 self.target_mm = np.where(there, pieces.command_mm[rows][-1], self.target_mm)
                 self.written_mm = np.where(there, pieces.command_mm[rows][-1], self.written_mm)
@@ -301,10 +334,11 @@ class ProgramWriter:
         count = rows.stop - rows.start
         texts = []
         total = share_before[rows]
+        times = self._shares_of_time(block, move, pieces, rows, total) if block.inverse_time and count > 1 else total
         for piece in range(count):
             command, centre = pieces.command_mm[rows.start + piece], pieces.centre_mm[rows.start + piece]
             share = float(total[piece])
-            part = _Piece(command, centre, float(move.sweep_rad[0]) * share, share, piece, count)
+            part = _Piece(command, centre, float(move.sweep_rad[0]) * share, float(times[piece]), piece, count)
             texts.append(self._piece(block, move, part, offset))
             self.target_mm = np.array(command)
         if block.kind == "arc" and self.dialect.klartext:
@@ -353,15 +387,17 @@ class ProgramWriter:
                 text, first, last = words[letter]
                 places = len(text.partition(".")[2].strip())
                 calculated = self.dialect.klartext and places >= CALCULATED
-                given, own = float(text.replace(" ", "")), digits if calculated else max(digits, places)
+                given = float(text.replace(" ", ""))
+                own = self.held(value, digits if calculated else max(digits, places))
                 if count == 1 and abs(value - given) <= _HALF * 10.0**-own and not calculated:
                     return given
                 changes.append((first, last, self._number(value, own, text)))
                 return round(value, own)
             if needed or always:
                 equals = "=" if len(letter) > 1 else ""  # CR= of SINUMERIK
-                more.append(f"{letter}{equals}{self._number(value, digits)}")
-                return round(value, digits)
+                own = self.held(value, digits)
+                more.append(f"{letter}{equals}{self._number(value, own)}")
+                return round(value, own)
             return None
 
         plane = int(move.plane[0])
@@ -400,14 +436,16 @@ class ProgramWriter:
             )
         if block.inverse_time and count > 1:
             text, first, last = next((t, a, b) for letter, t, a, b in block.words if letter == "F")
-            faster = f"{float(text) / share:.6g}"
+            faster = self._inverse_time(block, text, share)
             if piece == 0:
                 changes.append((first, last, faster))
             else:
                 more.append(f"F{faster}")
         if piece > 0:
             skip = re.match(r"\s*(/\d?)", block.text)
-            head = "L " if self.dialect.klartext else skip[1] if skip else ""
+            head = (skip[1] or "") if skip else ""
+            if self.dialect.klartext:
+                head = f"{'/' if skips(block.text) else ''}L "
             return head + " ".join(more) + self.line_end(block.text)
         if count > 1:
             for letter, text, first, last in block.words:
@@ -418,6 +456,46 @@ class ProgramWriter:
         end = end or max(stop for _, _, _, stop in block.words)
         text = _spliced(block.text, changes, end, more)
         return text if count == 1 or text.endswith("\n") else text + "\n"
+
+    def _shares_of_time(
+        self, block: SingleBlock, move: Moves, pieces: Pieces, rows: slice, shares: FloatArray
+    ) -> FloatArray:
+        """Parts of the time of a block under G93 that its pieces take: as long as they are, so that the feed is one."""
+        if block.kind == "arc" and self.dialect.name == "fanuc":
+            raise InputError(
+                "an arc under G93 has to be divided, and F counts per radius on FANUC, per block on Haas; post it with G94, or "
+                "give a larger --tolerance-um",
+                line=block.number,
+            )
+        way = np.diff(np.vstack([self.target_mm, pieces.command_mm[rows]]), axis=0)
+        if move.sweep_rad[0]:
+            a, b = PLANE_AXES[int(move.plane[0])]
+            radius = np.hypot(*(pieces.command_mm[rows, k] - pieces.centre_mm[rows, k] for k in (a, b)))
+            way[:, a], way[:, b] = radius * move.sweep_rad[0] * shares, 0.0
+        length = np.linalg.norm(way, axis=1)
+        total = float(length.sum())
+        return length / total if np.isfinite(total) and total > 0.0 and length.all() else shares
+
+    def _inverse_time(self, block: SingleBlock, text: str, share: float) -> str:
+        """F of a piece that takes ``share`` of the time of its block, in plain decimals that the control reads."""
+        given = number_of(text)
+        if self.dialect.point_needed and "." not in text:
+            raise InputError(
+                f"F{text} under G93 has no decimal point, and the block has to be divided: FANUC reads {given:g} or "
+                f"{given / 1000:g}; post it with a decimal point",
+                line=block.number,
+            )
+        exact = given / share
+        digits, most = self.dialect.inverse_time or (9, np.inf)
+        digits = self.held(exact, min(digits, max(5 - int(np.floor(np.log10(exact))), 0))) if exact > 0 else 0
+        found = self._number(exact, digits)
+        if not 0.0 < given <= exact <= most or abs(float(found) / exact - 1.0) > 0.005:
+            raise InputError(
+                f"F{text} under G93 becomes {exact:.6g} in a piece of the block, which the control does not take; post feed per "
+                "minute (G94), or give a larger --tolerance-um or --shortest-mm",
+                line=block.number,
+            )
+        return found if "." in found or not self.dialect.point_needed else f"{found}."
 
     def _rounded(self, block: SingleBlock) -> str:
         """Write numbers that were calculated with the decimals of the dialect."""
@@ -556,51 +634,56 @@ class ProgramWriter:
     ) -> str:
         """Rewrite a drilling block: place, depth, R level and pecks of the hole; ``last`` is the last piece of each move."""
         scale, digits, offset = block.scale, self.digits(block.scale), offset_mm.tolist()
+        deep = int(moves.plane[block.first])
+        sides = [k for k in range(3) if k != deep]
         rows = slice(block.first, block.first + block.count)
         kinds, may = moves.kind[rows].tolist(), moves.corrected[rows].tolist()
-        begin_z, end_z = moves.start_mm[rows, 2].tolist(), moves.end_mm[rows, 2].tolist()
+        begin_z, end_z = moves.start_mm[rows, deep].tolist(), moves.end_mm[rows, deep].tolist()
         strokes = [k for k, kind in enumerate(kinds) if kind != RAPID]
-        depth = next((k for k in strokes if may[k][2]), None)
+        depth = next((k for k in strokes if may[k][deep]), None)
         if depth is None:
             return block.text
         r_level, allowed = begin_z[strokes[0]], may[depth]
         reach_mm = r_level - end_z[depth]  # as programmed: a hole of five pecks stays one of five
         # the stroke to the depth may be several pieces; the hole is where the last ends
         target = command_mm[last[block.first + depth]].tolist()
-        at_level = [k for k, z in enumerate(end_z) if z == r_level and may[k][2]]
-        level_z = float(command_mm[last[block.first + at_level[-1]], 2]) if at_level else math.nan
+        at_level = [k for k, z in enumerate(end_z) if z == r_level and may[k][deep]]
+        level_z = float(command_mm[last[block.first + at_level[-1]], deep]) if at_level else math.nan
         words = {letter: (text, start, stop) for letter, text, start, stop in block.words}
         changes: list[tuple[int, int, str]] = []
         more: list[str] = []
-        before = [*((self.target_mm[:2] - offset_mm[:2]) / scale).tolist(), self.depth, self.level]
+        before = [*((self.target_mm - offset_mm) / scale).tolist(), self.level]
+        before[deep] = self.depth
         wanted = [*((there - zero) / scale for there, zero in zip(target, offset, strict=True))]
-        wanted.append((level_z - offset[2]) / scale)
+        wanted.append((level_z - offset[deep]) / scale)
         found = list(before)
         for k, letter in enumerate("XYZR"):
-            value, free = wanted[k], allowed[min(k, 2)]
+            value, free = wanted[k], allowed[deep if k == 3 else k]
             if math.isnan(value):
                 continue
             if letter in words:
                 text, first, stop = words[letter]
-                given, own = float(text.replace(" ", "")), max(digits, len(text.partition(".")[2].strip()))
+                given = float(text.replace(" ", ""))
+                own = self.held(value, max(digits, len(text.partition(".")[2].strip())))
                 if abs(value - given) > _HALF * 10.0**-own and free:
                     changes.append((first, stop, self._number(value, own, text)))
                     found[k] = round(value, own)
                 else:
                     found[k] = given
             elif free and math.isfinite(before[k]) and round(value * 10**digits) != round(before[k] * 10**digits):
-                more.append(f"{letter}{self._number(value, digits)}")
-                found[k] = round(value, digits)
-        self.depth, self.level = found[2], found[3]
+                own = self.held(value, digits)
+                more.append(f"{letter}{self._number(value, own)}")
+                found[k] = round(value, own)
+        self.depth, self.level = found[deep], found[3]
         self._note_peck(block)
         given, written = self.peck
-        if self.pecking and given > 0.0 and np.isfinite(found[3] - found[2]):
-            peck, deep, unit = given, found[3] - found[2], 10.0**-digits
-            strokes, now = (np.ceil((length - PECK_REST_MM / scale) / given) for length in (reach_mm / scale, deep))
+        if self.pecking and given > 0.0 and np.isfinite(found[3] - found[deep]):
+            peck, stroke, unit = given, found[3] - found[deep], 10.0**-digits
+            strokes, now = (np.ceil((length - PECK_REST_MM / scale) / given) for length in (reach_mm / scale, stroke))
             if now > strokes:
-                peck = (np.floor(deep / strokes / unit + 1e-6) + 1.0) * unit
+                peck = (np.floor(stroke / strokes / unit + 1e-6) + 1.0) * unit
             elif now < strokes:
-                peck = (np.ceil(deep / (strokes - 1.0) / unit - 1e-6) - 1.0) * unit
+                peck = (np.ceil(stroke / (strokes - 1.0) / unit - 1e-6) - 1.0) * unit
             if abs(peck - written) > _HALF * unit:
                 if "Q" in words:
                     text, first, stop = words["Q"]
@@ -608,15 +691,15 @@ class ProgramWriter:
                 else:
                     more.append(f"Q{self._number(peck, digits)}")
                 self.peck = given, peck
-        for k in range(2):
+        for k in sides:
             if AXES[k] in words or any(word[0] == AXES[k] for word in more):
                 self.written_mm[k] = found[k] * scale + offset[k]
-        self.target_mm[:2] = target[:2]
+        self.target_mm[sides] = np.array(target)[sides]
         if end_z[-1] == r_level:
-            self.target_mm[2] = level_z
-            self.written_mm[2] = found[3] * scale + offset[2]
+            self.target_mm[deep] = level_z
+            self.written_mm[deep] = found[3] * scale + offset[deep]
         else:  # at the initial level, whose number is that of the position written before the series
-            self.target_mm[2] = self.written_mm[2] = end_z[-1] + self.lift_mm + self.shift_mm[2]
+            self.target_mm[deep] = self.written_mm[deep] = end_z[-1] + self.lift_mm + self.shift_mm[deep]
         self.changed += bool(changes or more)
         end = max((stop for letter, (_, _, stop) in words.items() if letter in AXES), default=0)
         return _spliced(block.text, changes, end or max(w[3] for w in block.words), more)
@@ -737,7 +820,8 @@ class _RunPieces:
 
     def _settle(self, columns: slice, exact: FloatArray, needed: NDArray[np.bool_]) -> None:
         """Round numbers; those of words that change by less than half their last decimal stay, others are added if ``needed``."""
-        given, own, named = self.given[:, columns], self.own[:, columns], self.named[:, columns]
+        own = self.own[:, columns] = self._held(exact, self.own[:, columns])
+        given, named = self.given[:, columns], self.named[:, columns]
         same = named & self.whole[:, None] & (np.abs(exact - given) <= _HALF / _TENS[own])
         added = ~named & needed & ~np.isnan(exact)
         rounded = np.where(named | added, np.rint(exact * _TENS[own]) / _TENS[own], np.nan)
@@ -746,6 +830,15 @@ class _RunPieces:
             same,
             added,
         )
+
+    def _held(self, exact: FloatArray, own: NDArray[Any]) -> NDArray[Any]:
+        """:meth:`ProgramWriter.held` of many numbers."""
+        most, largest = self.writer.dialect.most_digits, float(np.fmax.reduce(np.abs(exact), axis=None, initial=0.0))
+        if int(own.max(initial=0)) + len(str(int(largest))) <= most:
+            return own
+        size = np.nan_to_num(np.abs(exact))
+        whole = np.where(size >= 1.0, np.floor(np.log10(np.maximum(size, 1.0))) + 1.0, 0.0)
+        return np.asarray(np.maximum(np.minimum(own, most - whole), 0)).astype(own.dtype)
 
     def _ends(self) -> None:
         scale, offset, later = self.run.scale, self.offset_mm, ~self.begins[:, None]
@@ -832,7 +925,7 @@ class _RunPieces:
 
     def _edit(self, edits: _Edits) -> None:
         """Put the numbers into the text: words replaced, words added after the axis words, and new blocks."""
-        words, text, line, digits = self.words, self.batch.text, self.line, self.digits
+        words, text, line = self.words, self.batch.text, self.line
         row, column = np.nonzero(self.named & ~self.same & ~np.isnan(self.value))
         more, letter = np.nonzero(self.added)
         # the first axis of a plane goes first: K before I in G18
@@ -842,7 +935,7 @@ class _RunPieces:
         begin, end = words.begin[line[row], column], words.end[line[row], column]
         numbers = _numbers(
             np.concatenate([self.value[row, column], self.value[more, letter]]),
-            np.concatenate([self.own[row, column], np.full(len(more), digits)]),
+            np.concatenate([self.own[row, column], self.own[more, letter]]),
             np.append(self.decimals[row, column] < self.own[row, column], np.full(len(more), True)),
             np.append(words.code[begin] == ord("+"), np.full(len(more), self.writer.dialect.pole)),
         )
@@ -1066,7 +1159,7 @@ class _ReadBack:
             self._add(self.after, wanted, owner, driven.moves.part(back), (low, high), directions)
             self._add_corners(path, driven, back, owner)
             if self.follow is not None:
-                self.follow(wanted, owner, read.part(back), low, high)
+                self.follow(wanted, owner, driven.moves.part(back), low, high)
 
     def _path(self, moves: Moves, origin: IntArray, pieces: Pieces | None = None) -> CentrePath:
         """The path of the tool centre; InputError with the line of the program for a contour that has none."""
@@ -1143,8 +1236,10 @@ class _ReadBack:
         self, wanted: Moves, read: Moves, owner: IntArray, command_mm: FloatArray, drilled: NDArray[np.bool_]
     ) -> None:
         """Hold the ends of moves at feed against the commands that were meant; of a cycle the depth of each hole."""
-        deep = (wanted.end_mm[:, 2] < wanted.start_mm[:, 2]) & (wanted.at_mm == wanted.end_mm).all(axis=1)
-        meant = wanted.corrected & (~drilled | (deep & wanted.corrected[:, 2]))[:, None]
+        rows, along = np.arange(len(wanted)), np.where(drilled, wanted.plane, 2)
+        deep = wanted.end_mm[rows, along] < wanted.start_mm[rows, along]
+        deep &= (wanted.at_mm == wanted.end_mm).all(axis=1)
+        meant = wanted.corrected & (~drilled | (deep & wanted.corrected[rows, along]))[:, None]
         off = np.where(meant[owner], np.nan_to_num(np.abs(read.end_mm - command_mm), nan=np.inf), 0.0)
         worst = np.flatnonzero((off > self.least_mm).any(axis=1))
         if len(worst):
@@ -1269,9 +1364,13 @@ def _growth_said(blocks: int, added: int, piece_mm: float, errors: ErrorTable, o
         f"the corrected program has {blocks + added} blocks for {blocks}: a piece at feed is {piece_mm:.2f} mm long on average, "
         f"{1000.0 / 60.0 / piece_mm:.0f} blocks a second at 1000 mm/min"
     )
+    # where a curve bends, the length of a piece goes with the root of the tolerance
+    enough_um = options.tolerance_um * (added / max(blocks, 1)) ** 2
     cure = (
         f"a larger --tolerance-um ({options.tolerance_um:g}) or --shortest-mm ({options.shortest_mm:g}) make it shorter"
     )
+    if enough_um <= 10.0 * options.tolerance_um:
+        cure += f"; at about {float(f'{enough_um:.2g}'):g} um it has twice the blocks"
     if not errors.curves:
         return f"{said}; {cure}"
     name, curve = min(errors.curves.items(), key=lambda item: float(np.diff(item[1].position_mm).min(initial=np.inf)))
@@ -1418,12 +1517,13 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
             tuple(reasons),
             ("" if not reasons else REJECTED_PREFIX) + source.name,
             errors_file,
-            (*notes, *remarks),
+            (*notes, *([] if model.growth is None else model.growth.lines()), *remarks),
             model.machine.units,
             tuple(name for name in reader.used_offsets if not dialect.check or dialect.register(name) is None),
             check.travel.count,
             tuple(check.travel.found),
             reader.used_radii,
+            model.growth,
         )
         final = work / "program"
         with source.open("rb") as stream:

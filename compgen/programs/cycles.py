@@ -6,6 +6,7 @@ the cycles from 200, P01 and P02 of the cycles before, which count from where th
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -38,7 +39,12 @@ _HEIDENHAIN = {
 }
 _HEIDENHAIN |= {"G206": True, "G207": True, "G209": True, "G240": False, "G241": False}
 #: Of Klartext also bore milling: the control mills about the place of the hole.
-_KLARTEXT = frozenset(name for name in _HEIDENHAIN if name[1:].isdigit() and len(name) == 4) | {"G208"}
+#: Cycles of Klartext before 200 that are those of DIN/ISO by other numbers: pecking, tapping, rigid tapping.
+OLD_CYCLES = {1: "G83", 2: "G84", 17: "G84"}
+_KLARTEXT = frozenset(name for name in _HEIDENHAIN if name[1:].isdigit() and len(name) == 4) | {
+    "G208",
+    *OLD_CYCLES.values(),
+}
 _HEIDENHAIN |= {"G208": False}
 
 
@@ -70,10 +76,11 @@ class DrillingCycle:
 
     def defined_further(self, line: str) -> DrillingCycle:
         """Return the cycle with a further line of its definition, which gives numbers as in ``Q201=-15`` or ``P02 -15``."""
-        found = re.finditer(
-            rf"(Q\d++(?=\s*+=)|P\d\d(?=[\s+-]))\s*+(?:=\s*+)?({VALUE})", line.partition(";")[0], re.IGNORECASE
-        )
+        code = line.partition(";")[0]
+        found = list(re.finditer(rf"(Q\d++(?=\s*+=)|P\d\d(?=[\s+-]))\s*+(?:=\s*+)?({VALUE})", code, re.IGNORECASE))
         more = {match[1].upper(): (len(self.lines), *match.span(2), match[2]) for match in found}
+        if old := re.search(rf"CYCLE?\s*DEF\s*\d+\s*\.\s*([12])\s[^\d+-]*({VALUE})\s*$", code, re.IGNORECASE):
+            more = {f"P0{old[1]}": (len(self.lines), *old.span(2), old[2])}
         return replace(self, lines=(*self.lines, line), numbers={**self.numbers, **more})
 
     def __getitem__(self, name: str) -> float:
@@ -95,6 +102,11 @@ class DrillingCycle:
         if self.name not in _SINUMERIK:
             return True
         return "DPR" in self if self["_AMODE"] % 10 == 0 else self["_AMODE"] % 10 == 1
+
+    @property
+    def _clearance(self) -> float:
+        """The way to the surface of a cycle before 200, by the sign of its depth: that alone gives the direction."""
+        return math.copysign(self["P01"], self["P02"])
 
     def problem(self) -> str:
         """Return why the cycle cannot be followed, or nothing."""
@@ -130,7 +142,7 @@ class DrillingCycle:
             depth = self["RFP"] - abs(self["DPR"]) if self._relative else self["DP"]
             return self["RFP"] + abs(self["SDIS"]), depth, self["RTP"]
         if "P02" in self.numbers:
-            return start, start + self["P01"] + self["P02"], start
+            return start, start + self._clearance + self["P02"], start
         surface = self["Q203"]
         return surface + self["Q200"], surface + self["Q201"], surface + max(self["Q200"], self["Q204"])
 
@@ -149,7 +161,7 @@ class DrillingCycle:
             reference = put("RFP", level - abs(self["SDIS"])) if "RFP" in numbers else 0.0
             put(*(("DPR", reference - depth) if self._relative else ("DP", depth)))
         elif "P02" in numbers:
-            put("P02", depth - start - self["P01"])
+            put("P02", depth - start - self._clearance)
         else:
             put("Q201", depth - put("Q203", level - self["Q200"]))
         return replace(self, numbers=numbers)

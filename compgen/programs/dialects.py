@@ -109,6 +109,7 @@ _KLARTEXT = {
     **{"R0": "compensation 0", "RL": "compensation 1", "RR": "compensation -1"},
     **{"CC here": "pole here", "CP": "helix", "CYCL CALL": "drill here", "M99": "drill here", "M89": "calls"},
     **{"M91": "machine coordinates", "M92": "unknown position", "M140": "lost height"},
+    **{"APPR": "approach", "DEP": "departure", "DEP away": "departs", "C round": "full circle"},
 }
 for _code in ("G20", "G21", "G94", "G95", "G61", "G64", "G97", "G9", *(f"G{k}" for k in range(55, 60))):
     del _HEIDENHAIN[_code]
@@ -245,6 +246,19 @@ class Dialect:
     starts_in_its_units: bool = True
     #: What else may shift the coordinates at the control, and is not checked.
     beside: str = ""
+    #: Characters of a block that the control takes, without the end of line; None where no document says. ``bare``: blanks
+    #: and comments do not count.
+    longest_block: int | None = None
+    bare: bool = False
+    #: Digits of a number that the control reads.
+    most_digits: int = 15
+    #: Decimals of F under G93 and its largest value; None where no document says.
+    inverse_time: tuple[int, float] | None = None
+
+    def length_of(self, block: str) -> int:
+        """Return how many characters of a block count for the control."""
+        block = block.rstrip("\r\n")
+        return len(re.sub(rf"{self.comments}|\s", "", block)) if self.bare else len(block)
 
     @property
     def klartext(self) -> bool:
@@ -338,6 +352,8 @@ DIALECTS = {
             "({})",
             semicolon_ends=True,
             point_needed=True,
+            most_digits=8,  # alarm 003; operator's manual of Series 16/18/160/180, range of addresses
+            inverse_time=(3, 9999.999),  # the same, G93
             # custom macro: system variables 5221 ... are the offsets of G54
             register=_register_of_fanuc,
             check_within=("0.001", "0.00006"),  # the last decimal of an offset is 0.0001 inch
@@ -359,6 +375,7 @@ DIALECTS = {
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 17, 70)),
             end=frozenset(("M2", "M17", "M30")),
             tool_by_number=True,
+            longest_block=511,  # 512 with the line feed: Programming Manual Fundamentals
             first=r";\s*+\$",  # the path of an archive: ;$PATH=/_N_WKS_DIR
             register=_register_of_siemens,
             beside="fine offsets, rotations and the basic offset are 0",
@@ -409,6 +426,7 @@ DIALECTS = {
             _PARENTHESES + r"|;[^\n]*",
             "({})",
             decimals=(5, 6),
+            longest_block=252,  # rs274 stops at 253: "Command too long"
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, *range(50, 54), *range(61, 69))),
             end=frozenset(("M2", "M30", "%")),
             register=_register_of_linuxcnc,
@@ -424,6 +442,9 @@ DIALECTS = {
             _GRBL,
             _PARENTHESES + r"|;[^\n]*",
             "({})",
+            longest_block=79,  # LINE_BUFFER_SIZE 80 of protocol.h
+            bare=True,
+            most_digits=8,  # MAX_INT_DIGITS of nuts_bolts.c: further ones are cut
             end_needed=False,
             starts_in_its_units=False,
             beside="the offset of G92 is 0",

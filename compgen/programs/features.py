@@ -193,14 +193,20 @@ class PartFeatures:
     _drilled: list[NDArray[np.bool_]] = field(default_factory=list)
     _count: int = 0
 
-    def add(self, moves: Moves, drilled: set[int], ended: FloatArray) -> None:
-        """Take the moves of a batch; ``drilled`` are lines of drilling cycles, ``ended`` directions of the axes at the ends."""
-        chain = _Chain(moves, self._count + np.arange(len(moves)), ended)
-        self._count += len(moves)
+    def add(self, moves: Moves, drilled: set[int], ended: FloatArray, number: IntArray) -> None:
+        """Take the moves of a batch; ``drilled`` are lines of drilling cycles, ``ended`` directions of the axes at the ends.
+
+        ``number`` (n,) is that of each in the batch; arcs about corners have the number of the move before them.
+        """
+        chain = _Chain(moves, self._count + number, ended)
+        self._count += int(number[-1]) + 1 if len(number) else 0
         in_hole = np.isin(moves.line, list(drilled))
-        stroke = in_hole & moves.cutting & (moves.start_mm[:, 2] > moves.end_mm[:, 2])
+        rows = np.arange(len(moves))
+        stroke = in_hole & moves.cutting & (moves.start_mm[rows, moves.plane] > moves.end_mm[rows, moves.plane])
         for k in np.flatnonzero(stroke).tolist():
-            self.holes[tuple(np.round(moves.end_mm[k, :2], 3).tolist())] = chain.part([k]), moves.offset_mm[k]
+            plane = int(moves.plane[k])
+            place = np.delete(np.round(moves.end_mm[k], 3), plane).tolist()
+            self.holes[plane, *place] = chain.part([k]), moves.offset_mm[k]
         # contours may go on in the next batch: those up to the last rapid move are whole
         breaks = np.flatnonzero(~moves.cutting)
         last = int(breaks[-1]) + 1 if len(breaks) else 0
@@ -353,15 +359,16 @@ class PartFeatures:
     # Quantities.
 
     def _of_holes(self) -> Iterator[Quantity]:
-        found = []
+        by_plane: dict[int, list[Any]] = {}
         for number, (chain, offset) in _evaluated(self.holes.values()):
-            samples = chain.samples(np.ones(1), np.ones(1))
-            at, name = chain.moves.end_mm[0], f"hole {number}"
-            for k in range(2):
+            samples, plane = chain.samples(np.ones(1), np.ones(1)), int(chain.moves.plane[0])
+            at, name = chain.moves.end_mm[0], f"hole {number}{_PLANES[plane]}"
+            for k in sorted(PLANE_AXES[plane]):
                 nominal = float(at[k] - offset[k])
                 yield Quantity(name, f"position {AXES[k]}", chain.line, nominal, "um", samples, np.eye(3)[[k]])
-            found.append((name, chain.line, at, samples, lambda k: np.eye(3)[[k]]))
-        yield from _between(found, (0, 1))
+            by_plane.setdefault(plane, []).append((name, chain.line, at, samples, lambda k: np.eye(3)[[k]]))
+        for plane, found in by_plane.items():
+            yield from _between(found, tuple(sorted(PLANE_AXES[plane])))
 
     def _of_circles(self) -> Iterator[Quantity]:
         by_plane: dict[int, list[Any]] = {}

@@ -276,7 +276,7 @@ class _Hole:
             depth = reference - abs(n.get("DPR", 0.0)) if from_plane else n.get("DP", 0.0)
             return reference + abs(n.get("SDIS", 0.0)), depth, n.get("RTP", 0.0)
         if "P02" in n:
-            return start, start + n.get("P01", 0.0) + n["P02"], start
+            return start, start + math.copysign(n.get("P01", 0.0), n["P02"]) + n["P02"], start
         top = n.get("Q203", 0.0)
         return top + n.get("Q200", 0.0), top + n.get("Q201", 0.0), top + max(n.get("Q200", 0.0), n.get("Q204", 0.0))
 
@@ -286,7 +286,7 @@ class _Series:
     """Numbers of a drilling cycle of G codes, as the program gives them, from its first block to its end."""
 
     kind: int
-    #: Z of the program at the first hole, and the machine position of its zero there (mm).
+    #: Z of the program at the first hole (Y in G18, X in G19), and the machine position of its zero there (mm).
     level: float
     zero: float
     z: float = math.nan
@@ -426,7 +426,7 @@ class Follower:
         if self.beside == _FREE:
             return PLAIN, 0.0
         far = [abs(b - a) for a, b in zip(self.at[:2], end[:2], strict=True) if not math.isnan(b)]
-        if not sweep and all(way <= _RESTS_MM for way in far):
+        if not sweep and all(way <= _RESTS_MM for way in far) and (far or self.beside != _GOING):
             return STILL, 0.0 if self.beside == _COMING else self.aside_mm
         phase = {_COMING: ENTRY, _BESIDE: CONTOUR, _GOING: EXIT}[self.beside]
         self.beside = _FREE if phase == EXIT else _BESIDE
@@ -860,10 +860,11 @@ class Follower:
 
     def _drill(self, words: _Words, axes: Sequence[float | None], moving: bool) -> None:
         """A drilling cycle of G codes: take its numbers, then drill where the block says, as often as it says."""
-        zero, numbers = self._zero(2), words.number
+        axis, numbers = self.plane, words.number
+        zero, sides = self._zero(axis), [k for k in range(3) if k != axis]
         kind = next((int(self.table[c][1]) for c in words.codes if self.table.get(c, ("", 0.0))[0] == "cycle"), None)
         if self.series is None:
-            self.series = _Series(kind or 0, (self.at[2] - zero) / self.unit, zero)
+            self.series = _Series(kind or 0, (self.at[axis] - zero) / self.unit, zero)
         series = self.series
         series.kind = series.kind if kind is None else kind
         series.q = numbers.get("Q", series.q)
@@ -873,10 +874,9 @@ class Follower:
         self._give(series, numbers, zero)
         if times == 0 or not moving:
             return
-        step = [0.0 if v is None or not self.relative else v * self.unit for v in axes[:2]]
-        place = [
-            self.at[k] if v is None or self.relative else self._zero(k) + v * self.unit for k, v in enumerate(axes[:2])
-        ]
+        across = [(k, axes[k]) for k in sides]
+        step = [0.0 if v is None or not self.relative else v * self.unit for _, v in across]
+        place = [self.at[k] if v is None or self.relative else self._zero(k) + v * self.unit for k, v in across]
         if self.linuxcnc:
             base = series.level if self.relative else 0.0
             level = base + series.r
@@ -889,7 +889,7 @@ class Follower:
 
     def _give(self, series: _Series, numbers: dict[str, float], zero: float) -> None:
         """Z and R of a block: LinuxCNC keeps the numbers, FANUC the heights that they mean in G91."""
-        z, r = numbers.get("Z"), numbers.get("R")
+        z, r = numbers.get("XYZ"[self.plane]), numbers.get("R")
         if self.relative and not self.linuxcnc and z is not None and r is not None:
             series.r = r + (series.level if zero == series.zero else math.nan)
             series.z = series.r + z
@@ -900,19 +900,19 @@ class Follower:
         self, series: _Series, place: Place, step: Place, times: int, heights: tuple[float, float, float]
     ) -> None:
         """The moves of LinuxCNC: it compares R with the level before the series, and pecks by Q."""
-        zero, unit = self._zero(2), self.unit
+        zero, unit = self._zero(self.plane), self.unit
         level, depth, initial = heights
-        here = (self.at[2] - zero) / unit
+        here = (self.at[self.plane] - zero) / unit
         here = level if abs(here - level) < _ROUNDED_MM / unit else here
         if initial < level:
-            self._to(RAPID, [*self.at[:2], zero + level * unit])
+            self._to(RAPID, self._at_height(self._beside_tool(), zero + level * unit))
             initial = here = level
         clear = level if self.to_r else initial
         for number in range(times):
             place = [a + b for a, b in zip(place, step, strict=True)]
 
-            def go(kind: int, height: float, x: float = place[0], y: float = place[1]) -> None:
-                self._to(kind, [x, y, zero + height * unit])
+            def go(kind: int, height: float, there: Place = place) -> None:
+                self._to(kind, self._at_height(there, zero + height * unit))
 
             go(RAPID, here if math.isnan(here) or (number == 0 and here > level) else clear)
             go(RAPID, level)
@@ -935,20 +935,29 @@ class Follower:
     def _as_fanuc(self, kind: int, place: Place, step: Place, times: int, heights: tuple[float, float, float]) -> None:
         """The moves of FANUC: over the hole at the height where the tool is, and back to R or to the initial level."""
         level, depth, initial = heights
-        if self.at[2] < level:
-            self._to(RAPID, [*self.at[:2], level])
-        clear, unknown = level if self.to_r or initial < level else initial, math.isnan(self.at[2])
+        if self.at[self.plane] < level:
+            self._to(RAPID, self._at_height(self._beside_tool(), level))
+        clear, unknown = level if self.to_r or initial < level else initial, math.isnan(self.at[self.plane])
         for _ in range(times):
             place = [a + b for a, b in zip(place, step, strict=True)]
-            over = math.nan if unknown else level if self.at[2] < level else self.at[2]
+            here = self.at[self.plane]
+            over = math.nan if unknown else level if here < level else here
             for how, height in (
                 (RAPID, over),
                 (RAPID, level),
                 (FEED, depth),
                 (FEED if kind in (84, 85, 89) else RAPID, level),
             ):
-                self._to(how, [*place, height])
-            self._to(RAPID, [*place, clear])
+                self._to(how, self._at_height(place, height))
+            self._to(RAPID, self._at_height(place, clear))
+
+    def _at_height(self, place: Place, height: float) -> Place:
+        """A place in the two axes of the plane, and along the third."""
+        return [*place[: self.plane], height, *place[self.plane :]]
+
+    def _beside_tool(self) -> Place:
+        """Where the tool is in the two axes of the plane, in the order of X, Y, Z."""
+        return [value for k, value in enumerate(self.at) if k != self.plane]
 
 
 # Klartext: sentences, not words with a letter.
@@ -1035,9 +1044,10 @@ def _sentences_of(text: str, numbers: Sequence[int]) -> list[_Line]:
             if not remark and said:
                 found[-1].text += f" {said}"
         else:
-            head = re.match(r"(?:\d+(?=[\s/*;]|$)\s*)?(/\d?\s*)?", said)
+            head = re.match(r"(?:/\s*\d+\s+|\d+(?=[\s/*;]|$)\s*)?(?:/\d?\s*)?", said)
             bare = said[head.end() :] if head else said
-            found.append(_Line(number, bare, bool(head and head[1])))
+            bare = bare.replace("CYCLE", "CYCL", 1) if bare.startswith("CYCLE ") else bare
+            found.append(_Line(number, bare, bool(head and "/" in head[0])))
             remark = not bare and ";" in line
         goes_on = line.endswith("~")
     return found
@@ -1058,6 +1068,41 @@ class KlartextFollower(Follower):
         #: The side that a sentence asks for, until it is taken.
         self.new_side: int | None = None
         self.around = (0, 1)
+        self.departed = False
+        #: By what the coordinates are turned about their zero, by what has done so, and for each of ``zeros``.
+        self.angles: dict[str, float] = {}
+        self.turn = 1 + 0j
+        self.turn_of: list[complex] = []
+
+    def _to(self, kind: int, end: Sequence[float], centre: Sequence[float] = _NOWHERE, sweep: float = 0.0) -> None:
+        """A move in the coordinates of the program, which may be turned."""
+        super()._to(kind, end, centre, sweep)
+        if len(self.zeros) > len(self.turn_of):
+            self.turn_of.append(self.turn)
+
+    def _taken(self) -> Moves:
+        turns = np.array([self.turn_of[int(row[13])] for row in self.rows], dtype=complex)
+        moves, self.turn_of = super()._taken(), []
+        for places in (moves.start_mm, moves.end_mm, moves.centre_mm) if (turns != 1.0).any() else ():
+            rows = np.flatnonzero(turns != 1.0)
+            zero = moves.offset_mm[rows, 0] + 1j * moves.offset_mm[rows, 1]
+            there = zero + (places[rows, 0] + 1j * places[rows, 1] - zero) * turns[rows]
+            places[rows, 0], places[rows, 1] = there.real, there.imag
+        return moves
+
+    def _turned(self, place: Place, turn: complex) -> Place:
+        """A place turned about the zero of the program."""
+        zero = complex(self._zero(0), self._zero(1))
+        there = zero + (complex(place[0], place[1]) - zero) * turn
+        return [there.real, there.imag, place[2]]
+
+    def _turn_to(self, what: str, degrees: float) -> None:
+        """Turn the coordinates: the tool stays where it is."""
+        self.angles[what] = degrees
+        new = cmath.exp(1j * math.radians(sum(self.angles.values()))) if sum(self.angles.values()) % 360.0 else 1 + 0j
+        if new != self.turn:
+            self.at, self.pole = (self._turned(place, self.turn / new) for place in (self.at, self.pole))
+            self.way, self.turn, self.zero_changed = complex(math.nan), new, True
 
     def follow(self, text: str, numbers: Sequence[int]) -> Moves:
         """Follow blocks, each with its number; calls lead to labels among them."""
@@ -1075,6 +1120,16 @@ class KlartextFollower(Follower):
                 continue
             self.number = line.number
             call = re.match(r"CALL\s*LBL\s*(\"[^\"]+\"|\d+)\s*(?:REP\s*([^\s/]+))?", line.text)
+            asks = None
+            if line.text.startswith("FN"):
+                asks = re.match(
+                    r"FN ?(?:9|1[0-2]) ?: ?IF ?(.+?) ?\b(EQU|NE|GT|LT)\b ?(.+?) ?GOTO ?LBL ?(\"[^\"]+\"|\d+)", line.text
+                )
+            if asks:
+                gap = _worth(asks[1], self.known) - _worth(asks[3], self.known)
+                if {"EQU": gap == 0.0, "NE": abs(gap) > 0.0, "GT": gap > 0.0, "LT": gap < 0.0}[asks[2]]:
+                    k = places.get(asks[4], len(every))
+                continue
             if call and call[2]:
                 again.setdefault(k, round(_worth(call[2], self.known)))
                 again[k] -= 1
@@ -1113,6 +1168,15 @@ class KlartextFollower(Follower):
             self.at, self.way = [math.nan] * 3, complex(math.nan)
         elif text.startswith("TOOL"):
             self._take_tool(text)
+        elif re.match(r"(?:STOP |M ?\d+ )*M ?140(?!\d)", text):
+            self._to(RAPID, [*self.at[:2], math.nan])
+        elif text.startswith("TRANS ROTATION"):
+            self._rotate(text)
+        elif text.startswith("PLANE"):
+            if not re.search(r"\bSTAY\b", text):
+                self.at = [math.nan] * 3
+            about_z = re.search(r"SPC ?([-+]? ?[\d.]+)", text)
+            self._turn_to("PLANE", float(about_z[1].replace(" ", "")) if about_z else 0.0)
         elif text.startswith("TRANS DATUM"):
             self._take(7, "1", text[17:] if "AXIS" in text else " X0 Y0 Z0")
         elif text.startswith("PATTERN"):
@@ -1131,6 +1195,8 @@ class KlartextFollower(Follower):
             )
         elif text.startswith("CYCL CALL"):
             self._hole_here()
+        elif found := re.match(r"(APPR|DEP) ?(P?)(LT|LN|CT|LCT)(?![A-Z])", text):
+            self._come_or_go(found[1] == "DEP", bool(found[2]), found[3], text[found.end() :])
         elif found := re.match(r"(LP|L|CTP|CT|CP|CR|CC|C|RND|CHF)(?![A-Z])", text):
             self._step(found[1], text[found.end() :])
         if re.search(r"(?<![A-Z])M0?(?:2|30)(?!\d)", text):
@@ -1159,6 +1225,8 @@ class KlartextFollower(Follower):
                 self.frame[k] = (
                     n[letter] * self.unit if letter in n else self.frame[k] + n.get("I" + letter, 0.0) * self.unit
                 )
+        elif number == 10 and part not in (None, "0"):
+            self._rotate(text)
         elif number == 247:
             name = f"PRESET{given.get('Q339', math.nan):g}"
             offsets = self.setup.work_offsets_mm
@@ -1167,6 +1235,16 @@ class KlartextFollower(Follower):
             self._take_pattern(number, given)
         elif number >= 200:
             self.cycle, self.cycle_name, self.modally = given, f"G{number}", False
+        elif number in (1, 2, 17):
+            if part in (None, "0"):
+                self.cycle, self.cycle_name, self.modally = {}, "G83" if number == 1 else "G84", False
+            elif part in ("1", "2") and (last := re.search(r"([-+]? ?[\d.]+)$", text.strip())):
+                self.cycle |= {f"P0{part}": float(last[1].replace(" ", ""))}
+
+    def _rotate(self, text: str) -> None:
+        found = re.search(r"(I?)ROT ?([-+]? ?\d*\.?\d+)", text)
+        angle = float(found[2].replace(" ", "")) if found else 0.0
+        self._turn_to("10", angle + (self.angles.get("10", 0.0) if found and found[1] else 0.0))
 
     def _take_pattern(self, number: int, q: dict[str, float]) -> None:
         self.cycle |= {name: q[name] for name in ("Q200", "Q203", "Q204") if name in q}
@@ -1269,17 +1347,44 @@ class KlartextFollower(Follower):
         elif 140 in codes:
             self._to(RAPID, [*self.at[:2], math.nan])
         elif 91 in codes:
-            self._to(RAPID, [n[letter] * self.unit if letter in n else self.at[k] for k, letter in enumerate("XYZ")])
+            here = self._turned(self.at, self.turn) if self.turn != 1.0 else self.at
+            there = [n[letter] * self.unit if letter in n else here[k] for k, letter in enumerate("XYZ")]
+            self._to(RAPID, self._turned(there, 1.0 / self.turn) if self.turn != 1.0 else there)
         elif 92 in codes:
             self._to(
                 RAPID, [math.nan if letter in n or "I" + letter in n else self.at[k] for k, letter in enumerate("XYZ")]
             )
         else:
-            self._draw(kind, n, end, text)
+            if kind != "L" or n:  # L M3 leads nowhere
+                self._draw(kind, n, end, text)
             self.modally = self.modally or 89 in codes
             if self.cycle_name and (99 in codes or (self.modally and kind in ("L", "LP") and n.keys() & set("XYZ"))):
                 self._hole_here()
                 self.modally = self.modally and 99 not in codes
+
+    def _come_or_go(self, goes: bool, polar: bool, way: str, text: str) -> None:
+        """APPR: to the first point of a contour; DEP: from the last one, to where only the control knows unless it is said."""
+        n = self._numbers(text)
+        end = [
+            self._zero(k) + n[letter] * self.unit if letter in n else self.at[k] + n.get("I" + letter, 0.0) * self.unit
+            for k, letter in enumerate("XYZ")
+        ]
+        if polar:
+            pole = complex(self.pole[0], self.pole[1])
+            arm = complex(self.at[0], self.at[1]) - pole
+            size = n["PR"] * self.unit if "PR" in n else abs(arm) + n["IPR"] * self.unit
+            angle = math.radians(n["PA"]) if "PA" in n else cmath.phase(arm) + math.radians(n.get("IPA", 0.0))
+            end[0], end[1] = (pole + size * cmath.exp(1j * angle)).real, (pole + size * cmath.exp(1j * angle)).imag
+        elif goes and way != "LCT":
+            end[0] = end[1] = math.nan
+        side = re.search(r"(?<![A-Z])R([LR0])(?![\w.])", text)
+        if goes:
+            self._turn_aside(0, "", {})
+        elif side:
+            self._turn_aside("R0L".index(side[1]) - 1, "", {})
+        self.plane = 2
+        self._to(RAPID, end)
+        self.way, self.arm, self.departed = complex(math.nan), math.nan, goes and way != "LCT"
 
     def _take_side(self) -> None:
         if self.new_side is not None:
@@ -1343,7 +1448,8 @@ class KlartextFollower(Follower):
             here = complex(self.at[0], self.at[1])
         self._take_side()
         if straight:
-            self._to(RAPID if fast else FEED, end)
+            lost = self.departed and math.isnan(self.at[0] + self.at[1])
+            self._to(RAPID if fast or lost else FEED, end)
             moved = there - here
             self.way = moved / abs(moved) if (a, b) == (0, 1) and abs(moved) > 1e-9 else complex(math.nan)
             return

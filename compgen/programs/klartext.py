@@ -21,18 +21,27 @@ from typing import NoReturn
 import numpy as np
 
 from compgen.errors import InputError, visible_line
+from compgen.programs.cycles import OLD_CYCLES
 from compgen.programs.dialects import VALUE
 from compgen.programs.runs import RADIUS_TOLERANCE_MM
-from compgen.programs.subprograms import DEEPEST, Linked, WrittenOut, file_of
+from compgen.programs.subprograms import DEEPEST, Linked, WrittenOut, file_of, mentions
 
 #: Numbers that are calculated here have so many decimals; the writer gives them those of the dialect.
 CALCULATED = 8
-_DEEPEST, _MOST_LINES, _MOST_HOLES = 20, 2_000_000, 100_000
+_DEEPEST, _MOST_LINES, _MOST_HOLES, _MOST_JUMPS = 20, 2_000_000, 100_000, 100_000
+#: FN 9: IF +Q1 EQU +5 GOTO LBL 2, and FN 10 (NE), FN 11 (GT), FN 12 (LT).
+_JUMP = (
+    r"FN\s*(?:9|10|11|12)\s*:\s*IF\s*(?P<one>[^\s].*?)\s*\b(?P<how>EQU|NE|GT|LT)\b\s*(?P<other>.+?)\s*GOTO\s*LBL\s*"
+    r"(?P<label>\"[^\"]+\"|\d+)"
+)
 _NEEDED = re.compile(
-    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|PATTERN|DEF\s*+22[01]|FN\s*+\d|(?<=[A-Z=+*/(\s-])Q[LR]?\d++(?!\s*+=)",
+    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|\b(?:APPR|DEP)\s*+P|PATTERN|PLANE\s*+(?!\s*RESET)|TRANS\s*+ROT\w*+\s*+I?ROT"
+    rb"|DEF\s*+(?:22[01]|10)\b|FN\s*+\d|(?<=[A-Z=+*/(\s-])Q[LR]?\d++(?!\s*+=)",
     re.IGNORECASE,
 )
-_STATEMENT = re.compile(r"\s*(?P<number>\d+(?=[\s/]|$))?\s*(?P<skip>/\d?)?\s*(?P<code>.*)", re.DOTALL)
+#: What stands before the code of a block: its number, and a slash if the control may skip it, before or after the number.
+_HEAD = r"\s*+(?:(?P<first>/)\s*+\d++(?=\s)|\d++(?=[\s/*;]|$))?+\s*+(?P<skip>/\d?)?\s*+"
+_STATEMENT = re.compile(rf"{_HEAD}(?P<code>.*)", re.DOTALL)
 _USED = re.compile(
     r"(?<![A-Z0-9_])(?P<word>I?[XYZABC]|I?P[RA]|REP\s*+|R|Q\d++\s*+=|(?:NUM|ROT|D|DX|DY|START|STEP)[XY]?)\s*+"
     r"(?P<sign>[+-]?)\s*+(?P<name>Q[LR]?\d++)",
@@ -45,6 +54,7 @@ _WORD = re.compile(
 _TAIL = re.compile(
     rf"(?<![A-Z])(?:R0|R[LR]|F\s*MAX|F\s*AUTO|F[ZU]?\s*(?:{VALUE}|Q[LR]?\d+)|M\d+)(?![\w.])", re.IGNORECASE
 )
+_FEED = re.compile(rf"(?<![A-Z])F(?:[ZU]?\s*(?:{VALUE}|[+-]?Q[LR]?\d+)|\s*AUTO)(?![\w.])", re.IGNORECASE)
 _MOTION = re.compile(r"(LP|L|CTP|CT|CP|CR|CC|C|RND|CHF)(?![A-Z])", re.IGNORECASE)
 _CYCLE_NUMBER = re.compile(rf"(Q\d+)(\s*=\s*)({VALUE})", re.IGNORECASE)
 _ASSIGNS = re.compile(r"(?:FN\s*\d+\s*:\s*)?(Q[LRS]?\d+)\s*=\s*(.+)", re.IGNORECASE | re.DOTALL)
@@ -56,12 +66,17 @@ _MOVE_WORD = re.compile(
     rf"\s*+(?:(?P<machine>M\s*140)\s*+(?:MB\s*+(?:MAX|{VALUE}))?"
     rf"|(?P<inc>I)?(?P<axis>[XYZABCUVW])\s*+(?P<value>{VALUE})|(?P<polar>I?P[AR])\s*+(?P<angle>{VALUE})"
     rf"|(?P<turn>DR\s*[+-])|(?P<side>R[LR](?![A-Z])|R0(?![.\d]))|R\s*+(?P<radius>{VALUE})|(?P<max>F\s*+MAX)|F\s*+AUTO"
-    rf"|F[ZU]?\s*+(?:{VALUE}|[+-]?Q[LR]?\d+)|M\s*+(?P<m>\d+)|(?P<bare>R[+-](?=\s|$)))",
+    rf"|F[ZU]?\s*+(?:{VALUE}|[+-]?Q[LR]?\d+)|M\s*+(?P<m>\d+)|(?P<bare>R[+-](?=\s|$))"
+    rf"|(?P<way>LEN|CCA)\s*+(?:{VALUE}|[+-]?Q[LR]?\d+))",
     re.IGNORECASE,
 )
+#: Approaches and departures, and what each needs beside coordinates.
+_APPROACH = r"(APPR|DEP)\s*+(P?)(LT|LN|CT|LCT)(?![A-Z])"
+_NEEDS = {"LT": ("LEN",), "LN": ("LEN",), "CT": ("CCA", "R"), "LCT": ("R",)}
 _SETTINGS = re.compile(
-    r"BLK\s+FORM|\*|LBL\s*(?:\"|\d)|FUNCTION\s+RESET|FUNCTION\s+MODE\s+MILL|PLANE\s+RESET\s+STAY|TRANS\s+DATUM\s+RESET\s*$"
-    r"|FN\s*(?:[0-8]|16|18|20|26|27|28)\b|Q[LRS]?\d+\s*=|ADP\b|SPINDLE\b|SECTION\b|END\s+SECTION\b",
+    r"BLK\s+FORM|\*|LBL\s*(?:\"|\d)|FUNCTION\s+RESET|FUNCTION\s+MODE\s+MILL|TRANS\s+(?:DATUM|ROTATION)\s+RESET\s*$"
+    r"|TRANS\s+ROTATION\s+I?ROT\s*[+-]?[0.]+\s*$"
+    r"|FN\s*(?:[0-8]|14|15|16|18|20|26|27|28|38)\b|Q[LRS]?\d+\s*=|ADP\b|SPINDLE\b|SECTION\b|END\s+SECTION\b",
     re.IGNORECASE,
 )
 #: Cycles that move nothing of X, Y and Z: dwell, spindle, tolerance; those with nothing in their lines end a turn.
@@ -69,23 +84,29 @@ _STILL, _TURNED = (9, 13, 32), (8, 10, 11, 19, 26)
 _REFUSED = (
     (
         r"APPR|DEP",
-        "approaches and departures are not followed; post their lines and arcs, with RL, RR or R0",
+        "is no approach or departure of Klartext; expected APPR LT, LN, CT or LCT (PLT ... with a pole), DEP LT, LN, CT, LCT or "
+        "PLCT",
     ),
     (r"F(?:POL|L|LT|C|CT|SELECT)\b", "free contours (FK) are not followed; post lines and arcs"),
     (
-        r"PLANE|FUNCTION|M128|LN\b|SPL\b",
-        "a turned plane, TCPM, normals and splines are not followed; post a program with X, Y and Z",
+        r"FUNCTION|M128|LN\b|SPL\b",
+        "TCPM, normals and splines are not followed; post a program with X, Y and Z",
     ),
     (
-        r"CALL\s*(?:PGM|LBL|SELECTED)|SEL\b|CYCL\s*DEF\s*12\b",
+        r"CALL\s*(?:PGM|LBL|SELECTED)|SEL\b|CYCLE?\s*DEF\s*12\b",
         "calls another program: give its folder with --subprograms (CALL PGM), or post one program without calls of files",
     ),
-    (r"CYCL\s*CALL\s*P|PATTERN|LP|CTP?|RND|CHF", "is not followed where it stands; post lines and arcs"),
+    (r"CYCLE?\s*CALL\s*P|PATTERN|LP|CTP?|RND|CHF", "is not followed where it stands; post lines and arcs"),
     (
         r"FN|IF\b|FOR\b|WHILE\b",
         "conditions, jumps and readings of the control are not followed; post the program without them",
     ),
 )
+
+
+def _without_side(text: str) -> str:
+    """A block without R0, RL and RR."""
+    return re.sub(r"(?<![A-Z])R(?:[LR](?![A-Z])|0(?![.\d]))", " ", text.upper())
 
 
 @dataclass
@@ -114,11 +135,11 @@ class Sentences:
         continued, self._continues = self._continues, goes_on
         if continued and self._comment:
             return Sentence("keep")
-        head = re.match(r"\s*(?:\d+(?=[\s/*;]|$))?\s*(/\d?)?\s*", code)
+        head = re.match(_HEAD, code)
         at = head.end() if head and not continued else len(code) - len(code.lstrip())
         self._comment = not code[at:].strip() and ";" in bare
         found = self._said(code, at)
-        found.deleted = bool(head and head[1]) and not continued
+        found.deleted = bool(head and (head["first"] or head["skip"])) and not continued
         return found
 
     def _said(self, code: str, at: int) -> Sentence:
@@ -134,21 +155,25 @@ class Sentences:
         if found := re.match(r"(BEGIN|END)\s++PGM\b", text):
             unit = next((name for name in ("MM", "INCH") if text.rstrip().endswith(name)), "")
             return Sentence(found[1].lower(), number=unit)
-        if found := re.match(r"CYCL\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", text):
+        if found := re.match(r"CYCLE?\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", text):
             return self._defined(code, at, at + found.end(), int(found[1]), found[2])
         del cycle
-        if re.match(r"CYCL\s*CALL(?!\s*P)", text):
+        if re.match(r"CYCLE?\s*CALL(?!\s*P)", text):
             return self._move(code, at + text.index("CALL") + 4, "CYCL CALL")
         if found := re.match(r"TOOL\s+(CALL|DEF)", text):
             return self._tool(code, at + found.end(), found[1])
         if found := re.match(r"TRANS\s+DATUM\s+AXIS", text):
             return self._shifted(code, at + found.end())
+        if text.startswith("PLANE"):
+            return self._plane(text)
         if re.match(r"TRANS\s+DATUM\s+RESET", text):
             return Sentence("shift", [(letter, "0", at, at) for letter in "XYZ"], dict.fromkeys("XYZ", "AC"))
         if _SETTINGS.match(text):
             return Sentence("keep")
         if found := re.match(r"(L|CC|CR|CP|C)(?![A-Z])", text):
             return self._move(code, at + found.end(), found[1])
+        if found := re.match(_APPROACH, text):
+            return self._approach(code, at + found.end(), found)
         if found := re.match(r"STOP\b|(?=M\d)", text):
             return self._move(code, at + found.end(), "STOP")
         for pattern, reason in _REFUSED:
@@ -191,8 +216,21 @@ class Sentences:
             self._cycle = "247"
             q = re.search(rf"Q339\s*=\s*({VALUE})", text)
             return Sentence("preset", number=f"{float(q[1].replace(' ', '')):g}") if q else Sentence("keep")
+        if number in OLD_CYCLES:
+            return Sentence("more" if part not in (None, "0") else "cycle", number=OLD_CYCLES[number])
         self._cycle = str(number)
         return Sentence("cycle", number=f"G{number}")
+
+    @staticmethod
+    def _plane(text: str) -> Sentence:
+        """PLANE RESET, or PLANE SPATIAL without angles: the plane is not turned; TURN and MOVE may draw the tool back."""
+        if re.search(r"TABLE\s+ROT|\bQ[LRS]?\d", text) or plane_turn_deg(text) != 0.0:
+            return Sentence(
+                "refused",
+                number=f"{text[:20].strip()}: only PLANE RESET, and PLANE SPATIAL with SPA+0 SPB+0 and without TABLE ROT, keep "
+                "the tool axis; post a program with X, Y and Z",
+            )
+        return Sentence("lost", number="stays" if re.search(r"\bSTAY\b", text) else "")
 
     @staticmethod
     def _shifted(code: str, at: int) -> Sentence:
@@ -229,6 +267,28 @@ class Sentences:
             rf"\b(DL|DR(?!2)|L|R(?!2))\s*({VALUE})", text[name.end() if name else 0 :], re.IGNORECASE
         ):
             found.words.append((word[1].upper(), word[2], at, at))
+        return found
+
+    def _approach(self, code: str, at: int, kind: re.Match[str]) -> Sentence:
+        """Split APPR or DEP into words: those of its line or arc stay with the control."""
+        what, polar, way = kind[1].upper(), kind[2], kind[3].upper()
+        found = self._move(code, at, what)
+        if found.what == "refused":
+            return found
+        letters = {letter for letter, *_ in found.words}
+        given = {
+            name
+            for name in ("LEN", "CCA", "R")
+            if re.search(rf"(?<![A-Z]){name}\s*+[-+.\dQ]", _without_side(code[at:]))
+        }
+        missing = [name for name in _NEEDS[way] if name not in given]
+        leads = what == "APPR" or way == "LCT"
+        if missing or (leads and not letters & {"X", "Y"}) or (not leads and letters & {"X", "Y"}) or polar:
+            needs = " and ".join([*(["X or Y"] if leads else []), *_NEEDS[way]])
+            return Sentence("refused", number=f"{what} {polar}{way}: expected {needs}")
+        found.words = [word for word in found.words if word[0] != "R"]
+        if not leads:
+            found.words.append(("DEP away", "", at, at))
         return found
 
     def _move(self, code: str, at: int, kind: str) -> Sentence:
@@ -276,12 +336,17 @@ class Sentences:
         """Refuse moves that lack what says where they lead."""
         letters = [letter for letter, *_ in found.words]
         axes = set(letters) & set("XYZ")
+        approach = kind in ("APPR", "DEP")
+        if not approach and ("LEN" in text.upper() or "CCA" in text.upper()):
+            return Sentence("refused", number=f"{kind}{text.rstrip()[:30]}: LEN and CCA belong to APPR and DEP")
         if kind in ("C", "CR", "CP") and not {"DR+", "DR-"} & set(letters):
             return Sentence("refused", number=f"{kind} without DR+ or DR-; post the sense of the arc")
-        if kind in ("C", "CR") and not axes:
-            return Sentence("refused", number=f"{kind} without the coordinates of its end; post them")
+        if kind == "CR" and not axes:
+            return Sentence("refused", number="CR without the coordinates of its end; post them")
+        if kind == "C" and not axes:  # it ends where it begins
+            found.words.append(("C round", "", 0, 0))
         if (
-            (kind == "CR") != ("R" in letters)
+            ((kind == "CR") != ("R" in letters) and not approach)
             or (kind == "CP") != bool({"PA", "IPA"} & set(letters))
             or {"PR", "IPR"} & set(letters)
         ):
@@ -314,7 +379,7 @@ def _statements(lines: list[str]) -> Iterator[_Statement]:
             found.lines.append(lines[k])
         k += 1
         head = _STATEMENT.match(found.lines[0].partition(";")[0].rstrip().rstrip("~"))
-        found.code, found.deleted = (head["code"].strip(), bool(head["skip"])) if head else ("", False)
+        found.code, found.deleted = (head["code"].strip(), bool(head["first"] or head["skip"])) if head else ("", False)
         comment = not found.code and ";" in found.lines[0]
         if not comment:
             more = (line.partition(";")[0].rstrip().rstrip("~").strip() for line in found.lines[1:])
@@ -436,6 +501,17 @@ class _Linker:
     def _label(found: re.Match[str], path: Path) -> str:
         label = found[2].strip('"')
         return found[0] if re.fullmatch("0+", label) else f'{found[1]}"{label} {path.name}"'
+
+
+def plane_turn_deg(text: str) -> float | None:
+    """By what angle about Z a block with PLANE turns the coordinates; None if it turns the tool axis, or in another way."""
+    if re.match(r"PLANE\s+RESET\b", text):
+        return 0.0
+    angles = dict(re.findall(rf"\b(SP[ABC])\s*+({VALUE})", text))
+    if not re.match(r"PLANE\s+SPATIAL\b", text) or len(angles) != 3:
+        return None
+    a, b, c = (float(angles[name].replace(" ", "")) for name in ("SPA", "SPB", "SPC"))
+    return c if a == b == 0.0 else None
 
 
 def holes_of_circle(q: dict[str, float]) -> list[complex]:
@@ -561,8 +637,17 @@ class _Program:
     corner: tuple[str, float, int] | None = None
     polar: float = math.nan
     shift: list[float] = field(default_factory=lambda: [0.0] * 3)
+    #: By what the coordinates are turned about Z (cycle 10, TRANS ROTATION, PLANE SPATIAL): all places here are in turned ones.
+    turn: complex = 1 + 0j
+    angles_deg: dict[str, float] = field(default_factory=dict)
+    heading: _Statement | None = None
     called: dict[str, None] = field(default_factory=dict)
     written_lines: set[int] = field(default_factory=set)
+    #: F in force, that of a rounding or chamfer (in its block only), and the one that the move after it needs again.
+    feed: str = ""
+    corner_feed: str = ""
+    feed_again: str = ""
+    jumps: int = 0
 
     def written(self) -> WrittenOut:
         """Execute from the first statement to the end."""
@@ -573,7 +658,7 @@ class _Program:
                 if label[1] in labels and label[1] != "0":
                     self._fail(item, f"LBL {label[1]} is given twice; give each its own number")
                 labels[label[1]] = k
-        self.calls = any(re.match(r"CALL\s*LBL", item.code, re.IGNORECASE) for item in every)
+        self.calls = any(re.match(rf"CALL\s*LBL|{_JUMP}", item.code, re.IGNORECASE) for item in every)
         stack: list[int] = []
         left: dict[int, int] = {}
         k = 0
@@ -588,8 +673,11 @@ class _Program:
                 self._keep(item)
                 continue
             call = re.match(r"CALL\s*LBL\s*(\"[^\"]+\"|\d+)(?:\s*REP\s*(\S+))?", item.code, re.IGNORECASE)
+            jump = re.match(_JUMP, item.code, re.IGNORECASE)
             if call:
                 k = self._call(item, call, k, labels, stack, left)
+            elif jump:
+                k = self._jump(item, jump, k, labels, every)
             elif re.match(r"LBL\s*(?:\"|\d)", item.code, re.IGNORECASE):
                 self._comment(item) if self.calls else self._keep(item)
                 if re.match(r"LBL\s*0+\b", item.code, re.IGNORECASE) and stack:
@@ -655,6 +743,31 @@ class _Program:
             return labels[name] + 1
         return k
 
+    def _jump(
+        self, item: _Statement, jump: re.Match[str], k: int, labels: dict[str, int], every: list[_Statement]
+    ) -> int:
+        """Follow FN 9 to FN 12: where both sides are constant the control jumps, or it does not."""
+        both = [self._evaluated(jump[name]) for name in ("one", "other")]
+        if None in both:
+            self._fail(
+                item, "a jump (FN 9 to FN 12) that depends on what is known when the program runs; post it without"
+            )
+        one, other = (float(value) for value in both if value is not None)
+        holds = {"EQU": one == other, "NE": one != other, "GT": one > other, "LT": one < other}[jump["how"].upper()]
+        self._comment(item)
+        if not holds:
+            return k
+        name = jump["label"]
+        if name not in labels or re.fullmatch("0+", name):
+            self._fail(item, f"GOTO LBL {name}: the label is not in this program; give one program with all its labels")
+        self.jumps += 1
+        if self.jumps > _MOST_JUMPS:
+            self._fail(item, f"more than {_MOST_JUMPS} jumps: the program may never end; post it in parts")
+        for skipped in every[k : labels[name]]:
+            self._comment(skipped) if skipped.code and not self._closes(skipped.code) else self._keep(skipped)
+        self.element, self.tangent = None, None if self.element is None else self.tangent
+        return labels[name]
+
     # Output.
 
     def _keep(self, item: _Statement) -> None:
@@ -671,8 +784,74 @@ class _Program:
             self._put(f"; {bare.rstrip().rstrip('~').rstrip()}", item, k)
 
     def _put(self, text: str, item: _Statement, k: int = 0) -> None:
-        line = item.lines[0]
+        line, text = item.lines[0], self._turned(text)
         self.out.append((text + (line[len(line.rstrip("\r\n")) :] or "\n"), item.first + k))
+
+    # Turned coordinates.
+
+    def _turned(self, text: str) -> str:
+        """A line with X and Y of the coordinates that are not turned."""
+        if self.turn == 1.0 or text.startswith(";"):
+            return text
+        code, mark, comment = text.partition(";")
+
+        def put(found: re.Match[str]) -> str:
+            place = complex(float(found[1]), float(found[2])) * self.turn
+            return f"{self._word(0, place.real)} {self._word(1, place.imag)}"
+
+        return re.sub(r"(?<![A-Z])X([+-][\d.]+) Y([+-][\d.]+)", put, code) + mark + comment
+
+    def _turn_by(self, item: _Statement, what: str, angle_deg: float) -> None:
+        """Turn the coordinates about their zero: cycle 10 and PLANE add up."""
+        if self.corner:
+            self._fail(item, f"turned coordinates behind {self.corner[0]}, which needs a move of the contour")
+        if angle_deg and not any(self.angles_deg.values()) and any(one != one for one in self.shift):
+            self._fail(item, "turned coordinates after a shift that is not known")
+        self.angles_deg[what] = angle_deg
+        before, self.turn = self.turn, cmath.rect(1.0, math.radians(sum(self.angles_deg.values()) % 360.0))
+        if not sum(self.angles_deg.values()) % 360.0:
+            self.turn = 1 + 0j
+        if self.turn != before:
+            for place in (self.at, self.pole):
+                here = complex(place[0], place[1]) * before / self.turn
+                place[0], place[1] = here.real, here.imag
+            self.element, self.tangent, self.polar = None, None, math.nan
+
+    def _rotate(self, item: _Statement, code: str) -> None:
+        """Cycle 10 and TRANS ROTATION: what they turn is written out, and they become comments."""
+        if re.match(r"CYCLE?\s*DEF\s*10\s*\.\s*0", code):
+            self.heading = item
+            return
+        heading, self.heading = self.heading, None
+        found = re.search(rf"(?<![A-Z])(I?)ROT\s*+({VALUE})", code)
+        reset = re.match(r"TRANS\s+ROTATION\s+RESET", code)
+        if not found and not reset:
+            self._fail(item, "a rotation without ROT or IROT; expected a number of degrees")
+        before = self.angles_deg.get("10", 0.0)
+        angle = float(found[2].replace(" ", "")) if found else 0.0
+        angle += before if found and found[1] else 0.0
+        for one in filter(None, (heading, item)):
+            self._comment(one) if angle or before else self._keep(one)
+        self._turn_by(item, "10", angle)
+
+    def _plane(self, item: _Statement, code: str) -> None:
+        """PLANE SPATIAL about Z turns the coordinates; the block stays, without its angle, since it may draw the tool back."""
+        angle = plane_turn_deg(code)
+        if angle is None or re.search(r"TABLE\s+ROT", code):
+            self._keep(item)  # it is refused where it stands
+            return
+        self._turn_by(item, "PLANE", angle)
+        if not re.search(r"\bSTAY\b", code):
+            self.at, self.element, self.tangent = [math.nan] * 3, None, None
+        lines = [
+            re.sub(rf"(SPC\s*+){VALUE}", r"\1+0", line, count=1, flags=re.IGNORECASE) if angle else line
+            for line in item.lines
+        ]
+        self._keep(_Statement(item.first, lines, item.code, item.deleted))
+
+    def _shift_turned(self, item: _Statement) -> None:
+        if self.turn != 1.0:
+            self._fail(item, "a datum shift or preset in turned coordinates is not followed; turn them back before")
 
     # Numbers.
 
@@ -731,20 +910,31 @@ class _Program:
         item = self._substituted(item)
         code = item.code.upper()
         motion = _MOTION.match(code)
+        if code.startswith("TOOL") and _FEED.search(code):
+            self.feed = "F AUTO"
         if code.startswith("CYCL") and "DEF" in code[:10]:
             return self._define(item, code)
         if code.startswith("TCH"):
             return self._probe(item)
+        if code.startswith("PLANE"):
+            return self._plane(item, code)
+        if re.match(r"TRANS\s+ROT", code):
+            return self._rotate(item, code)
+        if shifted := re.match(r"TRANS\s+DATUM\s+(AXIS|RESET)", code):
+            words = self._words(code[shifted.end() :]) if shifted[1] == "AXIS" else dict.fromkeys("XYZ", 0.0)
+            return self._shift_by(item, words)
         if code.startswith("PATTERN"):
             self.points = self._points(item)
             return self._comment(item)
-        if re.match(r"CYCL\s*CALL\s*PAT", code):
+        if re.match(r"CYCLE?\s*CALL\s*PAT", code):
             return self._drill(item, self.points, code)
-        if re.match(r"CYCL\s*CALL\s*POS", code):
+        if re.match(r"CYCLE?\s*CALL\s*POS", code):
             words = self._words(code)
             if not {"X", "Y"} <= words.keys():
                 self._fail(item, "CYCL CALL POS without X and Y; post both")
             return self._drill(item, [(words["X"], words["Y"], words.get("Z", 0.0))], code)
+        if approach := re.match(_APPROACH, code):
+            return self._approach(item, approach, code)
         if motion:
             return self._move(item, motion[1].upper(), code)
         if re.match(r"FN\s*(?:9|10|11|12)\b", code):
@@ -768,25 +958,32 @@ class _Program:
 
     def _define(self, item: _Statement, code: str) -> None:
         """Take a definition of a cycle; patterns are drilled at once."""
-        number = re.match(r"CYCL\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", code)
+        number = re.match(r"CYCLE?\s*DEF\s*(\d+)(?:\s*\.\s*(\d+))?", code)
         name = int(number[1]) if number else 0
+        if name == 10:
+            return self._rotate(item, code)
         numbers = {key.upper(): float(value.replace(" ", "")) for key, _, value in _CYCLE_NUMBER.findall(item.code)}
         self.q |= numbers
         if name in (220, 221):
             return self._pattern(item, name, numbers)
         if name == 7 and number and number[2] not in (None, "0"):
-            words = self._words(code[number.end() :])
-            for k, letter in enumerate("XYZ"):
-                new = words.get(letter, self.shift[k] + words.get(f"I{letter}", 0.0))
-                self.at[k] += self.shift[k] - new
-                self.pole[k] += self.shift[k] - new
-                self.shift[k] = new
+            return self._shift_by(item, self._words(code[number.end() :]))
         elif name == 247:
+            self._shift_turned(item)
             self.shift, self.at = [0.0] * 3, [math.nan] * 3
-        elif name >= 200:
+        elif name >= 200 or name in OLD_CYCLES:
             self.cycle, self.cycle_lines = numbers, item.lines
         self._keep(item)
         return None
+
+    def _shift_by(self, item: _Statement, words: dict[str, float]) -> None:
+        self._shift_turned(item)
+        for k, letter in enumerate("XYZ"):
+            new = words.get(letter, self.shift[k] + words.get(f"I{letter}", 0.0))
+            self.at[k] += self.shift[k] - new
+            self.pole[k] += self.shift[k] - new
+            self.shift[k] = new
+        self._keep(item)
 
     def _pattern(self, item: _Statement, name: int, q: dict[str, float]) -> None:
         needed = (
@@ -885,6 +1082,41 @@ class _Program:
 
     # Moves.
 
+    def _approach(self, item: _Statement, kind: re.Match[str], code: str) -> None:
+        """Keep APPR and DEP, whose line or arc the control makes; polar coordinates of the contour become those in X and Y."""
+        if self.corner:
+            self._fail(
+                item, f"{kind[0]} behind {self.corner[0]}, which needs a move of the contour; post its lines and arcs"
+            )
+        rest = re.sub(r"(?<![A-Z])(?:LEN|CCA)\s*+[-+]?[\d.]++", " ", _without_side(code[kind.end() :]))
+        words = self._words(re.sub(r"(?<![A-Z])R(?=\s*[-+\d.])", "r", rest))
+        end = [words.get(axis, self.at[k] + words.get(f"I{axis}", 0.0)) for k, axis in enumerate("XYZ")]
+        _, item = self._with_feed(item, "", code)
+        leads = kind[1] == "APPR" or kind[3] == "LCT"
+        if kind[2]:
+            if "PR" not in words and "IPR" not in words:
+                self._fail(item, f"{kind[0]} without PR; give the radius from the pole")
+            self._polar_end(item, kind[0], words, end)
+            a, b = sorted(self.axes)
+            if (a, b) != (0, 1):
+                self._fail(item, f"{kind[0]} about a pole outside the plane XY is not followed; post X and Y")
+        if kind[2] or (leads and self.turn != 1.0):
+            if any(math.isnan(value) for value in end[:2]):
+                self._fail(item, f"{kind[0]} from a position that is not known; post X and Y in absolute")
+            place = self._turned(" ".join(self._word(k, end[k]) for k in (0, 1)))
+            lines = [
+                re.sub(r"(?<![A-Z])I?(?:P[RA]|[XY])\s*+[-+]?\s*+[\d.]++\s*+", "", line, flags=re.IGNORECASE)
+                for line in item.lines
+            ]
+            lines[0] = re.sub(
+                r"(APPR|DEP)\s*+P?(LCT|LT|LN|CT)", rf"\1 \2 {place}", lines[0], count=1, flags=re.IGNORECASE
+            )
+            item = _Statement(item.first, lines, item.code, item.deleted)
+        self._keep(item)
+        away = kind[1] == "DEP" and kind[3] != "LCT"
+        self.at = [math.nan, math.nan, end[2]] if away else end
+        self.element, self.tangent, self.polar = None, None, math.nan
+
     def _move(self, item: _Statement, kind: str, code: str) -> None:
         words, (a, b) = self._words(code[len(kind) :]), self.axes
         if kind in ("RND", "CHF"):
@@ -915,7 +1147,11 @@ class _Program:
             self._round(item, kind, end, around, sense)
             start = list(self.at)
         tail = " ".join(re.sub(r"\s+", "", word) for word in _TAIL.findall(code))
-        rounded = self.rounded
+        tail, item = self._with_feed(item, tail, code)
+        turned = self.turn != 1.0 and not machine and self._holds_turned(item, kind, words)
+        if self.turn != 1.0 and machine and any(end[k] != end[k] for k in (0, 1)):
+            end[:2] = math.nan, math.nan  # which of the turned coordinates that leaves is not known
+        rounded = self.rounded or turned
         self.rounded = False
         place = len(self.out)
         if kind in ("CT", "CTP"):
@@ -923,6 +1159,8 @@ class _Program:
         elif polar or (rounded and straight):
             named_z = "Z" in words or "IZ" in words
             letters = [k for k in range(3) if k in (a, b) or (k == 2 and named_z) or (rounded and k < 2)]
+            if any(math.isnan(end[k]) for k in letters):
+                self._fail(item, "X and Y have to be placed together in absolute, once the coordinates are turned")
             number = None if item.first in self.written_lines else re.match(r"\s*\d+\s+", item.lines[0])
             self.written_lines.add(item.first)
             text = " ".join(["L", *(self._word(k, end[k]) for k in letters), tail]).rstrip()
@@ -931,11 +1169,16 @@ class _Program:
             self._put(f"{number[0] if number else ''}{text}{said}", item)
             self.tangent = self._direction(start, end)
         elif rounded:
+            way = 1j * sense * (complex(*end[:2]) - around)
+            if cmath.isnan(way) or abs(way) < 1e-9:
+                self._fail(item, f"{kind} needs a pole (CC), and a position that is known and not in it")
             self._comment(item)
-            for text in self._arc_lines(around, end, sense, tail):
+            lines = self._arc_lines(around, end, sense, tail)
+            if turned and kind == "CP":
+                lines[1] = self._helix(words, start, around, sense, tail)
+            for text in lines:
                 self._put(text, item)
             place = len(self.out) - 2 if len(self.out) > place + 2 else place
-            way = 1j * sense * (complex(*end[:2]) - around)
             self.tangent = way / abs(way)
         else:
             self._keep(item)
@@ -954,6 +1197,37 @@ class _Program:
         return None
 
     rounded = False
+
+    def _holds_turned(self, item: _Statement, kind: str, words: dict[str, float]) -> bool:
+        """Whether a move in turned coordinates has to be written out; refused if that cannot be done."""
+        named = {word[-1] for word in words if word[-1] in "XYZ"}
+        if kind in ("L", "LP"):
+            return kind == "LP" or bool(named & {"X", "Y"})
+        if self.axes != (0, 1) and kind != "CR" or (kind != "CP" and "Z" in named):
+            self._fail(item, f"{kind} outside the plane XY in turned coordinates is not followed; post lines")
+        return kind in ("C", "CR", "CP")
+
+    def _helix(self, words: dict[str, float], start: list[float], around: complex, sense: float, tail: str) -> str:
+        """CP by its angle from where it begins: that does not depend on how the coordinates are turned."""
+        if "IPA" in words:
+            angle = words["IPA"]
+        else:
+            begins = math.degrees(cmath.phase(complex(*start[:2]) - around))
+            angle = sense * (((words["PA"] - begins) * sense) % 360.0 or 360.0)
+        rise = "".join(f" {name}{words[name]:+.{CALCULATED}f}" for name in ("Z", "IZ") if name in words)
+        return f"CP IPA{angle:+.{CALCULATED}f}{rise} {'DR+' if sense > 0 else 'DR-'} {tail}".rstrip()
+
+    def _with_feed(self, item: _Statement, tail: str, code: str) -> tuple[str, _Statement]:
+        """Give a move behind a rounding with its own F the one that was in force before; keep which F is in force."""
+        if given := _FEED.search(code):
+            self.feed, self.feed_again = given[0], ""
+        elif self.feed_again and not re.search(r"(?<![A-Z])F\s*MAX", code):
+            again, self.feed_again = self.feed_again, ""
+            body = item.lines[0].partition(";")[0].rstrip("\r\n")
+            rest = item.lines[0][len(body) :]
+            lines = [f"{body.rstrip()} {again}{' ' if rest[:1] == ';' else ''}{rest}", *item.lines[1:]]
+            return f"{tail} {again}".strip(), _Statement(item.first, lines, f"{item.code} {again}", item.deleted)
+        return tail, item
 
     @staticmethod
     def _word(k: int, value: float) -> str:
@@ -974,7 +1248,12 @@ class _Program:
                 self.pole[k] = self.at[k] + words[f"I{letter}"]
             elif not named:
                 self.pole[k] = self.at[k]
-        self._keep(item)
+        if self.turn == 1.0:
+            return self._keep(item)
+        if self.axes != (0, 1) or cmath.isnan(complex(*self.pole[:2])):
+            self._fail(item, "CC in turned coordinates needs X and Y; post both")
+        self._put(f"CC {self._word(0, self.pole[0])} {self._word(1, self.pole[1])}", item)
+        return None
 
     def _polar_end(self, item: _Statement, kind: str, words: dict[str, float], end: list[float]) -> None:
         """Find where polar words lead: about the pole, by the radius and the angle."""
@@ -1070,6 +1349,12 @@ class _Program:
         if self.corner:
             self._fail(item, f"{kind} after {self.corner[0]} without a move between them")
         self.corner = kind, size, item.first
+        given = _FEED.search(code)
+        self.corner_feed = f" {given[0]}" if given else ""
+        if given and not self.feed:
+            self._fail(item, f"{kind} with its own F before any other F; post F in the block before")
+        if given:
+            self.feed_again = self.feed
         self._comment(item)
 
     def _round(self, item: _Statement, kind: str, end: list[float], around: complex, sense: float) -> None:
@@ -1118,16 +1403,16 @@ class _Program:
         if before.start[2] != before.start[2]:
             self._fail(item, f"{what} while the position of Z is not known")
         self.out[before.place] = (
-            f"{number[0] if number else ''}L {' '.join(words)}".rstrip() + (eol[0] if eol else "\n"),
+            self._turned(f"{number[0] if number else ''}L {' '.join(words)}".rstrip()) + (eol[0] if eol else "\n"),
             before.line,
         )
         marker = item
         if what == "RND":
             turn = "DR+" if (back.conjugate() * on).imag < 0 else "DR-"
             words = [self._word(0, second.real), self._word(1, second.imag), f"R{radius:+.{CALCULATED}f}", turn]
-            self._put(f"CR {' '.join(words)}", marker)
+            self._put(f"CR {' '.join(words)}{self.corner_feed}", marker)
         else:
-            self._put(f"L {self._word(0, second.real)} {self._word(1, second.imag)}", marker)
+            self._put(f"L {self._word(0, second.real)} {self._word(1, second.imag)}{self.corner_feed}", marker)
         self.at = [second.real, second.imag, before.end[2]]
 
     def _round_arcs(self, item: _Statement, radius: float, before: _Element, after: _Element) -> None:
@@ -1163,18 +1448,24 @@ class _Program:
         else:
             lines = [f"L {self._word(0, first.real)} {self._word(1, first.imag)} {before.tail}".rstrip()]
         lines[0] = (number[0] if number else "") + lines[0]
-        self.out[before.place : before.place + 1] = [(line + end, before.line) for line in lines]
+        self.out[before.place : before.place + 1] = [(self._turned(line) + end, before.line) for line in lines]
         direction = "DR+" if side > 0 else "DR-"
         words = [self._word(0, second.real), self._word(1, second.imag), f"R{radius:+.{CALCULATED}f}", direction]
-        self._put(f"CR {' '.join(words)}", item)
+        self._put(f"CR {' '.join(words)}{self.corner_feed}", item)
         self.at = [second.real, second.imag, before.end[2]]
+
+
+def skips(text: str) -> bool:
+    """Whether the control may skip a block: it has a slash before or after its number."""
+    head = re.match(_HEAD, text)
+    return bool(head and (head["first"] or head["skip"]))
 
 
 def arc_text(text: str, before: list[str], words: list[str], piece: int, count: int, last: Collection[str]) -> str:
     """Return the lines of one piece of an arc: the first has the words that are no coordinates, the last the M codes ``last``."""
     end = text[len(text.rstrip()) :] or "\n"
     code, mark, comment = text.rstrip().partition(";")
-    head = re.match(r"\s*(?:\d+\s+)?(?:/\d?\s*)?", code)
+    head = re.match(_HEAD, code)
     assert head is not None
     tail = [re.sub(r"\s+", "", word) for word in _TAIL.findall(code)]
     moved = [word for word in tail if word[0] in "Mm" and f"M{int(word[1:])}" in last]
@@ -1188,6 +1479,118 @@ def arc_text(text: str, before: list[str], words: list[str], piece: int, count: 
     lines = [f"{skip}{line}{end}" for line in before]
     said = f" {mark}{comment}" if mark and piece == 0 else ""
     return "".join(lines) + first + " ".join(words) + said + end
+
+
+# Programs in DIN/ISO: Q parameters that are constant become numbers.
+
+_ISO_NEEDED = (re.compile(rb"[A-Z=][ \t]*+[-+]?[ \t]*+Q[LR]?\d"), re.compile(rb"\bD\d{1,2}[ \t]*+Q"))
+_ISO_HEAD = re.compile(r"\s*+(?P<skip>/\d?\s*+)?(?:N\s*+\d++\s*+)?(?P<slash>/\d?\s*+)?")
+_ISO_FUNCTION = re.compile(
+    r"D(?P<code>\d{1,2})\s*+(?P<name>Q[LR]?\d++)\s*+(?P<rest>(?:P0[12]\s*+\S++\s*+)++)$", re.IGNORECASE
+)
+_ISO_FORMULA = re.compile(r"(?P<name>Q[LR]?\d++)\s*+=\s*+(?P<value>.+)$", re.IGNORECASE)
+_ISO_USED = re.compile(
+    r"(?<![A-Z0-9])(?P<word>[A-CF-JKL-PR-Z]|D[LR]|P\d\d|Q\d++\s*+=)\s*+(?P<sign>[-+]?)\s*+(?P<name>Q[LR]?\d++)",
+    re.IGNORECASE,
+)
+#: What the functions D00 to D08 make of their numbers.
+_ISO_RESULT: dict[int, Callable[..., float]] = {
+    0: lambda a: a,
+    1: operator.add,
+    2: operator.sub,
+    3: operator.mul,
+    4: operator.truediv,
+    5: math.sqrt,
+    6: lambda a: math.sin(math.radians(a)),
+    7: lambda a: math.cos(math.radians(a)),
+    8: math.hypot,
+}
+#: Q parameters of cycles: what a program assigns to them by itself may change the cycle that is defined.
+_OF_CYCLES = range(200, 500)
+
+
+def iso_computed(source: Path, *, skip_deleted: bool = False) -> WrittenOut | None:
+    """Return a DIN/ISO program with numbers in place of its Q parameters; None if it has none.
+
+    What is not known before the program runs stays, and is refused where it is read.
+    """
+    if not mentions(source, _ISO_NEEDED):
+        return None
+    found = _IsoProgram(skip_deleted)
+    lines = source.read_bytes().decode("latin-1").splitlines(keepends=True)
+    content = "".join(map(found.line, lines)).encode("latin-1")
+    if not found.used and not found.assigned:
+        return None
+    return WrittenOut(content, np.arange(1, len(lines) + 1), (), resolved=True, variables=tuple(found.used))
+
+
+@dataclass
+class _IsoProgram:
+    """Follows the Q parameters of a DIN/ISO program line by line."""
+
+    skip_deleted: bool
+    known: dict[str, float] = field(default_factory=dict)
+    used: dict[str, None] = field(default_factory=dict)
+    assigned: bool = False
+    defining: bool = False
+
+    def line(self, text: str) -> str:
+        """The line with numbers; an assignment becomes a comment."""
+        code, mark, comment = text.rstrip("\r\n").partition(";")
+        end = text[len(text.rstrip("\r\n")) :]
+        head = _ISO_HEAD.match(code)
+        assert head is not None
+        body = code[head.end() :].rstrip().rstrip("*").rstrip()
+        if self.skip_deleted and (head["skip"] or head["slash"]):
+            return text
+        if re.match(r"G[24]\d\d\b", body, re.IGNORECASE):
+            self.defining = True
+        elif body and not re.match(r"Q\d+\s*=", body, re.IGNORECASE):
+            self.defining = False
+        if not self.defining and (name := self._assigned(body)):
+            self.assigned = True
+            self.used.setdefault(name)
+            return f"{code[: head.start()]}; {text.rstrip().rstrip('*').strip()}{end}"
+        code = _ISO_USED.sub(self._number, code)
+        if self.defining:
+            given = re.findall(rf"(Q\d+)\s*=\s*({VALUE})", code, re.IGNORECASE)
+            self.known |= {key.upper(): float(value.replace(" ", "")) for key, value in given}
+        elif re.search(r"(?<![A-Z])(?:L\d+,|%|G4\d\d|D\d+)", code.upper()) and not code.lstrip().startswith("%"):
+            self.known.clear()  # what is called, measured or read may change them; it is refused where it is read
+        return code + mark + comment + end
+
+    def _assigned(self, body: str) -> str | None:
+        """The parameter that a block assigns and whose value is known after it."""
+        found = _ISO_FUNCTION.match(body) or _ISO_FORMULA.match(body)
+        if not found:
+            return None
+        name, code = found["name"].upper(), int(found["code"]) if "code" in found.groupdict() else None
+        try:
+            if code is None:
+                value = evaluated(found["value"], self.known)
+            else:
+                numbers = [
+                    evaluated(text, self.known)
+                    for text in re.findall(r"P0[12]\s*+(\S++)", found["rest"], re.IGNORECASE)
+                ]
+                value = float(_ISO_RESULT[code](*numbers))
+        except (ValueError, SyntaxError, ArithmeticError, KeyError, TypeError, RecursionError, MemoryError):
+            self.known.pop(name, None)
+            return None
+        if int(re.sub(r"\D", "", name)) in _OF_CYCLES:
+            return None
+        self.known[name] = value
+        return name
+
+    def _number(self, found: re.Match[str]) -> str:
+        name = found["name"].upper()
+        if name not in self.known:
+            return found[0]
+        self.used.setdefault(name)
+        value = self.known[name] * (-1.0 if found["sign"] == "-" else 1.0)
+        whole = found["word"].upper() in ("T", "S", "M", "G", "N", "L", "F")
+        text = f"{value:.{CALCULATED}f}".rstrip("0").rstrip(".")
+        return f"{found['word']}{'' if whole or text.startswith('-') else '+'}{'0' if text == '-0' else text}"
 
 
 _OPERATORS: dict[type, Callable[[float, float], float]] = {

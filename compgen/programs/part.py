@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from compgen.errors import InputError
 from compgen.identify.covariance import Covariance, error_design, posterior_with
 from compgen.identify.posterior import Posterior, assumed_text, open_shares, worse_text
 from compgen.kinematics.many_points import full_grid
+from compgen.programs.compensation import centre_path, unknown_radius
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
 from compgen.programs.features import PartFeatures, Quantity, Samples
@@ -36,6 +38,9 @@ from compgen.programs.path import (
 )
 from compgen.programs.reader import Reader, Setup, SingleBlock
 from compgen.tables import ReadTables
+
+if TYPE_CHECKING:
+    from compgen.heat import Growth
 
 #: Samples along an axis for the slope of tables, besides their nodes.
 BEND_SAMPLES = 101
@@ -146,7 +151,7 @@ class PartMachine:
     def with_tables(self) -> CompensatedModel:
         """The machine with its tables active."""
         model = self.model
-        return CompensatedModel(model.machine, model.errors, model.reversal, model.only, self.tables)
+        return CompensatedModel(model.machine, model.errors, model.reversal, model.only, model.growth, self.tables)
 
     @functools.cached_property
     def posterior(self) -> Posterior | None:
@@ -198,6 +203,7 @@ class PartPrediction:
     position_mm: FloatArray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     deviation_mm: Mapping[str, FloatArray] = field(default_factory=dict, repr=False)
     every: int = 1
+    growth: Growth | None = None
 
     @property
     def fitted(self) -> dict[str, dict[str, float]]:
@@ -240,6 +246,7 @@ class PartPrediction:
             "features_left_out": self.left_out,
             "assumed": list(self.assumed),
             "notes": list(self.notes),
+            **({} if self.growth is None else {"heat": self.growth.as_dict()}),
         }
 
     def ranked(self) -> dict[str, Any]:
@@ -335,13 +342,10 @@ def _on_machines(
         if reader.unknown:
             continue  # it is refused at its end, with all that is not known
         moves = reader.numbered_as_in_file(batch.moves)
+        number = np.arange(len(moves))
         if moves.phase.any():
-            line = int(moves.line[int(np.argmax(moves.phase > 0))])
-            raise InputError(
-                "radius compensation is followed by `volcomp correct` only; post the path of the tool centre",
-                file=source,
-                line=line,
-            )
+            moves, number = _beside_contours(moves, machines, source)
+            reader.assumed[BESIDE] = None
         ended = kept_directions(directions_at(moves, np.full(len(moves), 1.0 - 1e-7)), direction)
         directions = np.vstack([direction, ended[:-1]])[: len(moves)], ended
         direction = ended[-1] if len(moves) else direction
@@ -360,7 +364,7 @@ def _on_machines(
             for item in batch.segments
             if isinstance(item, SingleBlock) and item.kind in ("cycle", "hole")
         }
-        features.add(moves, drilled, ended)
+        features.add(moves, drilled, ended, number)
         show(f"{batch.first_line + len(batch.words.start) - 2} blocks")
     for machine in machines:
         machine.model.errors.warn_outside(reader.reached_mm)
@@ -386,6 +390,7 @@ def _on_machines(
             for reason in (one.reasons if one is not None else ())
         ]
         position_mm, deviation_mm = points.points(tables=after is not None)
+        notes += [] if machine.model.growth is None else machine.model.growth.lines()
         notes += machine.notes(*_some_of(evaluated.samples, position_mm))
         result = PartPrediction(
             machine.name,
@@ -401,9 +406,29 @@ def _on_machines(
             position_mm=position_mm,
             deviation_mm=deviation_mm,
             every=points.every,
+            growth=machine.model.growth,
         )
         results.append(result)
     return results
+
+
+#: What figures and features are about where a contour has radius compensation.
+BESIDE = "with radius compensation, figures and features are those of the path of the tool centre, with arcs about outer corners"
+
+
+def _beside_contours(moves: Moves, machines: Sequence[PartMachine], source: Path) -> tuple[Moves, IntArray]:
+    """Return the path of the tool centre, with arcs about outer corners, and the number of the move that each belongs to."""
+    for machine in machines:
+        for model in (machine.model, *([] if machine.tables is None else [machine.with_tables])):
+            if unknown := unknown_radius(model, moves, MM_PER_UM):
+                raise InputError(unknown.message, file=source, line=unknown.line)
+    path = centre_path(moves)
+    if path.problem:
+        row, why = path.problem
+        raise InputError(f"radius compensation: {why}", file=source, line=int(moves.line[row]))
+    number = np.concatenate([np.arange(len(moves)), path.after])
+    order = np.argsort(number, kind="stable")
+    return Moves.joined([path.moves, path.corners]).part(order), number[order]
 
 
 def _outside(machine: PartMachine, reached_mm: FloatArray) -> str:
@@ -472,10 +497,13 @@ def _u_of_feature(machine: PartMachine, samples: Samples, weight: FloatArray) ->
     model, covariance = machine.model, machine.covariance
     assert covariance is not None
     posterior = machine.posterior
+    # growth is the same at all samples: it cancels in sizes, and is whole in positions
+    by_heat = 0.0 if model.growth is None else float(np.linalg.norm(weight.sum(axis=0) * model.growth.u_mm))
     if posterior is not None:
-        return posterior.field(samples.position_mm, samples.tool_mm).u_of(weight)
+        return math.hypot(posterior.field(samples.position_mm, samples.tool_mm).u_of(weight), by_heat)
     design = error_design(model.machine, covariance, samples.position_mm, samples.tool_mm)
-    return float(np.linalg.norm(np.einsum("nk,nkp->p", weight, design) @ covariance.errors_factor))
+    own = float(np.linalg.norm(np.einsum("nk,nkp->p", weight, design) @ covariance.errors_factor))
+    return math.hypot(own, by_heat)
 
 
 class _Followed:

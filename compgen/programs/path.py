@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,9 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, error_named
 from compgen.errors import ConvergenceError
 from compgen.kinematics import exact_error
+
+if TYPE_CHECKING:
+    from compgen.heat import Growth
 
 IntArray = NDArray[np.int64]
 RAPID, FEED, CW, CCW = range(4)
@@ -91,12 +94,16 @@ class Moves:
 
 @dataclass(frozen=True)
 class ExactModel:
-    """The exact error of a machine, with its reversal if known; ``only`` (3,) are the axes that may be corrected."""
+    """The exact error of a machine, with its reversal if known; ``only`` (3,) are the axes that may be corrected.
+
+    ``growth`` is the displacement by heat at the temperatures at which the program runs, the same all over the volume.
+    """
 
     machine: Machine
     errors: ErrorTable
     reversal: ReversalCurves | None = None
     only: tuple[bool, bool, bool] = (True, True, True)
+    growth: Growth | None = None
 
     def error(
         self,
@@ -110,6 +117,8 @@ class ExactModel:
         ``taken_up`` (n, 3) is less than 1 while an axis that has turned takes up its slack, -1 at the beginning.
         """
         found = exact_error(self.machine, self.errors, position_mm, tool_mm)
+        if self.growth is not None:
+            found = found + self.growth.vector_mm
         return found if self.reversal is None else found + self.reversal.displacement(position_mm, direction, taken_up)
 
     def command(self, wanted_mm: FloatArray, tool_mm: FloatArray, direction: FloatArray) -> FloatArray:

@@ -65,6 +65,8 @@ _VARIABLE_Q = re.compile(r"[A-Z]+\s*+[-+]?Q\d|Q\d++\s*+=|D\d++\s*+Q", re.IGNOREC
 _ALLOWED = bytes([9, 10, 13, *range(32, 256)])
 #: How many lines of a code are said.
 MOST_LINES = 30
+#: Functions of DIN/ISO programs of HEIDENHAIN that change no Q parameter: error messages, output, signals to the PLC.
+_Q_FUNCTIONS_THAT_STAY = (14.0, 15.0, 16.0, 19.0, 20.0, 29.0)
 #: What LinuxCNC leaves between a peck and the depth reached before, mm.
 _PECK_CLEARANCE_MM = 0.254
 #: X and Y that differ by less are one place, mm: such a move is none of a contour.
@@ -132,6 +134,8 @@ class SingleBlock:
     parts: tuple[SingleBlock, ...] = ()
     #: Whether a series of holes begins here, whose initial level G98 returns to.
     begins_series: bool = False
+    #: The axis that the plane does not contain: that of the tool in a drilling cycle.
+    plane: int = 2
 
 
 @dataclass(frozen=True)
@@ -192,17 +196,20 @@ class Reader:
         self.motion: int | None = 0 if dialect.name == "grbl" else None
         self.cycle: int | None = None
         #: Depth and R level of the drilling cycle, mm above the zero of the program: a shift within the cycle moves both.
+        #: Along Z; in the planes G18 and G19 along Y and X.
         self.cycle_z = self.cycle_r = math.nan
         #: Z and R of the drilling cycle as they were given last, in the unit ``cycle_scale`` of the program.
         self.cycle_given, self.cycle_scale = [math.nan, math.nan], 1.0
-        #: Machine position of Z and its offset where the series of holes began.
-        self.initial_z, self.initial_offset = math.nan, 0.0
+        #: Machine position of the axis of the tool and its offset where the series of holes began, and the plane of the series.
+        self.initial_z, self.initial_offset, self.cycle_plane = math.nan, 0.0, 2
         self._begins_series = False
         self.cycle_peck, self.to_r_level = 0.0, dialect.name == "linuxcnc"
         self.plane, self.absolute, self.centre_absolute = 2, True, False
         #: mm per unit of length of the program: that of the control until G20 or G21.
         self.scale = MM_PER_UNIT[machine.units] if dialect.starts_in_its_units else 1.0
         self.feed, self.offset_name = "minute", ""
+        #: Whether G94 or G95 has ended G93 and no F has been given since.
+        self._feed_lost = False
         self._unit_known = False
         self.work, self.preset, self.length = (0.0,) * 3, (0.0,) * 3, (0.0,) * 3
         #: Shift of the coordinates by the program: G52, TRANS, G54 of HEIDENHAIN.
@@ -237,6 +244,8 @@ class Reader:
         self.used_radii: dict[str, float] = {}
         self._left_aside_mm = 0.0
         self._turned: tuple[str, int] | None = None
+        #: Whether DEP has led to where only the control knows, and no move has placed X and Y since.
+        self._departed = False
         self._d_number = self._tool_key = ""
         #: Radii of tools that the program defines, and what it adds to that of the tool (DR), mm.
         self._defined_radii: dict[str, float] = {}
@@ -267,6 +276,8 @@ class Reader:
             found = sinumerik.called_and_computed(
                 path, names, skip_deleted=setup.skip_deleted, folders=setup.subprograms
             )
+        if self.dialect.name == "heidenhain-iso":
+            found = klartext.iso_computed(path, skip_deleted=self.setup.skip_deleted)
         if self.dialect.klartext:
             self.linked = klartext.linked(path, self.setup.subprograms)
             found = klartext.lowered(path, self.linked, skip_deleted=self.setup.skip_deleted)
@@ -425,7 +436,7 @@ class Reader:
         """Whether blocks of plain words are now moves and nothing else, from a known position."""
         known = not any(math.isnan(value) for value in self.position) and all(self.named) and bool(self.offset_name)
         modal = self.cycle is None and not self.calling and self.feed != "inverse" and self._unit_known
-        modal = modal and self.contour in (_OUTSIDE, _ON)
+        modal = modal and self.contour in (_OUTSIDE, _ON) and not self._feed_lost
         return known and modal and not (self.ended or self.closed_by_percent)
 
     def _run(self, words: Words, lines: range, first_line: int, first: int) -> tuple[Run, Moves] | None:
@@ -527,7 +538,7 @@ class Reader:
     ) -> tuple[list[SingleBlock], Moves] | None:
         """Read blocks from ``line`` on that place holes of the active cycle, as :meth:`_cycle` does; None if they do more."""
         linuxcnc = self.dialect.name == "linuxcnc"
-        modal = self.absolute and self.plane == 2 and self.feed != "inverse" and all(self.named)
+        modal = self.absolute and self.plane == self.cycle_plane == 2 and self.feed != "inverse" and all(self.named)
         modal = modal and not (self.ended or self.closed_by_percent) and self.contour == _OUTSIDE
         offset = np.array(self._offset())
         zero, initial = float(offset[2]), self._initial_level(float(offset[2]))
@@ -625,6 +636,7 @@ class Reader:
             {letter: mode == "AC" for letter, mode in self._modes.items()},
             self.drilling if kind == "hole" else None,
             begins_series=self._begins_series,
+            plane=self.plane,
         )
 
     def _holes_in_absolute(
@@ -632,7 +644,7 @@ class Reader:
     ) -> tuple[SingleBlock, ...]:
         """Read a drilling cycle in increments as blocks in absolute, one for each hole; none if the block is no such cycle.
 
-        R counts from where Z was before the cycle, Z from R; X and Y count from hole to hole.
+        R counts from where Z was before the cycle, Z from R; X and Y count from hole to hole. In G18 Y is the depth, in G19 X.
         """
         numbers = {letter: number_of(value) for letter, value, *_ in words if value and value[0] != '"'}
         codes = [f"{letter}{number_of(value):g}" for letter, value, *_ in words if letter == "G"]
@@ -658,26 +670,29 @@ class Reader:
             if letters.count(letter) > 1:
                 self._fail(f"{letter} is given twice in a block")
         offset, scale, given = self._offset(), self.scale, list(self.cycle_given)
-        x, y, z = ((place - zero) / scale for place, zero in zip(self.position, offset, strict=True))
+        deep = next((int(meaning[6:]) for meaning in meanings if meaning.startswith("plane")), self.plane)
+        letter_deep, sides = "XYZ"[deep], [k for k in range(3) if k != deep]
+        place = [(here - zero) / scale for here, zero in zip(self.position, offset, strict=True)]
+        z = place[deep]
         if self.cycle is not None:
-            z = (self._initial_level(offset[2]) - offset[2]) / scale
-        if any(math.isnan(value) for value in (x, y, z)):
+            z = (self._initial_level(offset[deep]) - offset[deep]) / scale
+        if math.isnan(z) or any(math.isnan(value) for value in place):
             self._fail(
                 "a drilling cycle in incremental from a position that is not known; position it in absolute first"
             )
         if self.dialect.name == "linuxcnc":  # keeps the numbers, whatever they meant when they were given
-            raw = dict(zip("ZR", given, strict=True)) | numbers
+            raw = dict(zip((letter_deep, "R"), given, strict=True)) | numbers
             level = z + raw["R"]
-            depth = level + raw["Z"]
-        elif {"Z", "R"} <= numbers.keys():
+            depth = level + raw[letter_deep]
+        elif {letter_deep, "R"} <= numbers.keys():
             level = z + numbers["R"]
-            depth = level + numbers["Z"]
-        elif {"Z", "R"} & numbers.keys():
-            self._fail("a drilling cycle in incremental with one of Z and R; give both")
+            depth = level + numbers[letter_deep]
+        elif {letter_deep, "R"} & numbers.keys():
+            self._fail(f"a drilling cycle in incremental with one of {letter_deep} and R; give both")
         else:
             level, depth = self.cycle_r / scale, self.cycle_z / scale
         if math.isnan(level + depth):
-            self._fail("a drilling cycle without Z or R")
+            self._fail(f"a drilling cycle without {letter_deep} or R")
         repeats = self._repeats(numbers)
         if repeats == 0:
             self._fail("a drilling cycle in incremental that is only stored is not followed; post each hole")
@@ -693,21 +708,22 @@ class Reader:
             if mode or letter in drop:
                 begin = body.upper().rindex(letter, 0, begin)
                 body = body[:begin].rstrip(" ") + (" " if " " in body.strip() else "") + body[stop:].lstrip(" ")
-        step = numbers.get("X", 0.0), numbers.get("Y", 0.0)
-        place = [word("X", x + step[0]), word("Y", y + step[1]), word("Z", depth), word("R", level)]
+        step = [numbers.get("XYZ"[k], 0.0) for k in sides]
+        first_words = [word("XYZ"[k], place[k] + way) for k, way in zip(sides, step, strict=True)]
+        first_words += [word(letter_deep, depth), word("R", level)]
         body = body.lstrip()
         head = re.match(r"(?:/\d?\s*)?(?:N\d+\s*)?", body)
         at = head.end() if head else 0
-        texts = [" ".join([f"{body[:at]}G90", *place, body[at:]]).rstrip()]
+        texts = [" ".join([f"{body[:at]}G90", *first_words, body[at:]]).rstrip()]
         for k in range(2, int(repeats) + 1):
-            texts.append(" ".join([word("X", x + k * step[0]), word("Y", y + k * step[1])]))
+            texts.append(" ".join(word("XYZ"[n], place[n] + k * way) for n, way in zip(sides, step, strict=True)))
         texts.append("G91")
         parts: list[SingleBlock] = []
         for one in texts:
             parts.append(self._block(number, one + end, first + sum(part.count for part in parts)))
         self._text = text
         if self.dialect.name == "linuxcnc":
-            for k, letter in enumerate("ZR"):
+            for k, letter in enumerate((letter_deep, "R")):
                 self._give_height(k, numbers.get(letter, given[k]))
         return tuple(parts)
 
@@ -797,6 +813,10 @@ class Reader:
         elif what == "probe":
             self._note_probe(said.number)
             self.position, self.named = [math.nan] * 3, [False] * 3
+        elif what == "lost":
+            self.assumed["PLANE leaves the rotary axes where the errors were measured"] = None
+            if said.number != "stays":
+                self.position, self.named = [math.nan] * 3, [False] * 3
         elif what == "shift":
             self._modes = dict(said.modes)
             self._shift_by_words(words)
@@ -841,7 +861,10 @@ class Reader:
     def _take_cycle(self, what: str, code: str) -> None:
         if what == "cycle":
             if not defines_hole(code, klartext=True):
-                self._fail(f"cycle {code[1:]} is not followed (200 to 203, 205 to 209, 240, 241 are); post its moves")
+                why = ": back boring moves aside within the hole and cuts upwards" if code == "G204" else ""
+                self._fail(
+                    f"cycle {code[1:]} is not followed{why} (200 to 203, 205 to 209, 240, 241 are); post its moves"
+                )
             self.drilling, self.calling = DrillingCycle(code, (), {}), False
             self._drilling_scale = self.scale
             if code == "G208":
@@ -987,6 +1010,11 @@ class Reader:
             if letter in "ABCUVWE" and not setting and not dwells:
                 self._further_axis(letter, text, value, codes)
                 continue
+            if letter == "D" and dialect.pole and value not in _Q_FUNCTIONS_THAT_STAY:
+                self._fail(
+                    f"D{text}: of Q parameters only what is constant is followed (D00 to D08 with numbers); post the program "
+                    "without jumps, conditions and what it reads from the control"
+                )
             if letter in values:
                 self._fail(f"{letter} is given twice in a block")
             plain = setting or "G4" in codes
@@ -1115,6 +1143,9 @@ class Reader:
             self.plane = int(argument)
         elif what == "compensation":
             self._turned = code, int(argument)
+        elif meaning == "departure":
+            self._turned = code, 0
+            actions.append(meaning)
         elif meaning in ("inch", "mm"):
             self.scale, self._unit_known = (MM_PER_INCH if meaning == "inch" else 1.0), True
         elif meaning in ("absolute", "incremental"):
@@ -1122,6 +1153,7 @@ class Reader:
         elif what == "centre":
             self.centre_absolute = argument == "absolute"
         elif what == "feed":
+            self._feed_lost = argument != "inverse" and (self._feed_lost or self.feed == "inverse")
             self.feed = argument
         elif meaning == "work offset":
             if code in ("G54", "G54.1", "G154") and "P" in values and self.dialect.name == "fanuc":
@@ -1405,6 +1437,7 @@ class Reader:
         aside = self.side * self.radius_mm if self.side else self._left_aside_mm
         ways = [there - here for there, here in zip(end[:2], self.position[:2], strict=True) if there == there]
         planar = sweep != 0.0 or not all(abs(way) <= SAME_PLACE_MM for way in ways)
+        planar = planar or (self.contour == _LEAVING and not ways)  # to where only the control knows
         if not planar:
             return STILL, 0.0 if self.contour == _ENTERING else aside
         if self.contour == _ON:
@@ -1437,6 +1470,9 @@ class Reader:
         named = any(axis is not None for axis in axes)
         if named and self.feed == "inverse" and self.motion in (FEED, CW, CCW) and "F" not in values:
             self._fail("a move in inverse time (G93) needs F in its block")
+        self._feed_lost = self._feed_lost and "F" not in values
+        if named and self._feed_lost and (motion.startswith("cycle") or self.motion != RAPID):
+            self._fail("a move at feed after G93 has ended, without F since: controls keep the number, or stop; post F")
         single = [action for action in actions if not action.startswith(("motion", "cycle"))]
         if sum(action.startswith(("motion", "cycle")) for action in actions) > 1:
             self._fail("two motion codes in a block")
@@ -1456,6 +1492,8 @@ class Reader:
             self._fail(f"L{values['L']:g}: {self.dialect.refused['M98']}")
         if "no preset" in single:
             return "no preset"
+        if {"approach", "departure"} & set(single):
+            return self._approach(axes, departs="departure" in single, away="departs" in single)
         if self.contour in (_ENTERING, _ON):
             self._hold_contour(motion, single, moving)
         for action in single:
@@ -1481,7 +1519,7 @@ class Reader:
         arc = (
             self.motion in (CW, CCW)
             and "rapid once" not in single
-            and (moving or (any(c in values for c in "IJK") and not self.dialect.pole))
+            and (moving or "full circle" in single or (any(c in values for c in "IJK") and not self.dialect.pole))
         )
         if not moving and not arc:
             return "keep"
@@ -1491,8 +1529,33 @@ class Reader:
         if arc:
             self._arc(end, values)
             return "arc"
-        self._move(RAPID if "rapid once" in single else self.motion, end)
+        # the control alone knows where DEP has led; a line from there is in the air
+        lost = self._departed and any(math.isnan(value) for value in self.position[:2])
+        self._departed = lost
+        self._move(RAPID if "rapid once" in single or lost else self.motion, end)
         return "line"
+
+    def _approach(self, axes: list[float | None], *, departs: bool, away: bool) -> str:
+        """APPR and DEP: to the first point of the contour, or from the last; the line or arc between is the control's own."""
+        if self.contour == _ON:
+            self._fail(f"APPR while {self.side_code} is active; end the compensation before (DEP, R0)")
+        if self.calling:
+            self._fail("APPR and DEP while M89 calls a cycle at all positions are not followed; end it by M99 before")
+        self.assumed[
+            "the line or arc of APPR and DEP is that of the control beside the corrected contour; it is neither judged nor held "
+            "against the travel"
+        ] = None
+        self.named = [known or axis is not None for known, axis in zip(self.named, axes, strict=True)]
+        end = self._target(axes)
+        if away:
+            end[:2] = math.nan, math.nan
+        self._move(RAPID, end)
+        if self.contour == _ENTERING:
+            self._fail("APPR to where the tool is, so that it makes no approach; post the position before it")
+        if away:
+            self.named[:2] = False, False
+        self._departed = away
+        return "line" if any(axis is not None for axis in axes) else "keep"
 
     def _hold_contour(self, motion: str, single: list[str], moving: bool) -> None:
         """Refuse what controls do not do, or each in its way, while radius compensation is active."""
@@ -1714,59 +1777,72 @@ class Reader:
 
     def _cycle(self, motion: str, axes: list[float | None], values: dict[str, float]) -> str:
         """Expand a drilling cycle: over the hole, to the R level, to the depth at feed, back."""
-        if self.plane != 2:
-            self._fail("a drilling cycle outside the plane G17 is not followed; post moves")
         if not self.absolute:
             self._fail(
                 "a drilling cycle in incremental with other codes in its block is not followed; divide the block"
             )
-        offset, scale = self._offset(), self.scale
+        offset, scale, deep = self._offset(), self.scale, self.plane
         if motion:
             if self.cycle is None:
-                self.initial_z, self.initial_offset = self.position[2], offset[2]
-                self.cycle_scale, self._begins_series = scale, True
+                self.initial_z, self.initial_offset = self.position[deep], offset[deep]
+                self.cycle_scale, self.cycle_plane, self._begins_series = scale, deep, True
             self.cycle = int(motion[6:])
         if scale != self.cycle_scale:
             self._fail("the unit changes within a drilling cycle; end the cycle by G80 before, and give Z and R again")
+        if deep != self.cycle_plane:
+            self._fail("the plane changes within a drilling cycle; end the cycle by G80 before")
+        if deep != 2:
+            self._assume_tool_axis(deep)
         repeats = self._repeats(values)
-        self._give_height(0, axes[2])
+        self._give_height(0, axes[deep])
         self._give_height(1, values.get("R"))
         if "Q" in values:
             self.cycle_peck = values["Q"] * scale
         if repeats == 0.0 or not any(axis is not None for axis in axes):
             return "store"
         if math.isnan(self.cycle_z) or math.isnan(self.cycle_r):
-            self._fail("a drilling cycle without Z or R")
-        x, y, _ = self._target(axes)
+            self._fail(f"a drilling cycle without {'XYZ'[deep]} or R")
         if self.cycle_r < self.cycle_z:
             self._fail("the R level of the drilling cycle is below its depth")
-        self.named[2] = True  # by Z and R of the cycle, which count from the offset that is now in force
-        self._drill(x, y, offset[2], int(repeats))
+        self.named[deep] = True  # by Z and R of the cycle, which count from the offset that is now in force
+        self._drill(self._target(axes), offset[deep], int(repeats))
         return "cycle"
 
-    def _drill(self, x: float, y: float, zero: float, repeats: int) -> None:
-        """Move as the cycle does at one place; ``zero`` is the machine position of Z = 0 of the program."""
-        linuxcnc, initial = self.dialect.name == "linuxcnc", self._initial_level(zero)
+    def _assume_tool_axis(self, deep: int) -> None:
+        """Say what the control has to be set to, so that a cycle drills along Y or X."""
+        if self.dialect.name == "fanuc":
+            plane, axis = f"G{19 - deep}", "XY"[deep]
+            self.assumed[
+                f"a drilling cycle in {plane} drills along {axis} (parameter 5101 FXY = 1; with 0 it drills along Z)"
+            ] = None
+        if self.tool_on:
+            self.assumed["the tool length is added along Z in all planes (FANUC: tool length offset A)"] = None
+
+    def _drill(self, place: list[float], zero: float, repeats: int) -> None:
+        """Move as the cycle does at one place; ``zero`` is the machine position of 0 of the program along the tool."""
+        linuxcnc, initial, deep = self.dialect.name == "linuxcnc", self._initial_level(zero), self.plane
         bottom, level = zero + self.cycle_z, zero + self.cycle_r
 
-        def go(kind: int, z: float, *, there: bool = True) -> None:
-            sides = [x, y] if there else self.position[:2]
-            # place and depth are corrected at the bottom, the R level where it is, what is between by neither
-            end, at_level = [*sides, z], z == level
-            if end != self.position:
-                deep = at_level or (kind == FEED and z == bottom)
-                x_too, y_too, z_too = (
-                    int(o and known) for o, known in zip((there, there, deep), self.named, strict=True)
-                )
-                self._move(kind, end, at=[x, y, z if at_level else bottom], corrected=(x_too, y_too, z_too))
+        def at_height(sides: list[float], height: float) -> list[float]:
+            return [height if k == deep else value for k, value in enumerate(sides)]
 
-        known_z = not math.isnan(self.position[2])
+        def go(kind: int, z: float, *, there: bool = True) -> None:
+            # place and depth are corrected at the bottom, the R level where it is, what is between by neither
+            end, at_level = at_height(place if there else self.position, z), z == level
+            if end != self.position:
+                own = [there] * 3
+                own[deep] = at_level or (kind == FEED and z == bottom)
+                x_too, y_too, z_too = (int(o and known) for o, known in zip(own, self.named, strict=True))
+                at = at_height(place, z if at_level else bottom)
+                self._move(kind, end, at=at, corrected=(x_too, y_too, z_too))
+
+        known_z = not math.isnan(self.position[deep])
         # from below the R level up at first; LinuxCNC asks where the series of holes began, not where the tool is
-        if known_z and (initial if linuxcnc else self.position[2]) < level:
+        if known_z and (initial if linuxcnc else self.position[deep]) < level:
             go(RAPID, level, there=False)
         clear = level if self.to_r_level else initial if math.isnan(initial) else max(initial, level)
         for _ in range(repeats):  # in the same place
-            over = clear if linuxcnc and self.position[2] <= level else max(self.position[2], level)
+            over = clear if linuxcnc and self.position[deep] <= level else max(self.position[deep], level)
             go(RAPID, over if known_z else math.nan)
             go(RAPID, level)
             pecking = self.cycle in (73, 83) and linuxcnc
@@ -1784,7 +1860,7 @@ class Reader:
             go(back if linuxcnc and self.cycle == 89 else RAPID, clear)
 
     def _give_height(self, k: int, value: float | None) -> None:
-        """Take over Z (``k`` 0) or R (1) of a drilling cycle, if the block gives it."""
+        """Take over the depth (``k`` 0) or R (1) of a drilling cycle, if the block gives it."""
         if value is not None:
             self.cycle_given[k] = value
             if k == 0:

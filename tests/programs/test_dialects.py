@@ -533,3 +533,13 @@ def test_options_round_as_the_dialects_do():
         ("klipper", "grbl"),
     ):
         assert PROGRAM_STEPS_MM.get(control, PROGRAM_STEP_MM) == pytest.approx(last_mm[dialect]), control
+
+
+def test_the_clearance_of_g83_counts_by_the_sign_of_the_depth():
+    """Programs for the TNC 407 give P01 the sign of P02, those since the TNC 426 none: both go 22 mm down."""
+    setup = Setup({"PRESET": ZERO}, {"1": ZERO})
+    deep = [
+        moves_of(HOLES_HEIDENHAIN.replace("P01 -2", clearance), "heidenhain-iso", setup).end_mm[:, 2].min()
+        for clearance in ("P01 -2", "P01 +2", "P01 2")
+    ]
+    assert deep == [-20.0] * 3

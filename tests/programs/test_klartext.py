@@ -8,11 +8,12 @@ import pytest
 from programs.make import mill
 from programs.test_correct import run, shift
 
+from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.programs import Reader, Setup
 from compgen.programs.dialects import DIALECTS
 from compgen.programs.follower import read_twice
-from compgen.programs.path import Moves
+from compgen.programs.path import CONTOUR, ENTRY, EXIT, FEED, PLAIN, RAPID, Moves
 
 KLARTEXT, ZERO = "heidenhain-klartext", (0.0, 0.0, 0.0)
 SETUP = Setup({"PRESET": ZERO}, {"1": ZERO, "MILL": (0.0, 0.0, 50.0)})
@@ -291,23 +292,247 @@ def test_patterns_and_calls_are_written_out(tmp_path):
     assert not re.search(r"^(?!;).*(LBL|PATTERN)", found, re.MULTILINE)
 
 
+# Approaches, departures and turned coordinates.
+
+
+@pytest.mark.parametrize(
+    "way", ["LT X+10 Y+20 LEN7", "LN X+10 Y+20 LEN7", "CT X+10 Y+20 CCA90 R+6", "LCT X+10 IY+20 R6"]
+)
+@pytest.mark.parametrize("side", ["RL", "RR", "R0", ""])
+def test_an_approach_leads_to_the_contour_and_its_path_stays(tmp_path, way, side):
+    """The tool is 10 um too far in X and 20 in Y: the first point of the contour goes by as much, LEN, CCA, R and F stay."""
+    body = f"L X-9 Y+0 Z+2 R0 FMAX\nAPPR {way} Z-3 {side} F300 M8 ; to it\nL Y+60\nL X+50\nDEP LT LEN20 F900\nL Z+50 R0 FMAX\n"
+    setup = Setup({"PRESET": ZERO}, {"1": ZERO}, radii_mm={"1": 4.0})
+    moves = moves_of(tmp_path, program(body), setup)
+    assert places(moves, 2)[:3] == [[10, 20, -3], [10, 60, -3], [50, 60, -3]]
+    assert moves.phase[2:6].tolist() == ([PLAIN] * 4 if side in ("R0", "") else [ENTRY, CONTOUR, CONTOUR, EXIT])
+    assert moves.kind[2] == RAPID and np.isnan(moves.end_mm[5, :2]).all()
+    result, found = corrected(tmp_path, program(body), setup, x=10.0, y=20.0)
+    assert result.accepted
+    word = way.replace("X+10", "X+9.99").replace(" Y+20", " Y+19.98")  # an increment from a corrected place stays
+    assert f"APPR {word} Z-3 {side} F300 M8 ; to it\nL Y+59.98\nL X+49.99\nDEP LT LEN20 F900\nL Z+50 R0 FMAX\n" in found
+
+
+def test_departures_and_what_follows_them(tmp_path):
+    """DEP LCT says where it ends; where the others do only the control knows: a line from there is not judged."""
+    for way, end in (("DEP LCT X+60 Y+70 R5", [60, 70, 0]), ("DEP CT CCA90 R-4", None), ("DEP LN LEN+8", None)):
+        moves = moves_of(tmp_path, program(f"APPR LT X+5 Y+5 LEN4 R0 F9\nL X+40\n{way}\nL Z+5\nL X+1 Y+2\nL X+3\n"))
+        assert (places(moves, 3)[0] == end) == (end is not None)
+        assert moves.kind[4:].tolist() == ([FEED] * 3 if end else [RAPID, RAPID, FEED])
+        assert places(moves, 5) == [[1, 2, 5], [3, 2, 5]]
+
+
+def test_polar_approaches_become_those_in_x_and_y(tmp_path):
+    body = "CC X+10 Y+10\nAPPR PLCT PR+20 PA+90 R3 RR F9 ; up\nL X+40\nDEP PLCT PR+50 PA+0 R3 F8\nL Z+5 FMAX\n"
+    setup = Setup({"PRESET": ZERO}, {"1": ZERO}, stated_radii_mm={"": 2.0})
+    moves = moves_of(tmp_path, program(body), setup)
+    assert places(moves) == [[10, 30, 0], [40, 30, 0], [60, 10, 0], [60, 10, 5]]
+    _, found = corrected(tmp_path, program(body), setup, x=10.0)
+    assert "APPR LCT X+9.99 Y+30 R3 RR F9 ; up\nL X+39.99\nDEP LCT X+59.99 Y+10 R3 F8\n" in found
+
+
+TURNABLE = {
+    **{
+        name: body
+        for name, (body, _) in LINES.items()
+        if "Z" not in name and "M30" not in body and "DEF 7" not in body and "M91" not in body
+    },
+    "roundings": "L X+50 Y+1 F9\nRND R5 F3\nL Y+30\nRND R2\nCC X+20 Y+30\nC X+20 Y+60 DR+ M8\nRND R3\nL X+0\nCHF 2\nL Y+1\n",
+    "helix with absolute angle": "L X+20 F9\nCC X+10 Y+0\nCP PA+200 Z-5 DR-\nCP PA+200 IZ+2 DR+\n",
+    "holes": f"{DRILL}L X+7 Y+8 FMAX M99\nL IX+9 M99\n"
+    "PATTERN DEF POS1 (X+1 Y+2 Z+1) CIRC1 (X+9 Y+9 D30 START+10 NUM4 Z+0)\nCYCL CALL PAT\n"
+    "CYCL CALL POS X+3 Y+4 Z+0 FMAX\n",
+    "calls": "LBL 1\nL IX+5 F9\nL IY+2\nCALL LBL 1 REP 3\nL Z+5\n",
+    "approaches": "APPR LT X+10 Y+20 LEN7 RL F9\nL Y+60\nRND R9\nL X+50\nDEP LCT X+90 Y+70 R5\n"
+    "CC X+9 Y+9\nAPPR PCT PR+5 PA+9 CCA9 R4 R0\nL X+70\n",
+    "compensated": "L X+10 Y+5 RR F9\nL X+40\nCR X+60 Y+25 R+20 DR+\nL Y+60\nL X+90 R0\n",
+}
+#: What turns the coordinates, with the angle in the end and the words that turn them back.
+TURNS = {
+    "CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+30\n": (30.0, "CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+0\n"),
+    "TRANS ROTATION ROT-75\nTRANS ROTATION IROT+15.5\n": (-59.5, "TRANS ROTATION RESET\n"),
+    "PLANE SPATIAL SPA+0 SPB+0 SPC+90 STAY COORD ROT\n": (90.0, "PLANE RESET STAY\n"),
+}
+
+
+@pytest.mark.parametrize("name", TURNABLE)
+@pytest.mark.parametrize("turn", TURNS)
+def test_turned_coordinates_lead_where_the_turned_path_does(tmp_path, name, turn):
+    """The moves of a program, turned about the datum, are those of the program in turned coordinates; then it is turned back."""
+    angle, back = TURNS[turn]
+    setup = Setup({"PRESET": (3.0, -4.0, 0.0)}, {"1": ZERO}, radii_mm={"1": 2.0})
+    shift = "CYCL DEF 7.0 DATUM SHIFT\nCYCL DEF 7.1 X+5\nCYCL DEF 7.2 Y+7\n"
+    body = TURNABLE[name] + "L X+1 Y+2 Z+9 R0 FMAX\n"
+    straight = moves_of(tmp_path, program(f"{shift}L X+0 Y+0 FMAX\n{body}"), setup)
+    turned = moves_of(
+        tmp_path, program(f"{shift}{turn}L X+0 Y+0 FMAX\n{body}{back}L X+4 Y+4 FMAX\nL X+4.5 F9\n"), setup
+    )
+    assert len(turned) == len(straight) + 2
+    zero, way = complex(8.0, 3.0), np.exp(1j * math.radians(angle))
+    for which in ("end_mm", "centre_mm"):
+        there, here = getattr(turned, which)[1:-2], getattr(straight, which)[1:]
+        expected = zero + (here[:, 0] + 1j * here[:, 1] - zero) * way
+        np.testing.assert_allclose(there[:, 0] + 1j * there[:, 1], expected, atol=2e-7)
+        np.testing.assert_allclose(there[:, 2], here[:, 2], atol=1e-9)
+    np.testing.assert_allclose(turned.sweep_rad[1:-2], straight.sweep_rad[1:], atol=1e-9)
+    assert (turned.kind[:-2] == straight.kind).all() and (turned.phase[:-2] == straight.phase).all()
+    assert turned.end_mm[-1].tolist() == [12.5, 7.0, 9.0]
+
+
+def test_a_corrected_program_in_turned_coordinates(tmp_path):
+    """Cycle 10 becomes a comment; PLANE stays without its angle, since it draws the tool back."""
+    body = "CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+90\nL X+10 Y+0 F100\nL X+20 ; out\n"
+    body += "CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+0\n"
+    body += (
+        "PLANE SPATIAL SPA+0 SPB+0 SPC-90 TURN MB MAX FMAX\nL X+0 Y+5 FMAX\nL Z-1 FMAX\nL X+8 F50\nPLANE RESET STAY\n"
+    )
+    result, found = corrected(tmp_path, program(body), x=10.0, y=20.0)
+    assert result.accepted
+    assert (
+        "; CYCL DEF 10.0 ROTATION\n; CYCL DEF 10.1 ROT+90\nL X-0.01 Y+9.98 F100\nL X-0.01 Y+19.98 ; out\n; CYCL"
+        in found.replace("L Y+19.98", "L X-0.01 Y+19.98")
+    )
+    assert (
+        "PLANE SPATIAL SPA+0 SPB+0 SPC+0 TURN MB MAX FMAX\nL X+4.99 Y-0.02 FMAX\nL Z-1 FMAX\n"
+        "L X+4.99 Y-8.02 F50\nPLANE RESET STAY\n" in found
+    )
+    assert "PLANE leaves the rotary axes where the errors were measured" in result.assumed
+    unturned = program("CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+0\nTRANS ROTATION RESET\nL X+5 F9\n")
+    assert corrected(tmp_path, unturned)[1] == unturned
+
+
+# What programs of others have.
+
+FOLLOWED = {
+    "a slash before the number": ("/ 13 L X+5 F9\n/7 L X+6 M8\n15 / L X+7\n", [[5, 0, 0], [6, 0, 0], [7, 0, 0]]),
+    "a full circle without its end": ("CC X+5 Y+0\nC DR+ F9\nC DR-\n", [[0, 0, 0], [0, 0, 0]]),
+    "codes alone": ("L X+5 F9\nL M8\nL M3\nL R0\nL Y+1\n", [[5, 0, 0], [5, 1, 0]]),
+    "a loop": ("Q1 = 2\nLBL 1\nL IX+Q1 F9\nFN 1: Q1 = +Q1 + +1\nFN 12: IF +Q1 LT +4.5 GOTO LBL1\nL Y+1\n",
+               [[2, 0, 0], [5, 0, 0], [9, 0, 0], [9, 1, 0]]),
+    "a part that is left out": ('FN 0: Q1 = +5\nFN9: IF +Q1 EQU 5 GOTO LBL "end"\nL X+50 F9\nLBL "end"\nL Y+1 F9\n', [[0, 1, 0]]),
+    "a jump that is not made": ('FN 10: IF 2 NE 2 GOTO LBL "end"\nL X+50 F9\nLBL "end"\nL Y+1 F9\n', [[50, 0, 0], [50, 1, 0]]),
+    "messages": ("FN 15: PRINT 20\nFN 14: ERROR = 1000\nCYCLE DEF 9.0 DWELL TIME\nCYCLE DEF 9.1 5\nL X+5 F9\n", [[5, 0, 0]]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FOLLOWED)
+def test_what_programs_of_others_have(tmp_path, name):
+    body, ends = FOLLOWED[name]
+    assert places(moves_of(tmp_path, program(body))) == ends
+    result, found = corrected(tmp_path, program(body), x=10.0)
+    assert result.accepted
+    assert all(
+        line.strip() in found
+        for line in body.splitlines()
+        if line.startswith((";", "CYCLE", "FN 1", "L M")) and "IF" not in line
+    )
+
+
+def test_a_part_that_a_jump_leaves_out_stays_as_comments(tmp_path):
+    body = "Q1 = 5\nFN 9: IF +Q1 EQU +5 GOTO LBL 2 ; on\nL X+50 F9 ; not\nLBL 2\nL Y+1 F9\n"
+    _, found = corrected(tmp_path, program(body), x=10.0)
+    assert "Q1 = 5\n; FN 9: IF +Q1 EQU +5 GOTO LBL 2 ; on\n; L X+50 F9 ; not\n; LBL 2\nL Y+1 F9\n" in found
+
+
+def test_pieces_of_a_block_with_a_slash_have_one(tmp_path):
+    errors = ErrorTable({"EYX": Curve(np.array([-600.0, 50.0, 600.0]), np.array([0.0, 0.02, 0.0]), np.zeros(3))})
+    for head in ("/ 13 ", "13 /", "/"):
+        text = program(f"L X-100 FMAX\n{head}L X+200 F9\n")
+        _, found = run(tmp_path, text, errors, KLARTEXT, SETUP)
+        pieces = [line for line in found.splitlines() if re.search(r"L X\+[1-9]", line)]
+        assert len(pieces) == 3 and all("/" in line for line in pieces)
+        skipped = Setup(SETUP.work_offsets_mm, SETUP.tools_mm, skip_deleted=True)
+        assert places(moves_of(tmp_path, found.replace("CORRECTED BY VOLCOMP", ""), skipped))[-1][0] == pytest.approx(
+            -100, abs=0.1
+        )
+
+
+@pytest.mark.parametrize("number", [1, 2, 17])
+@pytest.mark.parametrize("clearance", ["ABST 2", "SET UP -2", "DIST+2.000"])
+def test_cycles_before_200_count_from_where_the_tool_is(tmp_path, number, clearance):
+    """From Z 3 by 2 to the surface at 1, 10 into it: the depth is -9, and the tool goes back to 3."""
+    more = {
+        1: "CYCL DEF 1.3 ZUSTLG 5\nCYCL DEF 1.4 V.ZEIT 0.1\nCYCL DEF 1.5 F100\n",
+        2: "CYCL DEF 2.3 V.ZEIT 0\nCYCL DEF 2.4 F90\n",
+    }
+    define = f"CYCL DEF {number}.0 CYCLE\n7 CYCL DEF {number}.1 {clearance}\nCYCL DEF {number}.2 TIEFE -10\n"
+    define += more.get(number, "CYCL DEF 17.3 STEIGUNG+1\n")
+    body = f"L Z+3 FMAX\n{define}L X+7 Y+8 FMAX M99\nL X+9 FMAX\nCYCL CALL\n"
+    moves = moves_of(tmp_path, program(body))
+    deep = moves.part(np.flatnonzero(moves.cutting & (moves.end_mm[:, 2] < moves.start_mm[:, 2])))
+    assert places(deep, 0) == [[7, 8, -9], [9, 8, -9]]
+    assert moves.end_mm[-1].tolist() == [9, 8, 3]
+    result, found = corrected(tmp_path, program(body), x=10.0, z=30.0)
+    assert result.accepted
+    assert "L X+6.99 Y+8 Z+2.97 FMAX M99" in found.replace(" Z+2.97 ", " Z+2.97 ") or "L X+6.99 Y+8 FMAX M99" in found
+
+
+@pytest.mark.parametrize("way", ["L M140 MB MAX\nL Z+0 FMAX M91\n", "M140 MB MAX\nL Z+0 FMAX M91\n"])
+def test_increments_after_m140_count_from_where_the_tool_is(tmp_path, way):
+    """M140 leads along Z alone: X and Y stay where the corrected block before has led."""
+    result, found = corrected(tmp_path, program(f"{way}L IY+3 F9\nL IX+2\n"), x=10.0, y=20.0, slope=0.1)
+    assert result.accepted, result.reasons
+    assert re.search(r"L IY\+3 (?:IX\S+ )?F9\nL IX\+1\.999\d*\n", found)
+
+
+def test_the_height_after_dep_is_the_one_that_was_written(tmp_path):
+    body = "APPR LT X+5 Y+5 LEN4 R0 F9\nL X+40\nDEP LT LEN5\nL IZ+7\nL X+1 Y+2\nL X+3\n"
+    result, found = corrected(tmp_path, program(body), x=10.0, z=30.0)
+    assert result.accepted, result.reasons
+    assert "DEP LT LEN5\nL IZ+7\nL X+0.99 Y+2" in found
+
+
 REFUSED = [
     ("X+10 R+ F100", 4, "is not known in Klartext"),
     ("X+10 R- F100", 4, "is not known in Klartext"),
-    ("L X+1\nAPPR LT X+1 Y+1 LEN5 RL", 5, "APPR"),
+    ("L X+1\nAPPR LT X+1 Y+1 RL", 5, "APPR LT: expected X or Y and LEN"),
+    ("APPR CT X+1 Y+1 CCA90 RL", 4, "CCA and R"),
+    ("APPR CT X+1 Y+1 R5 RL", 4, "CCA and R"),
+    ("APPR LCT R5 RL", 4, "X or Y and R"),
+    ("APPR LX X+1 Y+1 LEN5 RL", 4, "APPR LX"),
+    ("DEP LT X+5 LEN5", 4, "DEP LT: expected LEN"),
+    ("DEP CT CCA90", 4, "CCA and R"),
+    ("DEP LCT R4", 4, "X or Y and R"),
+    ("L X+5 LEN5", 4, "belong to APPR"),
+    ("APPR PLT PA+10 LEN5 RL", 4, "pole"),
+    ("CC X+0 Y+0\nAPPR PLT PA+10 LEN5 RL", 5, "PR"),
+    ("L X+9 Y+9\nAPPR LT X+9 Y+9 LEN4 RL F9\nL X+20", 5, "where the tool is"),
+    ("L X+9 RL F9\nL X+20\nAPPR LT X+30 Y+9 LEN4 RL F9\nL X+40", 6, "while RL is active"),
+    ("L X+9 F9\nRND R2\nDEP LT LEN5", 6, "behind RND"),
+    ("APPR LT X+9 Y+9 LEN4 F9\nL X+20\nDEP LT LEN5\nCC X+0 Y+0\nC X+5 Y+5 DR+", 8, "position"),
+    ("APPR LT X+9 Y+9 LEN4 F9\nL X+20\nDEP LT LEN5\nL IX+5", 7, "increment"),
     ("CYCL DEF 251 POCKET ~\n Q215=0", 4, "cycle 251"),
     ("CYCL DEF 204 BACK ~\n Q200=2", 4, "cycle 204"),
-    ("CYCL DEF 1.0 PECKING", 4, "cycle 1"),
-    ("CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+35", 5, "cycle 10"),
+    ("CYCL DEF 3.0 SLOT", 4, "cycle 3"),
+    ("CYCL DEF 1.0 PECKING\nCYCL DEF 1.1 SET UP 2\nL X+5 M99", 6, "P02"),
+    ("CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+Q9", 5, "Q9"),
+    ("CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+35\nCYCL DEF 7.0\nCYCL DEF 7.1 X+5", 7, "turned"),
+    ("CYCL DEF 10.0 ROTATION\nCYCL DEF 10.1 ROT+35\nCYCL DEF 247 DATUM Q339=+1", 6, "turned"),
+    ("TRANS ROTATION ROT+35\nTRANS DATUM AXIS X+5", 5, "turned"),
+    ("TRANS ROTATION ROT+35\nCC X+0 Z+5\nC X+5 Z+5 DR+", 5, "turned"),
+    ("TRANS ROTATION ROT+35\nCR X+5 Y+5 Z+5 R9 DR+", 5, "turned"),
+    ("L X+9 F9\nRND R2\nTRANS ROTATION ROT+35\nL Y+9", 6, "behind RND"),
+    ("TCH PROBE 410 DATUM\nTRANS ROTATION ROT+35\nL X+5", 6, "together"),
+    ("TRANS ROTATION ROT+9\nCC\nCP IPA+90 DR+", 6, "not in it"),
+    ("TRANS ROTATION ROT+9\nC X+5 Y+5 DR+", 5, "pole"),
+    ("PLANE SPATIAL SPA+0 SPB+0 SPC+30 TURN FMAX TABLE ROT", 4, "TABLE ROT"),
+    ("PLANE SPATIAL SPB+0 SPC+30 STAY", 4, "PLANE"),
+    ("PLANE VECTOR BX0.8 BY-0.4 BZ-0.4 NX0.2 NY0.2 NZ0.9 STAY", 4, "PLANE"),
+    ("PLANE RELATIV SPC+10 STAY", 4, "PLANE"),
+    ("PLANE SPATIAL SPA+0 SPB+0 SPC+0 MOVE DIST5 F9\nL X+5 F9", 5, "position of X is not known|position of Y"),
+    ("PLANE RESET TURN MB MAX FMAX\nL X+5 Y+5 FMAX\nL X+6 F9", 6, "position of Z"),
     ("CYCL DEF 8.0 MIRROR\nCYCL DEF 8.1 X", 5, "cycle 8"),
     ("CYCL DEF 7.0\nCYCL DEF 7.1 #5", 5, "table"),
     ("L X+Q7 F9", 4, "Q7"),
     ("FN 18: SYSREAD Q5 = ID210\nL X+Q5", 5, "Q5"),
-    ("FN 9: IF +Q1 EQU +1 GOTO LBL 5", 4, "FN 9"),
+    ("FN 9: IF +Q1 EQU +1 GOTO LBL 5", 4, "jump"),
+    ("FN 18: SYSREAD Q5 = ID210\nFN 11: IF Q5 GT 3 GOTO LBL 5\nLBL 5", 5, "jump"),
+    ("FN 9: IF +1 EQU +1 GOTO LBL 5", 4, "label is not in this program"),
+    ("LBL 1\nFN 10: IF +1 NE +2 GOTO LBL 1", 5, "never end"),
     ("CALL LBL 9", 4, "LBL 9"),
     ("CALL PGM TNC:\\A.H", 4, "another program"),
     ("TCH PROBE 410 DATUM\nL X+5 F9", 5, "position of X is not known"),
-    ("PLANE SPATIAL SPA+0 SPB+10 SPC+0 STAY", 4, "plane"),
+    ("PLANE SPATIAL SPA+0 SPB+10 SPC+0 STAY", 4, "PLANE"),
     ("FUNCTION TCPM F TCP", 4, "TCPM"),
     ("FC DR- R5", 4, "FK"),
     ("TOOL CALL 2 Z S9", 4, "length of tool 2"),

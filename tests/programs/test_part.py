@@ -280,6 +280,23 @@ def test_holes_of_a_long_list_are_found_and_thinned(tmp_path):
     assert at["hole 1"].line == 4
 
 
+def test_holes_along_y_have_their_places_in_z_and_x(tmp_path):
+    """G18: X is 100 um/m too long, so that two holes 40 mm apart in X and 30 in Z are 3.2 um farther from each other."""
+    program = tmp_path / "p.ngc"
+    program.write_text(
+        "G21 G90 G17 G54 G0 X0 Y50 Z0\nG18 F100\nG81 X10 Z0 Y-3 R1\nX50 Z30\nG80\nG17 G0 Y60\nG0 Z60\nG81 X1 Y1 Z-3 R1\nM2\n"
+    )
+    ends = np.array([-600.0, 600.0])
+    errors = ErrorTable({"EXX": Curve(ends, 100e-6 * ends, np.zeros(2)), "EYX": Curve(ends, 1e-3 * ends, np.zeros(2))})
+    found = predict_part(model_of(mill(), errors, None), program, setup=Setup({"G54": (0.0, 0.0, 0.0)}))
+    at = {(item.name, item.quantity): item.error for item in found.features}
+    assert at["hole 1 in ZX", "position X"] == pytest.approx(1.0, abs=1e-6)
+    assert at["hole 2 in ZX", "position Z from hole 1 in ZX"] == pytest.approx(0.0, abs=1e-9)
+    assert at["hole 1 in ZX to 2", "distance"] == pytest.approx(0.8 * 4.0, abs=1e-6)
+    assert at["hole 3", "position Y"] == pytest.approx(1.0, abs=1e-6)
+    assert not any("position Y" in quantity for name, quantity in at if "ZX" in name)
+
+
 def test_the_uncertainty_is_the_scatter_of_machines_drawn_from_it(tmp_path, make_errors):
     """Every quantity there is: errors drawn from a covariance with correlations, each evaluated on the exact machine."""
     errors = make_errors(mill(), 2)
@@ -461,10 +478,63 @@ def test_the_command_ranks_machines_and_evaluates_tables(tmp_path, small_machine
 
 def test_a_program_that_cannot_be_followed_is_refused(tmp_path):
     program = tmp_path / "p.nc"
-    program.write_text(PART.replace("X80.", "G41 X80."))
-    with pytest.raises(InputError, match="radius compensation is followed by `volcomp correct` only") as caught:
+    program.write_text(PART.replace("X80.", "G16 X80."))
+    with pytest.raises(InputError, match="polar") as caught:
         predict_part(model_of(mill(), ErrorTable(), None), program, "fanuc", SETUP)
     assert caught.value.line == 12
+
+
+#: Contours with radius compensation (radius 5), and the same as paths of the tool centre.
+BESIDE = {
+    "pocket": (
+        "G1 G41 D1 X0. Y-30. F200\nX30.\nY30.\nX-30.\nY-30.\nX0.\nG40 Y0.\n",
+        "G1 X0. Y-25. F200\nX25.\nY25.\nX-25.\nY-25.\nX0.\nY0.\n",
+    ),
+    "outside": (
+        "G1 G42 D1 X0. Y-30. F200\nX30.\nY30.\nX-30.\nY-30.\nX0.\nG40 Y-60.\n",
+        "G1 X0. Y-35. F200\nX30.\nG3 X35. Y-30. I0. J5.\nG1 Y30.\nG3 X30. Y35. I-5. J0.\nG1 X-30.\nG3 X-35. Y30. I0. J-5.\n"
+        "G1 Y-30.\nG3 X-30. Y-35. I5. J0.\nG1 X0.\nY-60.\n",
+    ),
+    "bore": (
+        "G1 G41 D1 X20. Y0. F200\nG3 X20. Y0. I-20. J0.\nG1 G40 X0.\n",
+        "G1 X15. Y0. F200\nG3 X15. Y0. I-15. J0.\nG1 X0.\n",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BESIDE)
+def test_a_part_with_radius_compensation_is_that_of_the_path_of_the_tool_centre(tmp_path, make_errors, name):
+    """Contour and path of the tool centre, posted by hand, give the same features with the same errors, also corrected."""
+    errors = make_errors(mill(), 6)
+    found = []
+    for text in BESIDE[name]:
+        program = tmp_path / "p.nc"
+        program.write_text(
+            f"%\nG21 G90 G17 G54\nG0 X0. Y0. Z5.\nG0 Y{-60 if name == 'outside' else 0}.\nG1 Z-5. F90\n{text}G0 Z20.\nM30\n%\n"
+        )
+        setup = Setup({"G54": (12.0, 7.0, -30.0)}, radii_mm={"1": 5.0})
+        found.append(predict_part(model_of(mill(), errors, None), program, "fanuc", setup, correct=CorrectOptions()))
+    beside, centre = found
+    assert len(beside.features) == len(centre.features) >= 3
+    for item, other in zip(beside.features, centre.features, strict=True):
+        assert (item.name.split()[0], item.quantity) == (other.name.split()[0], other.quantity)
+        assert item.nominal == pytest.approx(other.nominal, abs=1e-6)
+        assert item.error == pytest.approx(other.error, abs=2e-3 * max(abs(other.error), 1.0))
+        # three decimals of FANUC: 1 um, and 1 um over 50 mm
+        assert abs(item.corrected) < (25.0 if item.quantity == "angle" else 1.5)
+    assert beside.figures.normal_mm == pytest.approx(centre.figures.normal_mm, abs=1e-5)
+    assert any("path of the tool centre" in text for text in beside.assumed)
+
+
+def test_a_part_with_a_contour_that_has_no_path_is_refused_with_its_line(tmp_path):
+    program = tmp_path / "p.nc"
+    program.write_text(f"%\nG21 G90 G17 G54\nG0 X0. Y0. Z-5.\n{BESIDE['bore'][0]}M30\n%\n")
+    offsets, curve = {"G54": (0.0, 0.0, 0.0)}, Curve(np.array([-600.0, 600.0]), np.array([-0.6, 0.6]), np.zeros(2))
+    model = model_of(mill(), ErrorTable({"EXX": curve}), None)
+    for setup, words in ((Setup(offsets, radii_mm={"1": 25.0}), "too large"), (Setup(offsets), "--tool-radius 5")):
+        with pytest.raises(InputError, match=words) as caught:
+            predict_part(model, program, "fanuc", setup)
+        assert caught.value.line == 5
 
 
 # --- errors that were not measured ---------------------------------------------------------------------------------

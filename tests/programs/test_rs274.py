@@ -311,6 +311,26 @@ def without_header(text):
     return "\n".join(line for line in text.splitlines() if not re.match(r"o<|\(abort|\(CORRECTED", line)) + "\n"
 
 
+def hold_holes(folder, corrected, model, every, truth, axis=2):
+    """The interpreter's holes of a corrected program are, by the exact errors, where the program wants them."""
+    body = folder / "body.ngc"
+    body.write_text(without_header(corrected.read_text()))
+    driven = machine_moves(body, folder)
+    cut = every.part(np.flatnonzero(every.cutting))
+    command = np.array([end for feed, end in driven if feed])
+    assert len(command) == len(cut)
+    tip = command + model.error(command, cut.tool_mm, np.zeros_like(command))
+    deep = (cut.end_mm[:, axis] < cut.start_mm[:, axis]) & (cut.at_mm == cut.end_mm).all(
+        axis=1
+    )  # not between two pecks
+    assert deep.sum() > 5
+    assert np.abs(tip - cut.end_mm)[deep].max() < PRINTED_MM / 2
+    before = np.abs(model.error(cut.end_mm, cut.tool_mm, np.zeros_like(command)))[deep].max()
+    assert before > 5 * PRINTED_MM
+    # rapid moves lead where the program led, but for the correction
+    assert np.abs(driven[-1][1] - truth[-1][1]).max() < 3 * before
+
+
 @pytest.mark.parametrize("seed", range(16))
 def test_holes_are_where_the_interpreter_drills_them_whatever_changes_between_them(
     tmp_path, seed, make_errors, monkeypatch
@@ -329,20 +349,7 @@ def test_holes_are_where_the_interpreter_drills_them_whatever_changes_between_th
     model = model_of(mill(), make_errors(mill(), seed, (900e-6, -600e-6, 700e-6)), None)
     result = correct_program(model, program, tmp_path / "out", CorrectOptions("linuxcnc"), SETUP)
     assert result.accepted, result.reasons
-    body = tmp_path / "body.ngc"
-    body.write_text(without_header((tmp_path / "out" / result.file).read_text()))
-    driven = machine_moves(body, tmp_path)
-    cut = every.part(np.flatnonzero(every.cutting))
-    command = np.array([end for feed, end in driven if feed])
-    assert len(command) == len(cut)
-    tip = command + model.error(command, cut.tool_mm, np.zeros_like(command))
-    deep = (cut.end_mm[:, 2] < cut.start_mm[:, 2]) & (cut.at_mm == cut.end_mm).all(axis=1)  # not between two pecks
-    assert deep.sum() > 5
-    assert np.abs(tip - cut.end_mm)[deep].max() < PRINTED_MM / 2
-    before = np.abs(model.error(cut.end_mm, cut.tool_mm, np.zeros_like(command)))[deep].max()
-    assert before > 5 * PRINTED_MM
-    # rapid moves lead where the program led, but for the correction
-    assert np.abs(driven[-1][1] - truth[-1][1]).max() < 3 * before
+    hold_holes(tmp_path, tmp_path / "out" / result.file, model, every, truth)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -469,3 +476,25 @@ def test_contours_beside_which_the_interpreter_goes(tmp_path, seed, wear, make_e
         row += int(apart.argmin())
     assert before > 5 * PRINTED_MM
     assert max(nearest) < PRINTED_MM, (max(nearest), before)
+
+
+#: Programs of the plane G17 with other axes: Z, along which cycles drill, becomes Y or X.
+TURNED_AXES = {18: str.maketrans("ZXY", "YZX"), 19: str.maketrans("ZXY", "XYZ")}
+
+
+@pytest.mark.parametrize("plane", TURNED_AXES)
+@pytest.mark.parametrize("seed", [2, 5, 7, 11, 20, 21])
+def test_cycles_drill_along_y_in_g18_and_along_x_in_g19(tmp_path, plane, seed, make_errors):
+    """The random series of holes again, in the two other planes: reader, follower and corrected program."""
+    program = tmp_path / "p.ngc"
+    program.write_text(random_holes(seed).translate(TURNED_AXES[plane]).replace("G17", f"G{plane}"))
+    truth = machine_moves(program, tmp_path)
+    for follower in (True, False):
+        found, every = our_machine_moves(program.read_text(), follower=follower)
+        assert [feed for feed, _ in found] == [feed for feed, _ in truth]
+        for k, ((_, end), (_, there)) in enumerate(zip(found, truth, strict=True)):
+            assert np.abs(end - there).max(where=~np.isnan(end), initial=0.0) < PRINTED_MM, (k, end, there)
+    model = model_of(mill(), make_errors(mill(), seed, (900e-6, -600e-6, 700e-6)), None)
+    result = correct_program(model, program, tmp_path / "out", CorrectOptions("linuxcnc"), SETUP)
+    assert result.accepted, result.reasons
+    hold_holes(tmp_path, tmp_path / "out" / result.file, model, every, truth, {18: 1, 19: 0}[plane])
