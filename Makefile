@@ -20,7 +20,7 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --no-compile
 PIP := $(BIN)/python $(PIP_INSTALL)
 PIP_DOCS := $(DOCS)/python $(PIP_INSTALL)
 PIP_RELEASE := $(RELEASE)/python $(PIP_INSTALL)
-COMPILE = uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
+COMPILE = uv pip compile --quiet --no-strip-extras --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
 
 # the tests of a file go to one process, which then prepares once what they share; three processes for two processors, because
 # some tests wait (for LinuxCNC, a browser, other processes); in the order of tests/conftest.py
