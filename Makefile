@@ -10,6 +10,7 @@
 # make docs        builds the documentation site in docs-out/; make docs-links follows its links to other sites
 PYTHON ?= python3
 BIN := .venv/bin
+TEXTS := $(patsubst %.po,%.mo,$(wildcard templates/_language/*.po))
 CONTROLLERS := isg-csv etalon-exchange siemens-eec siemens-cec fanuc-pitch
 
 DOCS := .venv-docs/bin
@@ -32,7 +33,7 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: demo extras test lint system bench coverage docs docs-links texts pins sbom release clean
 .DELETE_ON_ERROR:
 
-demo: .venv/ready
+demo: .venv/ready $(TEXTS)
 	$(BIN)/volcomp run zha-gantry examples/zha-gantry.lengths.csv $(foreach name,$(CONTROLLERS),--controller $(name)) --out demo-out
 	$(BIN)/python examples/against_truth.py demo-out
 
@@ -42,11 +43,11 @@ extras: .venv/ready-extras
 test coverage: export OPENBLAS_NUM_THREADS ?= 1
 test coverage: export MKL_NUM_THREADS ?= 1
 
-test: lint system
+test: lint system $(TEXTS)
 	$(BIN)/python -m pytest $(SPREAD) -ra
 
 # as the tests of `make test`; the figures are those of all processes together
-coverage: .venv/ready-dev system
+coverage: .venv/ready-dev system $(TEXTS)
 	$(BIN)/python -m pytest $(SPREAD) -q --cov=compgen --cov-branch --cov-report=term
 
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
@@ -68,6 +69,10 @@ lint: .venv/ready-dev
 	$(PIP) --require-hashes -r requirements.txt
 	$(PIP) --no-build-isolation --no-deps -e .
 	@touch $@
+
+# the installation has compiled the catalogues of texts; again after a change
+%.mo: %.po | .venv/ready
+	@$(BIN)/python hatch_build.py
 
 .venv/ready-extras: .venv/ready requirements-extras.txt
 	$(PIP) --require-hashes -r requirements-extras.txt

@@ -16,7 +16,7 @@ from compgen.resources import VERSION, data_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA_FOLDERS = ("templates", "machines")
-COPIED = ("compgen", *DATA_FOLDERS, "pyproject.toml", "README.md", "LICENSE", ".gitignore")
+COPIED = ("compgen", *DATA_FOLDERS, "pyproject.toml", "hatch_build.py", "README.md", "LICENSE", ".gitignore")
 
 
 def build_wheel(folder):
