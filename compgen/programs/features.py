@@ -362,7 +362,7 @@ class PartFeatures:
         by_plane: dict[int, list[Any]] = {}
         for number, (chain, offset) in _evaluated(self.holes.values()):
             samples, plane = chain.samples(np.ones(1), np.ones(1)), int(chain.moves.plane[0])
-            at, name = chain.moves.end_mm[0], f"hole {number}{_PLANES[plane]}"
+            at, name = chain.moves.end_mm[0], _in_plane(f"hole {number}", plane)
             for k in sorted(PLANE_AXES[plane]):
                 nominal = float(at[k] - offset[k])
                 yield Quantity(name, f"position {AXES[k]}", chain.line, nominal, "um", samples, np.eye(3)[[k]])
@@ -375,7 +375,7 @@ class PartFeatures:
         circles = [circle for items in self._circles.values() for _, circle in items]
         circles.sort(key=lambda circle: int(circle.chain.number[-1]))
         for number, circle in _evaluated(circles):
-            name, line, plane = f"circle {number}{_PLANES[circle.plane]}", circle.chain.line, circle.plane
+            name, line, plane = _in_plane(f"circle {number}", circle.plane), circle.chain.line, circle.plane
             samples = circle.samples()
             outward = samples.position_mm - circle.centre_mm
             outward[:, plane] = 0.0
@@ -404,7 +404,7 @@ class PartFeatures:
                 one, two = sides[k], sides[(k + 1) % count]
                 if abs(float(one.along @ two.along)) < SQUARE_RAD:
                     corner += 1
-                    yield _corner(f"corner {corner}{_PLANES[plane]}", one, two)
+                    yield _corner(_in_plane(f"corner {corner}", plane), one, two)
             ahead = range(2, count if count <= MOST_SIDES else 3)
             for k, step in itertools.product(range(count), ahead):
                 if k + step < count and _belong_together(sides[k], sides[k + step], next_but_one=step == 2):
@@ -419,8 +419,13 @@ class PartFeatures:
             at = samples.position_mm[:, list(PLANE_AXES[plane])]
             columns = np.column_stack([np.ones(len(at)), at - at.mean(axis=0)])
             weight = np.tile(np.eye(3)[plane], (len(at), 1))
-            name, line = f"milled face {number}{_PLANES[plane]}", rows[-1].chain.line
+            name, line = _in_plane(f"milled face {number}", plane), rows[-1].chain.line
             yield Quantity(name, "flatness", line, 0.0, "um", samples, weight, columns)
+
+
+def _in_plane(name: str, plane: int) -> str:
+    """Return the name of a feature, with its plane unless that is XY."""
+    return name + _PLANES[plane]
 
 
 def _evaluated(items: Iterable[Item]) -> list[tuple[int, Item]]:
@@ -569,7 +574,7 @@ def _parallel(one: _Side, two: _Side) -> Iterator[Quantity]:
     first, second = one.samples(), two.samples()
     away = np.sign(gap) * one.normal
     line = int(two.chain.moves.line[0])
-    name = f"sides at lines {int(one.chain.moves.line[0])} and {line}{_PLANES[one.plane]}"
+    name = _in_plane(f"sides at lines {int(one.chain.moves.line[0])} and {line}", one.plane)
     both = Samples.joined([first, second])
     mean = np.tile(away / ON_SIDE, (ON_SIDE, 1))
     yield Quantity(name, "distance", line, abs(gap), "um", both, np.concatenate([-mean, mean]))
@@ -592,7 +597,7 @@ def _walls(plane: int, levels: Sequence[list[_Side]], height_mm: Sequence[float]
         normal = last.normal * np.sign(last.normal[np.argmax(np.abs(last.normal))])
         slope = np.repeat(height / float(height @ height) / ON_LEVEL, ON_LEVEL)
         line = int(last.chain.moves.line[0])
-        name, samples = f"wall at line {line}{_PLANES[plane]}", Samples.joined(parts)
+        name, samples = _in_plane(f"wall at line {line}", plane), Samples.joined(parts)
         yield Quantity(name, f"tilt over {AXES[plane]}", line, 0.0, "urad", samples, slope[:, None] * normal)
 
 
