@@ -35,10 +35,10 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import CURVE_NAMES, SQUARENESS_NAMES, error_named
-from compgen.fit import FitOptions, fit, zero_ends
-from compgen.fit.bounds import Bounds, constraint_rows
-from compgen.fit.fitting import CurveProblem, prepare, smoothness, solve, solve_curves
-from compgen.fit.smoother import Smoother, second_difference
+from compgen.fitting import FitOptions, fit, zero_ends
+from compgen.fitting.bounds import Bounds, constraint_rows
+from compgen.fitting.curve_fit import CurveProblem, prepare, smoothness, solve, solve_curves
+from compgen.fitting.smoother import Smoother, second_difference
 from compgen.kinematics import modelled_errors
 
 OURS, OSQP, CVXPY = "compgen", "OSQP cold", "cvxpy+Clarabel"

@@ -24,10 +24,10 @@ from scipy.optimize import least_squares
 from compgen.data.length_archive import write_archive
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Axis, Chain, Machine
-from compgen.identify import identify, identify_measurement, joint_covariance, read_measurement, sample_errors
-from compgen.identify.adjust.grid_problem import grid_problem
-from compgen.identify.adjust.starts import start_moments, station_start_from_moments
-from compgen.identify.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identification import identify, identify_measurement, joint_covariance, read_measurement, sample_errors
+from compgen.identification.adjust.grid_problem import grid_problem
+from compgen.identification.adjust.starts import start_moments, station_start_from_moments
+from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters
 from compgen.kinematics import load_kernels, modelled_errors
 from compgen.kinematics.exact_chain import exact_columns, tip_position
 from compgen.kinematics.kernel_switch import PLAIN, VARIABLE

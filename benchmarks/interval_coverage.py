@@ -18,7 +18,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import CHAINS, Axis, Chain, Machine
 from compgen.data.names import SQUARENESS_NAMES, error_named
-from compgen.identify import Identification, identify
+from compgen.identification import Identification, identify
 from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import tip_position
 

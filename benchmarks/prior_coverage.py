@@ -31,8 +31,8 @@ from pathlib import Path
 import numpy as np
 
 from compgen.errors import CompgenError
-from compgen.identify import IdentifyOptions
-from compgen.identify.identification import Identification
+from compgen.identification import IdentifyOptions
+from compgen.identification.result import Identification
 from compgen.pipeline import identify_bare
 from compgen.tables.verification import ProbableGain, probable_gain
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from scipy.optimize import leastsq
 
 import compgen
-from compgen.identify import IdentifyOptions, identify_measurement, joint_covariance
-from compgen.identify.any_measurement import read_measurement
-from compgen.identify.covariance import error_design
+from compgen.identification import IdentifyOptions, identify_measurement, joint_covariance
+from compgen.identification.any_measurement import read_measurement
+from compgen.identification.covariance import error_design
 
 Array = NDArray[np.float64]
 #: The correction that the workshop adopted for its mill, 1e-6 and degrees, and after the repair of 2012.

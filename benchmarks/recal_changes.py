@@ -22,7 +22,7 @@ from compgen.data.machine import Axis, Chain, Machine
 from compgen.data.names import error_named
 from compgen.data.repeatability import Repeatability
 from compgen.fleet.change import Calibration, change_since
-from compgen.identify.covariance import Covariance, covariance_of_values
+from compgen.identification.covariance import Covariance, covariance_of_values
 from compgen.kinematics import modelled_errors
 
 #: Expansion of the scales, 1/K; standard uncertainty of curves (mm), angles and squareness (rad) of a measurement.

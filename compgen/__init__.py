@@ -15,35 +15,86 @@ if sys.argv[:1] == ["-m"] and not sys.flags.safe_path and os.path.join(sys.path[
     del sys.path[0]
 
 import warnings
-from types import ModuleType
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from compgen.resources import on_first_use
 
-#: The public names by the module that defines them.
-_HOMES = {
-    "compgen.controls": "CONTROLLERS",
-    "compgen.data.error_table": "Curve ErrorTable ReversalCurves format_errors read_errors read_reversal",
-    "compgen.data.deviations": "Deviations read_deviations",
-    "compgen.data.lengths": "Lengths Points read_lengths read_points",
-    "compgen.data.machine": "Axis Chain Machine load_machine",
-    "compgen.errors": "CompgenError CompgenWarning ConvergenceError InputError UndeterminedError",
-    "compgen.tables": "Export ReadTables Verification export read_tables verify without_rigid_motion",
-    "compgen.fit": "FitOptions FitResult fit",
-    "compgen.identify": "Identification IdentifyOptions identify",
-    "compgen.kinematics": "c_matrix exact_error observable_errors predict volumetric_error",
-    "compgen.pipeline": "RunResult run",
-    "compgen.plan": "Plan plan planned_stations",
-    "compgen.plugins": "load_plugins",
-    "compgen.simulate": "read_scenario simulate write_simulation",
-}
+if TYPE_CHECKING:
+    from compgen.controls import CONTROLLERS
+    from compgen.data.deviations import Deviations, read_deviations
+    from compgen.data.error_table import Curve, ErrorTable, ReversalCurves, format_errors, read_errors, read_reversal
+    from compgen.data.lengths import Lengths, Points, read_lengths, read_points
+    from compgen.data.machine import Axis, Chain, Machine, load_machine
+    from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+    from compgen.fitting import FitOptions, FitResult, fit
+    from compgen.identification import Identification, IdentifyOptions, identify
+    from compgen.kinematics import c_matrix, exact_error, observable_errors, predict, volumetric_error
+    from compgen.pipeline import RunResult, run
+    from compgen.planning import Plan, plan, planned_stations
+    from compgen.plugins import load_plugins
+    from compgen.simulation import read_scenario, simulate, write_simulation
+    from compgen.tables import Export, ReadTables, Verification, export, read_tables, verify, without_rigid_motion
+
+__all__ = [
+    "Axis",
+    "CONTROLLERS",
+    "Chain",
+    "CompgenError",
+    "CompgenWarning",
+    "ConvergenceError",
+    "Curve",
+    "Deviations",
+    "ErrorTable",
+    "Export",
+    "FitOptions",
+    "FitResult",
+    "Identification",
+    "IdentifyOptions",
+    "InputError",
+    "Lengths",
+    "Machine",
+    "Plan",
+    "Points",
+    "ReadTables",
+    "ReversalCurves",
+    "RunResult",
+    "UndeterminedError",
+    "Verification",
+    "c_matrix",
+    "exact_error",
+    "export",
+    "fit",
+    "format_errors",
+    "identify",
+    "load_machine",
+    "load_plugins",
+    "observable_errors",
+    "plan",
+    "planned_stations",
+    "predict",
+    "read_deviations",
+    "read_errors",
+    "read_lengths",
+    "read_points",
+    "read_reversal",
+    "read_scenario",
+    "read_tables",
+    "run",
+    "simulate",
+    "verify",
+    "volumetric_error",
+    "without_rigid_motion",
+    "write_simulation",
+]
+
 #: Public in :mod:`compgen.readers`, and found here as well: `compgen.read_axis_runs`; ``read_artefact`` and ``read_part`` are
 #: the readers of one file or several, by the name that one tries first.
 _OF_READERS = (
     "ActiveTables Artefact AxisRuns Circles Diagonals DriftSession ImportOptions ReversalCurves SafetyLimits SixDof "
     "SixDofInstrument SphereCentres StatedNumbers Temperatures open_errors open_measurement read_active read_artefact "
-    "read_artefacts read_axis_runs read_circles read_diagonals read_drift read_instrument read_part read_parts read_sixdof "
-    "read_spheres read_stations read_temperatures"
+    "read_artefacts read_axis_runs read_circles read_diagonals read_drift read_instrument read_part read_parts "
+    "read_sixdof read_spheres read_stations read_temperatures"
 )
 #: Names that were public until 0.1; they remain in the modules that define them.
 _DEPRECATED = {
@@ -51,45 +102,31 @@ _DEPRECATED = {
     "compgen.data.deviations": "format_deviations",
     "compgen.data.lengths": "format_lengths format_points",
     "compgen.tables": "Residuals residuals wanted_correction",
-    "compgen.identify": (
+    "compgen.identification": (
         "Covariance SystematicInputs identify_deviations joint_covariance predict_uncertainty read_covariance"
     ),
     "compgen.kinematics": "modelled_errors",
-    "compgen.plan": "PlannedStations suggest",
-    "compgen.simulate": "Scenario Simulation",
+    "compgen.planning": "PlannedStations suggest",
+    "compgen.simulation": "Scenario Simulation",
 }
 #: Version that removes the deprecated names.
 _REMOVED_IN = "0.3"
-__all__ = sorted(name for names in _HOMES.values() for name in names.split())
-
-
-def _deprecated(name: str, home: str) -> property:
-    """Load a deprecated name like the others, with a warning that gives its replacement."""
-    found = on_first_use(name, home)
-
-    def load(package: ModuleType) -> Any:
-        text = f"compgen.{name} is deprecated and will be removed in {_REMOVED_IN}; use `from {home} import {name}`"
-        warnings.warn(text, DeprecationWarning, stacklevel=2)
-        return found.__get__(package)
-
-    return property(load, found.fset)
 
 
 def __dir__() -> list[str]:
     return __all__
 
 
-sys.modules[__name__].__class__ = type(
-    "_Package",
-    (ModuleType,),
-    {
-        name: make(name, home)
-        for table, make in (
-            ({"compgen.readers": _OF_READERS}, on_first_use),
-            (_HOMES, on_first_use),
-            (_DEPRECATED, _deprecated),
-        )
-        for home, names in table.items()
-        for name in names.split()
-    },
-)
+if not TYPE_CHECKING:
+    _public = on_first_use(__name__)
+
+    def __getattr__(name: str) -> Any:
+        """Load a public name on first use; a deprecated one with a warning that gives its replacement."""
+        if name in _OF_READERS.split():
+            return getattr(import_module("compgen.readers"), name)
+        for home, names in _DEPRECATED.items():
+            if name in names.split():
+                text = f"compgen.{name} is deprecated and will be removed in {_REMOVED_IN}; use `from {home} import {name}`"
+                warnings.warn(text, DeprecationWarning, stacklevel=2)
+                return getattr(import_module(home), name)
+        return _public(name)

@@ -27,8 +27,8 @@ from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, Input
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import FileHead, heads_of
 from compgen.foreign.source import open_measurement
-from compgen.identify import Identification, IdentifyOptions, covariance
-from compgen.identify.any_measurement import (
+from compgen.identification import Identification, IdentifyOptions, covariance
+from compgen.identification.any_measurement import (
     Measurement,
     MixedMeasurement,
     describe,
@@ -37,16 +37,16 @@ from compgen.identify.any_measurement import (
     identify_mixed,
     known_alone,
 )
-from compgen.identify.options import StatedNumbers
-from compgen.identify.reversal_errors import SIGNIFICANT
+from compgen.identification.options import StatedNumbers
+from compgen.identification.reversal_errors import SIGNIFICANT
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES
 
 if TYPE_CHECKING:
-    from compgen.fit import FitOptions, FitResult
-    from compgen.identify.monte_carlo import SelfCheck
-    from compgen.identify.stated import Shown
-    from compgen.plan.next_best import NextBest
+    from compgen.fitting import FitOptions, FitResult
+    from compgen.identification.monte_carlo import SelfCheck
+    from compgen.identification.stated import Shown
+    from compgen.planning.next_measurement import NextBest
     from compgen.tables import Export, ReadTables, SafetyLimits, Verification
     from compgen.tables.active import ActiveTables
 
@@ -147,7 +147,7 @@ def next_measurements(result: Identification) -> NextBest | None:
     """Return what to measure next; None where the readings determine every error, and without a prior."""
     if "posterior_means" not in result.details or result.posterior is None:
         return None
-    from compgen.plan.next_best import next_best
+    from compgen.planning.next_measurement import next_best
 
     return next_best(result.posterior)
 
@@ -397,7 +397,7 @@ def identify_beside(
     """
     if not (numbers.squareness or numbers.scale or numbers.backlash or isinstance(measurement, MixedMeasurement)):
         return identify_bare(machine, measurement, options, active)
-    from compgen.identify import stated  # loaded only where it is needed
+    from compgen.identification import stated  # loaded only where it is needed
 
     if numbers.squareness or numbers.scale:
         alone = _measured_alone(machine, stated.without_stated(measurement), options, active)
@@ -444,7 +444,7 @@ def with_reversal(result: Identification, stated: ReversalCurves | None, shown: 
     """
     if stated is None:
         return result
-    from compgen.identify.stated import joined_reversal, shown_reversals
+    from compgen.identification.stated import joined_reversal, shown_reversals
 
     machine = result.layout.machine
     measured = shown_reversals(None, result) if shown is None else shown
@@ -585,7 +585,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     >>> [name for name in names if name.startswith("volcomp0")]
     ['volcomp0.csv', 'volcomp0.lis']
     """
-    from compgen.fit import FitOptions, fit
+    from compgen.fitting import FitOptions, fit
 
     of_kind("machine", machine, Machine)
     measurements, controllers = paths_of("measurements", measurements), names_of("controllers", controllers)

@@ -13,10 +13,10 @@ from compgen.controls import CONTROLLERS, Controller
 from compgen.data.arguments import paths_of
 from compgen.data.registry import PATH_ORIGIN, Kind, call_problem, load_entry_points, load_file
 from compgen.effects import FAMILIES
-from compgen.effects.catalogue import check_family
+from compgen.effects.all_effects import check_family
 from compgen.errors import InputError
-from compgen.simulate import EFFECTS, INSTRUMENTS
-from compgen.simulate.run import check_effect, check_instrument
+from compgen.simulation import EFFECTS, INSTRUMENTS
+from compgen.simulation.run import check_effect, check_instrument
 from compgen.tables.render import check_templates
 
 

@@ -12,7 +12,7 @@ takes those of other programs, too, and any mixture. The module of a name is imp
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns, Diagonals, read_axis_runs, read_diagonals
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from compgen.foreign.answers import ImportOptions
     from compgen.foreign.source import open_errors, open_measurement
     from compgen.heat.sessions import DriftSession, Temperatures, read_drift, read_temperatures
-    from compgen.identify.options import StatedNumbers, read_stations
+    from compgen.identification.options import StatedNumbers, read_stations
     from compgen.instruments.sixdof_instrument import SixDof, SixDofInstrument, read_instrument, read_sixdof
     from compgen.tables.active import ActiveTables, read_active
     from compgen.tables.judge import SafetyLimits
@@ -75,7 +75,8 @@ __all__ = [
     "read_temperatures",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)
 
 
 def read_artefact(path: str | Path) -> "Artefact":

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 
@@ -54,33 +53,33 @@ def program_version() -> str:
     return VERSION
 
 
-def on_first_use(name: str, home: str) -> property:
-    """Return a public name of a package as a property that imports its ``home`` when it is used.
+def homes_of(package: str) -> dict[str, str]:
+    """Public names of a package -> the module that defines each: the imports below ``if TYPE_CHECKING`` of its source."""
+    import ast  # here: `import compgen` alone needs none of it
 
-    A property, and not the ``__getattr__`` of a module: importing the sub-module ``compgen.fit`` must not hide the
-    function ``fit``.
+    source = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    blocks = [node for node in ast.parse(source).body
+              if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]  # fmt: skip
+    imports = [node for block in blocks for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: str(node.module) for node in imports for alias in node.names}
+
+
+def on_first_use(package: str) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a package that imports its public names on first use.
+
+    A command should not wait for what it does not need. The block ``if TYPE_CHECKING`` of the package says which module each
+    name comes from, for type checkers and for this function. No module below the package may have the name of a function:
+    its import would hide the function.
     """
+    homes: dict[str, str] = {}
 
-    def load(package: ModuleType) -> Any:
-        return getattr(import_module(home), name)
+    def load(name: str) -> Any:
+        if not homes:
+            homes.update(homes_of(package))
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        found = getattr(import_module(homes[name]), name)
+        setattr(sys.modules[package], name, found)
+        return found
 
-    def keep(package: ModuleType, value: Any) -> None:
-        # the import system sets every sub-module as an attribute of its package; the public name must keep its meaning
-        if not isinstance(value, ModuleType):
-            raise AttributeError(f"{package.__name__}.{name} cannot be replaced; it belongs to {home}")
-
-    return property(load, keep)
-
-
-def load_on_first_use(package: str, names: Iterable[str]) -> None:
-    """Let a room import its public names on first use; a command should not wait for what it does not need.
-
-    The ``if TYPE_CHECKING`` block of its ``__init__`` gives the modules of the names.
-    """
-    import ast
-
-    module = sys.modules[package]
-    imports = [node for node in ast.walk(ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8")))
-               if isinstance(node, ast.ImportFrom)]  # fmt: skip
-    homes = {alias.name: str(node.module) for node in imports for alias in node.names}
-    module.__class__ = type("Room", (ModuleType,), {name: on_first_use(name, homes[name]) for name in names})
+    return load

@@ -27,7 +27,7 @@ import compgen
 from compgen.__main__ import main as volcomp
 from compgen.instruments.sixdof_instrument import SIGNALS, Optics, SetUp, drift_matrix, solve_errors
 from compgen.kinematics import modelled_errors
-from compgen.simulate.sixdof import Tracer
+from compgen.simulation.sixdof import Tracer
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend is chosen before)

@@ -10,7 +10,7 @@ import matplotlib
 import numpy as np
 
 from compgen.instruments.sixdof_instrument import SIGNALS, Optics
-from compgen.simulate.sixdof import Tracer
+from compgen.simulation.sixdof import Tracer
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402  (the backend is chosen before)

@@ -192,5 +192,5 @@ def test_pages_name_files_and_functions_that_exist(path):
 
 
 def test_names_that_do_not_exist_are_found():
-    text = "`compgen.fit.FitOptions` `compgen.fit.nothing(x)` `compgen.nothing.at.all` `tests/none.py` `docs/conf.py`"
-    assert missing_names(text) == ["tests/none.py", "compgen.fit.nothing", "compgen.nothing.at.all"]
+    text = "`compgen.fitting.FitOptions` `compgen.fitting.nothing(x)` `compgen.nothing.at.all` `tests/none.py` `docs/conf.py`"
+    assert missing_names(text) == ["tests/none.py", "compgen.fitting.nothing", "compgen.nothing.at.all"]

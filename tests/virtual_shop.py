@@ -23,7 +23,7 @@ from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.identify.any_measurement import MixedMeasurement
+from compgen.identification.any_measurement import MixedMeasurement
 from machines import machine_of
 
 Array = NDArray[np.float64]

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.accuracy.compare import CompareOptions, Comparison, compare_errors, compare_fields, compare_runs
@@ -59,4 +59,5 @@ __all__ = [
     "with_prediction",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

@@ -33,7 +33,7 @@ from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.many_points import volume_grid
 
 if TYPE_CHECKING:
-    from compgen.identify import Identification
+    from compgen.identification import Identification
 
 # Straightness against a stated reference line, and squareness of two reference lines (ISO 230-1).
 #

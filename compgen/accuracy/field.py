@@ -24,8 +24,8 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, ERRORS, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
-from compgen.identify.covariance import Covariance, covariance_or_independent, posterior_with
-from compgen.identify.posterior import Posterior, assumed_text, worse_text
+from compgen.identification.covariance import Covariance, covariance_or_independent, posterior_with
+from compgen.identification.posterior import Posterior, assumed_text, worse_text
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, factor, tool_of
 from compgen.kinematics.many_points import blocks, full_grid, volumetric_error

@@ -41,9 +41,15 @@ from compgen.data.lengths import POSITION_COLUMNS, Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError, UndeterminedError
-from compgen.identify import Identification, IdentifyOptions, identify_measurement, joint_covariance, read_measurement
-from compgen.identify.any_measurement import Measurement
-from compgen.identify.covariance import covariance_named_by
+from compgen.identification import (
+    Identification,
+    IdentifyOptions,
+    identify_measurement,
+    joint_covariance,
+    read_measurement,
+)
+from compgen.identification.any_measurement import Measurement
+from compgen.identification.covariance import covariance_named_by
 from compgen.tables import ReadTables
 
 # What the two sides of a comparison can be: error files, measurements of any kind, predictions.

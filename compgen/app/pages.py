@@ -92,7 +92,7 @@ from compgen.fleet.dashboard.guard import (
 from compgen.fleet.dashboard.server import LARGEST_BODY, bounded, small_for
 from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.foreign import native_format
-from compgen.identify.options import StatedNumbers
+from compgen.identification.options import StatedNumbers
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.pictures import describe_error, thousands
 from compgen.report.html.write import markdown
@@ -702,7 +702,7 @@ def make_sheet(runner: Runner, state: ProjectState, item: int) -> str | None:
 @action("measurement", "numbers")
 def state_numbers(runner: Runner, state: ProjectState) -> None:
     """Take numbers that are known without a file, with unit and uncertainty as one types them."""
-    from compgen.identify.stated import check_signs
+    from compgen.identification.stated import check_signs
 
     numbers: dict[str, list[str]] = {}
     for option, names in (("squareness", SQUARENESS_NAMES), ("backlash", AXES), ("scale", AXES)):

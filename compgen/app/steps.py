@@ -17,7 +17,7 @@ from typing import Any
 
 from compgen.data.toml_files import Section, flag, not_negative, whole
 from compgen.errors import InputError, visible_line
-from compgen.fit.bounds import FitOptions
+from compgen.fitting.bounds import FitOptions
 from compgen.foreign import ImportOptions
 from compgen.resources import LANGUAGES
 

@@ -25,7 +25,7 @@ from compgen.controls.isg_kernel import read_error_file
 from compgen.data.files import OutputFolder, json_text
 from compgen.data.machine import Machine
 from compgen.diagnose import AxisDiagnosis, CircleDiagnosis, DiagnoseOptions, Diagnosis, diagnose
-from compgen.diagnose.diagnose import SixDofDiagnosis, diagnose_sixdof, sixdof_text
+from compgen.diagnose.any_diagnosis import SixDofDiagnosis, diagnose_sixdof, sixdof_text
 from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
 from compgen.diagnose.observed import read_diagnosed
 from compgen.diagnose.page import diagnosis_files, next_steps, summary, told

@@ -42,7 +42,7 @@ from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.job import job_of, job_schema
 from compgen.instruments.sixdof_instrument import instrument_of, instrument_schema
-from compgen.simulate.run import Scenario, scenario_of
+from compgen.simulation.run import Scenario, scenario_of
 from compgen.tables import load_format
 
 # The kinds of TOML files: how each is detected, read, and described.
@@ -225,7 +225,7 @@ def check_command(files: tuple[str, ...], kind: str | None, spheres: Path | None
 def _check_senses(files: Sequence[str], spheres: Path, as_json: bool) -> int:
     """Say which way each rotary axis of a machine turns."""
     from compgen.data.rotary import read_spheres
-    from compgen.identify.spheres import senses
+    from compgen.identification.spheres import senses
 
     if len(files) != 1:
         raise InputError("expected one machine", field="--spheres")

@@ -583,7 +583,7 @@ def recheck_command(
     from compgen.data.names import error_named
     from compgen.fleet.change import calibrations_of
     from compgen.fleet.recheck import shortest_recheck, write_recheck_points
-    from compgen.plan import read_stations
+    from compgen.planning import read_stations
 
     job.machine(machine)
     history, _, model = opened(job, lambda store: calibrations_of(store, store.machine(machine)))

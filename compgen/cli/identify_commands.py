@@ -31,10 +31,10 @@ from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import heads_of
 from compgen.foreign.source import open_measurement
-from compgen.identify import IdentifyOptions
-from compgen.identify.any_measurement import describe, evidence_files
-from compgen.identify.covariance import covariance_file_of
-from compgen.identify.options import StatedNumbers
+from compgen.identification import IdentifyOptions
+from compgen.identification.any_measurement import describe, evidence_files
+from compgen.identification.covariance import covariance_file_of
+from compgen.identification.options import StatedNumbers
 from compgen.pipeline import (
     add_identification,
     failure_reported,
@@ -47,8 +47,8 @@ from compgen.pipeline import (
 from compgen.report.terminal import advice_text, identification_table
 
 if TYPE_CHECKING:
-    from compgen.identify.rotary_runs import RotaryPositioning
-    from compgen.identify.spheres import SphereIdentification
+    from compgen.identification.rotary_runs import RotaryPositioning
+    from compgen.identification.spheres import SphereIdentification
     from compgen.tables.active import ActiveTables
 
 
@@ -59,7 +59,7 @@ from compgen.cli.shared_options import (
     fitting_options,
 )
 from compgen.cli.terminal import answer
-from compgen.fit import FitOptions, fit
+from compgen.fitting import FitOptions, fit
 from compgen.foreign.source import open_errors
 from compgen.pipeline import fit_files, write_all
 from compgen.report.terminal import fit_table
@@ -137,7 +137,7 @@ def identify_command(
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):
                 raise InputError("--self-check needs tracer lengths that were measured without active tables")
-            from compgen.identify.monte_carlo import self_check
+            from compgen.identification.monte_carlo import self_check
 
             with mapper(workers, cluster) as spread:
                 checked = self_check(
@@ -228,8 +228,8 @@ def _rotary_files(
     import json
 
     from compgen.data.rotary import RotaryErrors, format_machine_errors, is_rotary_runs, read_rotary_runs, read_spheres
-    from compgen.identify.rotary_runs import identify_rotary_runs
-    from compgen.identify.spheres import identify_spheres
+    from compgen.identification.rotary_runs import identify_rotary_runs
+    from compgen.identification.spheres import identify_spheres
 
     others = [path for path in measurements if not of_rotary_axes(path)]
     if others:

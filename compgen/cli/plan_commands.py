@@ -31,12 +31,12 @@ from compgen.data.machine import Machine
 from compgen.effects import active_effects, displacement_of, readings_of_points
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
-from compgen.identify import IdentifyOptions, predict_uncertainty, read_covariance
-from compgen.identify.covariance import covariance_or_independent, posterior_with
-from compgen.identify.posterior import assumed_text
+from compgen.identification import IdentifyOptions, predict_uncertainty, read_covariance
+from compgen.identification.covariance import covariance_or_independent, posterior_with
+from compgen.identification.posterior import assumed_text
 from compgen.kinematics import predict
 from compgen.kinematics.many_points import full_grid
-from compgen.plan import (
+from compgen.planning import (
     Plan,
     PlanVisibility,
     Suggestion,
@@ -53,8 +53,8 @@ from compgen.plan import (
     regions_of,
     suggest,
 )
-from compgen.plan.gauges import plan_gauges, plan_page
-from compgen.plan.suggest import DEFAULT_EVALUATIONS, Criterion
+from compgen.planning.gauges import plan_gauges, plan_page
+from compgen.planning.suggestions import DEFAULT_EVALUATIONS, Criterion
 from compgen.report.terminal import (
     gauge_plan_table,
     next_table,
@@ -63,7 +63,7 @@ from compgen.report.terminal import (
     trajectory_table,
     visibility_table,
 )
-from compgen.simulate import (
+from compgen.simulation import (
     LaserTracer,
     MovingSimulation,
     SimulatedReadings,
@@ -77,8 +77,8 @@ from compgen.simulate import (
     simulate_sixdof,
     write_simulation,
 )
-from compgen.simulate.gauges import circle_from_text, pose_from_text, read_gauge
-from compgen.simulate.run import OwnPath
+from compgen.simulation.gauges import circle_from_text, pose_from_text, read_gauge
+from compgen.simulation.run import OwnPath
 from compgen.tables import residuals
 from compgen.tables.probe_program import PROGRAM_NAME, probe_program, read_probing
 
@@ -293,8 +293,8 @@ def _plan_gauges(
 
 def _plan_next(machine: Machine, errors: Path | None, out: Path, language: str, *, as_json: bool) -> int:
     """Say what to measure next, from the errors that are known, or from nothing but the prior."""
-    from compgen.identify.posterior import not_measured
-    from compgen.plan.next_best import next_best, next_page, unmeasured
+    from compgen.identification.posterior import not_measured
+    from compgen.planning.next_measurement import next_best, next_page, unmeasured
 
     if machine.prior.is_none:
         raise InputError(
@@ -495,7 +495,7 @@ def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with
     import numpy as np
 
     from compgen.data.rotary import format_poses, read_machine_errors, read_poses
-    from compgen.identify.rotary_covariance import known_covariance, pose_uncertainty
+    from compgen.identification.rotary_covariance import known_covariance, pose_uncertainty
     from compgen.kinematics.rotary_chain import pose_error
 
     poses = read_poses(machine, points)

@@ -32,8 +32,8 @@ from compgen.data.machine import INTEGERS, MM_PER_UNIT, Machine, ProgramNumbers,
 from compgen.effects import effects_reversal
 from compgen.errors import InputError, number_text, visible
 from compgen.foreign import open_errors
-from compgen.identify.covariance import covariance_or_independent, posterior_with
-from compgen.identify.posterior import assumed_text, worse_text
+from compgen.identification.covariance import covariance_or_independent, posterior_with
+from compgen.identification.posterior import assumed_text, worse_text
 from compgen.programs import CorrectOptions, FolderWatch, Setup, correct_program, model_of, read_radii, read_tools
 from compgen.resources import program_version
 

@@ -21,7 +21,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM
 from compgen.data.rotary import RotaryErrors, format_poses, read_machine_errors, read_poses
 from compgen.errors import InputError
-from compgen.identify.rotary_covariance import constant_covariance
+from compgen.identification.rotary_covariance import constant_covariance
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 from compgen.pipeline import provenance_of
 from compgen.tables.rotary_parameters import RotaryExport, export_rotary, judged

@@ -34,10 +34,10 @@ from compgen.controls import ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
-from compgen.fit import FitOptions
+from compgen.fitting import FitOptions
 from compgen.foreign.answers import ImportOptions
-from compgen.identify import IdentifyOptions
-from compgen.identify.options import StatedNumbers
+from compgen.identification import IdentifyOptions
+from compgen.identification.options import StatedNumbers
 from compgen.pipeline import run
 from compgen.report.terminal import advice_text, identification_table, verification_table
 from compgen.tables.judge import SafetyLimits

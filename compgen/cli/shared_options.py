@@ -19,9 +19,9 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.foreign.answers import ImportOptions
-from compgen.identify import Covariance, IdentifyOptions, read_covariance, read_stations
-from compgen.identify.covariance import covariance_named_by
-from compgen.identify.options import StatedNumbers
+from compgen.identification import Covariance, IdentifyOptions, read_covariance, read_stations
+from compgen.identification.covariance import covariance_named_by
+from compgen.identification.options import StatedNumbers
 from compgen.resources import data_folder
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ answer_options = options_of(ImportOptions, "answers")
 
 def fitting_options(command: Command) -> Command:
     """Add smoothness, bounds and loss of the fit; the command receives ``fitting``."""
-    from compgen.fit import FitOptions
+    from compgen.fitting import FitOptions
 
     return options_of(
         FitOptions,

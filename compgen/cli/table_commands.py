@@ -38,7 +38,7 @@ from compgen.data.machine import Machine, zone_of
 from compgen.effects import effects_reversal
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_errors
-from compgen.identify.covariance import joint_covariance
+from compgen.identification.covariance import joint_covariance
 from compgen.pipeline import (
     RunResult,
     export_and_verify,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from compgen.data.files import read_text
 from compgen.errors import InputError, nearest
-from compgen.resources import data_folder, load_on_first_use
+from compgen.resources import data_folder, on_first_use
 
 if TYPE_CHECKING:
     from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
@@ -162,4 +162,5 @@ __all__ = [
     "controller_named",
 ]
 
-load_on_first_use(__name__, ["AnyController", "Controller", "Monomial", "SourceFile", "Term"])
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

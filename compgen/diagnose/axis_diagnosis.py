@@ -35,7 +35,7 @@ from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessi
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Effect, active_effects, catalogue, section_text
-from compgen.effects.catalogue import belongs_to, what_to_do
+from compgen.effects.all_effects import belongs_to, what_to_do
 from compgen.errors import InputError
 from compgen.kinematics.kernel_switch import one_thread
 

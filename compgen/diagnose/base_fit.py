@@ -16,7 +16,7 @@ from compgen.data.names import ERROR_INDEX, SQUARENESS_NAMES, error_named
 from compgen.diagnose.observed import Observed
 from compgen.effects import Effect, Readings
 from compgen.errors import InputError
-from compgen.identify.adjust.unknowns import DistinctPoses
+from compgen.identification.adjust.unknowns import DistinctPoses
 from compgen.kinematics.exact_chain import exact_columns, tip_position
 from compgen.kinematics.first_order import modelled_errors
 from compgen.kinematics.kernel_switch import lapack

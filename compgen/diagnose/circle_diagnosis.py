@@ -35,9 +35,9 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Readings, active_effects, catalogue, section_text
-from compgen.effects.catalogue import belongs_to
+from compgen.effects.all_effects import belongs_to
 from compgen.errors import InputError, nearest
-from compgen.identify.axis_tests import SQUARENESS_OF, circle_positions, correlated
+from compgen.identification.axis_tests import SQUARENESS_OF, circle_positions, correlated
 from compgen.kinematics.first_order import c_matrix
 
 Show = Callable[[str], None]

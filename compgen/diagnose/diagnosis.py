@@ -22,7 +22,7 @@ from compgen.diagnose.search import Design
 from compgen.diagnose.verdict import DisplayedDiagnosis, Named, Unknown, Verdict
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.active import section_text
-from compgen.effects.catalogue import belongs_to, what_to_do
+from compgen.effects.all_effects import belongs_to, what_to_do
 from compgen.errors import one_line
 
 # The full nonlinear model including the effects: their parameters with uncertainty, and the extended machine file.

@@ -21,8 +21,8 @@ from compgen.data.records import detect_format
 from compgen.diagnose.layout import IntArray, MeasurementLayout, layout_of
 from compgen.effects import Readings, readings_of_deviations, readings_of_lengths
 from compgen.errors import InputError
-from compgen.identify.adjust.starts import StationStart, station_start
-from compgen.identify.adjust.unknowns import DistinctPoses, dead_lengths_of, distinct_poses
+from compgen.identification.adjust.starts import StationStart, station_start
+from compgen.identification.adjust.unknowns import DistinctPoses, dead_lengths_of, distinct_poses
 from compgen.kinematics.first_order import tool_of
 
 # Start values of a station in closed form, refined on the distances; no search, so gross errors show immediately.

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.effects.active import (
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
         section_text,
         with_effects_reversal,
     )
+    from compgen.effects.all_effects import FAMILIES, catalogue, listed
     from compgen.effects.base import (
         ANY_STATION,
         AllStations,
@@ -29,7 +30,6 @@ if TYPE_CHECKING:
         Single,
         along,
     )
-    from compgen.effects.catalogue import FAMILIES, catalogue, listed
     from compgen.effects.readings import Readings, readings_of_deviations, readings_of_lengths, readings_of_points
 
 __all__ = [
@@ -62,4 +62,5 @@ __all__ = [
     "with_effects_reversal",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

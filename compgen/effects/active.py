@@ -23,9 +23,9 @@ from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ReversalCurves
 from compgen.data.machine import Machine
+from compgen.effects.all_effects import catalogue, listed
 from compgen.effects.axes import Backlash, LostMotion, Periodic
 from compgen.effects.base import ANY_STATION, DisplacementEffect, Effect
-from compgen.effects.catalogue import catalogue, listed
 from compgen.effects.optics import DeadPath
 from compgen.effects.readings import Readings, legendre
 from compgen.errors import nearest

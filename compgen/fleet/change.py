@@ -19,7 +19,7 @@ from compgen.errors import InputError
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import AFTER, WITHOUT_PRIOR, IdentificationRecord, MachineRecord, TableRecord, comparable
 from compgen.fleet.store import Store, at_one_moment, counting
-from compgen.identify.covariance import (
+from compgen.identification.covariance import (
     Covariance,
     covariance_of_values,
     covariance_or_independent,

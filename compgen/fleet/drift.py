@@ -35,7 +35,7 @@ from compgen.fleet.change import (
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import MachineRecord, active_of
 from compgen.fleet.store import Store
-from compgen.identify.covariance import error_design
+from compgen.identification.covariance import error_design
 
 # Trend of one figure over time: weighted regression plus a random walk, temperature and sudden steps.
 #

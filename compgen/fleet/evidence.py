@@ -31,7 +31,7 @@ from compgen.fleet.change import Known, compared_fields, volume_points
 from compgen.fleet.inbox import backup_part
 from compgen.fleet.records import TableRecord
 from compgen.fleet.store import Store
-from compgen.identify.covariance import Covariance, covariance_of_values, error_design
+from compgen.identification.covariance import Covariance, covariance_of_values, error_design
 from compgen.tables import ReadTables, parse_tables, read_tables
 from compgen.tables.entries import numbers_of, with_factor
 

@@ -218,7 +218,7 @@ _TOLERANCES: Mapping[str, tuple[str, float]] = {
 
 def _identify_checks() -> dict[str, Callable[[Any], Any]]:
     """Keys of ``[identify]``, each with its check: the options of an identification that depend on the machine."""
-    from compgen.identify.options import IdentifyOptions  # imported here: it needs numpy
+    from compgen.identification.options import IdentifyOptions  # imported here: it needs numpy
 
     checks = {item.name: item.metadata.get("in_job") for item in fields(IdentifyOptions)}
     return {name: check for name, check in checks.items() if check is not None}

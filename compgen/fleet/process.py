@@ -60,9 +60,9 @@ from compgen.fleet.tables_on import (
     span_of,
     what_it_held,
 )
-from compgen.identify import IdentifyOptions, joint_covariance
-from compgen.identify.covariance import FILE_NAME as COVARIANCE
-from compgen.identify.covariance import Covariance, covariance_or_independent
+from compgen.identification import IdentifyOptions, joint_covariance
+from compgen.identification.covariance import FILE_NAME as COVARIANCE
+from compgen.identification.covariance import Covariance, covariance_or_independent
 from compgen.pipeline import RunResult, identified_reversal, run
 from compgen.tables import ReadTables, program_version, verify
 from compgen.tables.active import ActiveTables, difference

@@ -28,11 +28,11 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError
 from compgen.fleet.records import RequestedChange
-from compgen.identify.adjust.unknowns import ErrorParameters
-from compgen.identify.covariance import Covariance, error_values
-from compgen.identify.options import IdentifyOptions
+from compgen.identification.adjust.unknowns import ErrorParameters
+from compgen.identification.covariance import Covariance, error_values
+from compgen.identification.options import IdentifyOptions
 from compgen.kinematics.many_points import full_grid
-from compgen.plan import PlannedStations, planned, planned_noise
+from compgen.planning import PlannedStations, planned, planned_noise
 
 #: Levels of the lattice of candidate points on each axis.
 LEVELS = 4
@@ -94,7 +94,7 @@ def shortest_recheck(
     Parameters
     ----------
     machine : chain, nodes, and which errors its model contains.
-    stations : as for :func:`compgen.plan.prediction`; a station reads every point once per pass.
+    stations : as for :func:`compgen.planning.prediction`; a station reads every point once per pass.
     request : error, size of its change, power and confidence.
     covariance : of the errors of the last calibration; None takes them as exactly known.
     options : standard uncertainty of a reading.

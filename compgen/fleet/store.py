@@ -46,7 +46,7 @@ from compgen.fleet.records import (
     TableRecord,
     state_of,
 )
-from compgen.identify.covariance import Covariance, parse_covariance
+from compgen.identification.covariance import Covariance, parse_covariance
 
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")

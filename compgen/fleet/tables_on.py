@@ -51,7 +51,7 @@ from compgen.fleet.records import (
     active_of,
 )
 from compgen.fleet.store import Store
-from compgen.identify.covariance import Covariance
+from compgen.identification.covariance import Covariance
 from compgen.tables import ReadTables
 
 #: A clock that was not set to daylight-saving time, or back, is wrong by this in addition to what clocks differ by.

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.foreign.answers import ImportOptions
@@ -23,4 +23,5 @@ __all__ = [
     "native_format",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

@@ -42,16 +42,16 @@ from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, InputError
-from compgen.fit import FitOptions, fit
-from compgen.fit.zeroing import zero_ends
+from compgen.fitting import FitOptions, fit
+from compgen.fitting.zeroing import zero_ends
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.detect import import_file
 from compgen.foreign.findings import Imported
 from compgen.foreign.laser_files import Capture
-from compgen.identify import Identification
-from compgen.identify.axis_tests import positioning_errors
-from compgen.identify.identification import metadata_of, without_adjustment
-from compgen.identify.stated import factor_of_numbers, is_stated, over_travel
+from compgen.identification import Identification
+from compgen.identification.axis_tests import positioning_errors
+from compgen.identification.result import metadata_of, without_adjustment
+from compgen.identification.stated import factor_of_numbers, is_stated, over_travel
 from compgen.instruments.sixdof_instrument import read_sixdof
 
 Plain = Lengths | Deviations | AxisRuns | Artefact | Circles

@@ -26,7 +26,7 @@ from compgen.foreign.column_names import (
 )
 from compgen.foreign.findings import USUAL_URAD, Imported, TableFindings, usual_deviation_mm
 from compgen.foreign.source import parse_number, shown
-from compgen.identify.options import LARGEST_RAD
+from compgen.identification.options import LARGEST_RAD
 
 
 def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> ErrorTable:

@@ -16,7 +16,7 @@ from compgen.data.error_table import ErrorTable, about_own_lines, is_apart, read
 from compgen.data.files import check_lines, read_bytes
 from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
 from compgen.errors import InputError
-from compgen.identify.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
+from compgen.identification.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
 if TYPE_CHECKING:
     from compgen.foreign.answers import ImportOptions

@@ -67,7 +67,7 @@ from compgen.foreign.one_axis import (
     remarks,
 )
 from compgen.foreign.source import parse_number, shown
-from compgen.identify.axis_tests import POSITIONING, SAME_TARGET_MM, two_way_mean
+from compgen.identification.axis_tests import POSITIONING, SAME_TARGET_MM, two_way_mean
 
 # Tables of readings along axes: a row for each reading, or a row for each target and a column for each run.
 #

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program, model_of
@@ -32,4 +32,5 @@ __all__ = [
     "read_tools",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

@@ -17,8 +17,8 @@ from compgen.data.files import read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import InputError
-from compgen.identify.covariance import Covariance, error_design, posterior_with
-from compgen.identify.posterior import Posterior, assumed_text, open_shares, worse_text
+from compgen.identification.covariance import Covariance, error_design, posterior_with
+from compgen.identification.posterior import Posterior, assumed_text, open_shares, worse_text
 from compgen.kinematics.many_points import full_grid
 from compgen.programs.compensation import centre_path, unknown_radius
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from compgen.accuracy.compare import Comparison
     from compgen.accuracy.evaluate import Accuracy
     from compgen.accuracy.field import ComparedFigure, Figure
-    from compgen.fit import FitResult
-    from compgen.identify import Identification
-    from compgen.identify.spheres import SphereIdentification
-    from compgen.plan import Plan, PlanVisibility, Suggestion, TrajectoryCandidate, VolumeUncertainty
-    from compgen.plan.gauges import GaugePlan
-    from compgen.plan.next_best import NextBest
+    from compgen.fitting import FitResult
+    from compgen.identification import Identification
+    from compgen.identification.spheres import SphereIdentification
+    from compgen.planning import Plan, PlanVisibility, Suggestion, TrajectoryCandidate, VolumeUncertainty
+    from compgen.planning.gauges import GaugePlan
+    from compgen.planning.next_measurement import NextBest
     from compgen.tables import Residuals, Verification
     from compgen.tables.active import MergeReport, TableDifference
     from compgen.tables.signs import CrashTest
@@ -117,7 +117,7 @@ def _assumed(result: Identification) -> list[str]:
     """Return what was assumed of errors that no reading determines, and whether the machine is worse than its class."""
     if "posterior_means" not in result.details or result.posterior is None:  # the readings determine every error
         return []
-    from compgen.identify.posterior import assumed_text, worse_text
+    from compgen.identification.posterior import assumed_text, worse_text
 
     return [text for text in (assumed_text(result.posterior), worse_text(result.posterior)) if text]
 
@@ -567,7 +567,7 @@ def plan_table(plan: Plan) -> Group:
 
 def gauge_plan_table(plan: GaugePlan) -> Group:
     """Return what a plan with artefacts and circles determines, what it leaves out, and what to add."""
-    from compgen.plan.gauges import volume_text
+    from compgen.planning.gauges import volume_text
 
     summary = plan.summary()
     lines = [*summary["gauges"], f"{plan.readings} readings, {summary['degrees_of_freedom']} degrees of freedom"]
@@ -601,7 +601,7 @@ def gauge_plan_table(plan: GaugePlan) -> Group:
 
 def next_table(found: NextBest, assumed: str) -> Group:
     """Return what to measure next, with what each measurement would bring and how it is done."""
-    from compgen.plan.next_best import NOTHING_NEXT
+    from compgen.planning.next_measurement import NOTHING_NEXT
 
     table = Table("measurement", "u after (um)", "reduces", box=box.SIMPLE)
     for item in found.measurements:
@@ -672,7 +672,7 @@ def trajectory_table(
 
 def visibility_table(visible: PlanVisibility) -> Group:
     """Return which effects other than geometric errors the plan cannot show, and which look alike."""
-    from compgen.effects.catalogue import separating
+    from compgen.effects.all_effects import separating
 
     never = Table("what this plan cannot show", "why", "measure in addition", box=box.SIMPLE)
     for (reason, breaker), names in _grouped(visible).items():

@@ -2,13 +2,13 @@
 
 from typing import TYPE_CHECKING
 
-from compgen.resources import load_on_first_use
+from compgen.resources import on_first_use
 
 if TYPE_CHECKING:
     from compgen.data.comparison import Residuals, residuals, without_rigid_motion
     from compgen.data.files import REJECTED_PREFIX, Provenance
     from compgen.resources import program_version
-    from compgen.tables.export import REPORT_FILES, Export, export, set_aside_superseded, usable_format, with_known
+    from compgen.tables.exporting import REPORT_FILES, Export, export, set_aside_superseded, usable_format, with_known
     from compgen.tables.judge import SafetyLimits
     from compgen.tables.render import Format, load_format
     from compgen.tables.signs import check_files
@@ -59,4 +59,5 @@ __all__ = [
     "without_rigid_motion",
 ]
 
-load_on_first_use(__name__, __all__)
+if not TYPE_CHECKING:
+    __getattr__ = on_first_use(__name__)

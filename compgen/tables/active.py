@@ -22,8 +22,13 @@ from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenWarning, ConvergenceError, InputError
-from compgen.identify.adjust.unknowns import check_travel
-from compgen.identify.covariance import Covariance, covariance_of_values, covariance_or_independent, posterior_with
+from compgen.identification.adjust.unknowns import check_travel
+from compgen.identification.covariance import (
+    Covariance,
+    covariance_of_values,
+    covariance_or_independent,
+    posterior_with,
+)
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, modelled_errors, observable_errors
 from compgen.kinematics.many_points import volume_grid
@@ -149,7 +154,7 @@ def _circles_without(
 
     The errors are then those at p + c(p), taken as at p: they differ by about 1e-4 of c.
     """
-    from compgen.identify.axis_tests import circle_positions
+    from compgen.identification.axis_tests import circle_positions
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CompgenWarning)  # said when the circles are identified

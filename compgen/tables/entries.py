@@ -32,7 +32,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.errors import CompgenError
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid
-from compgen.tables.export import table_values
+from compgen.tables.exporting import table_values
 from compgen.tables.judge import POINT_SHARE, POINT_UNCERTAINTIES, Judge, displacement_uncertainty, node_positions
 from compgen.tables.synthesis import basis_field
 

@@ -21,7 +21,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Emphasis, Interval, Machine
 from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError
-from compgen.identify.covariance import Covariance
+from compgen.identification.covariance import Covariance
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.many_points import full_grid, volume_grid, volumetric_error

@@ -18,9 +18,9 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.toml_files import setting
 from compgen.errors import InputError, program_text
-from compgen.identify.adjust.unknowns import check_travel
+from compgen.identification.adjust.unknowns import check_travel
 from compgen.kinematics.exact_chain import rotate
-from compgen.simulate.gauges import TouchProbe
+from compgen.simulation.gauges import TouchProbe
 from compgen.tables.render import load_format, render, template_folders
 
 TEMPLATE, PROGRAM_NAME = "probe-program.nc.j2", "probe-program.nc"

@@ -19,8 +19,8 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, MM_PER_UM, error_named
 from compgen.errors import CompgenError
-from compgen.identify.covariance import Covariance
-from compgen.identify.posterior import Posterior
+from compgen.identification.covariance import Covariance
+from compgen.identification.posterior import Posterior
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import full_grid
 from compgen.resources import LANGUAGES

@@ -27,9 +27,9 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
 from compgen.errors import CompgenWarning, InputError, one_line, um_text
-from compgen.identify.covariance import Covariance, covariance_or_independent, error_design, posterior_with
-from compgen.identify.identification import Identification
-from compgen.identify.posterior import Posterior, assumed_text, not_determined_um, not_measured, worse_text
+from compgen.identification.covariance import Covariance, covariance_or_independent, error_design, posterior_with
+from compgen.identification.posterior import Posterior, assumed_text, not_determined_um, not_measured, worse_text
+from compgen.identification.result import Identification
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.first_order import coefficients, observable_errors, tool_of
 from compgen.kinematics.many_points import blocks, volumetric_error

@@ -21,7 +21,7 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.fleet.change import Calibration, aligned, calibrations_of
 from compgen.fleet.drift import Drift, DriftSettings, FigureDrift, drift_report, interval_of
 from compgen.fleet.store import open_store
-from compgen.identify.covariance import covariance_or_independent
+from compgen.identification.covariance import covariance_or_independent
 from compgen.kinematics import volumetric_error
 from compgen.kinematics.many_points import volume_grid
 

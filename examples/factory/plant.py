@@ -19,7 +19,7 @@ from compgen.fleet.job import Job
 from compgen.fleet.store import open_store
 from compgen.kinematics.exact_chain import exact_error, tip_position
 from compgen.kinematics.many_points import volume_grid
-from compgen.simulate import RandomErrors, Scenario, TruthPlan, draw_truth
+from compgen.simulation import RandomErrors, Scenario, TruthPlan, draw_truth
 from compgen.tables import ReadTables, read_tables
 
 MONTHS = 12

@@ -1,6 +1,6 @@
 "use strict";
 // Draws what artefacts and circles show again when a slider of an error is moved: the sum of the responses of all errors,
-// each times its share. The first drawing is that of compgen/plan/gauges.py.
+// each times its share. The first drawing is that of compgen/planning/gauges.py.
 (function () {
   var root = document.documentElement;
   root.classList.add("script");

@@ -19,7 +19,7 @@ from compgen.data.machine import read_machine
 from compgen.data.names import BODY_DIAGONALS
 from compgen.errors import InputError
 from compgen.kinematics import volumetric_error
-from compgen.simulate import read_scenario, simulate_axis_runs
+from compgen.simulation import read_scenario, simulate_axis_runs
 
 EXACT = 1e-9
 BOX_MM = (300.0, 400.0, 1200.0)

@@ -1,6 +1,5 @@
 """The command line: help, exit codes, what goes to stdout and to stderr, and that bad input writes nothing."""
 
-import ast
 import io
 import json
 import os
@@ -11,8 +10,10 @@ import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
+from importlib import import_module
 from itertools import product
 from pathlib import Path
+from pkgutil import iter_modules
 
 import click
 import numpy as np
@@ -20,12 +21,13 @@ import pytest
 from click.testing import CliRunner
 
 import compgen
+from compgen import resources
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.csv_files import read_csv
 from compgen.data.error_table import format_errors
 from compgen.data.files import sha256_of
-from compgen.identify.covariance import Covariance, format_covariance, read_covariance
+from compgen.identification.covariance import Covariance, format_covariance, read_covariance
 from compgen.kinematics.first_order import c_matrix
 from compgen.tables import Residuals
 
@@ -742,19 +744,28 @@ def test_public_names_are_loaded_on_first_use_and_are_not_hidden_by_sub_packages
     # what loads on first use is in compgen.resources, of a few lines
     code = "import sys, compgen; loaded = set(sys.modules) - {'compgen.resources'}; "
     code += "assert not {m for m in loaded if m.startswith(('compgen.', 'numpy', 'scipy'))}; "
-    code += "import compgen.fit, compgen.identify; assert callable(compgen.fit) and callable(compgen.identify); "
+    code += "import compgen.fitting.bounds as bounds, compgen.identification.options; "
+    code += (
+        "assert bounds.FitOptions is compgen.FitOptions; assert callable(compgen.fit) and callable(compgen.identify); "
+    )
     code += "assert {'fit', 'Machine'} <= set(dir(compgen))"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_the_stub_for_type_checkers_names_what_the_package_offers():
-    package = Path(compgen.__file__)
-    stub = ast.parse(package.with_suffix(".pyi").read_text())
-    homes = {a.name: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for a in node.names}
-    listed = next(ast.literal_eval(node.value) for node in stub.body if isinstance(node, ast.Assign))
-    assert homes == {name: home for home, names in compgen._HOMES.items() for name in names.split()}
-    assert sorted(homes) == sorted(listed) == compgen.__all__
+def test_type_checkers_see_the_names_that_the_package_offers():
+    homes = resources.homes_of("compgen")
+    assert sorted(homes) == sorted(compgen.__all__)
     assert all(getattr(compgen, name) is not None for name in compgen.__all__)
+
+
+@pytest.mark.parametrize(
+    "room", [None, *(name for _, name, is_package in iter_modules(compgen.__path__) if is_package)]
+)
+def test_no_module_hides_a_public_name_of_its_room(room):
+    """Importing a module sets it as an attribute of its room: a function of the same name would be gone."""
+    package = import_module(f"compgen.{room}") if room else compgen
+    modules = {name for _, name, _ in iter_modules(package.__path__)}
+    assert not modules & set(getattr(package, "__all__", ()))
 
 
 # --- the width of a terminal -----------------------------------------------------------------------------------------

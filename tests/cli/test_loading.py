@@ -85,7 +85,7 @@ def test_a_second_completion_of_an_option_loads_no_command_unless_the_program_ha
     assert completed(tmp_path, "volcomp fit --smoothness ")[1] == {"identify_commands"}
     (note,) = (tmp_path / "cache" / "compgen" / "completion").glob("fit-*.json")
     content = json.loads(note.read_text())
-    assert any(path.endswith("fit/bounds.py") for path, *_ in content["files"])
+    assert any(path.endswith("fitting/bounds.py") for path, *_ in content["files"])
     content["parameters"] = [item for item in content["parameters"] if "--max-abs" not in item["words"]]
     note.write_text(json.dumps(content))
     assert "--max-abs" not in completed(tmp_path, "volcomp fit --max")[2]  # the note is used
@@ -195,14 +195,14 @@ def test_a_run_loads_the_control_in_use_and_no_room_that_it_does_not_need(tmp_pa
     controls = {name for name in modules if name.startswith("controls.") and not name.startswith("controls.shared")}
     assert controls == {"controls.isg_kernel"}
     rooms = {name.partition(".")[0] for name in modules}
-    assert not rooms & {"simulate", "plan", "diagnose", "fleet", "accuracy", "plugins"}
+    assert not rooms & {"simulation", "planning", "diagnose", "fleet", "accuracy", "plugins"}
     assert not {name for name in modules if name.startswith("scipy.")} - {"scipy.linalg._flapack"}
     assert "importlib.metadata" not in modules
     assert not modules & {
-        "effects.catalogue",
+        "effects.all_effects",
         "foreign.detect",
-        "identify.positions",
-        "identify.six_dof",
+        "identification.positions",
+        "identification.six_dof",
         "tables.active",
     }
 

@@ -14,7 +14,7 @@ import compgen
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.registry import Kind, load_entry_points, restored
 from compgen.plugins import KINDS
-from compgen.simulate import EFFECTS, INSTRUMENTS
+from compgen.simulation import EFFECTS, INSTRUMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial-control.md"
@@ -86,7 +86,7 @@ def test_the_tables_of_the_tutorial_hold_minus_the_positioning_error_of_the_midd
 
 
 def test_the_round_trip_of_the_tutorial_gives_the_same_bytes(tutorial, example):
-    from compgen.tables.export import Provenance, export_context, rerender
+    from compgen.tables.exporting import Provenance, export_context, rerender
 
     compgen.load_plugins(["shop/shop_csv.py"], installed=False)
     machine, errors = example.machine, example.fitted.errors
@@ -386,7 +386,7 @@ def test_an_instrument_of_a_plug_in_measures(tmp_path, call, small_machine_file)
     """A tracer that reads 1 um more than the built-in one."""
     (tmp_path / "p.py").write_text(
         "from dataclasses import replace\n"
-        "from compgen.simulate.lasers import read_laser_tracer\n"
+        "from compgen.simulation.lasers import read_laser_tracer\n"
         "class Longer:\n"
         "    def __init__(self, inner):\n"
         "        self.inner, self.passes = inner, inner.passes\n"

@@ -22,7 +22,7 @@ from compgen.data.prior import PriorSettings
 from compgen.kinematics.exact_chain import exact_error
 from compgen.report.cards import control_card
 from compgen.tables import read_tables, verify
-from compgen.tables.export import Provenance, export, export_context, rerender
+from compgen.tables.exporting import Provenance, export, export_context, rerender
 from compgen.tables.judge import COMPONENT_FLOOR_MM, judge_of
 from compgen.tables.synthesis import synthesize
 

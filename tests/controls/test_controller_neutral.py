@@ -97,7 +97,7 @@ def test_the_four_files_hold_the_same_numbers_and_take_the_errors_away(chain, re
 
 
 def test_a_read_file_is_written_again_byte_for_byte(make_errors):
-    from compgen.tables.export import Provenance, export_context, rerender
+    from compgen.tables.exporting import Provenance, export_context, rerender
 
     errors = make_errors(PLAIN)
     files = compgen.export(PLAIN, errors, NAME).files

@@ -14,7 +14,7 @@ from compgen.data.csv_files import csv_table, fixed, format_csv, read_csv
 from compgen.data.files import OutputFolder, read_bytes, read_text, write_file
 from compgen.data.lengths import Points, format_points, read_points
 from compgen.errors import CompgenWarning, InputError
-from compgen.identify.any_measurement import format_residuals
+from compgen.identification.any_measurement import format_residuals
 
 
 @pytest.fixture

@@ -13,8 +13,8 @@ from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import load_machine, read_machine
 from compgen.diagnose import DiagnoseOptions, diagnose
+from compgen.diagnose.any_diagnosis import observed_of
 from compgen.diagnose.base_fit import first_basis, fit_base, least_norm, orthonormal
-from compgen.diagnose.diagnose import observed_of
 from compgen.diagnose.groups import fit_smooth
 from compgen.diagnose.noise_model import (
     PRIOR,

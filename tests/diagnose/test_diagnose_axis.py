@@ -27,7 +27,7 @@ from compgen.diagnose.axis_model import (  # noqa: E402
 )
 from compgen.diagnose.axis_session import LEAST_MM, grid_step_mm, sessions_of  # noqa: E402
 from compgen.effects import active_effects, listed  # noqa: E402
-from compgen.effects.catalogue import WHAT_TO_DO, what_to_do  # noqa: E402
+from compgen.effects.all_effects import WHAT_TO_DO, what_to_do  # noqa: E402
 from compgen.errors import InputError  # noqa: E402
 
 UM = 1e-3

@@ -12,7 +12,7 @@ from compgen.cli.common import run_command
 from compgen.data.circles import PLANES, Circles, format_circles
 from compgen.diagnose import DiagnoseOptions, diagnose
 from compgen.errors import InputError
-from compgen.simulate import read_scenario, simulate_axis_runs
+from compgen.simulation import read_scenario, simulate_axis_runs
 
 RADIUS_MM, NOISE_UM = 100.0, 0.1
 

@@ -12,7 +12,7 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.deviations import Artefact, Part
 from compgen.diagnose import diagnose
-from compgen.diagnose.diagnose import diagnose_sixdof
+from compgen.diagnose.any_diagnosis import diagnose_sixdof
 from compgen.diagnose.page import told
 from compgen.instruments.sixdof_instrument import RAD_PER_ARCSEC, read_instrument, read_sixdof
 

@@ -13,8 +13,8 @@ from compgen.data.machine import Chain, load_machine
 from compgen.effects import FAMILIES, DisplacementEffect, catalogue, listed, readings_of_deviations, readings_of_lengths
 from compgen.effects.readings import step_times_s, velocity_mm_s
 from compgen.kinematics.exact_chain import tip_position
-from compgen.simulate.effects import LengthEffect, Sights, read_effects
-from compgen.simulate.trajectory import Line, Session, Temperature, Trajectory, plan_session, with_temperatures
+from compgen.simulation.effects import LengthEffect, Sights, read_effects
+from compgen.simulation.trajectory import Line, Session, Temperature, Trajectory, plan_session, with_temperatures
 
 STATIONS = ("A", "B 2")
 PLACES_MM = np.array([[-1300.0, 250.0, -500.0], [400.0, -1400.0, 300.0]])

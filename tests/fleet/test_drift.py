@@ -11,7 +11,7 @@ from compgen.data.names import ERROR_INDEX
 from compgen.errors import InputError
 from compgen.fleet.change import Calibration, aligned, changes, holm
 from compgen.fleet.drift import WALKS, DriftSettings, TimeSeries, drift_report, first_exit, fit_trend, forecast
-from compgen.identify.covariance import Covariance, covariance_or_independent
+from compgen.identification.covariance import Covariance, covariance_or_independent
 from compgen.kinematics.gauge import gauge_directions
 from compgen.kinematics.many_points import volumetric_error
 

@@ -7,11 +7,11 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import InputError
 from compgen.fleet.recheck import power_of, shortest_recheck
 from compgen.fleet.records import RequestedChange
-from compgen.identify import IdentifyOptions
-from compgen.identify.covariance import Covariance
+from compgen.identification import IdentifyOptions
+from compgen.identification.covariance import Covariance
 from compgen.kinematics.first_order import modelled_errors
 from compgen.kinematics.many_points import volumetric_error
-from compgen.plan import planned_stations
+from compgen.planning import planned_stations
 
 UM, URAD = 1e-3, 1e-6
 SIGMA_UM = 0.5

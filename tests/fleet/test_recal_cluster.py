@@ -30,7 +30,7 @@ from compgen.fleet.job import read_job
 from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
 from compgen.fleet.watch import Watch
-from compgen.identify import identify, self_check
+from compgen.identification import identify, self_check
 from compgen.kinematics import parallel
 from compgen.kinematics import parallel as cluster
 from compgen.kinematics.exact_chain import exact_error

@@ -28,7 +28,7 @@ from compgen.fleet.job import read_job
 from compgen.fleet.records import RESERVATION
 from compgen.fleet.status import history
 from compgen.fleet.store import open_store
-from compgen.simulate import read_scenario, simulate_axis_runs
+from compgen.simulation import read_scenario, simulate_axis_runs
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "factory"
 MODULES = ("factory", "plant", "people", "checks", "clocks")

@@ -31,7 +31,7 @@ from compgen.fleet.dashboard import charts as serve_history
 from compgen.fleet.database import StoreError
 from compgen.fleet.records import NewMeasurement, NewResult, StoredTableFile
 from compgen.fleet.store import Store, backup, open_store, restore
-from compgen.identify.covariance import covariance_or_independent
+from compgen.identification.covariance import covariance_or_independent
 from compgen.kinematics.gauge import gauge_directions
 
 DAY = datetime(2026, 3, 1, 12, tzinfo=UTC)

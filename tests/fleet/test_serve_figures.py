@@ -27,8 +27,8 @@ from compgen.fleet.dashboard.charts import ChartSeries, chart
 from compgen.fleet.recheck import shortest_recheck
 from compgen.fleet.records import NewMeasurement, NewResult, RequestedChange, StoredTableFile
 from compgen.fleet.store import counting
-from compgen.identify.covariance import Covariance, format_covariance
-from compgen.plan import planned_stations
+from compgen.identification.covariance import Covariance, format_covariance
+from compgen.planning import planned_stations
 
 factory = helper.factory
 STATIONS = {"LT1": [-300.0, -400.0, 100.0], "LT2": [800.0, -300.0, 50.0], "LT3": [-200.0, 700.0, -250.0]}

@@ -11,7 +11,7 @@ import compgen
 from compgen.data.deviations import read_artefacts, read_parts
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import ImportOptions, import_file, open_measurement
-from compgen.identify.any_measurement import identify_measurement
+from compgen.identification.any_measurement import identify_measurement
 
 ORIGIN = (-700.0, -900.0, -250.0)
 GRID = np.array([[x, y, 0.0] for x in range(0, 601, 100) for y in range(0, 801, 100)], dtype=float)

@@ -9,7 +9,7 @@ import compgen
 from compgen.data.circles import read_circles
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import ImportOptions, import_file, open_measurement
-from compgen.identify.axis_tests import identify_circles
+from compgen.identification.axis_tests import identify_circles
 
 STEPS = np.arange(0, 360, 3)
 

@@ -29,8 +29,8 @@ from compgen.instruments.sixdof_instrument import (
     systematic_signals,
 )
 from compgen.instruments.sixdof_reduction import expected_away, printed_run, reduce_runs
-from compgen.simulate import SimulatedSixDof
-from compgen.simulate.sixdof import Tracer
+from compgen.simulation import SimulatedSixDof
+from compgen.simulation.sixdof import Tracer
 
 ARCSEC, UM = np.pi / 648000, 1e-3
 GIVEN = Optics(100.0, 30.0, 1.5151, 30.0, 3.0, 25.4, 0.0)

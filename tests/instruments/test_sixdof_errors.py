@@ -21,7 +21,7 @@ from compgen.instruments.sixdof_instrument import (
     known_systematics,
 )
 from compgen.instruments.sixdof_reduction import errors_of_run, expected_away, reduce_runs
-from compgen.simulate.sixdof import Tracer, run_signals
+from compgen.simulation.sixdof import Tracer, run_signals
 
 ARCSEC = np.pi / 648000
 UM = 1e-3

@@ -16,7 +16,7 @@ from compgen.instruments.sixdof_instrument import (
     systematic_columns,
     systematic_signals,
 )
-from compgen.simulate.sixdof import Tracer
+from compgen.simulation.sixdof import Tracer
 
 RAD_PER_ARCSEC = np.pi / 648000
 ARCSEC, UM = RAD_PER_ARCSEC, 1e-3

@@ -21,9 +21,9 @@ from compgen.instruments.sixdof_evaluation import (
 )
 from compgen.instruments.sixdof_instrument import known_systematics, read_instrument
 from compgen.instruments.sixdof_uncertainty import uncertainty_budget
-from compgen.simulate import SimulatedSixDof, draw_truth
-from compgen.simulate.sixdof import HALF_RANGE, TABLE_3
-from compgen.simulate.truth import RandomErrors, TruthPlan
+from compgen.simulation import SimulatedSixDof, draw_truth
+from compgen.simulation.sixdof import HALF_RANGE, TABLE_3
+from compgen.simulation.truth import RandomErrors, TruthPlan
 
 ARCSEC, UM = np.pi / 648000, 1e-3
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"

@@ -15,7 +15,7 @@ from compgen.data.files import json_text
 from compgen.data.names import AXES
 from compgen.data.prior import PriorSettings
 from compgen.errors import InputError
-from compgen.identify.covariance import covariance_of_values, covariance_or_independent
+from compgen.identification.covariance import covariance_of_values, covariance_or_independent
 from compgen.kinematics import exact_error
 from compgen.programs import CorrectOptions, PartMachine, Setup, correct_program, model_of, predict_part, rank_machines
 from compgen.programs.path import PLANE_AXES, ExactModel

@@ -155,7 +155,7 @@ def test_residuals_are_measurement_minus_model(small_machine, small_lengths_file
     """The largest one lies where the reading was made 40 um longer, with a plus sign."""
     from dataclasses import replace
 
-    from compgen.identify.any_measurement import format_residuals
+    from compgen.identification.any_measurement import format_residuals
 
     lengths = compgen.read_lengths(small_lengths_file)
     reading = lengths.length_mm.copy()

@@ -23,7 +23,7 @@ from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import MOST_POINTS
 from compgen.tables import export, synthesize
-from compgen.tables.export import Provenance, export_context, rerender
+from compgen.tables.exporting import Provenance, export_context, rerender
 
 #: The residual of the file may exceed the best of a direct optimisation over the test's own points by this.
 MOST_ABOVE_BEST = 1.05

@@ -13,7 +13,7 @@ from compgen.cli.common import run_command
 from compgen.data import toml_files
 from compgen.data.error_table import Curve
 from compgen.data.names import SQUARENESS_NAMES, error_named
-from compgen.identify.covariance import covariance_of_values, covariance_or_independent, posterior_with
+from compgen.identification.covariance import covariance_of_values, covariance_or_independent, posterior_with
 from compgen.kinematics.exact_chain import exact_error
 from compgen.tables import export, read_tables
 from compgen.tables.active import (

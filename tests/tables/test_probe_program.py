@@ -14,11 +14,11 @@ from compgen.data.error_table import Curve, ErrorTable
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign import open_measurement
 from compgen.foreign.detect import import_file
-from compgen.identify.options import IdentifyOptions
-from compgen.identify.positions import identify_artefact
+from compgen.identification.options import IdentifyOptions
+from compgen.identification.positions import identify_artefact
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.many_points import volumetric_error
-from compgen.simulate.gauges import PlatePose, TouchProbe
+from compgen.simulation.gauges import PlatePose, TouchProbe
 from compgen.tables.probe_program import Probing, probe_program, read_probing
 
 #: One control of each dialect.

@@ -17,7 +17,7 @@ from compgen.data.deviations import Deviations
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.errors import InputError
-from compgen.identify import identify_measurement
+from compgen.identification import identify_measurement
 from compgen.kinematics.exact_chain import exact_error
 from compgen.pipeline import identify_bare
 from compgen.tables import export, read_tables, verify

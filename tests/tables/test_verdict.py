@@ -20,7 +20,7 @@ from compgen.data.lengths import read_lengths
 from compgen.data.machine import load_machine
 from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning
-from compgen.identify import IdentifyOptions, identify, joint_covariance
+from compgen.identification import IdentifyOptions, identify, joint_covariance
 from compgen.pipeline import export_and_verify
 from compgen.report.html.folder import read_folder
 from compgen.report.html.write import content
@@ -323,7 +323,7 @@ def test_the_promised_rms_with_its_uncertainty_holds_the_true_one(plain):
 
 def test_the_uncertainty_of_the_rms_is_that_of_drawn_errors():
     """Monte Carlo: errors drawn from the joint covariance move the tool by the rms that is stated."""
-    from compgen.identify.covariance import error_design
+    from compgen.identification.covariance import error_design
 
     machine = replace(load_machine("zha-gantry"), prior=PriorSettings(class_name="none"))
     found = identify(machine, read_lengths(EXAMPLE), IdentifyOptions())

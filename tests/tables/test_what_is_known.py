@@ -10,8 +10,8 @@ from virtual_shop import MIXTURES, case
 from compgen.data.error_table import format_errors, read_errors
 from compgen.data.files import Provenance
 from compgen.errors import CompgenWarning
-from compgen.fit import FitOptions, fit
-from compgen.identify.covariance import covariance_named_by, joint_covariance
+from compgen.fitting import FitOptions, fit
+from compgen.identification.covariance import covariance_named_by, joint_covariance
 from compgen.pipeline import fit_files, identification_files, identify_bare, verified_export
 from compgen.report.options_text import explanation_markdown, level_rows, options_markdown
 from compgen.tables import export, with_known

@@ -17,7 +17,7 @@ from pathlib import Path
 from compgen.controls import CONTROLLERS
 from compgen.data.language import LABEL, MARKER, PART, WORD, parts
 from compgen.data.toml_files import section_schema
-from compgen.simulate import INSTRUMENTS
+from compgen.simulation import INSTRUMENTS
 
 ROOT = Path(__file__).parents[2]
 CATALOGUES = ROOT / "templates" / "_language"
@@ -28,15 +28,15 @@ MODULES = (
     "cli/file_commands.py",
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
     "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
-    "effects/*.py", "fit/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identify/*.py",
-    "identify/adjust/*.py", "instruments/*.py", "pipeline.py", "plan/*.py", "programs/correct.py",
+    "effects/*.py", "fitting/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identification/*.py",
+    "identification/adjust/*.py", "instruments/*.py", "pipeline.py", "planning/*.py", "programs/correct.py",
     "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py",
     "report/html/*.py", "report/pdf.py", "report/options_text.py",
     "report/part_page.py", "report/sheets.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
 WITH_ERRORS = re.compile(
-    r"compgen/(accuracy|app|data|diagnose|fit|foreign|identify|instruments|plan|programs|tables)/|"
+    r"compgen/(accuracy|app|data|diagnose|fitting|foreign|identification|instruments|planning|programs|tables)/|"
     r"compgen/(cli/common|cli/\w+_commands|pipeline)\.py"
 )
 ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")

@@ -229,7 +229,7 @@ def test_effects_and_settings_of_all_controls_have_german_texts():
     from compgen.controls import CONTROLLERS
     from compgen.data.toml_files import section_schema
     from compgen.effects import listed
-    from compgen.effects.catalogue import what_to_do
+    from compgen.effects.all_effects import what_to_do
 
     german = texts_of("de")
     texts = [

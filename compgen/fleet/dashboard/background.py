@@ -32,7 +32,7 @@ from compgen.fleet.job import Job, read_job
 from compgen.fleet.recheck import Recheck, shortest_recheck
 from compgen.fleet.records import IdentificationRecord, MachineRecord, RequestedChange
 from compgen.fleet.store import Store, counting
-from compgen.plan import PlannedStations
+from compgen.planning import PlannedStations
 
 #: Results that stay in memory, and requests that may wait for their turn.
 MOST, WAITING = 300, 20

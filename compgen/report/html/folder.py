@@ -21,7 +21,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.errors import CompgenError, CompgenWarning, InputError, one_line
-from compgen.identify.any_measurement import MEASURED_WITH
+from compgen.identification.any_measurement import MEASURED_WITH
 from compgen.pipeline import NOT_MADE
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector

@@ -68,7 +68,7 @@ def draw_proposed(entries: Sequence[Mapping[str, Any]]) -> list[Picture]:
     """How the instruments of proposed measurements stand; entries that are damaged are left out."""
     if not entries:
         return []
-    from compgen.plan.next_best import set_up_picture  # few folders propose something
+    from compgen.planning.next_measurement import set_up_picture  # few folders propose something
 
     found = []
     for k, entry in enumerate(entries):

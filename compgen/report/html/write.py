@@ -26,7 +26,7 @@ from compgen.data.files import OutputFolder, json_text, json_values, read_bytes,
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
 from compgen.errors import CompgenError, number_text, one_line, um_text
-from compgen.identify.covariance import covariance_named_by
+from compgen.identification.covariance import covariance_named_by
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.report.handover import handed_over
 from compgen.report.html.folder import (
