@@ -19,6 +19,7 @@ from compgen.cli.common import PATH, json_option, option_name, options_of, print
 from compgen.cli.shared_options import open_machine
 from compgen.cli.terminal import answer, say, stdout
 from compgen.controls import CONTROLLERS
+from compgen.controls.heat_cards import ABOUT as ABOUT_HEAT
 from compgen.controls.rotary_parameters import ABOUT as ABOUT_PARAMETERS
 from compgen.controls.rotary_pitch import ABOUT as ABOUT_PITCH
 from compgen.data.axis_runs import AxisRuns
@@ -42,8 +43,8 @@ from compgen.tables import Format, load_format
 # ``volcomp controllers``, ``machines``, ``effects`` and ``instruments``: what is available.
 
 
-#: What takes errors of rotary axes.
-ABOUT = {**ABOUT_PARAMETERS, **ABOUT_PITCH}
+#: What takes errors of rotary axes, or a model of heat.
+ABOUT = {**ABOUT_PARAMETERS, **ABOUT_PITCH, **ABOUT_HEAT}
 
 
 @click.command("controllers")

@@ -30,7 +30,7 @@ from compgen.cli.shared_options import (
     unverified_option,
 )
 from compgen.cli.terminal import progress, say, say_paths, stdout
-from compgen.controls import ROTARY_PITCH, ROTARY_TARGETS
+from compgen.controls import HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
@@ -265,6 +265,10 @@ def run_command(
         from compgen.report.dcc.laboratory import read_certificate
 
         read_certificate(certificate, complete=False)
+    if heat := [name for name in controller if name in HEAT_OUTPUTS]:
+        message = f"{heat[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml "
+        f"--controller {heat[0]}"
+        raise InputError(message, field="--controller")
     if any(name in (*ROTARY_TARGETS, *ROTARY_PITCH) for name in controller):
         from compgen.cli.identify_commands import run_spheres
 

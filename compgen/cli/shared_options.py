@@ -14,7 +14,7 @@ import click
 
 from compgen import effects
 from compgen.cli.common import PATH, Command, options_of
-from compgen.controls import CONTROLLERS, ROTARY_PITCH, ROTARY_TARGETS, controller_named
+from compgen.controls import CONTROLLERS, HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS, controller_named
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
 from compgen.errors import CompgenWarning, InputError, nearest
@@ -78,7 +78,13 @@ def check_settings(machine: Machine, controller: str) -> None:
         return
     from compgen.data.registry import why_missing
 
-    message = f"is not a controller; {nearest(controller, [*CONTROLLERS, *ROTARY_TARGETS, *ROTARY_PITCH])}"
+    if controller in HEAT_OUTPUTS:
+        from compgen.controls.heat_outputs import output_of
+
+        output_of(machine, controller)
+        return
+    names = [*CONTROLLERS, *ROTARY_TARGETS, *ROTARY_PITCH, *HEAT_OUTPUTS]
+    message = f"is not a controller; {nearest(controller, names)}"
     message += why_missing(CONTROLLERS.broken, controller) or "; if it comes from a plug-in, add --plugin PATH"
     raise machine.controller_settings(controller).fail("", message, kind="unknown")
 

@@ -29,7 +29,7 @@ from compgen.cli.shared_options import (
     unverified_option,
 )
 from compgen.cli.terminal import answer, complain, progress, say, say_paths, stdout
-from compgen.controls import CONTROLLERS, ROTARY_PITCH, ROTARY_TARGETS
+from compgen.controls import CONTROLLERS, HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import format_errors, read_reversal
 from compgen.data.files import OutputFolder, write_file
@@ -192,6 +192,9 @@ def export_command(
     get the parameters that say where its rotary axes are (mm); linuxcnc-rotary-comp, siemens-rotary-eec, siemens-rotary-cec,
     fanuc-rotary-pitch, heidenhain-rotary-com, twincat-rotary-list and aerotech-rotary get tables over the angle (degrees).
 
+    With a model of heat (NAME.heat.toml of `volcomp heat`) in place of ERRORS the controls linuxcnc-heat, siemens-heat,
+    twincat-heat and klipper-heat get what takes the growth (um) away over temperatures (degC).
+
     \b
     Example:
       volcomp export zha-gantry fitted/fitted.errors.csv --controller siemens-cec --out tables/
@@ -205,6 +208,15 @@ def export_command(
         from compgen.cli.rotary_commands import export_tables
 
         return export_tables(machine, errors, controller, out, as_json, allow_unverified)
+    if controller in HEAT_OUTPUTS:
+        from compgen.cli.heat_outputs import export_output
+
+        return export_output(machine, errors, controller, out, as_json)
+    if errors.name.endswith(".heat.toml"):
+        outputs = ", ".join(HEAT_OUTPUTS)
+        raise InputError(
+            f"is a model of heat, which {controller} does not take; --controller is one of {outputs}", file=errors
+        )
     table, extra_files = open_errors(errors), {}
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     known = covariance_of(errors, table, None, independent=False)
@@ -274,7 +286,8 @@ def read_command(
 
     FILE gets the points plus cx_um, cy_um, cz_um: what the control adds to the command. Of a table over the angle of rotary
     axes it gets ca_arcsec, cb_arcsec, cc_arcsec at a_deg, b_deg, c_deg, and where tables act by direction of travel also
-    ca_negative_arcsec ... for negative travel.
+    ca_negative_arcsec ... for negative travel. Of an output for heat --points is a *.temperatures.csv (degC), and FILE says
+    what is added at each reading.
 
     \b
     Example:
@@ -288,6 +301,10 @@ def read_command(
         from compgen.cli.rotary_commands import read_pitch
 
         return read_pitch(machine, tables, controller, points, out, as_json)
+    if controller in HEAT_OUTPUTS:
+        from compgen.cli.heat_outputs import read_output
+
+        return read_output(machine, tables, controller, points, out, as_json)
     where = read_points(points)
     parsed = read_tables(machine, tables, controller, foreign=True)
     for text in parsed.contradictions:
@@ -353,6 +370,10 @@ def verify_command(
         from compgen.cli.rotary_commands import verify_tables
 
         return verify_tables(machine, tables, controller, errors, out, as_json)
+    if controller in HEAT_OUTPUTS:
+        from compgen.cli.heat_outputs import verify_output
+
+        return verify_output(machine, tables, controller, errors, out, as_json)
     where = read_points(points) if points else None
     both = read_reversal(reversal) if reversal else effects_reversal(machine)
     parsed, table = read_tables(machine, tables, controller), open_errors(errors)

@@ -103,6 +103,17 @@ ROTARY_PITCH = (
     "aerotech-rotary",
 )
 
+#: Names of what takes a model of heat; :mod:`compgen.controls.heat_outputs` makes them, or says why it cannot.
+HEAT_OUTPUTS = (
+    "linuxcnc-heat",
+    "siemens-heat",
+    "twincat-heat",
+    "klipper-heat",
+    "marlin-heat",
+    "fanuc-heat",
+    "heidenhain-heat",
+)
+
 #: Controls that users request but whose file format is not published: what to use instead.
 NOT_PUBLIC = {
     "siemens-vcs": "the file format of the SINUMERIK volumetric compensation system is not public; export with another "
@@ -134,6 +145,10 @@ def controller_named(name: str) -> type[AnyController]:
     if name not in CONTROLLERS:
         from compgen.data.registry import why_missing
 
+        if name in HEAT_OUTPUTS:
+            raise InputError(
+                f"{name} takes a model of heat (NAME.heat.toml of volcomp heat); use it with export, verify or read"
+            )
         if name in (*ROTARY_TARGETS, *ROTARY_PITCH):
             raise InputError(f"{name} takes errors of rotary axes; use it with export, verify, read or run")
 
@@ -153,6 +168,7 @@ def controller_named(name: str) -> type[AnyController]:
 
 __all__ = [
     "CONTROLLERS",
+    "HEAT_OUTPUTS",
     "ROTARY_TARGETS",
     "AnyController",
     "Controller",

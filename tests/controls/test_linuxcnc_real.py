@@ -26,8 +26,11 @@ from scipy.spatial import cKDTree
 
 import compgen
 from compgen.controls import SourceFile, controller_named
+from compgen.controls.heat_outputs import output_of
 from compgen.controls.linuxcnc_comp import standstill_outcome
 from compgen.data.error_table import Curve, ReversalCurves
+from compgen.heat import HeatModel, Temperatures
+from compgen.heat.model import Range, Term
 from compgen.kinematics.exact_chain import exact_error
 from compgen.programs import DIALECTS, CorrectOptions, Reader, Setup, correct_program, model_of
 from compgen.programs.path import lengths_of, points_of
@@ -199,7 +202,9 @@ def workshop():
         modules.mkdir()
         for name in ("volkins.comp", "volcomp.comp", "volcomp.h"):
             shutil.copy(SOURCES / name, modules)
-        for name in ("volkins.comp", "volcomp.comp"):
+        for name in ("volheat.comp", "volheat.h"):
+            shutil.copy(data_folder("templates") / "linuxcnc-heat" / name, modules)
+        for name in ("volkins.comp", "volcomp.comp", "volheat.comp"):
             output, code = run(["halcompile", "--compile", name], modules)
             assert code == 0, output
         yield SimpleNamespace(folder=folder, modules=modules)
@@ -264,7 +269,8 @@ def session(workshop, steps, sampled, *, kinematics="trivkins coordinates=XYZ", 
     if second:
         ini = ini.replace("HALFILE = mill.hal", "HALFILE = mill.hal\nHALFILE = volkins.hal")
     wiring += sampler(sampled, wiring + second)
-    channels = "".join("b" if name.endswith("settling") else "f" for name in sampled)
+    kinds = {"settling": "b", "at-zero": "b", "fault-code": "s"}
+    channels = "".join(next((kinds[end] for end in kinds if name.endswith(end)), "f") for name in sampled)
     texts = {
         "mill.ini": ini,
         "mill.hal": HAL.format(cfg=channels, more=wiring),
@@ -875,3 +881,84 @@ def test_the_hal_component_refuses_a_table_in_another_unit(workshop, small_machi
     assert done.started is False
     assert done.pins == {"volcomp.loaded": False}
     assert re.search("NO COMPENSATION.*volcomp.tab.*the table is in mm, but the machine is in inch", done.output)
+
+
+# --- heat -------------------------------------------------------------------------------------------------------------
+
+#: dz = 2 um/K of the spindle behind 1200 s, dx = -3 um/K of the bed; 12 hours pass in 6 s, so the lag is 1/6 s here.
+DAY_S, HASTE = 6.0, 7200.0
+HEAT_TERMS = (
+    Term("spindle", 1200.0 / HASTE, "bed", {"dx": 0.0, "dz": 2.0}),
+    Term("bed", 0.0, "bed", {"dx": -3.0, "dz": 0.0}),
+)
+HEAT_HULL = (Range("spindle", "", 18.0, 36.0), Range("bed", "", 18.0, 26.0))
+HEAT_MODEL = HeatModel(
+    "mill", HEAT_TERMS, dict.fromkeys(("dx", "dz"), np.eye(2)), HEAT_HULL, dict.fromkeys(("dx", "dz"), (9.0, 1.0))
+)
+HEAT_NAMES = (
+    *(f"volheat.{pin}-{a}" for pin in ("drive", "motor", "motor-fb", "offset") for a in "xz"),
+    *("volheat.temp-00", "volheat.temp-01", "volheat.share", "volheat.at-zero", "volheat.fault-code"),
+)
+HEAT_RATE_UM_S = 100.0
+
+
+def heat_session(workshop, machine, steps):
+    """Run the exported component between motion and drives; returns rows by pin, the output, and the session."""
+    output = output_of(machine.with_setting("linuxcnc-heat", "rate_um_s", HEAT_RATE_UM_S), "linuxcnc-heat")
+    files = output.files(HEAT_MODEL)
+    drives = "".join(f"net drive-{a} volheat.drive-{a} => volheat.drive-fb-{a}\n" for a in "xyz")
+    hal = files["volheat.hal"] + drives + "addf volheat.command servo-thread\naddf volheat.feedback servo-thread\n"
+    # as on a machine whose sensors have been read before LinuxCNC starts its threads
+    hal += "sets heat-spindle 20\nsets heat-bed 20\n"
+    done = session(workshop, steps, HEAT_NAMES, hal=hal + ENABLE, files={"volheat.tab": files["volheat.tab"]},
+                   pins=("volheat.loaded", "volheat.fault", "volheat.fault-sensor"))  # fmt: skip
+    return done.rows, output.parse([SourceFile(Path("volheat.tab"), files["volheat.tab"])]), done
+
+
+def heat_of_a_day(count):
+    """Spindle and bed: a morning that warms, hot beyond the hull in the middle, and back."""
+    t = np.linspace(0.0, 1.0, count)
+    spindle = 20 + 14 * np.sin(np.pi * t) ** 2 + 8 * np.exp(-(((t - 0.55) / 0.06) ** 2))
+    return np.column_stack([spindle, 20 + 4 * t]).tolist()
+
+
+def test_a_day_of_heat_in_a_running_control_is_taken_away_at_a_limited_rate(workshop, small_machine):
+    """Through the hull and beyond it, moves and an e-stop, then a broken sensor: what is added is what the emulator says."""
+    day = {"signals": ["heat-spindle", "heat-bed"], "seconds": DAY_S, "rows": heat_of_a_day(1200)}
+    hot = {**day, "seconds": 1.0, "rows": [[20 + 10 * k / 200, 24.0] for k in range(201)]}
+    steps = [
+        {"temperatures": day},
+        {"temperatures": hot},
+        {"mdi": "G21 G90 G1 X100 Z-50 F60000"},
+        {"estop": 0},
+        {"mdi": "G1 X20 Z-10 F60000"},
+        {"temperatures": {**day, "seconds": 1.0, "rows": [[float("nan"), 24.0]]}},
+    ]
+    rows, table, done = heat_session(workshop, small_machine, steps)
+    assert done.messages == []
+    assert done.pins == {"volheat.loaded": True, "volheat.fault": True, "volheat.fault-sensor": 0}
+    spindle, bed = rows["volheat.temp-00"], rows["volheat.temp-01"]
+    offset = columns(rows, ["volheat.offset-x", "volheat.offset-z"])
+    sound = np.isfinite(spindle)
+    count = int(np.argmin(sound))
+    assert sound[:count].all()
+    # never faster than the rate, whatever happens
+    assert np.abs(np.diff(offset, axis=0)).max() <= HEAT_RATE_UM_S * 1e-6 * (1 + 1e-6)
+    # what the emulator says, from the first reading of the component to the fault
+    read = Temperatures(1e-3 * np.arange(count), {"spindle": spindle[:count], "bed": bed[:count]})
+    expected = table.added(read)[:, [0, 2]]
+    begun = int(np.argmax(np.any(offset != 0, axis=1))) + 200
+    assert np.abs(offset[:count] - expected)[begun:].max() < 2e-4  # mm: steps of the temperature against straight lines
+    assert np.abs(offset[:count, 1]).max() > 0.02
+    beyond = rows["volheat.share"][:count] == 0
+    assert beyond.sum() > 100
+    assert np.abs(offset[:count][beyond]).min() == 0.0
+    # drives: the offset is added, the control does not see it, and nothing steps at the e-stop
+    for k, axis in enumerate("xz"):
+        drive, motor = rows[f"volheat.drive-{axis}"], rows[f"volheat.motor-{axis}"]
+        assert np.abs(drive - motor - offset[:, k]).max() < AGREEMENT_MM
+        assert np.abs(rows[f"volheat.motor-fb-{axis}"] - motor).max() < AGREEMENT_MM
+    # the fault is said, and the offset is back at zero
+    assert set(rows["volheat.fault-code"][count + 1 :].tolist()) == {1.0}
+    assert rows["volheat.at-zero"][-1]
+    assert not offset[-1].any()

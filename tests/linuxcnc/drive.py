@@ -46,7 +46,7 @@ def wait_cycles(count):
 class Session:
     def __init__(self):
         self.command, self.stat, self.errors = linuxcnc.command(), linuxcnc.stat(), linuxcnc.error_channel()
-        self.messages = []
+        self.messages, self.sensors = [], None
 
     def polled(self):
         self.stat.poll()
@@ -83,6 +83,33 @@ class Session:
         name, text = name_and_text
         subprocess.run(["halcmd", "setp" if "." in name else "sets", name, text], check=True)
         wait_cycles(50)
+
+    def temperatures(self, day):
+        """Write rows of values to signals that nobody writes, evenly over some seconds."""
+        if self.sensors is None:
+            self.sensors = hal.component(f"compgen-sensors-{os.getpid()}")
+            for name, value in zip(day["signals"], day["rows"][0], strict=True):
+                self.sensors.newpin(name, hal.HAL_FLOAT, hal.HAL_OUT)
+                self.sensors[name] = value
+            self.sensors.ready()
+            for name in day["signals"]:
+                hal.connect(f"compgen-sensors-{os.getpid()}.{name}", name)
+        rows, begin = day["rows"], time.monotonic()
+        for number, row in enumerate(rows, start=1):
+            for name, value in zip(day["signals"], row, strict=True):
+                self.sensors[name] = value
+            time.sleep(max(0.0, begin + day["seconds"] * number / len(rows) - time.monotonic()))
+
+    def estop(self, _):
+        """Press the e-stop, and switch on again."""
+        self.command.state(linuxcnc.STATE_ESTOP)
+        wait(lambda: self.polled().estop, "e-stop")
+        wait_cycles(100)
+        self.command.state(linuxcnc.STATE_ESTOP_RESET)
+        wait(lambda: not self.polled().estop, "e-stop taken back")
+        self.command.state(linuxcnc.STATE_ON)
+        wait(lambda: self.polled().enabled, "switching on")
+        wait_cycles(100)
 
     def rest(self, pin):
         """Wait until a pin is FALSE, after what came before has reached it, and a moment longer."""

@@ -41,7 +41,15 @@ WITH_ERRORS = re.compile(
 )
 ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")
 #: Readers of controls' files, and modules with names of columns and keys: their texts are no sentences for people.
-READERS = ("heidenhain_text.py", "siemens_text.py", "registry.py", "language.py", "display.py")
+READERS = (
+    "heidenhain_text.py",
+    "siemens_text.py",
+    "registry.py",
+    "language.py",
+    "display.py",
+    "heat_outputs.py",
+    "heat_programs.py",
+)
 #: Calls whose texts are for help, or are no texts.
 NOT_SHOWN = re.compile(
     r"(setting|option|choice|positive|number_of|compile|match|search|sub|split|startswith|endswith|strip|argument|"
