@@ -8,7 +8,8 @@ import re
 import unicodedata
 from collections.abc import Hashable, Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from string import Formatter
+from typing import Any, TypeVar
 
 Item = TypeVar("Item", bound=Hashable)
 #: Characters that a terminal interprets instead of showing, or that change the direction of a line; not line end and
@@ -16,6 +17,95 @@ Item = TypeVar("Item", bound=Hashable)
 _OBEYED = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
+
+
+class Message(str):
+    """A sentence for people as data: the English text, the code that programs may rely on, its template and its values.
+
+    It is the text wherever a text is due. What shows it in another language translates the template and fills in the values,
+    so that a path or a name of the user's is never taken for words; JSON lists code and values beside the text. Texts may
+    change, codes do not.
+
+    Parameters
+    ----------
+    code : words joined by hyphens, e.g. ``"file-not-found"``.
+    template : the English sentence with named places as in :meth:`str.format`, e.g. ``"{path}: expected {count:d} rows"``.
+    values : what is filled in; another message is translated with the sentence around it.
+
+    Examples
+    --------
+    >>> said = Message("row-count", "{path}: expected {count:d} rows", path="new data.csv", count=7)
+    >>> said, said.code, said.values["path"]
+    ('new data.csv: expected 7 rows', 'row-count', 'new data.csv')
+    >>> said.filled("{path}: {count} Zeilen erwartet")
+    'new data.csv: 7 Zeilen erwartet'
+    """
+
+    code: str
+    template: str
+    values: dict[str, Any]
+
+    def __new__(cls, code: str, template: str, /, **values: Any) -> Message:
+        """Fill the values into the template."""
+        made = super().__new__(cls, template.format(**values))
+        made.code, made.template, made.values = code, template, values
+        return made
+
+    def __getnewargs_ex__(self) -> tuple[tuple[str, str], dict[str, Any]]:  # type: ignore[override]
+        """Let worker processes send messages: values as they are shown."""
+        literal = "".join(
+            text.replace("{", "{{").replace("}", "}}") + (f"{{{name}}}" if name is not None else "")
+            for text, name, _, _ in Formatter().parse(self.template)
+        )
+        return (self.code, literal), self.shown()
+
+    @property
+    def sentence(self) -> str:
+        """The template as catalogues of texts list it: places without formats, braces of the text as they are read."""
+        return "".join(
+            text + (f"{{{name}}}" if name is not None else "")
+            for text, name, _, _ in Formatter().parse(self.template)
+        )
+
+    def shown(self) -> dict[str, Any]:
+        """Return each value as it stands in the text; messages, and errors that carry one, stay messages."""
+        return {
+            name: message_of(self.values[name])
+            or (f"{{0!{how}:{form}}}" if how else f"{{0:{form}}}").format(self.values[name])
+            for _, name, form, how in Formatter().parse(self.template)
+            if name is not None
+        }
+
+    def filled(self, sentence: str, **translated: str) -> str:
+        """Return another sentence with the same values; ``translated`` replaces some of them."""
+        values = {**self.shown(), **translated}
+        return re.sub(r"\{(\w+)\}", lambda place: str(values.get(place[1], place[0])), sentence)
+
+    def data(self) -> dict[str, Any]:
+        """Return code, text and values as JSON lists them."""
+        return {"code": self.code, "text": str(self), "values": {name: str(v) for name, v in self.shown().items()}}
+
+
+def message_of(value: object) -> Message | None:
+    """Return a message, or the one that an exception carries; None for anything else."""
+    if isinstance(value, CompgenError | ValueError | CompgenWarning):
+        value = value.said if isinstance(value, InputError) else value.args[0] if value.args else None
+    return value if isinstance(value, Message) else None
+
+
+def messages_of(texts: Iterable[object]) -> dict[str, Any]:
+    """Return the entry ``messages`` of a JSON object: code, text and values of each text that is a message.
+
+    >>> messages_of(["a plain text", Message("no-file", "no file {path}", path="a.csv")])
+    {'messages': [{'code': 'no-file', 'text': 'no file a.csv', 'values': {'path': 'a.csv'}}]}
+    """
+    found = []
+    for said in filter(None, map(message_of, texts)):
+        core = message_of(said.values.get("message")) if said.code == "at-place" else said
+        place = {"place": said.values["place"]} if said.code == "at-place" else {}
+        if core is not None:
+            found.append({**core.data(), "text": str(said), "values": {**place, **core.data()["values"]}})
+    return {"messages": found} if found else {}
 
 
 class CompgenError(Exception):
@@ -64,7 +154,9 @@ class InputError(CompgenError, ValueError):
             place += f":{line}" if place else f"line {line}"
         if field:
             place += f": {field}" if place else field
-        super().__init__(f"{place}: {message}" if place else message)
+        #: The whole sentence: the message, behind the place if one is known.
+        self.said = Message("at-place", "{place}: {message}", place=place, message=message) if place else message
+        super().__init__(self.said)
 
 
 class UndeterminedError(CompgenError):

@@ -20,7 +20,7 @@ import click
 
 from compgen.data.files import json_text
 from compgen.data.names import AXES
-from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.errors import CompgenError, CompgenWarning, InputError, Message, message_of, messages_of
 from compgen.resources import LANGUAGES
 
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -78,7 +78,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
             if issubclass(category, CompgenWarning) and str(message) not in said:
                 said.add(str(message))
-                _complain(f"warning: {message}", "yellow")
+                _complain(Message("warning", "warning: {message}", message=message_of(message) or str(message)), "yellow")
 
         warnings.showwarning = show
         try:
@@ -102,7 +102,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         except SystemExit as error:  # click and rich leave with 1 when the reader of a pipe has gone; completion with 0
             return READER_GONE if error.code else 0
         except CompgenError as error:
-            return _fail(str(error), error.exit_code, words)
+            return _fail(message_of(error) or str(error), error.exit_code, words)
         except MemoryError:
             return _fail("not enough memory for this input", 3, words)
         except Exception as error:  # last resort: exit code 3 of the contract
@@ -117,9 +117,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:
-    _complain(f"error: {message}", "red")
+    _complain(Message("error", "error: {message}", message=message), "red")
     if "--json" in words:
-        print_json({"error": message, "exit_code": code})
+        print_json({"error": message, "exit_code": code, **messages_of([message])})
     return code
 
 

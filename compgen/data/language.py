@@ -19,7 +19,7 @@ from gettext import GNUTranslations
 from html import escape, unescape
 from typing import TYPE_CHECKING, Any
 
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.resources import LANGUAGES, data_folder
 
 if TYPE_CHECKING:
@@ -123,13 +123,39 @@ class Texts:
         sentence is never a mixture of two languages. Messages with fewer than ``least`` letters of their own are only
         looked for in values, and between numbers.
         """
+        if isinstance(english, Message):
+            return self.message(english)
         found = self._complete(english, least)
         if found is None:
             found = " ".join(self._part(piece, least) or piece for piece in _SENTENCES.split(english))
         return found
 
+    def message(self, said: Message) -> str:
+        """Return a message in this language: its sentence is looked up, its values are filled in.
+
+        What a user named (paths, columns, cells) stays as it is, whatever words it has.
+
+        >>> german = Texts({"no file {path}": "keine Datei {path}"})
+        >>> german.message(Message("no-file", "no file {path}", path="data of the last week.csv"))
+        'keine Datei data of the last week.csv'
+        """
+        sentence = said.sentence
+        known = self.messages.get(sentence)
+        if known is None and _LETTERS.search(_PLACE.sub(" ", sentence)):  # in English, or known as parts
+            return self.text(str(said))
+        values = {name: self._value(value) for name, value in said.shown().items()}
+        return said.filled(sentence if known is None else known, **values)
+
+    def _value(self, value: str) -> str:
+        """Return what is filled into a message: messages and words of the program in this language, all else as it is."""
+        if isinstance(value, Message):
+            return self.message(value)
+        return self._word(value) or self._complete(value) or value
+
     def label(self, english: str) -> str:
         """Return a text that may be a single word, e.g. of a picture or a verdict, a heading, or a number with one."""
+        if isinstance(english, Message):
+            return self.message(english)
         core = english.strip()
         known = self._word(core) or self.messages.get(f"{LABEL}\x04{core}")
         return self.text(english) if known is None else english.replace(core, known)
@@ -233,6 +259,8 @@ class Texts:
         >>> Texts({"not used: {name}": "unbenutzt: {name}"}).lines("- not used: X.TAB\n  * a text of a user")
         '- unbenutzt: X.TAB\n  * a text of a user'
         """
+        if isinstance(english, Message):
+            return self.message(english)
         found = []
         for line in english.split("\n"):
             marker = MARKER.match(line)
@@ -262,6 +290,8 @@ class Texts:
 
     def _named(self, english: str) -> str:
         """Return a cell of a table, a name and its value, or a message and its kind, in this language."""
+        if isinstance(english, Message):
+            return self.message(english)
         name, colon, value = english.partition(":")
         if colon and (
             kind := self.messages.get(f"{name}: {{message}}")
@@ -321,7 +351,7 @@ class Texts:
         assert environment.loader is not None
         environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
         environment.finalize = self.filled
-        environment.filters["word"] = lambda value: self.label(value) if type(value) is str else self.filled(str(value))
+        environment.filters["word"] = lambda value: self.label(value) if type(value) in (str, Message) else self.filled(str(value))
         environment.globals["language"] = self.language
         if not html:  # in HTML this would switch off the escaping
             from markupsafe import Markup
@@ -331,6 +361,8 @@ class Texts:
 
     def filled(self, value: Any) -> Any:
         """Return a value that is filled into a template: a text in this language, lines of a file and all else as they are."""
+        if isinstance(value, Message):
+            return self.message(value)
         return self.text(value, _WEAK) if type(value) is str and "\n" not in value else value
 
 

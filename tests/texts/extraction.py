@@ -9,6 +9,7 @@ import ast
 import html
 import inspect
 import re
+import string
 import sys
 import tomllib
 from datetime import UTC, datetime
@@ -164,6 +165,12 @@ def sentence(node):
     return "".join(found)
 
 
+def template_sentence(template):
+    """Return the template of a message as the catalogue lists it: places without formats."""
+    pieces = string.Formatter().parse(template)
+    return "".join(literal + (f"{{{name}}}" if name is not None else "") for literal, name, _, _ in pieces)
+
+
 def pieces_of(text):
     """Return what is translated as one: the text between two tags of a page, a line of a list without its marker."""
     if re.search(r"</?[a-z]\w*[ >]", text):
@@ -196,6 +203,11 @@ def of_module(source, *, errors=False, constants_are_words=False):
             return
         if isinstance(node, ast.Call):
             called = ast.unparse(node.func).split("(")[-1]
+            if called == "Message":  # code, template, values
+                yield template_sentence(node.args[1].value)
+                for value in node.keywords:
+                    yield from walk(value.value)
+                return
             if NOT_SHOWN.search(called) or (not errors and ERRORS.search(called)):
                 return
             if called == "Card":  # of an effect: equations and sources are the same in every language
