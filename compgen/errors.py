@@ -63,8 +63,7 @@ class Message(str):
     def sentence(self) -> str:
         """The template as catalogues of texts list it: places without formats, braces of the text as they are read."""
         return "".join(
-            text + (f"{{{name}}}" if name is not None else "")
-            for text, name, _, _ in Formatter().parse(self.template)
+            text + (f"{{{name}}}" if name is not None else "") for text, name, _, _ in Formatter().parse(self.template)
         )
 
     def shown(self) -> dict[str, Any]:

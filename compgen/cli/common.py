@@ -78,7 +78,9 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         def show(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
             if issubclass(category, CompgenWarning) and str(message) not in said:
                 said.add(str(message))
-                _complain(Message("warning", "warning: {message}", message=message_of(message) or str(message)), "yellow")
+                _complain(
+                    Message("warning", "warning: {message}", message=message_of(message) or str(message)), "yellow"
+                )
 
         warnings.showwarning = show
         try:

@@ -351,7 +351,9 @@ class Texts:
         assert environment.loader is not None
         environment.loader = _loader(environment.loader, lambda source: self.template(source, html=html))
         environment.finalize = self.filled
-        environment.filters["word"] = lambda value: self.label(value) if type(value) in (str, Message) else self.filled(str(value))
+        environment.filters["word"] = lambda value: (
+            self.label(value) if type(value) in (str, Message) else self.filled(str(value))
+        )
         environment.globals["language"] = self.language
         if not html:  # in HTML this would switch off the escaping
             from markupsafe import Markup
