@@ -17,12 +17,12 @@ from compgen import effects, tables
 from compgen.controls import controller_named
 from compgen.data.arguments import names_of, of_kind, path_of, paths_of
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working_folder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
+from compgen.drawing.display import Bars, Drawable, Overview, Panel
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import FileHead, heads_of

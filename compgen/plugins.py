@@ -11,80 +11,70 @@ from typing import Any
 
 from compgen.controls import CONTROLLERS, Controller
 from compgen.data.arguments import paths_of
-from compgen.data.registry import PATH_ORIGIN, Kind, call_problem, load_entry_points, load_file
 from compgen.effects import FAMILIES
 from compgen.effects.all_effects import check_family
 from compgen.errors import InputError
+from compgen.registry import PATH_ORIGIN, Kind, call_problem, load_entry_points, load_file
 from compgen.simulation import EFFECTS, INSTRUMENTS
 from compgen.simulation.run import check_effect, check_instrument
 from compgen.tables.render import check_templates
 
 
 def check_control(name: str, thing: Any) -> tuple[Any, list[str]]:
-    """Return the class of the control and its problems; a control of the former interface gets its adapter."""
+    """Return the class of the control and its problems."""
     code: Any = thing if inspect.isclass(thing) else type(thing)
-    former = next((item for item in code.__mro__ if "bound_form" in vars(item)), None)
-    interface = former or Controller
-    if not issubclass(code, interface):
+    if not issubclass(code, Controller):
         return thing, ["it is not a subclass of compgen.controls.Controller"]
-    problems = _method_problems(code, interface)
-    if former and not problems:
-        try:
-            thing = code() if thing is code else thing
-        except Exception as error:  # code of a third party
-            return code, [f"{code.__name__}() fails: {type(error).__name__}: {error}"]
+    problems = _method_problems(code)
     own = getattr(code, "name", None)
     if own != name:
         problems.append(f"{code.__name__}.name must be {name!r}, but is {'missing' if own is None else repr(own)}")
     for item in ("anchored", "bidirectional"):
         if not isinstance(getattr(code, item), bool):
             problems.append(f"{code.__name__}.{item} must be True or False")
-    if code.bidirectional is True and code.with_reversal is interface.with_reversal:
-        arguments = ", ".join(_arguments(interface, "with_reversal"))
+    if code.bidirectional is True and code.with_reversal is Controller.with_reversal:
+        arguments = ", ".join(_arguments("with_reversal"))
         problems.append(f"{code.__name__} is bidirectional, so it needs with_reversal({arguments})")
     if problems:
         return code, problems
-    control = thing.bound_form() if former else code
-    if control.templates is None:
+    if code.templates is None:
         file = inspect.getsourcefile(code)
-        control.templates = Path(file).resolve().parent / "templates" if file else None
-    if not isinstance(control.templates, Path) or not (control.templates / name / "format.toml").is_file():
-        place = f"{control.templates}/{name}" if control.templates else f"templates/{name}"
+        code.templates = Path(file).resolve().parent / "templates" if file else None
+    if not isinstance(code.templates, Path) or not (code.templates / name / "format.toml").is_file():
+        place = f"{code.templates}/{name}" if code.templates else f"templates/{name}"
         return code, [f"its folder {place} with format.toml and the templates is missing"]
     try:
-        check_templates(name, control.templates)
+        check_templates(name, code.templates)
     except InputError as error:
         return code, [str(error)]
-    return control, []
+    return code, []
 
 
-def _method_problems(code: type, interface: type) -> list[str]:
+def _method_problems(code: type) -> list[str]:
     """Return the methods that the class lacks, or that cannot be called like those of the interface."""
     problems = []
     abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
-    missing = [item for item in vars(interface) if item in abstract]
+    missing = [item for item in vars(Controller) if item in abstract]
     if missing:
-        texts = [f"{item}({', '.join(_arguments(interface, item))})" for item in missing]
+        texts = [f"{item}({', '.join(_arguments(item))})" for item in missing]
         problems.append(f"{code.__name__} has no {', '.join(texts)}")
-    for item in vars(interface):
+    for item in vars(Controller):
         method = getattr(code, item, None)
-        if item not in missing and item[0] != "_" and callable(getattr(interface, item)):
+        if item not in missing and item[0] != "_" and callable(getattr(Controller, item)):
             bound = method.__get__(object()) if inspect.isfunction(method) else method
-            problems += call_problem(bound, _arguments(interface, item), f"{code.__name__}.{item}")
-    if interface is Controller:
-        own = code.__mro__[: code.__mro__.index(Controller)]
-        if not hasattr(code, "settings_class") and not any("read_settings" in vars(item) for item in own):
-            problems.append(f"{code.__name__} has no settings_class, the dataclass of its settings")
-        problems += call_problem(code, _BINDING, code.__name__)
-    return problems
+            problems += call_problem(bound, _arguments(item), f"{code.__name__}.{item}")
+    own = code.__mro__[: code.__mro__.index(Controller)]
+    if not hasattr(code, "settings_class") and not any("read_settings" in vars(item) for item in own):
+        problems.append(f"{code.__name__} has no settings_class, the dataclass of its settings")
+    return problems + call_problem(code, _BINDING, code.__name__)
 
 
 #: The arguments of the class of a control.
 _BINDING = ("machine", "settings")
 
 
-def _arguments(interface: type, method: str) -> list[str]:
-    return [key for key in inspect.signature(getattr(interface, method)).parameters if key != "self"]
+def _arguments(method: str) -> list[str]:
+    return [key for key in inspect.signature(getattr(Controller, method)).parameters if key != "self"]
 
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.

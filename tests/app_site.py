@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from compgen.app.pages import Workbench, make_app, make_server
-from compgen.fleet.dashboard.settings import DashboardSettings
+from compgen.web.site import LocalSite
 
 ROOT = Path(__file__).resolve().parents[1]
 PATIENCE_S = 90.0
@@ -33,7 +33,7 @@ class Site:
     """The workbench in a test client, with one open project."""
 
     def __init__(self, folder, *, start=True, language="en"):
-        self.workbench = Workbench(DashboardSettings("", port=8765), language)
+        self.workbench = Workbench(LocalSite(8765), language)
         self.number = self.workbench.open(folder)
         self.runner = self.workbench.projects[0]
         self.project = self.runner.project
@@ -66,13 +66,13 @@ class Served:
     """The workbench on a real port."""
 
     def __init__(self, folder, language="en"):
-        self.workbench = Workbench(DashboardSettings("", port=0), language)
+        self.workbench = Workbench(LocalSite(0), language)
         self.workbench.open(folder)
         self.runner = self.workbench.projects[0]
         self.project = self.runner.project
         self.server = make_server(self.workbench)
         port = int(self.server.effective_port)
-        self.workbench.settings = DashboardSettings("", port=port)
+        self.workbench.site = LocalSite(port)
         self.address, self.url = ("127.0.0.1", port), f"http://127.0.0.1:{port}"
         self.start = f"{self.url}/start?token={self.workbench.ticket}"
         self.thread = threading.Thread(target=self._run, daemon=True)

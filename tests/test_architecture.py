@@ -9,7 +9,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 #: The stages in the order of the pipeline; those of one line may import each other.
 ORDER = (
-    ("data", "errors", "resources"),
+    ("errors", "resources", "registry", "drawing", "language"),
+    ("data",),
+    ("new_machine",),
     ("kinematics",),
     ("effects",),
     ("instruments",),
@@ -26,11 +28,11 @@ ORDER = (
     ("diagnose",),
     ("pipeline", "plugins"),
     ("report",),
+    ("web",),
     ("fleet",),
     ("app",),
     ("cli",),
     ("readers",),  # public names of several rooms, for scripts: none of the rooms uses it
-    ("controllers", "core"),  # former homes of the plug-in interface, for one minor version
     ("__main__",),
 )
 RANK = {stage: rank for rank, stages in enumerate(ORDER) for stage in stages}

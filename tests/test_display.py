@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 import compgen
 from compgen.accuracy import accuracy_of_errors, compare_errors, error_source
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.display import Bars, Displayed, Drawable, Overview, Panel, PlottedLine, drawn, html_of, shortened
 from compgen.diagnose import diagnose
+from compgen.drawing.display import Bars, Displayed, Drawable, Overview, Panel, PlottedLine, drawn, html_of, shortened
 from compgen.identification import joint_covariance
 from compgen.pipeline import ControllerResult, RunResult
 

@@ -46,12 +46,12 @@ from compgen.accuracy.positioning import (
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
-from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM, error_named
 from compgen.data.toml_files import option
+from compgen.drawing.display import Bars, Drawable, Overview, Panel
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.gauge import common_gauge_part

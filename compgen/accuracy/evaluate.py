@@ -23,11 +23,11 @@ from compgen.accuracy.field import (
     volume_figures,
 )
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Bars, Drawable, Overview, Panel, shortened
 from compgen.data.error_table import Curve, ReversalCurves, fitted_line, hat_matrix, read_reversal
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, BODY_DIAGONALS, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, error_named
+from compgen.drawing.display import Bars, Drawable, Overview, Panel, shortened
 from compgen.errors import InputError
 from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.many_points import volume_grid

@@ -21,22 +21,22 @@ from compgen.app.steps import ANSWERS, CERTIFICATE_FIELDS, PROGRAM_FIELDS, Step,
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.charts import BOX, CYCLE, Picture, Plot, limits_of, svg
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.machine import CHAINS, ROTARY, Chain, machine_files, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
-from compgen.data.new_machine import in_words
 from compgen.data.prior import CLASS_WORDS
+from compgen.drawing.charts import BOX, CYCLE, Picture, Plot, limits_of, svg
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.foreign.source import parse_number
 from compgen.kinematics import exact_error
 from compgen.kinematics.many_points import full_grid
+from compgen.new_machine import in_words
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.folder import read_volume
 from compgen.report.html.pictures import (

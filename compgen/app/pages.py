@@ -71,15 +71,23 @@ from compgen.app.steps import (
     command_line,
 )
 from compgen.controls import CONTROLLERS
-from compgen.data.charts import LABEL
 from compgen.data.files import json_text, read_text, working_folder, write_file
-from compgen.data.language import texts_of
 from compgen.data.machine import INTEGERS, load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
-from compgen.data.new_machine import chains_of, in_words
 from compgen.data.prior import class_named
+from compgen.drawing.charts import LABEL
 from compgen.errors import CompgenError, InputError, number_text, um_text, visible
-from compgen.fleet.dashboard.guard import (
+from compgen.foreign import native_format
+from compgen.identification.options import StatedNumbers
+from compgen.language import texts_of
+from compgen.new_machine import chains_of, in_words
+from compgen.programs.dialects import DIALECTS
+from compgen.report.html.pictures import describe_error, thousands
+from compgen.report.html.write import markdown
+from compgen.report.pdf import pdf_of
+from compgen.resources import LANGUAGES, cache_folder, data_folder
+from compgen.web.connections import LARGEST_BODY, bounded, small_for
+from compgen.web.guard import (
     HEADERS,
     check_host,
     check_method,
@@ -89,15 +97,7 @@ from compgen.fleet.dashboard.guard import (
     same,
     set_cookie,
 )
-from compgen.fleet.dashboard.server import LARGEST_BODY, bounded, small_for
-from compgen.fleet.dashboard.settings import DashboardSettings
-from compgen.foreign import native_format
-from compgen.identification.options import StatedNumbers
-from compgen.programs.dialects import DIALECTS
-from compgen.report.html.pictures import describe_error, thousands
-from compgen.report.html.write import markdown
-from compgen.report.pdf import pdf_of
-from compgen.resources import LANGUAGES, cache_folder, data_folder
+from compgen.web.site import LocalSite, Site
 
 #: Largest request (files that are dropped together), largest part of a form that is not a file, bytes; parts of a form.
 LARGEST_UPLOAD, LARGEST_FORM, MOST_PARTS = 200_000_000, 2_000_000, 400
@@ -167,7 +167,7 @@ class Workbench:
     ``ticket`` is the token of the first address, used once; ``first_page`` a private file that leads the browser there.
     """
 
-    settings: DashboardSettings
+    site: Site
     language: str = LANGUAGES[0]
     projects: list[Runner] = field(default_factory=list)
     ticket: str | None = field(default_factory=lambda: secrets.token_urlsafe(32))
@@ -291,7 +291,7 @@ def start() -> BaseResponse:
     response: BaseResponse = redirect(target, code=303)
     if request.args.get("from") == "file":
         response = Response(leading_to(target), mimetype="text/html")
-    set_cookie(response, workbench.settings, "app", workbench.session)
+    set_cookie(response, workbench.site, "app", workbench.session)
     return response
 
 
@@ -1194,11 +1194,11 @@ def make_app(workbench: Workbench) -> Flask:
 def _begin_request() -> None:
     workbench = the_workbench()
     g.session = False
-    check_host(request, workbench.settings)
+    check_host(request, workbench.site)
     check_method(request)
-    g.session = same(request.cookies.get(cookie_name(workbench.settings, "app"), ""), workbench.session)
+    g.session = same(request.cookies.get(cookie_name(workbench.site, "app"), ""), workbench.session)
     if request.method not in SAFE:
-        check_origin(request, workbench.settings)
+        check_origin(request, workbench.site)
     if request.endpoint in OPEN:
         return
     if not g.session:
@@ -1276,10 +1276,10 @@ def make_server(workbench: Workbench) -> Any:
 
     def stranger(cookies: str) -> bool:
         given = (part.strip() for part in cookies.split(";"))
-        own = f"{cookie_name(workbench.settings, 'app')}={workbench.session}"
+        own = f"{cookie_name(workbench.site, 'app')}={workbench.session}"
         return not any(same(part, own) for part in given)
 
-    port = workbench.settings.port
+    port = workbench.site.port
     try:
         server = waitress.create_server(
             make_app(workbench), host="127.0.0.1", port=port, threads=8, ident=None, connection_limit=300,
@@ -1327,11 +1327,11 @@ def serve(
     """
     import _thread
 
-    workbench = Workbench(DashboardSettings("", port=port), language)
+    workbench = Workbench(LocalSite(port), language)
     if folder is not None:
         workbench.open(folder)
     server = make_server(workbench)
-    workbench.settings = DashboardSettings("", port=int(server.effective_port))
+    workbench.site = LocalSite(int(server.effective_port))
 
     def watch() -> None:
         while True:

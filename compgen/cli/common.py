@@ -127,8 +127,8 @@ def _fail(message: str, code: int, words: Sequence[str]) -> int:
 
 def load_for(context: click.Context, paths: Sequence[Path] = (), *, installed: bool = False) -> None:
     """Load plug-ins for one command and unload them when it ends."""
-    from compgen.data.registry import restored
     from compgen.plugins import KINDS, load_plugins
+    from compgen.registry import restored
 
     with restored(KINDS, only_after_errors=True):
         context.find_root().with_resource(restored(KINDS))
@@ -236,7 +236,7 @@ def for_readers(files: Mapping[str, File], language: str) -> dict[str, File]:
     """Return files with the pages and lists for people (``*.html``, ``*.md``) in a language; the others are not changed."""
     if language == LANGUAGES[0]:
         return dict(files)
-    from compgen.data.language import texts_of, wrapped
+    from compgen.language import texts_of, wrapped
 
     texts, made = texts_of(language), dict(files)
     for name, content in files.items():

@@ -36,12 +36,12 @@ from compgen.data.machine import (
     parse_machine,
 )
 from compgen.data.names import AXES
-from compgen.data.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.data.prior import CLASS_WORDS, USUAL_CLASS, class_named
 from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.job import job_of, job_schema
 from compgen.instruments.sixdof_instrument import instrument_of, instrument_schema
+from compgen.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.simulation.run import Scenario, scenario_of
 from compgen.tables import load_format
 

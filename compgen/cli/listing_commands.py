@@ -29,7 +29,6 @@ from compgen.data.files import OutputFolder, read_text
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, machine_files
 from compgen.data.names import AXES, error_named
-from compgen.data.registry import Kind
 from compgen.effects import ANY_STATION, FAMILIES, catalogue, listed
 from compgen.effects.active import STATION_NAME
 from compgen.errors import CompgenWarning, InputError, nearest
@@ -37,6 +36,7 @@ from compgen.foreign import ImportOptions, describe_native, import_file, native_
 from compgen.foreign.heads import heads_of, with_head
 from compgen.kinematics import modelled_errors
 from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
+from compgen.registry import Kind
 from compgen.report.cards import card_summary, card_text, control_card, effect_card_text
 from compgen.tables import Format, load_format
 

@@ -76,7 +76,7 @@ def check_settings(machine: Machine, controller: str) -> None:
 
         format_of(machine, controller)
         return
-    from compgen.data.registry import why_missing
+    from compgen.registry import why_missing
 
     if controller in HEAT_OUTPUTS:
         from compgen.controls.heat_outputs import output_of

@@ -21,7 +21,7 @@ from compgen.errors import visible
 from compgen.resources import LANGUAGES
 
 if TYPE_CHECKING:
-    from compgen.data.language import Texts
+    from compgen.language import Texts
 
 #: Tables in a pipe or a file get the width they need, not the width of an unknown terminal.
 PIPE_WIDTH = None if sys.stdout.isatty() else 130
@@ -71,7 +71,7 @@ def speak(language: str) -> None:
     """Print in a language from now on, unless COMPGEN_MESSAGES asks for English: a program reads the messages then."""
     texts = None
     if language != LANGUAGES[0] and os.environ.get("COMPGEN_MESSAGES") != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         texts = texts_of(language)
     stdout.texts = stderr.texts = texts

@@ -143,7 +143,7 @@ def controller_named(name: str) -> type[AnyController]:
     if instead := program_instead(name):
         raise InputError(instead)
     if name not in CONTROLLERS:
-        from compgen.data.registry import why_missing
+        from compgen.registry import why_missing
 
         if name in HEAT_OUTPUTS:
             raise InputError(

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Tabular
 from compgen.data.names import AXES, BODY_DIAGONALS
 from compgen.data.records import AXIS, DIRECTION, POSITION, RUN, RUN_DEVIATION, Field, Schema, fail_at
+from compgen.drawing.display import Tabular
 from compgen.errors import InputError, repeated
 
 # Positioning runs along single axes (ISO 230-2): ``*.axis.csv``.

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview, Tabular
 from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, one_of, uncertainties, within
+from compgen.drawing.display import Displayed, Overview, Tabular
 from compgen.errors import InputError
 
 #: First and second axis of each plane; angles count from the first to the second.

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from compgen.data.arguments import numbers
 from compgen.data.comparison import best_rotation
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview, Tabular, ranges_of
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import (
     APPROACH,
@@ -30,6 +29,7 @@ from compgen.data.records import (
     deviations_um,
     uncertainties,
 )
+from compgen.drawing.display import Displayed, Overview, Tabular, ranges_of
 from compgen.errors import InputError
 
 __all__ = [

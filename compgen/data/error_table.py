@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, read_csv
-from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.data.files import read_text
 from compgen.data.names import (
     AXES,
@@ -33,6 +32,7 @@ from compgen.data.names import (
     error_named,
 )
 from compgen.data.records import axes_of, within
+from compgen.drawing.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.errors import CompgenWarning, InputError, nearest, repeated
 
 K = TypeVar("K", bound=Hashable)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import labels_of, paths_of, whole_numbers
 from compgen.data.csv_files import CsvTable, FloatArray
-from compgen.data.display import Displayed, Overview, Tabular, ranges_of, shortened
 from compgen.data.records import (
     APPROACH,
     ARCHIVE,
@@ -27,6 +26,7 @@ from compgen.data.records import (
     check_rows,
     within,
 )
+from compgen.drawing.display import Displayed, Overview, Tabular, ranges_of, shortened
 from compgen.errors import InputError
 
 #: Archives of at most this many readings are read whole, like text files.

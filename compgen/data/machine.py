@@ -19,10 +19,10 @@ import numpy as np
 from compgen.data import toml_files
 from compgen.data.arguments import numbers, of_kind, path_of, text_of
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Displayed, Overview
 from compgen.data.names import AXES, ERROR_NAMES
 from compgen.data.prior import PriorSettings, prior_schema, read_prior
 from compgen.data.repeatability import EXPANSION_SHARE, Repeatability
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.resources import data_folder
 

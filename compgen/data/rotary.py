@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import numbers
 from compgen.data.csv_files import CsvTable, FloatArray, csv_table, format_csv, names_in_header, read_csv
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, parse_errors
 from compgen.data.files import read_text
 from compgen.data.machine import ROTARY, Machine
@@ -32,6 +31,7 @@ from compgen.data.records import (
     uncertainties,
     within,
 )
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import InputError, nearest
 
 # Names and units.

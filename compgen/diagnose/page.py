@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from compgen.data.charts import (
+from compgen.data.circles import PLANES
+from compgen.data.files import json_text
+from compgen.data.names import MM_PER_UM
+from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
+from compgen.diagnose.circle_diagnosis import CircleDiagnosis
+from compgen.diagnose.diagnosis import Diagnosis
+from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
+from compgen.diagnose.search import gains, remainder_of
+from compgen.drawing.charts import (
     BOX,
     DIVERGING,
     Picture,
@@ -20,14 +28,6 @@ from compgen.data.charts import (
     picture_grid,
     svg,
 )
-from compgen.data.circles import PLANES
-from compgen.data.files import json_text
-from compgen.data.names import MM_PER_UM
-from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
-from compgen.diagnose.circle_diagnosis import CircleDiagnosis
-from compgen.diagnose.diagnosis import Diagnosis
-from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
-from compgen.diagnose.search import gains, remainder_of
 
 # Figures of a diagnosis: residuals before and after over all quantities they may depend on, and the suspects.
 

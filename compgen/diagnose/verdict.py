@@ -11,7 +11,6 @@ import numpy as np
 from scipy.special import chdtrc
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Bars, Drawable, Overview, Panel
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
@@ -26,6 +25,7 @@ from compgen.diagnose.search import (
     plain_covariates,
     remainder_of,
 )
+from compgen.drawing.display import Bars, Drawable, Overview, Panel
 from compgen.effects import catalogue
 from compgen.kinematics.exact_chain import tip_position
 

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Drawable, Overview, Panel, shortened
 from compgen.data.error_table import ErrorTable
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.data.toml_files import option
+from compgen.drawing.display import Drawable, Overview, Panel, shortened
 from compgen.errors import ConvergenceError, InputError, nearest
 from compgen.fitting.smoother import Method, Smoother
 from compgen.fitting.zeroing import FrameChange

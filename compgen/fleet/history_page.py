@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from compgen.data.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.data.files import OutputFolder
 from compgen.data.names import COVERAGE
+from compgen.drawing.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
 from compgen.report.html.pictures import describe_error
 from compgen.report.html.write import page_environment
@@ -24,7 +24,7 @@ def history_page(drift: Drift, language: str = LANGUAGES[0]) -> str:
     style, _, policy = page_assets()
     pictures = draw_history(drift)
     if language != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         pictures = [texts_of(language).picture(item) for item in pictures]
     return environment.get_template("history.html.j2").render(

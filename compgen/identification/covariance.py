@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.files import read_bytes, sha256_of
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import CompgenWarning, InputError
 from compgen.identification.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
 from compgen.identification.adjust.unknowns import ErrorParameters

@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Drawable, Overview, Panel, PlottedLine
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES
 from compgen.data.prior import DETERMINED
+from compgen.drawing.display import Drawable, Overview, Panel, PlottedLine
 from compgen.errors import UndeterminedError
 from compgen.identification.adjust.propagation import Adjustment, Systematic
 from compgen.identification.adjust.residual_tests import Misfit, ResidualSeries, Whiteness, misfit_of, warn_of_residuals

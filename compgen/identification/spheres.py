@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, MM_PER_UM, SQUARENESS_NAMES
@@ -36,6 +35,7 @@ from compgen.data.rotary import (
     si_per_unit,
     unit_of,
 )
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import ConvergenceError, InputError
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 

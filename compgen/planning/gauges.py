@@ -10,17 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from compgen.data.charts import Picture, Plot, page_assets, picture_grid, rounded, svg, ticks
 from compgen.data.circles import PLANES, Circles
 from compgen.data.comparison import without_rigid_motion
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.files import json_text
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
+from compgen.drawing.charts import Picture, Plot, page_assets, picture_grid, rounded, svg, ticks
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import CompgenWarning, InputError, UndeterminedError, number_text, um_text
 from compgen.identification.adjust.determined import Determined
 from compgen.identification.adjust.unknowns import error_parameters

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.charts import Picture, Plot, page_assets, picture_grid, svg
 from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
+from compgen.drawing.charts import Picture, Plot, page_assets, picture_grid, svg
 from compgen.errors import um_text
 from compgen.identification.adjust.determined import Observations
 from compgen.identification.adjust.unknowns import ErrorParameters

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from compgen.data.arguments import of_kind
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Drawable, Overview, Panel
 from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.data.records import approach_of
+from compgen.drawing.display import Drawable, Overview, Panel
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.all_effects import INVISIBLE, Pair, VisiblePart, alike_pairs, separating, visible_parts
 from compgen.effects.structure import SignError, Squareness

@@ -1540,7 +1540,7 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
         folder.add(CORRECTION_FILE, json_text({**result.as_dict(), "sha256": sha256_of_file(final)}))
         listed = preflight(result)
         if language != LANGUAGES[0]:
-            from compgen.data.language import texts_of, wrapped
+            from compgen.language import texts_of, wrapped
 
             listed = wrapped(texts_of(language).lines(listed))
         folder.add(PREFLIGHT_FILE, listed)

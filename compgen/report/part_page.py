@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from compgen.data.charts import page_assets, rounded
 from compgen.data.names import MM_PER_UM
+from compgen.drawing.charts import page_assets, rounded
 from compgen.programs.part import VARIANTS, PartPrediction, columns_of
 from compgen.report.html.write import page_environment, script_data
 from compgen.resources import LANGUAGES

@@ -16,11 +16,11 @@ from compgen.accuracy.field import Figure
 from compgen.accuracy.positioning import EDITIONS
 from compgen.accuracy.sides import Side
 from compgen.data.axis_runs import AxisRuns
-from compgen.data.charts import DASHED, Picture, Plot, legend, limits_of, page_assets, svg
 from compgen.data.circles import PLANES, Circles, arcs_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
+from compgen.drawing.charts import DASHED, Picture, Plot, legend, limits_of, page_assets, svg
 from compgen.errors import InputError
 from compgen.report.dcc.laboratory import Certificate, Condition
 from compgen.report.html.write import page_environment
@@ -113,7 +113,7 @@ def sheet_page(
             sheet["picture"] = draw_circle(name, side.circles, own)
             measured = side.circles
         if language != LANGUAGES[0]:
-            from compgen.data.language import texts_of
+            from compgen.language import texts_of
 
             sheet["picture"] = texts_of(language).picture(sheet["picture"])
         sheet["facts"] = [*facts_of(machine, certificate), *conditions_of(measured, own, certificate)]

@@ -15,11 +15,11 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
-from compgen.data.registry import Registry, call_problem, why_missing
 from compgen.effects import ANY_STATION, DisplacementEffect, Effect, catalogue, listed, readings_of_points
 from compgen.effects.active import STATION_NAME, dead_path_stations, keys_schema, read_values, station_pattern
 from compgen.errors import InputError, nearest
 from compgen.kinematics.exact_chain import tip_position
+from compgen.registry import Registry, call_problem, why_missing
 from compgen.simulation.trajectory import Stops
 
 # What simulated effects act on: the stops of the machine, and the lines of sight of the tracers.

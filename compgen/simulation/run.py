@@ -23,7 +23,6 @@ from compgen.data.axis_runs import AxisRuns, Diagonals, format_axis_runs, format
 from compgen.data.circles import Circles, format_circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, format_artefact
-from compgen.data.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable, format_errors
 from compgen.data.files import OutputFolder
 from compgen.data.length_archive import write_archive
@@ -31,12 +30,13 @@ from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import SECONDS_PER_MIN
 from compgen.data.records import ARCHIVE
-from compgen.data.registry import call_problem
 from compgen.data.rotary import RotaryErrors, SphereCentres, format_machine_errors, format_spheres
 from compgen.data.toml_files import part_setting, setting
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import InputError
 from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
+from compgen.registry import call_problem
 from compgen.simulation.effects import (
     Displacement,
     LengthEffect,

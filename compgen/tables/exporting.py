@@ -13,12 +13,12 @@ from compgen import effects
 from compgen.controls import CONTROLLERS, AnyController, SourceFile, controller_named
 from compgen.data.arguments import of_kind, text_of
 from compgen.data.csv_files import FloatArray
-from compgen.data.display import Displayed, Overview, shortened
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves, format_errors, format_reversal, reversal_name
 from compgen.data.files import REJECTED_PREFIX, OutputFolder, Provenance, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
+from compgen.drawing.display import Displayed, Overview, shortened
 from compgen.errors import CompgenWarning, InputError
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES, program_version
@@ -318,7 +318,7 @@ def with_known(exported: Export, lines: Sequence[str], language: str = LANGUAGES
     """Return the export whose preflight list says what is known of the machine, before its first step."""
     heading = "What is known of the machine"
     if language != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         heading, *lines = [texts_of(language).text(line) for line in (heading, *lines)]
     section = f"## {heading}\n\n" + "".join(f"- {line}\n" for line in lines) + "\n"

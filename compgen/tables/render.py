@@ -258,7 +258,7 @@ def _environment(folders: tuple[Path, ...], language: str = LANGUAGES[0]) -> Imm
     environment.filters["plain"] = lambda value: one_line(value)
     environment.filters |= {"word": str, "name": str}
     if language != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         texts_of(language).translate(environment, html=False)
     return environment
@@ -310,7 +310,7 @@ def render(
         message = f"the template cannot be rendered: {one_line(error)}"
         raise InputError(message, file=file or f"templates/{card.name}/{template}", line=line) from error
     if language != LANGUAGES[0]:
-        from compgen.data.language import wrapped
+        from compgen.language import wrapped
 
         text = wrapped(text)
     return text

@@ -20,12 +20,12 @@ from compgen.controls.shared.base import Monomial, Term
 from compgen.data.arguments import of_kind, paths_of, text_of
 from compgen.data.comparison import Difference, Residuals, residuals_twice, rms, small_motion
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.files import check_lines, read_bytes, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, ERROR_NAMES, MM_PER_UM, error_named
+from compgen.drawing.display import Displayed, Drawable, Overview, Panel, PlottedLine, Tabular, package, shortened
 from compgen.errors import CompgenWarning, InputError, one_line, um_text
 from compgen.identification.covariance import Covariance, covariance_or_independent, error_design, posterior_with
 from compgen.identification.posterior import Posterior, assumed_text, not_determined_um, not_measured, worse_text

@@ -1,5 +1,5 @@
 "use strict";
-// Zoom and values under the pointer for the pictures that compgen/data/charts.py draws: every figure.picture contains one
+// Zoom and values under the pointer for the pictures that compgen/drawing/charts.py draws: every figure.picture contains one
 // svg.plot with one g.axes; "data" holds the values of its curves or cells by the figure's key.
 (function () {
   var root = document.documentElement;

@@ -27,8 +27,8 @@ import app_site as helper
 from compgen.app import pages
 from compgen.app.pages import OpenPages
 from compgen.app.project import Step
-from compgen.fleet.dashboard import server
-from compgen.fleet.dashboard.settings import DashboardSettings
+from compgen.web import connections as server
+from compgen.web.site import LocalSite
 
 IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
 
@@ -36,7 +36,7 @@ IMPORTS = Path(__file__).resolve().parents[2] / "tests" / "golden" / "imports"
 def addresses(method):
     """Every address that answers a method, from the URL map: numbers are 1, a page of a step is its report."""
     filled = []
-    for rule in pages.make_app(pages.Workbench(DashboardSettings("", port=8765))).url_map.iter_rules():
+    for rule in pages.make_app(pages.Workbench(LocalSite(8765))).url_map.iter_rules():
         if method not in rule.methods or rule.endpoint in pages.OPEN:
             continue
         path = re.sub(r"<number[^>]*>", "1", rule.rule).replace("<path:name>", "report.html")

@@ -20,8 +20,8 @@ from compgen.app import pages, project
 from compgen.app.project import Project, Step
 from compgen.data import files
 from compgen.errors import InputError
-from compgen.fleet.dashboard.settings import DashboardSettings
 from compgen.fleet.dashboard.users import Users
+from compgen.web.site import LocalSite
 
 PITCH = b"axis,position_mm,direction,run,deviation_um\nX,-800,1,1,1\nX,0,1,1,2\n"
 posix = pytest.mark.skipif(os.name != "posix", reason="modes of files mean nothing on this system")
@@ -96,7 +96,7 @@ def test_the_private_file_is_gone_once_its_token_has_been_used(tmp_path, monkeyp
 def test_where_browsers_are_snaps_the_file_is_where_they_may_read(tmp_path, monkeypatch):
     home = tmp_path / "home"
     home.mkdir()
-    workbench = pages.Workbench(DashboardSettings("", port=8765))
+    workbench = pages.Workbench(LocalSite(8765))
     monkeypatch.setattr(pages.Path, "home", lambda: home)
     monkeypatch.setattr(pages, "SNAPS", tmp_path)
     with pages.start_file(workbench, "http://127.0.0.1:1/start?token=x") as shown:

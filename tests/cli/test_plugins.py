@@ -3,7 +3,6 @@
 import json
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,8 +11,8 @@ import pytest
 
 import compgen
 from compgen.controls import CONTROLLERS, controller_named
-from compgen.data.registry import Kind, load_entry_points, restored
 from compgen.plugins import KINDS
+from compgen.registry import Kind, load_entry_points, restored
 from compgen.simulation import EFFECTS, INSTRUMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -470,77 +469,8 @@ def test_a_further_registry_takes_one_line(tmp_path):
     shelf = {}
     kind = Kind("tool", "TOOLS", "compgen.tools", shelf, lambda name, thing: (thing, []))
     (tmp_path / "p.py").write_text("TOOLS = {'hammer': 1}\n")
-    from compgen.data.registry import load_file
+    from compgen.registry import load_file
 
     load_file(tmp_path / "p.py", (*KINDS, kind))
     assert shelf == {"hammer": 1}
     assert kind.origins == {"hammer": f"plug-in {tmp_path / 'p.py'}"}
-
-
-def test_the_former_homes_of_the_interface_still_serve_and_name_the_new_ones():
-    """A plug-in written for the version before keeps working for one minor version, with a warning."""
-    script = (
-        "import warnings\n"
-        "with warnings.catch_warnings(record=True) as told:\n"
-        "    warnings.simplefilter('always')\n"
-        "    from compgen.controllers import Controller, grids\n"
-        "    from compgen.controllers.base import coverage_violations\n"
-        "    from compgen.core import tomlio\n"
-        "from compgen.controllers.base import Controller as again\n"
-        "from compgen.data import toml_files\n"
-        "assert Controller is again and tomlio is toml_files and grids.uneven_nodes_mm and coverage_violations\n"
-        "print(*(str(item.message) for item in told), sep='\\n')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert "compgen.controllers is now compgen.controls" in done.stdout
-    assert "compgen.core.tomlio is now compgen.data.toml_files" in done.stdout
-
-
-def former(text):
-    """The tutorial's control as it was written for the former interface: methods with the machine and the settings."""
-    text = text.replace("from compgen.controls import Controller", "from compgen.controllers import Controller")
-    reader = "    def read_settings(self, machine):\n        section = machine.controller_settings(self.name)\n"
-    reader += "        return toml_files.read_settings(Settings, section)\n"
-    text = text.replace("    settings_class = Settings\n", reader)
-    text = text.replace("resolution_mm(self)", "resolution_mm(self, settings)")
-    text = re.sub(r"(    def (?!read_settings|resolution_mm)\w+\(self, )", r"\1machine, settings, ", text)
-    return text.replace("self.machine", "machine").replace("self.settings", "settings")
-
-
-@pytest.mark.filterwarnings("ignore:compgen.controllers is now:DeprecationWarning")
-@pytest.mark.parametrize("instance", ["ShopCsv", "ShopCsv()"])
-def test_a_control_of_the_former_interface_gives_the_same_files_with_a_warning(
-    tutorial, small_machine, small_errors, instance
-):
-    made, text = [], Path("shop/shop_csv.py").read_text()
-    for change in (str, lambda text: former(text).replace("ShopCsv}", f"{instance}}}")):
-        with restored(KINDS):
-            path = Path("shop") / f"shop_{len(made)}.py"
-            path.write_text(change(text))
-            if made:
-                with pytest.warns(DeprecationWarning, match="'shop-csv' has the interface of compgen.controllers"):
-                    compgen.load_plugins([path], installed=False)
-            else:
-                compgen.load_plugins([path], installed=False)
-            made.append(compgen.export(small_machine, small_errors, "shop-csv").files)
-    assert made[0] == made[1]
-    assert "END" in made[0]["SHOP.CSV"]
-
-
-@pytest.mark.filterwarnings("ignore:compgen.controllers is now:DeprecationWarning")
-@pytest.mark.parametrize(
-    ("old", "new", "texts"),
-    [
-        ("ShopCsv}", "ShopCsv}\nShopCsv.__init__ = lambda self: 1 / 0", ["ShopCsv() fails: ZeroDivisionError"]),
-        ("def parse(self, machine, settings, files)", "def parse(self, files)", ["ShopCsv.parse(files) cannot be"]),
-        ("def parse(self, machine, settings, files)", "def pars(self)", ["has no parse(machine, settings, files)"]),
-        ("    def read_settings", "    def read_it", ["has no read_settings(machine)"]),
-        ('    name = "shop-csv"', '    name = "shop-csv"\n    bidirectional = True', ["needs with_reversal(machine, "]),
-    ],
-)
-def test_a_wrong_control_of_the_former_interface_is_refused(tutorial, old, new, texts):
-    def change(text):
-        assert old in former(text)
-        return former(text).replace(old, new)
-
-    refused(shop(change), "shop_csv.py", *texts)

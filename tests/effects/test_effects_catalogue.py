@@ -11,7 +11,6 @@ import pytest
 from compgen.data.axis_runs import read_axis_runs
 from compgen.data.lengths import Points
 from compgen.data.machine import load_machine
-from compgen.data.registry import restored
 from compgen.effects import (
     active_effects,
     advice_of_effects,
@@ -24,6 +23,7 @@ from compgen.effects import (
 )
 from compgen.errors import InputError
 from compgen.plugins import KINDS
+from compgen.registry import restored
 from compgen.report.cards import catalogue_markdown
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "effects.md"

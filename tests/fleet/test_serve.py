@@ -22,12 +22,12 @@ from compgen.errors import InputError
 from compgen.fleet import decisions
 from compgen.fleet.dashboard import app as reading
 from compgen.fleet.dashboard import background
-from compgen.fleet.dashboard import guard as limits
-from compgen.fleet.dashboard import guard as sessions
 from compgen.fleet.dashboard.settings import DashboardSettings, check_settings, default_users
 from compgen.fleet.dashboard.users import Users
 from compgen.fleet.status import fleet
 from compgen.fleet.store import open_store
+from compgen.web import guard as limits
+from compgen.web import guard as sessions
 
 factory, Site, Clock = helper.factory, helper.Site, helper.Clock
 OWN, PASSWORD, PAGES, DECISIONS = helper.OWN, helper.PASSWORD, helper.PAGES, helper.DECISIONS

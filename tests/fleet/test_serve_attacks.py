@@ -16,10 +16,10 @@ import serve_site as helper
 
 from compgen.errors import InputError
 from compgen.fleet import decisions
-from compgen.fleet.dashboard import guard as limits
 from compgen.fleet.dashboard import server
-from compgen.fleet.dashboard import server as patience
 from compgen.fleet.dashboard.users import Users
+from compgen.web import connections as patience
+from compgen.web import guard as limits
 
 factory, OWN, PASSWORD, DECISIONS = helper.factory, helper.OWN, helper.PASSWORD, helper.DECISIONS
 #: How long a test waits for an answer of the server, s.

@@ -13,10 +13,10 @@ import pytest
 import compgen
 from compgen.cli import cli
 from compgen.cli.common import run_command
-from compgen.data.charts import ROLES, Plot, svg
 from compgen.data.csv_files import read_csv
 from compgen.data.error_table import format_errors
 from compgen.data.files import sha256_of
+from compgen.drawing.charts import ROLES, Plot, svg
 from compgen.errors import CompgenWarning, InputError
 from compgen.pipeline import write_all
 from compgen.report.html import FILES, build_report, write_report

@@ -16,8 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from compgen.controls import CONTROLLERS
-from compgen.data.language import LABEL, MARKER, PART, WORD, parts
 from compgen.data.toml_files import section_schema
+from compgen.language import LABEL, MARKER, PART, WORD, parts
 from compgen.simulation import INSTRUMENTS
 
 ROOT = Path(__file__).parents[2]
@@ -28,7 +28,9 @@ MODULES = (
     "accuracy/*.py", "app/*.py", "cli/common.py", "cli/accuracy_commands.py", "cli/diagnose_commands.py",
     "cli/file_commands.py",
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
-    "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py", "diagnose/*.py",
+    "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py",
+    "diagnose/*.py", "drawing/*.py",
+    "language.py", "new_machine.py", "registry.py",
     "effects/*.py", "fitting/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identification/*.py",
     "identification/adjust/*.py", "instruments/*.py", "pipeline.py", "planning/*.py", "programs/correct.py",
     "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py",
@@ -37,8 +39,8 @@ MODULES = (
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
 WITH_ERRORS = re.compile(
-    r"compgen/(accuracy|app|data|diagnose|fitting|foreign|identification|instruments|planning|programs|tables)/|"
-    r"compgen/(cli/common|cli/\w+_commands|pipeline)\.py"
+    r"compgen/(accuracy|app|data|diagnose|drawing|fitting|foreign|identification|instruments|planning|programs|tables)/|"
+    r"compgen/(cli/common|cli/\w+_commands|pipeline|language|new_machine|registry)\.py"
 )
 ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")
 #: Readers of controls' files, and modules with names of columns and keys: their texts are no sentences for people.

@@ -3,7 +3,7 @@
 import html
 import re
 
-from compgen.data.language import wrapped
+from compgen.language import wrapped
 
 #: Words that only an English sentence has; names and keys are taken out before.
 ENGLISH = re.compile(

@@ -15,7 +15,7 @@ from texts.reading import left_in_english, numbers, shown
 
 from compgen.cli import cli
 from compgen.cli.common import run_command
-from compgen.data.language import Texts, texts_of
+from compgen.language import Texts, texts_of
 
 ROOT = Path(__file__).resolve().parents[2]
 IMPORTS = ROOT / "tests" / "golden" / "imports"

@@ -16,8 +16,8 @@ from texts.reading import left_in_english, numbers, shown
 
 import compgen
 from compgen.controls import CONTROLLERS
-from compgen.data.language import Texts, parts, texts_of, wrapped
 from compgen.errors import InputError
+from compgen.language import Texts, parts, texts_of, wrapped
 from compgen.report.html import build_report
 from compgen.resources import LANGUAGES
 from compgen.tables import check_files

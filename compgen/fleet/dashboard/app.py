@@ -27,7 +27,7 @@ from werkzeug.exceptions import Forbidden, HTTPException
 from werkzeug.routing import IntegerConverter
 from werkzeug.wrappers import Response as BaseResponse
 
-from compgen.data.charts import LABEL
+from compgen.drawing.charts import LABEL
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import actions, decisions, logs
 from compgen.fleet.actions import NotPublishedError
@@ -45,7 +45,17 @@ from compgen.fleet.dashboard.background import (
     trend_rows,
 )
 from compgen.fleet.dashboard.charts import ErrorCache, find_table, history, proposal
-from compgen.fleet.dashboard.guard import (
+from compgen.fleet.dashboard.metrics import CONTENT_TYPE, ServeMetrics
+from compgen.fleet.dashboard.settings import DashboardSettings, check_settings
+from compgen.fleet.dashboard.users import Users
+from compgen.fleet.database import StoreError
+from compgen.fleet.job import read_job
+from compgen.fleet.recheck import format_recheck_points
+from compgen.fleet.records import DecisionRecord, MachineRecord
+from compgen.fleet.status import STATUSES, audit_page, fleet, fleet_page, machine_by_id
+from compgen.fleet.store import Store, open_store
+from compgen.resources import data_folder
+from compgen.web.guard import (
     LONGEST_S,
     LoginLimit,
     LoginTokens,
@@ -59,16 +69,6 @@ from compgen.fleet.dashboard.guard import (
     same,
     set_cookie,
 )
-from compgen.fleet.dashboard.metrics import CONTENT_TYPE, ServeMetrics
-from compgen.fleet.dashboard.settings import DashboardSettings, check_settings
-from compgen.fleet.dashboard.users import Users
-from compgen.fleet.database import StoreError
-from compgen.fleet.job import read_job
-from compgen.fleet.recheck import format_recheck_points
-from compgen.fleet.records import DecisionRecord, MachineRecord
-from compgen.fleet.status import STATUSES, audit_page, fleet, fleet_page, machine_by_id
-from compgen.fleet.store import Store, open_store
-from compgen.resources import data_folder
 
 #: Maximum length of a reason, characters.
 LONGEST_REASON = 1000

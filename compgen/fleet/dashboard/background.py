@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from compgen.data.charts import LABEL
 from compgen.data.names import COVERAGE, SQUARENESS_NAMES, error_named
+from compgen.drawing.charts import LABEL
 from compgen.errors import InputError
 from compgen.fleet import database, logs
 from compgen.fleet.dashboard.charts import Chart, ChartSeries, chart, time_ticks

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from compgen.data.charts import LABEL, tick_texts, ticks
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import sha256_of
 from compgen.data.names import COVERAGE, error_named
+from compgen.drawing.charts import LABEL, tick_texts, ticks
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import (
     OPEN,

@@ -15,11 +15,11 @@ from prometheus_client.registry import Collector
 
 from compgen.errors import CompgenError, InputError
 from compgen.fleet import logs
-from compgen.fleet.dashboard.guard import HOST
-from compgen.fleet.dashboard.settings import LOCAL_NAMES
 from compgen.fleet.records import TableState
 from compgen.fleet.status import STATUSES, fleet
 from compgen.fleet.store import Store
+from compgen.web.guard import HOST
+from compgen.web.site import LOCAL_NAMES
 
 if TYPE_CHECKING:
     from compgen.fleet.runner import MachineOutcome

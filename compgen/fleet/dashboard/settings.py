@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +12,8 @@ from pathlib import Path
 from compgen.data.files import read_text
 from compgen.data.toml_files import option
 from compgen.errors import InputError
+from compgen.web.site import LOCAL_NAMES, is_any, is_local
 
-#: Host names by which a browser on this computer reaches the dashboard.
-LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?|\[[0-9A-Fa-f:.]+\]")
 
 
@@ -61,22 +59,6 @@ class DashboardSettings:
         """Host names that a request may use, in lower case."""
         listens = () if is_any(self.host) else (f"[{self.host}]" if ":" in self.host else self.host,)
         return frozenset(name.lower() for name in (*LOCAL_NAMES, *listens, *self.names))
-
-
-def is_any(host: str) -> bool:
-    """Whether ``host`` means every address of this computer."""
-    try:
-        return ipaddress.ip_address(host).is_unspecified
-    except ValueError:
-        return host == ""
-
-
-def is_local(host: str) -> bool:
-    """Whether only this computer can reach ``host``."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def check_settings(settings: DashboardSettings) -> DashboardSettings:

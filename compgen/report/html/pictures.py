@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from compgen.data.charts import (
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import ErrorTable, hat_matrix
+from compgen.data.names import AXES, COVERAGE, error_named
+from compgen.drawing.charts import (
     BOX,
     CYCLE,
     DASHED,
@@ -24,9 +27,6 @@ from compgen.data.charts import (
     rounded,
     svg,
 )
-from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import ErrorTable, hat_matrix
-from compgen.data.names import AXES, COVERAGE, error_named
 from compgen.errors import um_text
 from compgen.kinematics.many_points import full_grid
 from compgen.report.html.folder import ReadingResiduals, TableCurve, Volume

@@ -20,11 +20,11 @@ from rich.text import Text
 
 from compgen.accuracy.evaluate import axis_figures, diagonal_figures, groups_of_errors, statements_of, volume_fields
 from compgen.accuracy.field import ErrorSource, Figure, error_source, volume_figures
-from compgen.data.charts import LABEL, Picture, page_assets
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, json_text, json_values, read_bytes, read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
+from compgen.drawing.charts import LABEL, Picture, page_assets
 from compgen.errors import CompgenError, number_text, one_line, um_text
 from compgen.identification.covariance import covariance_named_by
 from compgen.kinematics.kernel_switch import one_thread
@@ -599,7 +599,7 @@ def render_page(
     style, script, policy = page_assets("charts.js", "script.js")
     has_named = any(item["series"][-1]["name"].startswith("table ") for item in (p.data for p in pictures["curves"]))
     if language != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         pictures = {group: [texts_of(language).picture(item) for item in items] for group, items in pictures.items()}
     drawn = [picture for group in pictures.values() for picture in group]
@@ -656,7 +656,7 @@ def page_environment(kind: str, language: str = LANGUAGES[0]) -> Environment:
         "word": str,
     }
     if language != LANGUAGES[0]:
-        from compgen.data.language import texts_of
+        from compgen.language import texts_of
 
         texts_of(language).translate(environment, html=True)
     return environment

@@ -1,4 +1,4 @@
-"""Protection of the dashboard: host names, origin, headers, sessions, rate limit of logins.
+"""Protection of pages: host names, origin, headers, sessions, rate limit of logins.
 
 Flask-Login and Flask-WTF are not used for sessions because they keep them in a signed browser cookie: a copy of the
 cookie remains valid after the user logged out, logged in again or was idle too long, and a key would have to be stored.
@@ -23,7 +23,7 @@ from flask import Response as FlaskResponse
 from werkzeug.exceptions import Forbidden, HTTPException, MethodNotAllowed
 from werkzeug.wrappers import Response
 
-from compgen.fleet.dashboard.settings import DashboardSettings
+from compgen.web.site import Site
 
 HOST = re.compile(r"(?P<name>\[[0-9a-fA-F:.]+\]|[A-Za-z0-9.-]+)(:(?P<port>[0-9]{1,5}))?")
 METHODS = ("GET", "HEAD", "OPTIONS", "POST")
@@ -50,10 +50,10 @@ class Misdirected(HTTPException):
     description = "This server does not have that name; add it with --name."
 
 
-def check_host(request: Request, settings: DashboardSettings) -> None:
+def check_host(request: Request, site: Site) -> None:
     """Refuse other host names: a foreign page may point its name at this computer (DNS rebinding)."""
     found = HOST.fullmatch(request.headers.get("Host", ""))
-    if found is None or found["name"].lower() not in settings.host_names:
+    if found is None or found["name"].lower() not in site.host_names:
         raise Misdirected
 
 
@@ -63,9 +63,9 @@ def check_method(request: Request) -> None:
         raise MethodNotAllowed(METHODS)
 
 
-def check_origin(request: Request, settings: DashboardSettings) -> None:
+def check_origin(request: Request, site: Site) -> None:
     """Refuse a request that would change something unless it comes from the dashboard's pages."""
-    own = f"{settings.scheme}://{request.headers.get('Host', '')}"
+    own = f"{site.scheme}://{request.headers.get('Host', '')}"
     origin = request.headers.get("Origin")
     if origin is None:
         referrer = request.headers.get("Referer", "")
@@ -74,26 +74,24 @@ def check_origin(request: Request, settings: DashboardSettings) -> None:
         raise Forbidden("This request does not come from a page of this dashboard.")
 
 
-def add_headers(response: Response, settings: DashboardSettings) -> None:
+def add_headers(response: Response, site: Site) -> None:
     """Add the security headers to a response."""
     for name, value in HEADERS.items():
         response.headers[name] = value
-    if settings.tls:
+    if site.tls:
         response.headers["Strict-Transport-Security"] = "max-age=31536000"
 
 
-def cookie_name(settings: DashboardSettings, name: str) -> str:
+def cookie_name(site: Site, name: str) -> str:
     """Return the name of a cookie; over HTTPS a name that browsers bind to this host."""
-    return f"__Host-compgen-{name}" if settings.tls else f"compgen-{settings.port}-{name}"
+    return f"__Host-compgen-{name}" if site.tls else f"compgen-{site.port}-{name}"
 
 
-def set_cookie(
-    response: Response, settings: DashboardSettings, name: str, value: str, seconds: int | None = None
-) -> None:
+def set_cookie(response: Response, site: Site, name: str, value: str, seconds: int | None = None) -> None:
     """Set a cookie that scripts cannot read and other sites cannot send; an empty value removes it."""
     age = seconds if value else 0
-    full = cookie_name(settings, name)
-    response.set_cookie(full, value, max_age=age, secure=settings.tls, httponly=True, samesite="Strict", path="/")
+    full = cookie_name(site, name)
+    response.set_cookie(full, value, max_age=age, secure=site.tls, httponly=True, samesite="Strict", path="/")
 
 
 # --- sessions ------------------------------------------------------------------------------------------------------

@@ -3,9 +3,9 @@
 import pytest
 
 from compgen.data.machine import CHAINS, parse_machine
-from compgen.data.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.data.prior import class_named
 from compgen.errors import InputError
+from compgen.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from jinja2 import BaseLoader, Environment
 
-    from compgen.data.charts import Picture
+    from compgen.drawing.charts import Picture
 
 #: Context of single words in the catalogue. They are translated only where a page shows them as a word, because a word in a
 #: text may be a key or a value that has to be typed as it is (``sign = "error"``).
