@@ -73,6 +73,9 @@ _COMMANDS = {
     "heat_commands": {
         "heat": "Learn how heat moves the tool, from days of drift; judged on days left out.",
     },
+    "log_commands": {
+        "log": "Write temperatures to a file while one measures: OPC UA, MTConnect, LinuxCNC, loggers.",
+    },
     "app_commands": {
         "app": "Open the workbench in the browser: from files to checked tables without a command line.",
     },
