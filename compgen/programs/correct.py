@@ -1101,6 +1101,7 @@ class _ReadBack:
     reader: Reader
     follower: Follower
     step_mm: float
+    tolerance_mm: float
     least_mm: float
     before: PathFigures = field(default_factory=PathFigures)
     after: PathFigures = field(default_factory=PathFigures)
@@ -1136,7 +1137,9 @@ class _ReadBack:
         self.travel.add(path.moves, expected_path.moves, expected_origin, text, self.lines + 1)
         self.lines += len(origins)
         contour, wanted = wanted, path.moves
-        ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
+        ended = np.zeros((len(wanted), 3))
+        if self.model.by_direction:
+            ended = kept_directions(directions_at(wanted, np.full(len(wanted), 1.0 - 1e-7)), self.direction)
         directions = np.vstack([self.direction, ended[:-1]])[: len(wanted)], ended
         if len(wanted):
             self.direction = ended[-1]
@@ -1189,7 +1192,7 @@ class _ReadBack:
         self._add(self.after, wanted, rows, arcs, shares, (still, still))
 
     def _note_unplaced(self, wanted: Moves) -> None:
-        ends = wanted.cutting & (wanted.at_mm == wanted.end_mm).all(axis=1)
+        ends = wanted.cutting & wanted.corrected_there
         for k, axis in enumerate(AXES):
             lines = wanted.line[ends & ~wanted.corrected[:, k]]
             if len(lines):
@@ -1238,7 +1241,7 @@ class _ReadBack:
         """Hold the ends of moves at feed against the commands that were meant; of a cycle the depth of each hole."""
         rows, along = np.arange(len(wanted)), np.where(drilled, wanted.plane, 2)
         deep = wanted.end_mm[rows, along] < wanted.start_mm[rows, along]
-        deep &= (wanted.at_mm == wanted.end_mm).all(axis=1)
+        deep &= wanted.corrected_there
         meant = wanted.corrected & (~drilled | (deep & wanted.corrected[rows, along]))[:, None]
         off = np.where(meant[owner], np.nan_to_num(np.abs(read.end_mm - command_mm), nan=np.inf), 0.0)
         worst = np.flatnonzero((off > self.least_mm).any(axis=1))
@@ -1258,7 +1261,8 @@ class _ReadBack:
         shares: tuple[FloatArray, FloatArray],
         directions: tuple[FloatArray, FloatArray],
     ) -> None:
-        for found in path_deviations(self.model, self.step_mm, wanted, owner, driven, shares, directions):
+        within_mm = 0.5 * self.tolerance_mm
+        for found in path_deviations(self.model, self.step_mm, wanted, owner, driven, shares, directions, within_mm):
             figures.add(found)
 
     def _owners(self, wanted: Moves, rows: Any, read: Moves, origin: Any) -> tuple[Any, FloatArray, FloatArray]:
@@ -1430,7 +1434,13 @@ def correct_program(  # noqa: PLR0913  (options by keyword)
     follower = Follower(dialect.name, reader.setup, model.machine)
     rounding_mm = 3.0 * max(10.0 ** -decimals[0], MM_PER_INCH * 10.0 ** -decimals[1])
     check = _ReadBack(
-        model, again, follower, 2.0 * corrector.step_mm, rounding_mm + corrector.tolerance_mm, follow=follow
+        model,
+        again,
+        follower,
+        2.0 * corrector.step_mm,
+        corrector.tolerance_mm,
+        rounding_mm + corrector.tolerance_mm,
+        follow=follow,
     )
     again.travel_slack_mm = 10.0
     blocks, in_cycle = 0, False

@@ -132,7 +132,7 @@ def _runs(dialect: str, *, pointed: bool = False) -> re.Pattern[str]:
     place = (
         rf"(?:[XYZ{'' if straight else 'IJKR'}][+-]?{number}|[FS][+-]?(?:\d++\.?\d*+|\.\d++)|M0?[345789](?![\d.]))[ ]*+"
     )
-    head = rf"(?:N\d++[ ]*+)?(?:G0?[0-{1 if straight else 3}](?![\d.])[ ]*+)?"
+    head = rf"(?:N\d++[ ]*+)?(?:G(?:0?[0-{1 if straight else 3}]|9[01])(?![\d.])[ ]*+)*+"
     tail = rf"(?:[*;][ ]*+)?(?:(?:{_COMMENTS.get(dialect, _OTHER_COMMENTS)})[ ]*+)*+"
     return re.compile(rf"(?:^{head}(?:{place})*+{tail}\r?\n)+", re.MULTILINE | re.IGNORECASE)
 
@@ -141,13 +141,25 @@ _BLANK_LETTERS = bytes(32 if chr(k).isalpha() or chr(k) in "*;" else k for k in 
 _COLUMN_OF = np.array([b"XYZIJKR".find(bytes([k])) for k in range(256)])
 
 
-def _places(given_mm: FloatArray, at: FloatArray, zero: FloatArray, *, relative: bool) -> FloatArray:
-    """Places (n + 1, 3) before the first block and after each, from the numbers (n, 3) of the blocks."""
-    if relative:
-        return np.cumsum(np.vstack([at, np.nan_to_num(given_mm)]), axis=0)
-    every = np.vstack([at, given_mm + zero])
+def _places(given_mm: FloatArray, at: FloatArray, zero: FloatArray, relative: NDArray[np.bool_]) -> FloatArray:
+    """Places (n + 1, 3) before the first block and after each, from the numbers (n, 3) of the blocks.
+
+    An axis is where its last number in absolute says, or where it was at first, and by all increments since then farther.
+    """
+    every = np.vstack([at, np.where(relative[:, None], np.nan, given_mm + zero)])
     last = np.maximum.accumulate(np.where(np.isnan(every), 0, np.arange(len(every))[:, None]))
-    return np.take_along_axis(every, last, axis=0)
+    found = np.take_along_axis(every, last, axis=0)
+    if relative.any():
+        steps = np.where(relative[:, None], np.nan_to_num(given_mm), 0.0)
+        way = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+        found += way - np.take_along_axis(way, last, axis=0)
+    return found
+
+
+def _carried(given: IntArray, before: int) -> IntArray:
+    """The last of some modal numbers at each block, -1 where a block gives none; ``before`` that at the first."""
+    last = np.maximum.accumulate(np.where(given >= 0, np.arange(1, len(given) + 1), 0))
+    return np.asarray(np.append(before, given)[last])
 
 
 # What the codes of each dialect do to a position, with a number. A code that is not here does nothing to it.
@@ -678,7 +690,7 @@ class Follower:
     # Moves.
 
     def _run(self, text: str, numbers: IntArray) -> Moves | None:
-        """Follow many blocks that have nothing but numbers of places and G0 to G3; None if that cannot be done now."""
+        """Follow many blocks that have nothing but numbers of places, G0 to G3, G90 and G91; None if that cannot be done now."""
         at, zero, before = np.array(self.at), np.array([self._zero(k) for k in range(3)]), self.motion
         blocked = self.series is not None or self.modally or self.done or before is None
         blocked = blocked or self.beside not in (_FREE, _BESIDE)
@@ -697,10 +709,11 @@ class Follower:
         given = np.full((len(numbers), 7), np.nan)
         column = _COLUMN_OF[name]
         given[line[column >= 0], column[column >= 0]] = value[column >= 0]
-        own = np.full(len(numbers), -1)
-        own[line[name == ord("G")]] = value[name == ord("G")]
-        motion = np.append(before, own)[np.maximum.accumulate(np.where(own >= 0, np.arange(1, len(own) + 1), 0))]
-        place = _places(given[:, :3] * self.unit, at, zero, relative=self.relative)
+        own, mode = np.full((2, len(numbers)), -1)
+        goes, selects = ((name == ord("G")) & found for found in (value < 90.0, value >= 90.0))
+        own[line[goes]], mode[line[selects]] = value[goes], value[selects] - 90.0
+        motion, relative = _carried(own, before), _carried(mode, int(self.relative)) > 0
+        place = _places(given[:, :3] * self.unit, at, zero, relative)
         moving, centred = ~np.isnan(given[:, :3]).all(axis=1), ~np.isnan(given[:, 3:6]).all(axis=1)
         rows = np.flatnonzero(moving | (centred & (motion >= CW)))
         start, end = place[:-1][rows], place[1:][rows]
@@ -711,6 +724,7 @@ class Follower:
                 motion[rows][arcs], start[arcs], end[arcs], given[rows[arcs], 3:], zero
             )
         self.at, self.motion, self.moved = place[-1].tolist(), int(motion[-1]), self.moved or len(rows) > 0
+        self.relative = bool(relative[-1])
         turned = motion[own >= CW]
         self.turned = int(turned[-1]) if len(turned) else self.turned
         same = [np.broadcast_to(np.array(one), end.shape) for one in (zero, self._tool(), np.ones(3, dtype=bool))]
@@ -1552,6 +1566,7 @@ class KlartextFollower(Follower):
 
 #: Characters of a program, and blocks of one with calls, that are followed at a time.
 _AT_A_TIME, _BLOCKS_AT_A_TIME = 1 << 18, 8192
+_CALLS = re.compile(rb"[Mm][^\S\n+]*+\+?[^\S\n]*+0*+9[78]")
 
 
 def executed(source: Path, dialect: str, *, skip_deleted: bool = False) -> Iterator[tuple[str, Sequence[int]]]:
@@ -1576,7 +1591,10 @@ def executed(source: Path, dialect: str, *, skip_deleted: bool = False) -> Itera
 
 def _may_call(source: Path) -> bool:
     with source.open("rb") as stream:
-        return any(b"9" in line and re.search(rb"M[\s+]*0*9[78]", line, re.IGNORECASE) for line in stream)
+        while part := stream.readlines(_AT_A_TIME):
+            if _CALLS.search(b"".join(part)):
+                return True
+    return False
 
 
 def _with_calls(lines: Sequence[str], dialect: str, skip_deleted: bool) -> Iterator[tuple[int, str]]:

@@ -20,6 +20,7 @@ from compgen.errors import InputError
 from compgen.identification.covariance import Covariance, error_design, posterior_with
 from compgen.identification.posterior import Posterior, assumed_text, open_shares, worse_text
 from compgen.kinematics.many_points import full_grid
+from compgen.programs.bends import Bends
 from compgen.programs.compensation import centre_path, unknown_radius
 from compgen.programs.correct import CorrectOptions, ProgramCorrection, correct_program
 from compgen.programs.dialects import dialect_named
@@ -75,6 +76,16 @@ class CompensatedModel(ExactModel):
         tool = np.broadcast_to(tool_mm, position_mm.shape)
         added = self.tables.correction(self.machine, Points(position_mm, tool_mm=tool, approach=direction))
         return np.asarray(added + super().error(position_mm + added, tool_mm, direction, taken_up))
+
+    @property
+    def by_direction(self) -> bool:
+        """Tables may act in one direction of travel."""
+        return self.tables is not None or super().by_direction
+
+    @functools.cached_property
+    def bends(self) -> Bends | None:
+        """Tables have nodes of their own."""
+        return super().bends if self.tables is None else None
 
     def bend(self) -> float:
         """Add half the range of the slope of the tables, on nine lines along each axis."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, error_named
 from compgen.errors import ConvergenceError
 from compgen.kinematics import exact_error
+from compgen.programs.bends import Bends
 
 if TYPE_CHECKING:
     from compgen.heat import Growth
@@ -29,7 +31,20 @@ PLANE_AXES = ((1, 2), (2, 0), (0, 1))
 #: The inverse is repeated until commands would change by less, mm.
 CONVERGED_MM = 1e-9
 _MOST_STEPS, _MOST_SAMPLES = 30, 200_000
+#: A move is divided where the correction is off its chord by more than this part of the tolerance at a sample.
+_DIVIDED = 0.7
 _FIRST, _SECOND = np.array(PLANE_AXES).T
+
+
+def in_all(found: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether all three of (n, 3) are true; faster than ``all(axis=1)``, which treats each row by itself."""
+    return np.asarray(found[:, 0] & found[:, 1] & found[:, 2])
+
+
+def sizes(vectors: FloatArray) -> FloatArray:
+    """Lengths (n,) of vectors (n, 3), as ``numpy.linalg.norm`` has them, and faster."""
+    x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 @dataclass(frozen=True)
@@ -69,6 +84,11 @@ class Moves:
     def cutting(self) -> NDArray[np.bool_]:
         """Which moves are at feed."""
         return np.asarray(self.kind != RAPID)
+
+    @property
+    def corrected_there(self) -> NDArray[np.bool_]:
+        """Which moves are corrected by what the model says at their end; others are strokes of a hole."""
+        return in_all(self.at_mm == self.end_mm)
 
     def part(self, rows: Any) -> Moves:
         """Return the moves of ``rows``."""
@@ -141,13 +161,28 @@ class ExactModel:
             last = change
         raise ConvergenceError("the errors change too fast along the axes to be corrected; check the errors file")
 
+    @property
+    def lever_mm(self) -> float:
+        """The longest lever at which a rotation acts."""
+        reach_mm = float(np.linalg.norm([max(map(abs, axis.range_mm)) for axis in self.machine.axes]))
+        return reach_mm + float(np.linalg.norm(self.machine.tool_offset_mm)) + 300.0
+
+    @property
+    def by_direction(self) -> bool:
+        """Whether the error depends on the direction of travel."""
+        return self.reversal is not None
+
+    @cached_property
+    def bends(self) -> Bends | None:
+        """What bends the error along a move; None if that is not known."""
+        return Bends.of(self.errors, self.reversal, self.lever_mm)
+
     def bend(self) -> float:
         """Return half the range of the slope of the error along any line in the volume, an upper bound, mm per mm.
 
         Over a length l, the error is within bend * l / 2 of the straight line between its ends.
         """
-        lever_mm = float(np.linalg.norm([max(map(abs, axis.range_mm)) for axis in self.machine.axes]))
-        lever_mm += float(np.linalg.norm(self.machine.tool_offset_mm)) + 300.0
+        lever_mm = self.lever_mm
         total = 0.0
         for name, curve in self.errors.curves.items():
             # beyond its ends a curve is constant
@@ -159,9 +194,38 @@ class ExactModel:
         return total
 
 
+def _bent(model: ExactModel, moves: Moves, command_mm: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Moves for which a bound of the bend is known, and bounds (m,) of what nodes and what levers bend, mm.
+
+    ``command_mm`` (n, 3) are those at the ends of the moves: the curves count at commands, not where the tool is.
+    """
+    bends = model.bends
+    if bends is None:
+        return np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0)
+    known = in_all(moves.corrected) & (moves.phase == PLAIN) & in_all(np.isfinite(command_mm + moves.start_mm))
+    rows = np.flatnonzero(known)
+    some = moves.part(rows)
+    start, end, length = some.start_mm, some.end_mm, lengths_of(some)
+    way, low, high = np.abs(end - start), np.minimum(start, end), np.maximum(start, end)
+    arcs = np.flatnonzero(some.sweep_rad)
+    if len(arcs):
+        own, index = some.part(arcs), np.arange(len(arcs))
+        radius = np.maximum(*_radii(own))
+        for axis in (_FIRST[own.plane], _SECOND[own.plane]):
+            middle = own.centre_mm[index, axis]
+            low[arcs, axis], high[arcs, axis], way[arcs, axis] = middle - radius, middle + radius, length[arcs]
+    margin = np.abs(command_mm[rows] - end) + bends.change * length[:, None]
+    return rows, *bends.parts(low - margin, high + margin, way, length)
+
+
+def _parts_needed(nodes: FloatArray, levers: FloatArray, within_mm: float) -> FloatArray:
+    """Into how many parts moves are divided so that each bends by less: nodes by the number of parts less, levers by its square."""
+    return np.asarray(np.ceil(np.maximum(2.0 * nodes / within_mm, np.sqrt(2.0 * levers / within_mm)) - 1e-6))
+
+
 def lengths_of(moves: Moves) -> FloatArray:
     """Return the length of each move, (n,), mm; a helix by its angle and rise."""
-    straight = np.linalg.norm(moves.end_mm - moves.start_mm, axis=1)
+    straight = sizes(moves.end_mm - moves.start_mm)
     rows = np.flatnonzero(moves.sweep_rad)
     if len(rows):
         arcs = moves.part(rows)
@@ -304,7 +368,7 @@ def closest_offset(moves: Moves, own: IntArray, points_mm: FloatArray, fraction:
         angle = (np.arctan2(v, u) - np.arctan2(v0, u0)) / arcs.sweep_rad
         turn = 2.0 * np.pi / np.abs(arcs.sweep_rad)
         share[rows] = angle + turn * np.round((fraction[rows] - angle) / turn)
-    peck = (moves.at_mm != moves.end_mm).any(axis=1).take(own)
+    peck = (~moves.corrected_there).take(own)
     return points_mm - points_of(moves, np.where(peck, share, np.clip(share, 0.0, 1.0)), own)
 
 
@@ -352,9 +416,11 @@ class Corrector:
         ``by_radius`` (n,) are arcs that are programmed with a radius, ``drilled`` (n,) moves of a cycle, which stay whole.
         """
         one = np.ones(len(moves))
-        began = kept_directions(directions_at(moves, 1e-7 * one), self.direction)
-        ended = kept_directions(directions_at(moves, one - 1e-7), self.direction)
-        before = np.vstack([self.direction, ended[:-1]])
+        began = ended = np.zeros((len(moves), 3))
+        if self.model.by_direction:
+            began = kept_directions(directions_at(moves, 1e-7 * one), self.direction)
+            ended = kept_directions(directions_at(moves, one - 1e-7), self.direction)
+        before = np.vstack([self.direction, ended[:-1]])[: len(moves)]
         if len(moves):
             self.direction = ended[-1]
         compensated = moves.phase != PLAIN
@@ -363,11 +429,12 @@ class Corrector:
         command = self._ends(moves, ended)
         begin = np.vstack([self.command_mm, command[:-1]])[: len(moves)]
         self.command_mm = command[-1] if len(moves) else self.command_mm
-        divisible = ~drilled & moves.cutting & moves.corrected.any(axis=1) & (moves.at_mm == moves.end_mm).all(axis=1)
+        divisible = ~drilled & moves.cutting & moves.corrected.any(axis=1) & moves.corrected_there
         divisible &= ~compensated | (moves.phase == CONTOUR)
         turned: NDArray[np.bool_] = np.zeros(len(moves), dtype=bool)
         if self.model.reversal is not None:
             turned = np.asarray(((began * before) < 0).any(axis=1)) & ~compensated
+        divisible &= (moves.sweep_rad != 0) | turned | self._may_bend(moves, command)
         lines = np.flatnonzero(divisible & (moves.sweep_rad == 0))
         samples = np.ceil(lengths_of(moves.part(lines)) / self.step_mm).astype(np.int64) + 1
         inner = [self._straight(moves, lines[part], ended, turned, (begin, command)) for part in _portions(samples)]
@@ -383,6 +450,16 @@ class Corrector:
         joined = [np.concatenate([getattr(part, name) for part in every]) for name in Pieces.__dataclass_fields__]
         order = np.lexsort((joined[1], joined[0]))
         return Pieces(*(item[order] for item in joined))
+
+    def _may_bend(self, moves: Moves, command: FloatArray) -> NDArray[np.bool_]:
+        """Which straight moves the error may bend by so much that they are divided; True where no bound is known.
+
+        ``command`` are those at their ends: the curves that a move crosses are those at its commands.
+        """
+        rows, nodes, levers = _bent(self.model, moves, command)
+        found = np.ones(len(moves), dtype=bool)
+        found[rows] = nodes + levers > _DIVIDED * self.tolerance_mm
+        return found
 
     def _ends(self, moves: Moves, direction: FloatArray) -> FloatArray:
         """Commands for the ends of moves (n, 3); of contours with radius compensation so that the tool centre is right.
@@ -473,8 +550,8 @@ class Corrector:
             across = target - chord
             # the corner of a contour may be farther along its lines than what is right within them
             across -= np.einsum("ij,ij->i", across, along)[:, None] * along
-            off = np.where(breaks, 0.0, np.linalg.norm(across, axis=1))
-            new = (off > 0.7 * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
+            off = np.where(breaks, 0.0, sizes(across))
+            new = (off > _DIVIDED * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
             if not new.any():
                 break
             breaks[new] = True
@@ -497,12 +574,15 @@ class Corrector:
         """
         done: list[tuple[Any, ...]] = []
         length, work = lengths_of(moves), self._cuts(moves, rows, turned)
+        most = length / self.step_mm
+        known, nodes, levers = _bent(self.model, moves.part(rows), ends[1][rows])
+        most[rows[known]] = np.minimum(most[rows[known]], _parts_needed(nodes, levers, 0.25 * self.tolerance_mm))
         while len(work):  # all arcs at a time, then the halves of those that do not follow
             again = []
             # each arc has as many samples as its own length and angle need, in steps of a factor of two
             move, share = work[:, 0].astype(np.int64), work[:, 2] - work[:, 1]
             least = np.where(share * np.abs(moves.sweep_rad[move]) > 0.5 * np.pi + 1e-6, 16, 8)
-            needed = np.clip(share * length[move] / self.step_mm, least, 2048)
+            needed = np.clip(share * most[move], least, 2048)
             steps = 2 ** np.ceil(np.log2(needed)).astype(np.int64)
             for count in np.unique(steps).tolist():
                 for some in _portions(steps[steps == count]):
@@ -534,10 +614,11 @@ class Corrector:
         share[:, -1] = high
         many = np.repeat(move, steps + 1)
         wanted = points_of(moves, share.ravel(), many)
-        middle = directions_at(moves.part(move), 0.5 * (low + high))
-        contour = moves.phase[move] == CONTOUR
-        known = (middle != 0) | contour[:, None]
-        direction = np.where(known, np.where(contour[:, None], 0.0, middle), ended[move])
+        contour, direction = moves.phase[move] == CONTOUR, ended[move]
+        if self.model.by_direction:
+            middle = directions_at(moves.part(move), 0.5 * (low + high))
+            known = (middle != 0) | contour[:, None]
+            direction = np.where(known, np.where(contour[:, None], 0.0, middle), direction)
         target = self._commands(moves, many, wanted, np.repeat(direction, steps + 1, axis=0))
         sweep = (high - low) * moves.sweep_rad[move]
         target = target.reshape(len(move), steps + 1, 3)
@@ -555,7 +636,7 @@ class Corrector:
         wide |= gap > max(0.25 * self.resolution_mm, 0.2 * self.tolerance_mm)
         wide |= ~is_closed(sweep) & (np.abs(sweep) > np.pi) & (chord < 50.0 * self.resolution_mm)
         short = (high - low) * length[move] < 2.0 * self._shortest(moves.part(move))
-        fine = still | ((off <= 0.7 * self.tolerance_mm) & ~wide) | short
+        fine = still | ((off <= _DIVIDED * self.tolerance_mm) & ~wide) | short
         if self.model.reversal is not None:
             # the slack of an axis that has turned is taken up within a short arc, from where the piece before it ended
             arcs = moves.part(move)
@@ -723,6 +804,19 @@ def _slack_taken_up(
     return found
 
 
+#: Samples of a move at least, and of a quarter turn where the error itself would need fewer.
+_LEAST_SAMPLES, _IN_A_QUARTER = 2, 8
+
+
+def _samples_needed(model: ExactModel, driven: Moves, within_mm: float) -> FloatArray:
+    """How many samples each move needs (n,), so that the error is within this of what is between them; inf if not known."""
+    found = np.full(len(driven), np.inf)
+    rows, nodes, levers = _bent(model, driven, driven.end_mm)
+    quarters = np.abs(driven.sweep_rad[rows]) / (0.5 * np.pi)
+    found[rows] = np.maximum(_parts_needed(nodes, levers, within_mm), np.ceil(_IN_A_QUARTER * quarters - 1e-6))
+    return found
+
+
 def path_deviations(
     model: ExactModel,
     step_mm: float,
@@ -731,19 +825,24 @@ def path_deviations(
     driven: Moves,
     shares: tuple[FloatArray, FloatArray],
     directions: tuple[FloatArray, FloatArray],
+    within_mm: float = 0.0,
 ) -> Iterator[PathDeviations]:
     """Sample moves that are driven and compare the tool there with the moves that are wanted.
 
     Parameters
     ----------
     model, step_mm : the machine, and the distance of samples.
+    within_mm : fewer samples where the error is known to be within this of what is between them.
     wanted, directions : moves of the program, and the directions of the axes before each and at its end.
     owner, shares : for each driven move the wanted one, and the shares of that at which it begins and ends.
     driven : the moves at feed that the machine executes.
     """
     (low, high), (before, ended) = shares, directions
-    length = lengths_of(driven)
-    count = np.clip(np.ceil(length / step_mm), 2, 2000).astype(np.int64)
+    length, ends = lengths_of(driven), wanted.corrected_there
+    count = np.ceil(length / step_mm)
+    if within_mm:
+        count = np.minimum(count, _samples_needed(model, driven, within_mm))
+    count = np.clip(count, _LEAST_SAMPLES, 2000).astype(np.int64)
     for part in _portions(count):
         own = np.repeat(part, count[part])
         begin = np.repeat(np.cumsum(count[part]) - count[part], count[part])
@@ -766,7 +865,7 @@ def path_deviations(
         actual = at + model.error(at, wanted.tool_mm.take(path, axis=0), direction, taken_up)
         whole, normal = actual - points_of(wanted, where, path), closest_offset(wanted, path, actual, where)
         # on a steep helix the point at the same angle may be farther away than that at the same share
-        nearer = np.linalg.norm(whole, axis=1) < np.linalg.norm(normal, axis=1)
+        nearer = sizes(whole) < sizes(normal)
         yield PathDeviations(
             wanted.line[path],
             at,
@@ -774,7 +873,7 @@ def path_deviations(
             np.where(nearer[:, None], whole, normal),
             length[own] / count[own],
             # the end of a peck is none of the part
-            (share == 1.0) & (high[own] == 1.0) & (wanted.at_mm == wanted.end_mm).all(axis=1)[path],
+            (share == 1.0) & (high[own] == 1.0) & ends[path],
         )
 
 
@@ -797,7 +896,7 @@ class PathFigures:
 
     def add(self, found: PathDeviations) -> None:
         """Add the deviations of some samples."""
-        size, across = np.linalg.norm(found.whole_mm, axis=1), np.linalg.norm(found.normal_mm, axis=1)
+        size, across = sizes(found.whole_mm), sizes(found.normal_mm)
         worst = int(np.argmax(size))
         if size[worst] > self.largest_mm:
             self.largest_mm, self.line = float(size[worst]), int(found.line[worst])
