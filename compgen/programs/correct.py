@@ -993,25 +993,36 @@ class _Edits:
 
     def applied(self, text: str) -> str:
         """Return the edited text."""
-        parts: list[str] = []
-        at = 0
-        for start, stop, new in zip(self.starts, self.stops, self.texts, strict=True):
-            parts += text[at:start], new
-            at = stop
-        return "".join([*parts, text[at:]])
+        parts = [""] * (2 * len(self.texts) + 1)
+        parts[::2] = [text[at:start] for at, start in zip([0, *self.stops], [*self.starts, len(text)], strict=True)]
+        parts[1::2] = self.texts
+        return "".join(parts)
 
 
 def _numbers(value: FloatArray, digits: IntArray, stripped: NDArray[np.bool_], signed: NDArray[np.bool_]) -> list[str]:
     """Write many numbers as :meth:`ProgramWriter._number` does: ``stripped`` without trailing zeros, ``signed`` with a plus."""
-    forms = [f"%.{k}f" for k in range(len(_TENS))]
+    digits = np.where(stripped, digits - _trailing_zeros(value, digits), digits)
+    forms = [f"%.{k}f" if k else "%.0f." for k in range(len(_TENS))]
     # adding 0 makes -0 a 0
     texts = ("\n".join([forms[k] for k in digits.tolist()]) % tuple((value + 0.0).tolist())).split("\n")
-    for k in np.flatnonzero(stripped).tolist():
-        texts[k] = texts[k].rstrip("0")
+    for k in np.flatnonzero(~stripped & (digits == 0)).tolist():
+        texts[k] = texts[k].rstrip(".")
     for k in np.flatnonzero(signed).tolist():
         if texts[k][0] != "-":
             texts[k] = "+" + texts[k]
     return texts if len(value) else []
+
+
+def _trailing_zeros(value: FloatArray, digits: IntArray) -> IntArray:
+    """How many of the decimals of rounded values are zeros at the end."""
+    found, scaled = np.zeros(len(value), dtype=np.int64), np.rint(np.abs(value) * _TENS[digits])
+    rows = np.flatnonzero(digits > 0)
+    while len(rows):
+        rows = rows[scaled[rows] % 10.0 == 0.0]
+        scaled[rows] /= 10.0
+        found[rows] += 1
+        rows = rows[found[rows] < digits[rows]]
+    return found
 
 
 def _joined(words: Sequence[str], before: str) -> str:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine, Vector3
 from compgen.errors import InputError
-from compgen.programs.path import CCW, CONTOUR, CW, ENTRY, EXIT, FEED, PLAIN, RAPID, STILL, IntArray, Moves
+from compgen.programs.path import CCW, CONTOUR, CW, ENTRY, EXIT, FEED, PLAIN, RAPID, STILL, IntArray, Moves, in_all
 from compgen.programs.reader import Batch, Reader, Setup
 
 Place = list[float]
@@ -1656,23 +1656,17 @@ def difference(read: Moves, followed: Moves) -> tuple[int, str] | None:
 
     Where the reader does not know a position there is nothing to differ. Moves that lead nowhere do not count.
     """
-    first, second = (moves.part(np.flatnonzero(_moving(moves))) for moves in (read, followed))
+    first, second = (moves.only(_moving(moves)) for moves in (read, followed))
     count = min(len(first), len(second))
     a, b = first.part(slice(0, count)), second.part(slice(0, count))
-    places = np.abs(np.hstack([a.end_mm - b.end_mm, a.centre_mm - b.centre_mm]))
-    off = np.where(np.isnan(np.hstack([a.end_mm, a.centre_mm])), 0.0, np.nan_to_num(places, nan=np.inf)).max(
-        axis=1, initial=0.0
-    )
-    wrong = (
-        (off > _SAME_MM)
-        | (a.kind != b.kind)
-        | (a.line != b.line)
-        | (np.abs(a.tool_mm - b.tool_mm).max(axis=1, initial=0.0) > _SAME_MM)
-    )
-    arcs = a.sweep_rad != b.sweep_rad
-    radius_mm = np.nanmax(np.abs(a.start_mm - a.centre_mm), axis=1, initial=0.0)
-    wrong |= (a.phase != b.phase) | ~np.isclose(a.aside_mm, b.aside_mm, rtol=0.0, atol=_SAME_MM)
-    wrong |= arcs & (np.abs(a.sweep_rad - b.sweep_rad) * radius_mm > _SAME_MM)
+    wrong = (a.kind != b.kind) | (a.line != b.line) | (a.phase != b.phase)
+    for mine, theirs in ((a.end_mm, b.end_mm), (a.centre_mm, b.centre_mm), (a.tool_mm, b.tool_mm)):
+        wrong |= ~in_all(np.isnan(mine) | (np.abs(mine - theirs) <= _SAME_MM))
+    wrong |= ~np.isclose(a.aside_mm, b.aside_mm, rtol=0.0, atol=_SAME_MM)
+    arcs = np.flatnonzero(a.sweep_rad != b.sweep_rad)
+    if len(arcs):
+        radius_mm = np.nanmax(np.abs(a.start_mm[arcs] - a.centre_mm[arcs]), axis=1, initial=0.0)
+        wrong[arcs] |= np.abs(a.sweep_rad[arcs] - b.sweep_rad[arcs]) * radius_mm > _SAME_MM
     if wrong.any():
         k = int(np.argmax(wrong))
         return int(a.line[k]), f"{_told(a, k)}, or {_told(b, k)}"
@@ -1683,9 +1677,8 @@ def difference(read: Moves, followed: Moves) -> tuple[int, str] | None:
 
 
 def _moving(moves: Moves) -> NDArray[np.bool_]:
-    known = ~(np.isnan(moves.start_mm) & np.isnan(moves.end_mm))
-    apart = ~(np.abs(moves.end_mm - moves.start_mm) < 1e-6)
-    return np.asarray((known & apart).any(axis=1) | (moves.sweep_rad != 0))
+    unknown = np.isnan(moves.start_mm) & np.isnan(moves.end_mm)
+    return ~in_all(unknown | (np.abs(moves.end_mm - moves.start_mm) < 1e-6)) | (moves.sweep_rad != 0)
 
 
 def _told(moves: Moves, k: int) -> str:
@@ -1713,14 +1706,14 @@ class Agreement:
 
     def hold(self, moves: Moves) -> None:
         """Take the next moves of the reader, with the lines of the file."""
-        moves = moves.part(np.flatnonzero(_moving(moves)))
+        moves = moves.only(_moving(moves))
         parts = [self._ahead]
         while sum(map(len, parts)) < len(moves):
             some = next(self._blocks, None)
             if some is None:
                 break
             found = self._follower.follow(*some)
-            parts.append(found.part(np.flatnonzero(_moving(found))))
+            parts.append(found.only(_moving(found)))
         every = Moves.joined(parts)
         self._compare(moves, every.part(slice(0, len(moves))))
         self._ahead = every.part(slice(len(moves), None))

@@ -96,10 +96,16 @@ class Moves:
             return Moves(*(getattr(self, name).take(rows, axis=0) for name in Moves.__dataclass_fields__))
         return Moves(*(getattr(self, name)[rows] for name in Moves.__dataclass_fields__))
 
+    def only(self, chosen: NDArray[np.bool_]) -> Moves:
+        """Return the moves that are chosen (n,); these themselves if all are."""
+        return self if chosen.all() else self.part(np.flatnonzero(chosen))
+
     @staticmethod
     def joined(parts: Iterable[Moves]) -> Moves:
         """Return the moves of several parts in their order."""
-        known = list(parts) or [Moves.of_rows([])]
+        known = [part for part in parts if len(part)] or [Moves.of_rows([])]
+        if len(known) == 1:
+            return known[0]
         return Moves(*(np.concatenate([getattr(p, name) for p in known]) for name in Moves.__dataclass_fields__))
 
     @staticmethod

@@ -155,6 +155,8 @@ def number_of(text: str) -> float:
 
 
 _SIDE = re.compile(rb"(?<![A-Z])G[ \t]*0*4(0|[12](?:\.1)?)(?![\d.])", re.IGNORECASE)
+#: As they are without blanks and zeros: most programs have neither.
+_MAY_TURN = re.compile(rb"G4[12]|g4[12]")
 _SIDE_KLARTEXT = re.compile(rb"(?<![A-Z0-9])R(0|[LR])(?![\w.+-])", re.IGNORECASE)
 
 
@@ -167,6 +169,8 @@ def _whole_lines(content: bytes) -> tuple[bytes, bytes]:
 def _within_contour(content: bytes, dialect: Dialect, inside: bool) -> bool:
     """Whether radius compensation is active after some lines, before which it is if ``inside``."""
     pattern = _SIDE_KLARTEXT if dialect.klartext else _SIDE
+    if not (inside or dialect.klartext or _MAY_TURN.search(content.translate(None, b" \t0"))):
+        return False
     if not inside and not any(found[1] != b"0" for found in pattern.finditer(content)):
         return False
     code = re.sub(dialect.comments.encode(), b" ", content, flags=re.IGNORECASE)
