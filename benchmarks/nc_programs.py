@@ -6,6 +6,10 @@ Programs like those of CAM: a surface finished in lines of 0.4 mm (FANUC, LinuxC
 blanks (SINUMERIK); lines, arcs and all that CAM mixes among them, increments, and, a tenth of the blocks, holes under one
 cycle and pockets of arcs and lines (LinuxCNC). The machine is the example with its
 true errors. Least of several rounds of whole processes, one thread; processor time, which other programs disturb little.
+
+Each round also times a peer on the same file: a process that does nothing but split it with numpy, letters from numbers,
+line by line, once (``PEER``). ``correct`` splits the program and what it writes twice each, and does everything else; the
+ratio of the two says more than seconds where a computer is busy or another one.
 """
 
 from __future__ import annotations
@@ -23,6 +27,18 @@ import numpy as np
 from timing import machine_line, print_table
 
 ROOT = Path(__file__).resolve().parents[1]
+PEER = """
+import sys
+import numpy as np
+blank = bytes(32 if not chr(k).isdigit() and chr(k) not in "+-." else k for k in range(256))
+total, words = 0.0, 0
+with open(sys.argv[1], "rb") as stream:
+    for line in stream:
+        numbers = np.array(line.partition(b"(")[0].translate(blank).split(), dtype=np.float64)
+        total, words = total + float(numbers.sum()), words + len(numbers)
+print(words)
+"""
+ONE_THREAD = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
 
 def surface(blocks: int, numbered: bool) -> Iterator[str]:
@@ -99,6 +115,15 @@ def holes(blocks: int) -> Iterator[str]:
     yield "G80\nM2\n"
 
 
+def peer_s(program: Path) -> float:
+    """Processor time in s of the peer on the same file."""
+    child = subprocess.Popen([sys.executable, "-c", PEER, str(program)], stdout=subprocess.DEVNULL, env=ONE_THREAD)
+    _, status, used = os.wait4(child.pid, 0)
+    if status:
+        raise RuntimeError("the peer failed")
+    return used.ru_utime + used.ru_stime
+
+
 def measured(program: Path, dialect: str, offset: str) -> tuple[float, float, float, float]:
     """Processor time in s, peak memory in MB, largest deviation before and after in um of one run."""
     words = [sys.executable, "-m", "compgen", "correct", "zha-gantry", str(program), "--dialect", dialect, "--json"]
@@ -107,7 +132,7 @@ def measured(program: Path, dialect: str, offset: str) -> tuple[float, float, fl
         child = subprocess.Popen(
             [*words, "--out", str(program.parent / "out")],
             stdout=output,
-            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env=ONE_THREAD,
         )
         _, status, used = os.wait4(child.pid, 0)
         output.seek(0)
@@ -140,14 +165,23 @@ def main() -> None:
                 stream.writelines(text())
             with program.open("rb") as stream:
                 blocks = sum(1 for _ in stream)
-            runs = [measured(program, dialect, "-400,-500,-200") for _ in range(given.rounds)]
+            runs, peers = [], []
+            for _ in range(given.rounds):  # in turn, so that both meet the same load
+                runs.append(measured(program, dialect, "-400,-500,-200"))
+                peers.append(peer_s(program))
             time_s, peak = min(run[0] for run in runs), min(run[1] for run in runs)
             rows.append(
-                [name, f"{blocks}", f"{time_s:.1f} s", f"{1e6 * time_s / blocks:.1f} us", f"{peak:.0f} MB",
+                [name, f"{blocks}", f"{time_s:.1f} s", f"{1e6 * time_s / blocks:.1f} us",
+                 f"{time_s / min(peers):.1f}", f"{peak:.0f} MB",
                  f"{runs[0][2]:.1f} um", f"{runs[0][3]:.2f} um"]
             )  # fmt: skip
     print(machine_line())
-    print_table([["program", "blocks", "processor time", "a block", "peak memory", "largest before", "after"], *rows])
+    print_table(
+        [
+            ["program", "blocks", "processor time", "a block", "of the peer", "peak memory", "largest before", "after"],
+            *rows,
+        ]
+    )
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ At a node the slope jumps, by k (mm per mm of the axis; that of w times the leve
 
     k |dq| s (1 - s)  <=  k |dq| / 4            (the node is at share s of the move)
 
-Squareness is linear in both coordinates of a plane and does not bend. What finite rotations add is smaller than these by the errors themselves,
-which ``_SLACK`` covers.
+Squareness is linear along a move and does not bend. What finite rotations add is smaller than these by the errors
+themselves, which ``_SLACK`` covers.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ class Bends:
     @staticmethod
     def of(errors: ErrorTable, reversal: ReversalCurves | None, lever_mm: float) -> Bends:
         """Return the bound for errors that no lever longer than ``lever_mm`` turns into a displacement."""
-        linear, angular = ([[], [], []], [[], [], []])
+        linear: list[list[tuple[int, Curve]]] = [[], [], []]
+        angular: list[list[tuple[int, Curve]]] = [[], [], []]
         change = sum(abs(value) for value, _ in errors.squareness.values())
         for name, curve in errors.curves.items():
             error = error_named(name)

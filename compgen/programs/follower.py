@@ -1678,7 +1678,7 @@ def difference(read: Moves, followed: Moves) -> tuple[int, str] | None:
 
 def _moving(moves: Moves) -> NDArray[np.bool_]:
     unknown = np.isnan(moves.start_mm) & np.isnan(moves.end_mm)
-    return ~in_all(unknown | (np.abs(moves.end_mm - moves.start_mm) < 1e-6)) | (moves.sweep_rad != 0)
+    return np.asarray(~in_all(unknown | (np.abs(moves.end_mm - moves.start_mm) < 1e-6)) | (moves.sweep_rad != 0))
 
 
 def _told(moves: Moves, k: int) -> str:

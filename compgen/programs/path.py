@@ -225,7 +225,7 @@ def _bent(model: ExactModel, moves: Moves, command_mm: FloatArray) -> tuple[IntA
 
 
 def _parts_needed(nodes: FloatArray, levers: FloatArray, within_mm: float) -> FloatArray:
-    """Into how many parts moves are divided so that each bends by less: nodes by the number of parts less, levers by its square."""
+    """Into how many parts moves are divided so that each bends by less: of nodes each has its share, of levers the square."""
     return np.asarray(np.ceil(np.maximum(2.0 * nodes / within_mm, np.sqrt(2.0 * levers / within_mm)) - 1e-6))
 
 
