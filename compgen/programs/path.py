@@ -810,16 +810,19 @@ def _slack_taken_up(
     return found
 
 
-#: Samples of a move at least, and of a quarter turn where the error itself would need fewer.
-_LEAST_SAMPLES, _IN_A_QUARTER = 2, 8
+#: Samples of a move at least, also of one that the error hardly bends, and of a quarter turn of such an arc.
+_LEAST_SAMPLES, _HARDLY_BENT, _IN_A_QUARTER = 2, 5, 8
 
 
 def _samples_needed(model: ExactModel, driven: Moves, within_mm: float) -> FloatArray:
     """How many samples each move needs (n,), so that the error is within this of what is between them; inf if not known."""
     found = np.full(len(driven), np.inf)
+    if model.by_direction:
+        return found  # slack has steps of its own
     rows, nodes, levers = _bent(model, driven, driven.end_mm)
     quarters = np.abs(driven.sweep_rad[rows]) / (0.5 * np.pi)
-    found[rows] = np.maximum(_parts_needed(nodes, levers, within_mm), np.ceil(_IN_A_QUARTER * quarters - 1e-6))
+    needed = np.maximum(_parts_needed(nodes, levers, within_mm), np.ceil(_IN_A_QUARTER * quarters - 1e-6)) + 1.0
+    found[rows] = np.maximum(needed, _HARDLY_BENT)
     return found
 
 
@@ -845,14 +848,15 @@ def path_deviations(
     """
     (low, high), (before, ended) = shares, directions
     length, ends = lengths_of(driven), wanted.corrected_there
-    count = np.ceil(length / step_mm)
-    if within_mm:
-        count = np.minimum(count, _samples_needed(model, driven, within_mm))
-    count = np.clip(count, _LEAST_SAMPLES, 2000).astype(np.int64)
+    count = np.clip(np.ceil(length / step_mm - 1e-6), _LEAST_SAMPLES, 2000)
+    needed = _samples_needed(model, driven, within_mm) if within_mm else count
+    from_start = needed < count  # few samples have one at the start, which else is close to the first
+    count = np.where(from_start, needed, count).astype(np.int64)
     for part in _portions(count):
         own = np.repeat(part, count[part])
         begin = np.repeat(np.cumsum(count[part]) - count[part], count[part])
-        share = (np.arange(len(own)) - begin + 1) / count[own]
+        first = from_start[own]
+        share = (np.arange(len(own)) - begin + ~first) / (count[own] - first)
         path = owner[own]
         at, direction = points_of(driven, share, own), ended.take(path, axis=0)
         where = np.clip(low[own] + share * (high - low)[own], 0.0, 1.0)
@@ -877,7 +881,7 @@ def path_deviations(
             at,
             whole,
             np.where(nearer[:, None], whole, normal),
-            length[own] / count[own],
+            length[own] / (count[own] - first) * np.where(first & ((share == 0.0) | (share == 1.0)), 0.5, 1.0),
             # the end of a peck is none of the part
             (share == 1.0) & (high[own] == 1.0) & ends[path],
         )
