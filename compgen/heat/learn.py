@@ -7,7 +7,7 @@ are those of days that nothing was learned from.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import product
 from typing import Any
 
@@ -28,6 +28,8 @@ MOST_TERMS, LAGS = 5, 8
 MOST_OF_SENSOR, LAGS_APART = 2, 3.0
 #: A further term must take this share of what is left in left-out sessions.
 WORTH = 0.05
+#: The gain of a second term of a sensor must be so many of its standard errors: two lags of a sensor stand in for each other.
+SURE = 2.0
 #: A coefficient is expected within this, um/K (a metre of steel: 11.5); readings of a session count as so many that are
 #: independent, since a drift that is wrong stays wrong for an hour.
 USUAL_UM_PER_K, INDEPENDENT = 10.0, 5.0
@@ -49,35 +51,72 @@ class Learned:
 
 @dataclass(frozen=True)
 class _Sums:
-    """Sums over each session, divided by its readings: terms with terms (s, c, c), terms with movement, movement."""
+    """Sums over each session, divided by its readings: terms with terms (s, d, c, c), terms with movement, movement.
+
+    ``middle`` and ``middle_moved`` are the means of terms and movement, ``noise`` the variance of one reading (s, d), um^2.
+    """
 
     products: FloatArray
     with_moved: FloatArray
     moved: FloatArray
+    middle: FloatArray
+    middle_moved: FloatArray
+    noise: FloatArray
+    share: FloatArray
 
     def only(self, sessions: Ints) -> _Sums:
-        return _Sums(self.products[sessions], self.with_moved[sessions], self.moved[sessions])
+        return _Sums(*(getattr(self, item.name)[sessions] for item in fields(self)))
+
+    def apart(self, left: FloatArray) -> _Sums:
+        """Take away what the noise of the first reading, from which all others count, adds to a session.
+
+        That noise is a constant of the session with the variance of one reading. Against what the model leaves, ``left``
+        (s, d), of which so many readings are independent, its best estimate is a share of the mean of the session. Without
+        it, terms that grow early in the day are learned from the noise of single readings.
+        """
+        share = INDEPENDENT * self.noise / (INDEPENDENT * self.noise + left + 1e-12)
+        return replace(self, share=share)
+
+    @property
+    def rest(self) -> FloatArray:
+        """Mean square of movement (s, d), without that share of its mean."""
+        found: FloatArray = self.moved - self.share * self.middle_moved**2
+        return found
+
+    def of(self, sets: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
+        """Sums of sets (m, k) of terms: with each other (s, d, m, k, k), and with movement (s, d, m, k)."""
+        middle = self.middle[:, :, sets]
+        share = self.share[:, :, None, None]
+        a = self.products[:, :, sets[:, :, None], sets[:, None, :]]
+        a = a - share[..., None] * middle[..., :, None] * middle[..., None, :]
+        b = self.with_moved[:, :, sets] - share * middle * self.middle_moved[:, :, None, None]
+        return a, b
 
 
 def _sums(candidates: Sequence[Term], sessions: Sequence[DriftSession], directions: Sequence[str]) -> _Sums:
     """Return the sums of all candidates, from their change since the first reading of each session."""
-    products, with_moved, moved = [], [], []
+    rows: list[list[list[Any]]] = [[] for _ in fields(_Sums)]
     for item in sessions:
         states = states_of(candidates, item.temperatures)
         states = states - states[0]
-        own_products, own_with, own = [], [], []
+        own: list[list[Any]] = [[] for _ in rows]
         for name in directions:
             y = item.moved[name]
             used = np.isfinite(y)
             a, b = states[used], _since_first(y)[used]
             n = max(len(b), 1)
-            own_products.append(a.T @ a / n)
-            own_with.append(a.T @ b / n)
-            own.append(float(b @ b) / n)
-        products.append(own_products)
-        with_moved.append(own_with)
-        moved.append(own)
-    return _Sums(np.array(products), np.array(with_moved), np.array(moved))
+            found = (a.T @ a / n, a.T @ b / n, float(b @ b) / n, a.mean(axis=0), float(b.mean()), _noise(b), 0.0)
+            for kind, value in zip(own, found, strict=True):
+                kind.append(value)
+        for kind, values in zip(rows, own, strict=True):
+            kind.append(values)
+    return _Sums(*(np.array(kind) for kind in rows))
+
+
+def _noise(moved: FloatArray) -> float:
+    """Variance of the noise of one reading, from second differences (6 times it), in which drift does not show."""
+    bends = np.diff(moved, 2)
+    return float(np.median(bends**2) / 0.4549 / 6.0) if bends.size else 0.0
 
 
 def _since_first(moved: FloatArray) -> FloatArray:
@@ -88,12 +127,11 @@ def _since_first(moved: FloatArray) -> FloatArray:
 
 def _left_out(sums: _Sums, sets: NDArray[np.int64], ridge: FloatArray) -> FloatArray:
     """Return the mean square that is left of each session when it is left out, for sets (m, k) of terms: (m, s, d)."""
-    a = sums.products[:, :, sets[:, :, None], sets[:, None, :]]  # (s, d, m, k, k)
-    b = sums.with_moved[:, :, sets]  # (s, d, m, k)
+    a, b = sums.of(sets)
     count = len(a)
     eye = (count - 1) * ridge[:, None, None, None] * np.eye(sets.shape[1])
     k = np.linalg.solve(a.sum(0) - a + eye, (b.sum(0) - b)[..., None])[..., 0]
-    left = sums.moved[:, :, None] - 2 * (k * b).sum(-1) + np.einsum("sdmi,sdmij,sdmj->sdm", k, a, k)
+    left = sums.rest[:, :, None] - 2 * (k * b).sum(-1) + np.einsum("sdmi,sdmij,sdmj->sdm", k, a, k)
     found: FloatArray = np.maximum(left, 0.0).transpose(2, 0, 1)
     return found
 
@@ -113,13 +151,23 @@ def _chosen(sums: _Sums, candidates: Sequence[Term], usable: Ints) -> tuple[list
         trials = np.array([[*chosen, c] for c in usable if _goes_with(candidates, c, chosen)], dtype=np.int64)
         if not trials.size:
             break
-        results = _left_out(sums, trials, ridge)
+        own = sums.apart(left)
+        now = _left_out(own, np.array([chosen], dtype=np.int64), ridge)[0] if chosen else own.rest
+        results = _left_out(own, trials, ridge)
         best = int(np.argmin(results.mean(1).sum(1)))
-        if results[best].mean(0).sum() > (1 - WORTH) * left.mean(0).sum():
+        again = candidates[trials[best][-1]].sensor in [candidates[k].sensor for k in chosen]
+        if not _worth(now, results[best], SURE if again else 0.0):
             break
         chosen, left = trials[best].tolist(), results[best]
         chosen, left = _exchanged(sums, candidates, usable, chosen, left)
     return chosen, float(left.mean(0).sum())
+
+
+def _worth(before: FloatArray, after: FloatArray, sure: float) -> bool:
+    """Whether left-out sessions (s, d) get better by enough, and by so many standard errors of that over the sessions."""
+    gain = (before - after).sum(1)
+    chance = float(np.std(gain, ddof=1) / np.sqrt(len(gain))) if len(gain) > 1 else 0.0
+    return bool(gain.mean() >= WORTH * before.mean(0).sum() and gain.mean() > sure * chance)
 
 
 def _goes_with(candidates: Sequence[Term], new: int, chosen: Ints) -> bool:
@@ -142,7 +190,7 @@ def _exchanged(
         if not same:
             continue
         trials = np.array([[*chosen[:place], c, *chosen[place + 1 :]] for c in same], dtype=np.int64)
-        results = _left_out(sums, trials, _ridge(left))
+        results = _left_out(sums.apart(left), trials, _ridge(left))
         best = int(np.argmin(results.mean(1).sum(1)))
         if results[best].mean(0).sum() < 0.999 * left.mean(0).sum():
             chosen, left = trials[best].tolist(), results[best]
@@ -176,8 +224,7 @@ def _best(sums: _Sums, candidates: Sequence[Term], choices: Sequence[Ints]) -> l
 
 def _fitted(sums: _Sums, chosen: Ints, ridge: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return coefficients (d, k) and their covariance (d, k, k) from the scatter between sessions."""
-    a = sums.products[:, :, chosen][:, :, :, chosen]
-    b = sums.with_moved[:, :, chosen]
+    a, b = (found[:, :, 0] for found in sums.of(np.array([chosen], dtype=np.int64)))
     count = len(a)
     inverse = np.linalg.inv(a.sum(0) + count * ridge[:, None, None] * np.eye(len(chosen)))
     k = np.einsum("dij,dj->di", inverse, b.sum(0))
@@ -253,7 +300,7 @@ def _judged(
         chosen = _best(training, candidates, choices)
         row: dict[str, Any] = {"file": item.name}
         left = training.moved if not chosen else _left_out(training, np.array([chosen]), _ridge(training.moved))[0]
-        values = _fitted(training, chosen, _ridge(left))[0] if chosen else np.zeros((len(directions), 0))
+        values = _fitted(training.apart(left), chosen, _ridge(left))[0] if chosen else np.zeros((len(directions), 0))
         terms = [candidates[c] for c in chosen]
         states = states_of(terms, item.temperatures)
         share = _share(terms, [sessions[j] for j in others], item.temperatures)
@@ -315,13 +362,14 @@ def _refined(terms: Sequence[Term], sessions: Sequence[DriftSession], directions
         return [replace(item, lag_s=lags.get(k, item.lag_s)) for k, item in enumerate(terms)]
 
     def left(logs: FloatArray) -> float:
-        sums = _sums(with_lags(logs), sessions, directions)
+        sums = _sums(with_lags(logs), sessions, directions).apart(begun)
         trial = np.arange(len(terms), dtype=np.int64)[None]
         return float(_left_out(sums, trial, ridge)[0].mean(0).sum())
 
     begin = np.log([terms[k].lag_s for k in moving])
     sums = _sums(terms, sessions, directions)
-    ridge = _ridge(_left_out(sums, np.arange(len(terms))[None], _ridge(sums.moved))[0])
+    begun = _left_out(sums, np.arange(len(terms))[None], _ridge(sums.moved))[0]
+    ridge = _ridge(begun)
     bounds = [(value - 1.0, value + 1.0) for value in begin.tolist()]
     found = minimize(left, begin, method="Powell", bounds=bounds, options={"xtol": 1e-3, "ftol": 1e-6, "maxfev": 150})
     return with_lags(found.x) if found.fun < left(begin) else list(terms)
@@ -338,6 +386,7 @@ def _model(
     sums = _sums(terms, sessions, directions)
     every = np.arange(len(terms), dtype=np.int64)
     left = _left_out(sums, every[None], _ridge(sums.moved))[0]
+    sums = sums.apart(left)
     left = _left_out(sums, every[None], _ridge(left))[0]
     k, covariance = _fitted(sums, every.tolist(), _ridge(left))
     numbers = {name: k[directions.index(name)] for name in kept}
@@ -353,6 +402,6 @@ def _gains(sums: _Sums, terms: Sequence[Term], left: FloatArray) -> dict[str, fl
     found = {}
     for name in dict.fromkeys(item.sensor for item in terms):
         others = [k for k, item in enumerate(terms) if item.sensor != name]
-        without = _left_out(sums, np.array([others], dtype=np.int64), _ridge(left))[0] if others else sums.moved
+        without = _left_out(sums, np.array([others], dtype=np.int64), _ridge(left))[0] if others else sums.rest
         found[name] = float(np.sqrt(without.mean(0).sum() / max(left.mean(0).sum(), 1e-12)))
     return found
