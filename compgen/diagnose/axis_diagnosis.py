@@ -23,15 +23,15 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM
 from compgen.diagnose.axis_model import (
     DRIFTS,
-    LEAST_GAIN,
     OF_RUNS,
-    Candidate,
-    NoiseGrid,
-    Search,
+    AxisFit,
+    AxisSearch,
     candidates_of,
     invisible_of,
+    noise_of,
 )
 from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
+from compgen.diagnose.engine import ALIAS, LEAST_BESIDE, LEAST_GAIN, SMALL_BESIDE, Candidate, NoiseGrid
 from compgen.diagnose.layout import IntArray
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Effect, active_effects, catalogue, section_text
@@ -59,8 +59,6 @@ ZERO_AT_END = 2.5
 ZERO_SHARE = 0.08
 #: The smooth part must explain this share of a varying reversal; otherwise its law is unknown.
 SMOOTH_SHARE = 0.7
-#: Names whose criterion is within this of the best are reported as alternatives (99 %).
-ALIAS = 9.2
 #: A named effect that explains less than this share of what the unnamed terms explain is tentative.
 LEAST_SHARE = 0.5
 #: The same for a drift found together with a smooth term in time, of which it could be a part.
@@ -85,8 +83,6 @@ JUMPS, LEANS = 3.0, 4.5
 LEAST_SIZE = 2.0
 #: A disturbance of no more readings than this may be a rounding.
 FEW_READINGS = 3
-#: Gain in twice the log likelihood beyond the penalty that a small effect beside a large one needs, and its share.
-LEAST_BESIDE, SMALL_BESIDE = 12.0, 0.2
 #: So many names that explain a change nearly as well, and the gain from which it is told apart from them all the same: in 480
 #: sessions with nuisances, 5 of 7 such names were wrong, of those with fewer names 4 of 49.
 MANY_NAMES, TOLD_APART = 4, 25.0
@@ -257,11 +253,11 @@ def _findings(
     against: ErrorTable | None,
 ) -> AxisFindings:
     names = (*only, *add) if only else ()
-    grid = NoiseGrid(session)
+    grid = noise_of(session)
     repeated = session.repeated and grid.freedom >= LEAST_REPEATS
-    search = Search(session, grid, candidates_of(session, names) if repeated else [])
+    search = AxisSearch(session, grid, candidates_of(session, names) if repeated else [])
     members = _added(search, _seen(search, search.run(most)) if repeated else [], add)
-    changes = _Changes(search, members)
+    changes = AxisFit(search, members)
     source = "repeats" if repeated else "stated" if u_um is not None else "assumed"
     reversal = _Reversal(changes, None if repeated else u_um)
     effects, unknown = _changes_found(changes, most)
@@ -306,7 +302,7 @@ def _findings(
     )  # fmt: skip
 
 
-def _changes_found(changes: _Changes, most: int) -> tuple[list[AxisEffect], list[AxisUnknown]]:
+def _changes_found(changes: AxisFit, most: int) -> tuple[list[AxisEffect], list[AxisUnknown]]:
     """The changes with time: named ones, the strongest first, and unnamed ones.
 
     Of the effects on whole runs (a bad run, a step), one of each kind is accepted; if there are more, the runs do not
@@ -349,7 +345,7 @@ def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, 
     return ("time", "approach") if alike else ()
 
 
-def _instead(changes: _Changes, item: AxisEffect) -> AxisEffect:
+def _instead(changes: AxisFit, item: AxisEffect) -> AxisEffect:
     """Backlash, or the servo lag or settling that explains the reversal and its change with feed or dwell better."""
     session, point = changes.session, int(np.argmax(changes.weights))
     if item.grade == "tentative" or any(e.startswith(("servo_lag", "settling")) for e in changes.names):
@@ -389,9 +385,7 @@ def _doubted(item: AxisEffect, reason: str) -> AxisEffect:
     return replace(item, grade="tentative", reasons=(*item.reasons, reason))
 
 
-def _common_part(
-    session: AxisSession, item: AxisEffect, effects: Sequence[AxisEffect], changes: _Changes
-) -> AxisEffect:
+def _common_part(session: AxisSession, item: AxisEffect, effects: Sequence[AxisEffect], changes: AxisFit) -> AxisEffect:
     """Add to a tentative drift the statement that it is subtracted, if the means of the runs show it."""
     if item.name not in DRIFTS or item.grade != "tentative" or not session.in_runs:
         return item
@@ -436,7 +430,7 @@ def _levels_off(means: FloatArray, drift: FloatArray, u_mm: float) -> bool:
     )
 
 
-def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
+def _added(search: AxisSearch, members: list[int], add: Sequence[str]) -> list[int]:
     """Members plus the best scan position of every name requested by the user."""
     for name in add:
         own = [k for k, c in enumerate(search.candidates) if c.name == name]
@@ -446,17 +440,17 @@ def _added(search: Search, members: list[int], add: Sequence[str]) -> list[int]:
     return members
 
 
-def _seen(search: Search, members: list[int]) -> list[int]:
+def _seen(search: AxisSearch, members: list[int]) -> list[int]:
     """Members without those that are smaller than the step of the readings, or than their own uncertainty, allows.
 
     Readings that are rounded alike repeat without scatter, and one that is rounded the other way is a step off.
     """
     for k in sorted(members, key=lambda k: search.criteria([other for other in members if other != k])[0][k]):
-        item, changes = search.candidates[k], _Changes(search, members)
+        item, changes = search.candidates[k], AxisFit(search, members)
         if item.tier != "named" or not changes.freedom or not (item.free or item.columns.shape[1] == 1):
             continue
         rest = [other for other in members if other != k]
-        value, covariance = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+        value, covariance = changes.estimate(np.hstack([changes.grid.base, search.columns_of(rest)]), item.columns)
         size = float(np.abs(item.columns @ value).max())
         step_mm = search.session.step_mm * (1.5 if np.count_nonzero(item.columns) <= FEW_READINGS else 0.5)
         uncertain = len(value) == 1 and value[0] ** 2 < LEAST_SIZE**2 * covariance[0, 0]
@@ -465,70 +459,10 @@ def _seen(search: Search, members: list[int]) -> list[int]:
     return members
 
 
-class _Changes:
-    """The chosen changes with time, fitted together with the means of the cells, weighted over the noise grid."""
-
-    def __init__(self, search: Search, members: Sequence[int]) -> None:
-        self.search, self.members, self.session = search, list(members), search.session
-        self.grid = search.grid
-        self.columns = search.columns_of(members)
-        if self.grid.freedom - self.columns.shape[1] < 1:
-            self.weights = np.zeros(len(self.grid.points))
-            self.weights[0], self.freedom, self.sigma_mm, self.phi = 1.0, 0, float("nan"), 0.0
-            self.square = np.full(len(self.grid.points), np.nan)
-            return
-        self.square = search.square(members)
-        self.weights = self.grid.weights(self.square)
-        self.freedom = max(self.grid.freedom - self.columns.shape[1], 1)
-        self.sigma_mm = float(np.sqrt(self.weights @ self.square / self.freedom))
-        points = np.array(self.grid.points)
-        self.phi = float(self.weights @ (points[:, 0] * (1.0 - points[:, 1])))
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the members."""
-        return [self.search.candidates[k].name for k in self.members]
-
-    def slopes(self) -> FloatArray:
-        """Change of the effects with their time constants of settling, which are known from the readings only, (n, k)."""
-        found = [np.zeros((len(self.session), 0))]
-        for k in self.members:
-            effect = self.search.candidates[k].effect
-            if effect is not None and "tau_s" in effect.settings:
-                other = effect.with_settings({**effect.settings, "tau_s": 1.15 * effect.settings["tau_s"]})
-                columns = other.columns(self.session.readings)
-                found.append(self.search.candidates[k].columns * 0.0 if columns is None else columns)
-        return np.hstack(found)
-
-    @property
-    def rounded_alike(self) -> float:
-        """Share of the error of rounding that repeats have in common: 1 without scatter, 0 where it exceeds the step."""
-        if not self.session.step_mm or not self.freedom:
-            return 0.0
-        scatter = self.search.scatter_mm(self.members) / self.session.step_mm
-        return float(np.exp(-((2.0 * np.pi * scatter) ** 2) / 2.0))
-
-    def estimate(self, columns: FloatArray, extra: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Values and covariance of ``extra`` (n, k), fitted with ``columns`` (n, m), both weighted over the grid."""
-        design = np.hstack([columns, extra])
-        value, square, total = np.zeros(extra.shape[1]), np.zeros((extra.shape[1],) * 2), []
-        for point, (weight, rss) in enumerate(zip(self.weights, self.square, strict=True)):
-            if weight < 1e-4:
-                continue
-            pulled = self.grid.solve(point, design)
-            inverse = np.linalg.pinv(design.T @ pulled, rcond=1e-10, hermitian=True)
-            fitted = (inverse @ (pulled.T @ self.search.y))[-extra.shape[1] :]
-            value += weight * fitted
-            square += weight * inverse[-extra.shape[1] :, -extra.shape[1] :] * rss / max(self.freedom, 1)
-            total.append((weight, fitted))
-        square += sum(w * np.outer(f - value, f - value) for w, f in total)
-        return value, square
-
-
-def _restless(changes: _Changes) -> list[AxisUnknown]:
+def _restless(changes: AxisFit) -> list[AxisUnknown]:
     """Residuals that jump, are skewed, wander, or scatter unequally, more than noise does."""
     session, point = changes.session, int(np.argmax(changes.weights))
-    design = np.hstack([changes.grid.cells, changes.columns])
+    design = np.hstack([changes.grid.base, changes.columns])
     inverse = changes.grid.inverse(point)
     value = np.linalg.pinv(design.T @ inverse @ design, rcond=1e-10, hermitian=True) @ (
         design.T @ inverse @ changes.search.y
@@ -552,7 +486,7 @@ def _restless(changes: _Changes) -> list[AxisUnknown]:
     return _uneven_scatter(changes, rms)
 
 
-def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
+def _uneven_scatter(changes: AxisFit, rms: float) -> list[AxisUnknown]:
     """A scatter that changes during the session, along the axis, or with direction."""
     session, search = changes.session, changes.search
     chosen = np.flatnonzero(changes.weights > 0.1 * changes.weights.max())
@@ -570,7 +504,7 @@ def _uneven_scatter(changes: _Changes, rms: float) -> list[AxisUnknown]:
         gains = {}
         for change in SCATTERS:
             scatter = np.exp(change * (shape - shape.mean()))
-            grid = NoiseGrid(session, scatter, points)
+            grid = noise_of(session, scatter, points)
             columns = changes.columns / scatter[:, None]
             square = np.array([_left(grid, k, search.y / scatter, columns) for k in range(len(points))])
             square = np.maximum(square, grid.freedom * session.least_mm**2)
@@ -594,15 +528,15 @@ def _left(grid: NoiseGrid, point: int, y: FloatArray, columns: FloatArray) -> fl
     return float(y @ pulled[:, 0] - right @ np.linalg.pinv(gram, rcond=1e-10, hermitian=True) @ right)
 
 
-def _change(changes: _Changes, member: int, generic: Sequence[int]) -> AxisEffect:
+def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect:
     """Grade and parameters of a named change with time."""
     search, session = changes.search, changes.session
     item = search.candidates[member]
     assert item.effect is not None
     rest = [k for k in changes.members if k != member]
     gains, criteria = search.criteria(rest)
-    alias = _alias(search, criteria, member)
-    values, covariance = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+    alias = search.alternatives(criteria, member)
+    values, covariance = changes.estimate(np.hstack([changes.grid.base, search.columns_of(rest)]), item.columns)
     shift = item.columns @ values
     reasons, p = [], 1.0
     lost = item.name in LEFT_OUT
@@ -655,11 +589,11 @@ def _size_reasons(
     return reasons
 
 
-def _holds(changes: _Changes, member: int) -> bool:
+def _holds(changes: AxisFit, member: int) -> bool:
     """Whether an effect, fitted to all runs but one, makes the readings of that one fit better, in all runs together."""
     session, search = changes.session, changes.search
     rest = [k for k in changes.members if k != member]
-    known, own = np.hstack([changes.grid.cells, search.columns_of(rest)]), search.candidates[member].columns
+    known, own = np.hstack([changes.grid.base, search.columns_of(rest)]), search.candidates[member].columns
     before = after = 0.0
     for run in np.unique(session.cycle):
         out = session.cycle == run
@@ -680,26 +614,13 @@ def _holds(changes: _Changes, member: int) -> bool:
     return after < before
 
 
-def _alias(search: Search, criteria: FloatArray, member: int) -> tuple[tuple[str, float], ...]:
-    """Names that explain the readings nearly as well as a member, with their weights."""
-    best: dict[str, float] = {}
-    for k, candidate in enumerate(search.candidates):
-        if candidate.tier == "named" and criteria[member] - criteria[k] < ALIAS:
-            best[candidate.name] = max(best.get(candidate.name, -np.inf), float(criteria[k]))
-    weights = {name: float(np.exp(0.5 * (value - criteria[member]))) for name, value in best.items()}
-    total = sum(weights.values())
-    own = search.candidates[member].name
-    ranked = sorted(weights.items(), key=lambda entry: (-entry[1], entry[0] != own))
-    return tuple((name, value / total) for name, value in ranked if value / total >= 0.01 or name == own)
-
-
-def _uneven(changes: _Changes, member: int, shift: FloatArray) -> tuple[float, float]:
+def _uneven(changes: AxisFit, member: int, shift: FloatArray) -> tuple[float, float]:
     """p-value of the test whether an effect depends on position, direction or time, and the share that does."""
     session = changes.session
     item = changes.search.candidates[member]
     half = np.where(session.time > np.median(session.time), 1.0, -1.0)
     unit = shift / max(float(np.abs(shift).max()), 1e-12)
-    columns = np.hstack([changes.grid.cells, changes.columns])
+    columns = np.hstack([changes.grid.base, changes.columns])
     fading, number = [], np.arange(len(session), dtype=np.float64)
     # shape of a fading step or disturbance, in addition to the column of the effect
     if item.name == "step_between_runs":
@@ -760,12 +681,12 @@ def _text(
     return item.text
 
 
-def _unknown_of(changes: _Changes, member: int) -> AxisUnknown:
+def _unknown_of(changes: AxisFit, member: int) -> AxisUnknown:
     """An unnamed smooth term, with the name that resembles it most."""
     search = changes.search
     item = search.candidates[member]
     rest = [k for k in changes.members if k != member]
-    values, _ = changes.estimate(np.hstack([changes.grid.cells, search.columns_of(rest)]), item.columns)
+    values, _ = changes.estimate(np.hstack([changes.grid.base, search.columns_of(rest)]), item.columns)
     shift = item.columns @ values
     means = np.bincount(changes.session.cell, shift) / np.bincount(changes.session.cell)
     gains = search.criteria(rest)[0]
@@ -782,7 +703,7 @@ def _unknown_of(changes: _Changes, member: int) -> AxisUnknown:
 class _Reversal:
     """Half the difference up minus down at every target, with its covariance, fitted with the changes with time."""
 
-    def __init__(self, changes: _Changes, u_um: float | None) -> None:
+    def __init__(self, changes: AxisFit, u_um: float | None) -> None:
         self.changes, self.session = changes, changes.session
         session = self.session
         self.targets = session.both
@@ -1026,7 +947,7 @@ def _left_out_rms(
     return float(np.sqrt(total[0])), float(np.sqrt(total[1]))
 
 
-def _compared(changes: _Changes, errors: ErrorTable) -> dict[str, Any]:
+def _compared(changes: AxisFit, errors: ErrorTable) -> dict[str, Any]:
     """Mean curve against predicted errors: RMS of the difference without its mean, and whether it exceeds the noise."""
     session = changes.session
     name = f"E{session.letter}{session.letter}"

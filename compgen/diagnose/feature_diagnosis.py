@@ -1,7 +1,7 @@
 """Diagnosis of features: parts measured elsewhere, and artefacts under the machine's own probe.
 
 The pose of the part (of every set-up of an artefact), a squareness, the difference of the scales, and bows of the guides
-are free: they are errors of the machine, and `identify` shows them. Beside these are compared
+are free: they are errors of the machine, and `identify` shows them. They are the base of the engine; its candidates are
 
     part_temperature    d = c p                     all lengths are too long or too short alike
     tool_wear           d = c k, k the order        the same drift from feature to feature (wear, or warm-up)
@@ -10,15 +10,17 @@ are free: they are errors of the machine, and `identify` shows them. Beside thes
     probe_lobing        d = c cos 3a + s sin 3a     three lobes along a ring of features (a its angle)
     outliers            single features that are off
 
-and smooth fields without a name. The order of the features is that of the rows. Few features show little: every column
-pays its price, and what is named must also hold on features left out.
+and, without a name, smooth fields over the part (a Gaussian process in the place), what changes with the order (one in
+the order), and features that are off along one slanting line, each by itself. The order of the features is that of the
+rows. Few features show little: what is named must also hold on features left out, and nothing smooth without a name may
+explain them nearly as well.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,33 +32,44 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
+from compgen.diagnose.axis_session import LEAST_MM
+from compgen.diagnose.engine import LEAST_BESIDE, SMALL_BESIDE, Candidate, Fit, NoiseGrid, Search
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.errors import InputError
+from compgen.kinematics.kernel_switch import one_thread
 
 #: Degrees of freedom beside pose and machine that a diagnosis needs.
 LEAST_FREEDOM = 8
-#: Gain beyond the price that a name needs; criteria closer than this are alternatives (99 %).
-LEAST_GAIN, ALIAS = 9.0, 9.2
-#: What every name beyond the first must gain in addition.
-MORE_NAMES = 6.0
 #: Share of a column that must be left beside pose, machine and scales.
 LEAST_VISIBLE = 0.15
 #: An alternative moves the features by at most this multiple of the range of their deviations.
 PLAUSIBLE = 1.5
 #: Scales that differ by less than this share of their mean have a common cause.
 COMMON = 0.35
-#: What a field without a name must gain in addition.
-HANDICAP = 4.0
+#: Lengths over which fields without a name change: shares of the half width of the part, and of the order.
+FIELD_LENGTHS, ORDER_LENGTHS = (0.5, 1.0), (0.05, 0.15)
+#: Waves from the first feature to the last that are tried.
+WAVES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+#: Directions along which features may be off by themselves, degrees: between those of the axes, which may repeat unequally.
+SLANTING_DEG = (22.5, 45.0, 67.5, -22.5, -45.0, -67.5)
+#: Parts of a field below this share of its variance are left out.
+LEAST_OF_FIELD = 1e-3
+#: A name that explains less than this share of what the fields without a name explain is tentative.
+LEAST_OF_UNKNOWN = 1.0
+#: Gain in twice the log likelihood of a field, and of features off along a line, from which a name beside it is tentative.
+LEFT_OVER, LEFT_OVER_LINE = 5.0, 9.0
+#: The same as a share of what the name gains; criterion within which a field replaces a name.
+LEFT_OVER_SHARE, AS_GOOD = 0.12, 5.0
+#: Scan positions charged for the direction of a line: neighbours are nearly alike.
+LINE_SCANS = 2.0
+#: Why a name is tentative that a field without a name could replace.
+OF_FIELD = "a smooth field without a name explains the features nearly as well"
 #: p-value of the residuals against the stated uncertainty, below which something has no name.
 MISFIT_P = 1e-4
 #: Set-ups whose frames are further apart than this have poses of their own, mm.
 OWN_POSE_MM = 0.2
 #: A ring of features: largest share by which their distances from the centre differ.
 ROUND = 0.05
-#: Scales of the axes that differ: errors of the machine, which are not reported here.
-SCALES = "scales"
-#: Waves from the first feature to the last that are tried as fields without a name.
-WAVES = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
 #: Standard uncertainties below which an amount is not confirmed.
 LEAST_SIZE = 2.0
 
@@ -120,13 +133,10 @@ class Features:
 
 
 @dataclass(frozen=True, eq=False)
-class FeatureCandidate:
-    """Columns (n, k) with a name, or a field without one; ``scans`` places at which it was tried."""
+class FeatureCandidate(Candidate):
+    """A candidate with its parameters (name, mm per unit of it for a column of one), the feature ``at``, and ``which`` it is."""
 
-    name: str
-    columns: FloatArray
-    parameters: tuple[tuple[str, float], ...]
-    scans: float = 1.0
+    parameters: tuple[tuple[str, float], ...] = ()
     at: float = math.nan
     which: str = ""
 
@@ -141,6 +151,7 @@ class NamedFeatureEffect:
     alias: tuple[tuple[str, float], ...]
     reasons: tuple[str, ...]
     size_mm: float
+    clear: float = math.inf
 
 
 def features_of_part(deviations: Deviations) -> Features:
@@ -204,8 +215,8 @@ def features_of_artefact(artefact: Artefact) -> Features:
     )
 
 
-def base_of(f: Features) -> FloatArray:
-    """Pose of the part (of every set-up), squareness, difference of the scales, bows and cubic parts of the guides, (n, k)."""
+def pose_of(f: Features) -> FloatArray:
+    """Pose of the part (of every set-up), squareness, bows and cubic parts of the guides, (n, k)."""
     p = f.position_mm - f.position_mm.mean(axis=0)
     s = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
     columns = [f.own]
@@ -217,9 +228,27 @@ def base_of(f: Features) -> FloatArray:
                 continue
             for power in range(1, min(2, len(np.unique(np.round(p[:, j], 3))) - 1) + 1):
                 columns.append(f.field(_vector(i, s[:, j] ** power))[:, None])
-    axes = [i for i in range(3) if np.ptp(p[:, i]) > 1e-6 and (f.component == i).any()]
-    columns += [f.field(_vector(i, s[:, i] ** 2))[:, None] for i in axes if len(np.unique(np.round(p[:, i], 3))) > 3]
+    columns += [
+        f.field(_vector(i, s[:, i] ** 2))[:, None] for i in axes_of(f) if len(np.unique(np.round(p[:, i], 3))) > 3
+    ]
     return np.hstack(columns)
+
+
+def scales_of(f: Features) -> FloatArray:
+    """The scale of each axis along which the features lie, (n, axes)."""
+    p = f.position_mm - f.position_mm.mean(axis=0)
+    return np.column_stack([np.zeros((len(f.row), 0)), *(f.field(_vector(i, p[:, i])) for i in axes_of(f))])
+
+
+def base_of(f: Features) -> FloatArray:
+    """Pose and machine: what is in :func:`pose_of`, and the differences of the scales, (n, k)."""
+    scales = scales_of(f)
+    return np.hstack([pose_of(f), scales[:, 1:] - scales[:, :1]])
+
+
+def axes_of(f: Features) -> list[int]:
+    """Axes along which the features lie and were measured."""
+    return [i for i in range(3) if np.ptp(f.position_mm[:, i]) > 1e-6 and (f.component == i).any()]
 
 
 def _vector(axis: int, values: FloatArray) -> FloatArray:
@@ -236,111 +265,155 @@ def rigid(f: Features, own: NDArray[np.bool_]) -> FloatArray:
     return np.column_stack([*shifts, *turns])
 
 
-def candidates_of(f: Features) -> tuple[list[FeatureCandidate], list[FeatureCandidate]]:
+def candidates_of(f: Features) -> list[FeatureCandidate]:
     """Effects with a name, and fields without one."""
     p = f.position_mm - f.position_mm.mean(axis=0)
     number = np.arange(len(p), dtype=np.float64)
     order = number / max(len(p) - 1, 1)
     letters = [k for k in range(3) if (f.component == k).any()]
-    named = [FeatureCandidate("part_temperature", f.field(p)[:, None], (("c_um_per_m", 1e-6),))]
-    if len(axes := [k for k in letters if np.ptp(p[:, k]) > 1e-6]) > 1:
-        scales = np.column_stack([f.field(_vector(k, p[:, k])) for k in axes])
-        named.append(FeatureCandidate(SCALES, scales, tuple((f"c_{'xyz'[k]}_um_per_m", 1e-6) for k in axes)))
-    wear = np.column_stack([f.field(_vector(k, order)) for k in letters])
+    found = []
+
+    def add(
+        name: str,
+        columns: FloatArray,
+        parameters: tuple[tuple[str, float], ...],
+        scans: float = 1.0,
+        at: float = math.nan,
+        which: str = "",
+    ) -> None:
+        found.append(FeatureCandidate(name, "named", columns, scans, parameters=parameters, at=at, which=which))
+
+    def shifted(shape: FloatArray) -> FloatArray:
+        return np.column_stack([f.field(_vector(k, shape)) for k in letters])
+
+    size = float(np.abs(p).max())
+    add("part_temperature", f.field(p / size)[:, None], (("c_um_per_m", 1e-6 * size),))
     names = tuple((f"c{'xyz'[k]}_um", MM_PER_UM) for k in letters)
-    named.append(FeatureCandidate("tool_wear", wear, names))
+    add("tool_wear", shifted(order), names)
     for at in range(2, len(p) - 1):
-        after = number >= at
-        step = np.column_stack([f.field(_vector(k, after.astype(np.float64))) for k in letters])
-        named.append(FeatureCandidate("clamp_slip", step, names, float(len(p) - 3), float(at + 1)))
+        add("clamp_slip", shifted((number >= at).astype(np.float64)), names, float(len(p) - 3), float(at + 1))
     labels = np.unique(f.setup)
     if f.one_frame and len(labels) > 1:
         for label in labels[1:]:
-            own = (f.setup == label).astype(np.float64)
-            step = np.column_stack([f.field(_vector(k, own)) for k in letters])
-            named.append(FeatureCandidate("setup_step", step, names, float(len(labels) - 1), float(label)))
+            add(
+                "setup_step",
+                shifted((f.setup == label).astype(np.float64)),
+                names,
+                float(len(labels) - 1),
+                float(label),
+            )
     flat = p[:, :2]
     radius = np.linalg.norm(flat, axis=1)
     if len(p) >= 9 and radius.min() > 0 and np.ptp(radius) < ROUND * radius.mean():
         angle = np.arctan2(flat[:, 1], flat[:, 0])
         unit = np.column_stack([flat / radius[:, None], 0 * radius])
-        lobes = np.column_stack(
-            [f.field(unit * np.cos(3 * angle)[:, None]), f.field(unit * np.sin(3 * angle)[:, None])]
-        )
-        named.append(FeatureCandidate("probe_lobing", lobes, (("c3_um", MM_PER_UM), ("s3_um", MM_PER_UM))))
+        lobes = [f.field(unit * wave(3 * angle)[:, None]) for wave in (np.cos, np.sin)]
+        add("probe_lobing", np.column_stack(lobes), (("c3_um", MM_PER_UM), ("s3_um", MM_PER_UM)))
     for k in range(len(p)):
-        own = np.column_stack([f.field(_vector(j, (number == k).astype(np.float64))) for j in letters])
-        named.append(FeatureCandidate("outliers", own, names, float(len(p)), float(k + 1), f.names[k]))
-    s = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
-    fields = []
-    for what, shape in (
-        ("x with y", s[:, 0] * s[:, 1]),
-        ("the cube of x", s[:, 0] ** 3),
-        ("the cube of y", s[:, 1] ** 3),
-    ):
-        columns = np.column_stack([f.field(_vector(k, shape)) for k in letters])
-        fields.append(FeatureCandidate(what, columns, ()))
+        add("outliers", shifted((number == k).astype(np.float64)), names, float(len(p)), float(k + 1), f.names[k])
+    return [*found, *_fields(f, p, order[:, None], letters)]
+
+
+def _fields(f: Features, p: FloatArray, order: FloatArray, letters: Sequence[int]) -> list[FeatureCandidate]:
+    """What has no name: fields over the place and the order, in each component and in all, and features off along a line."""
+    found = []
+    kinds = [
+        (what, place, length, float(len(lengths)))
+        for what, place, lengths in (
+            ("the place", p / np.maximum(np.abs(p).max(axis=0), 1e-9), FIELD_LENGTHS),
+            ("the order", order, ORDER_LENGTHS),
+        )
+        for length in lengths
+    ]
+    for what, place, length, scans in kinds:
+        smooth = _process(place, length)[:, : max(len(p) // 2, 1)]
+        each = [np.column_stack([f.field(_vector(k, shape)) for shape in smooth.T]) for k in letters]
+        for columns in (*each, np.hstack(each)) if len(each) > 1 else each:
+            found.append(FeatureCandidate(what, "generic", columns, scans, covariates=("feature",), process=True))
+    q = p / np.maximum(np.abs(p).max(axis=0), 1e-9)
+    shapes = [
+        ("x with y", q[:, [0]] * q[:, [1]], 1.0),
+        ("the cube of x", q[:, [0]] ** 3, 1.0),
+        ("the cube of y", q[:, [1]] ** 3, 1.0),
+    ]
+    far = f.field(q * np.sum(q**2, axis=1, keepdims=True))[:, None]
+    text = "the distance from the middle, not linearly"
+    found.append(FeatureCandidate(text, "generic", far, 1.0, covariates=("feature",), process=True))
     for waves in WAVES:
-        turn = 2 * np.pi * waves * order
+        turn = 2 * np.pi * waves * order[:, 0]
         text = f"the order, about {waves:g} waves"
-        each = [
-            np.column_stack([f.field(_vector(k, np.sin(turn))), f.field(_vector(k, np.cos(turn)))]) for k in letters
-        ]
-        fields += [FeatureCandidate(text, columns, (), float(len(WAVES))) for columns in (*each, np.hstack(each))]
-    return named, fields
+        shapes.append((text, np.column_stack([np.sin(turn), np.cos(turn)]), float(len(WAVES))))
+    for what, shape, scans in shapes:
+        columns = np.hstack([f.field(_vector(k, one))[:, None] for k in letters for one in shape.T])
+        found.append(FeatureCandidate(what, "generic", columns, scans, covariates=("feature",), process=True))
+    if not {0, 1} - set(letters):
+        for degrees in SLANTING_DEG:
+            along = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0.0])
+            own = np.column_stack([f.field(np.outer(one, along)) for one in np.eye(len(p))])
+            text = f"a line at {degrees:g} degrees, each by itself"
+            line = FeatureCandidate(text, "generic", own, LINE_SCANS, covariates=("feature",), process=True)
+            found.append(replace(line, only_one="line"))
+    return found
 
 
-class _Fit:
-    """Least squares with base columns, and what further columns explain beside them."""
+def _process(place: FloatArray, length: float) -> FloatArray:
+    """Columns (n, k) whose random sums are a smooth process of unit variance over ``place`` (n, d)."""
+    apart = np.sum((place[:, None, :] - place[None, :, :]) ** 2, axis=2)
+    value, vector = np.linalg.eigh(np.exp(-0.5 * apart / length**2))
+    value, vector = value[::-1], vector[:, ::-1]
+    kept = value > LEAST_OF_FIELD * value[0]
+    return np.asarray(vector[:, kept] * np.sqrt(value[kept]))
 
-    def __init__(self, f: Features, base: FloatArray, sigma_mm: float | None) -> None:
-        self.f, self.base, self.weight = f, base, 1.0 if f.u_mm is None else np.mean(f.u_mm) / f.u_mm
-        self.sigma_mm = sigma_mm
 
-    def left(self, items: Sequence[FeatureCandidate], rows: NDArray[np.bool_] | None = None) -> tuple[FloatArray, int]:
-        """Weighted residuals (n,) and the rank; fitted to ``rows`` only, if given."""
-        columns = np.hstack([self.base, *(item.columns for item in items)])
-        wide = columns * np.broadcast_to(self.weight, len(columns))[:, None]
-        value = self.f.deviation_mm * self.weight
-        size = np.linalg.norm(wide, axis=0)
-        wide = wide / np.where(size > 1e-12, size, 1.0)
-        chosen = np.ones(len(value), dtype=bool) if rows is None else rows
-        found, _, rank, _ = np.linalg.lstsq(wide[chosen], value[chosen], rcond=1e-8)
-        return value - wide @ found, int(rank)
+class FeatureSearch(Search):
+    """The engine for features: white noise, weighted by the uncertainties; ``scale`` (n,) multiplies all readings."""
 
-    def shows(self, item: FeatureCandidate, others: Sequence[FeatureCandidate]) -> bool:
-        """Whether enough of an effect is left beside pose and machine, and beside the scales unless it is one itself.
+    def __init__(self, f: Features, candidates: Sequence[FeatureCandidate], sigma_mm: float | None) -> None:
+        self.f, self.of = f, list(candidates)
+        self.scale = np.ones(len(f.row)) if f.u_mm is None else np.asarray(np.mean(f.u_mm) / f.u_mm)
+        base = base_of(f) * self.scale[:, None]
+        size = np.linalg.norm(base, axis=0)
+        turn, singular, _ = np.linalg.svd(base / np.where(size > 1e-12, size, 1.0), full_matrices=False)
+        grid = NoiseGrid(np.ones(len(f.row) - 1), turn[:, singular > 1e-8 * singular[0]], ((0.0, 0.0),), sigma_mm)
+        weighted = [replace(item, columns=item.columns * self.scale[:, None]) for item in candidates]
+        super().__init__(f.deviation_mm * self.scale, grid, weighted, LEAST_MM)
 
-        Features in rows, one after another, drift with their order as they do with their place.
-        """
-        scales = [one.columns for one in others if one.name == SCALES and item.name not in (SCALES, "part_temperature")]
-        columns = np.hstack([self.base, *scales])
-        size = np.linalg.norm(columns, axis=0)
-        columns = columns / np.where(size > 1e-12, size, 1.0)
-        left = item.columns - columns @ np.linalg.lstsq(columns, item.columns, rcond=1e-8)[0]
-        own = np.linalg.norm(item.columns - item.columns.mean(axis=0), axis=0)
-        return bool((np.linalg.norm(left, axis=0) > LEAST_VISIBLE * own).any())
+    def left(self, members: Sequence[int], rows: NDArray[np.bool_] | None = None) -> FloatArray:
+        """Residuals (n,) as weighted; fitted to ``rows`` only, if given."""
+        wide = np.hstack([self.grid.base, self.columns_of(members)])
+        chosen = np.ones(len(self.y), dtype=bool) if rows is None else rows
+        found = np.linalg.lstsq(wide[chosen], self.y[chosen], rcond=1e-8)[0]
+        return np.asarray(self.y - wide @ found)
 
-    def plausible(self, items: Sequence[FeatureCandidate]) -> bool:
-        """Whether the last effect moves no feature by more than all features are off together."""
-        columns = np.hstack([self.base, *(item.columns for item in items)])
-        size = np.linalg.norm(columns, axis=0)
-        size = np.where(size > 1e-12, size, 1.0)
-        value = np.linalg.lstsq(columns / size, self.f.deviation_mm, rcond=1e-8)[0] / size
-        moved = items[-1].columns @ value[-items[-1].columns.shape[1] :]
+    def moves(self, rest: Sequence[int], member: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Values and covariance of a member beside others, and by how much it moves each coordinate (n,), mm."""
+        own = self.candidates[member].columns
+        known = np.hstack([self.grid.base, self.columns_of(rest)])
+        value, covariance = Fit(self, [*rest, member]).estimate(known, own)
+        return value, covariance, self.of[member].columns @ value
+
+    def plausible(self, rest: Sequence[int], member: int) -> bool:
+        """Whether it moves no feature by more than all features are off together."""
+        moved = self.moves(rest, member)[2]
         return float(np.ptp(moved)) <= PLAUSIBLE * float(np.ptp(self.f.deviation_mm))
 
-    def criterion(self, items: Sequence[FeatureCandidate], extra: float = 0.0) -> float:
-        """-2 log likelihood with the price of every column."""
-        left, rank = self.left(items)
-        n, square = len(left), float(left @ left)
-        if n - rank < 2:
-            return math.inf
-        if self.sigma_mm is not None:
-            fit = square / self.sigma_mm**2
-        else:  # the variance is estimated: every column also takes a degree of freedom
-            fit = n * math.log(max(square, 1e-18 * n) / n) + n * math.log(n / (n - rank))
-        return fit + rank * math.log(n) + sum(2.0 * math.log(item.scans) for item in items) + extra
+
+def shown(f: Features, base: FloatArray, candidates: Sequence[FeatureCandidate]) -> list[FeatureCandidate]:
+    """The candidates, those ``hidden`` of which too little is left beside pose and machine, and beside the scales.
+
+    Features in rows, one after another, drift with their order as they do with their place.
+    """
+    p = f.position_mm - f.position_mm.mean(axis=0)
+    scale, found = f.field(p / float(np.abs(p).max()))[:, None], []
+    for item in candidates:
+        known = base if item.name == "part_temperature" else np.hstack([base, scale])
+        size = np.linalg.norm(known, axis=0)
+        known = known / np.where(size > 1e-12, size, 1.0)
+        left = item.columns - known @ np.linalg.lstsq(known, item.columns, rcond=1e-8)[0]
+        own = np.linalg.norm(item.columns - item.columns.mean(axis=0), axis=0)
+        seen = bool((np.linalg.norm(left, axis=0) > LEAST_VISIBLE * own).any())
+        found.append(item if seen or item.tier == "generic" else replace(item, tier="hidden"))
+    return found
 
 
 @dataclass(frozen=True, repr=False)
@@ -437,149 +510,130 @@ def diagnose_features(
         for too few features.
     """
     f = features_of_artefact(measured) if isinstance(measured, Artefact) else features_of_part(measured)
-    base = base_of(f)
     stated = None if u_um is None else u_um * MM_PER_UM
     if stated is None and f.u_mm is not None and np.isfinite(f.u_mm).all():
         stated = float(np.mean(f.u_mm))
-    fit = _Fit(f, base, stated)
-    before, rank = fit.left([])
-    if len(before) - rank < LEAST_FREEDOM:
+    rank = int(np.linalg.matrix_rank(base_of(f)))
+    if len(f.row) - rank < LEAST_FREEDOM:
         reason = (
-            f"{len(before)} measured coordinates of {len(f.position_mm)} features leave {max(len(before) - rank, 0)} degrees of "
+            f"{len(f.row)} measured coordinates of {len(f.position_mm)} features leave {max(len(f.row) - rank, 0)} degrees of "
             f"freedom beside pose and machine; a diagnosis needs at least {LEAST_FREEDOM}: measure more features, or an "
             "uncalibrated artefact in more set-ups"
         )
-        if len(before) <= rank:
+        if len(f.row) <= rank:
             raise InputError(reason)
+        before = FeatureSearch(f, [], stated).left([])
         rms = float(np.sqrt(np.mean(before**2)))
         return FeatureDiagnosis(
             machine, f, (), (), (before, before), (rms, rms), rms, "assumed", tuple(MISSING), (reason,)
         )
     show("comparing candidate effects")
-    named, fields = candidates_of(f)
-    hidden = {item.name for item in named if not fit.shows(item, named)}
-    faint = [item for item in named if item.name in hidden]
-    named = [item for item in named if item.name not in hidden]
-    members, unnamed = _searched(fit, named, fields, most)
-    members = _common_scale(fit, members, named)
-    scales = [item for item in members if item.name == SCALES]
-    fit.base = np.hstack([fit.base, *(item.columns for item in scales)])
-    members = [item for item in members if item.name != SCALES]
-    before, _ = fit.left([])
-    named = [item for item in named if item.name != SCALES]
-    after, rank = fit.left(members)
-    freedom = len(after) - rank
-    sigma_mm = stated if stated is not None else float(np.sqrt(after @ after / max(freedom, 1)))
-    unknown = [f"a field that depends on {item.name}" for item in unnamed]
+    candidates = shown(f, base_of(f), candidates_of(f))
+    with one_thread():
+        search = FeatureSearch(f, candidates, stated)
+        members = search.run(most + 1)
+        scales = [
+            k for k in members if search.candidates[k].name == "part_temperature" and not _common(search, members, k)
+        ]
+        named = [k for k in members if search.candidates[k].tier == "named" and k not in scales][:most]
+        fields = [k for k in members if search.candidates[k].tier == "generic"]
+        always = [*scales, *fields]
+        effects = tuple(_graded(search, always, named, k, fields) for k in named)
+    largest = max((item.gain for item in effects), default=0.0)
+    effects = tuple(
+        replace(item, reasons=(*item.reasons, "it is small beside the others"))
+        if item.gain < SMALL_BESIDE * largest and item.clear < LEAST_BESIDE
+        else item
+        for item in effects
+    )
+    before, after = search.left(scales), search.left([*scales, *named])
+    freedom = max(len(after) - rank - search.columns_of([*scales, *named]).shape[1], 1)
+    sigma_mm = stated if stated is not None else Fit(search, members).sigma_mm
+    unknown = [_text(search.candidates[k].name) for k in fields]
+    doubted = [item for item in effects if OF_FIELD in item.reasons]
+    if not unknown and doubted and all(item.reasons for item in effects):
+        unknown.append(f"a pattern that {doubted[0].candidate.name} explains in part")
     if stated is not None and not unknown and float(chdtrc(freedom, float(after @ after) / stated**2)) < MISFIT_P:
         unknown.append("the features scatter by more than their uncertainty")
-    effects = tuple(_graded(fit, members, k, [*named, *faint], sigma_mm) for k in range(len(members)))
     show("testing on features left out")
-    shown = {item.name for item in named} - hidden
-    missing = [name for name in MISSING if name not in shown]
+    visible = {item.name for item in candidates if item.tier == "named"}
+    missing = [name for name in MISSING if name not in visible]
     return FeatureDiagnosis(
-        machine, f, effects, tuple(unknown), (before, after), _left_out(fit, members), sigma_mm,
+        machine, f, effects, tuple(unknown), (before, after), _left_out(search, scales, named), sigma_mm,
         "stated" if stated is not None else "residuals", tuple(missing),
     )  # fmt: skip
 
 
-def _searched(
-    fit: _Fit, named: Sequence[FeatureCandidate], fields: Sequence[FeatureCandidate], most: int
-) -> tuple[list[FeatureCandidate], list[FeatureCandidate]]:
-    """Names that improve the criterion, one after another, and fields without a name that compete with them."""
-    members: list[FeatureCandidate] = []
-    unnamed: list[FeatureCandidate] = []
-    while len(members) < most + 1:
-        now = fit.criterion([*members, *unnamed])
-        scored = [(fit.criterion([*members, *unnamed, item]), 0, item) for item in named if item not in members]
-        scored += [
-            (fit.criterion([*members, *unnamed, item]) + HANDICAP, 1, item) for item in fields if item not in unnamed
-        ]
-        value, kind, best = min(scored, key=lambda entry: entry[:2])
-        if now - value < LEAST_GAIN + MORE_NAMES * len(members):
-            break
-        (unnamed if kind else members).append(best)
-        if len(unnamed) > 2:
-            break
-    # an effect that another one made superfluous
-    for item in list(members):
-        rest = [one for one in members if one is not item]
-        if fit.criterion([*rest, *unnamed]) - fit.criterion([*members, *unnamed]) < LEAST_GAIN:
-            members = rest
-    return members, unnamed
+def _text(name: str) -> str:
+    return f"the features are off along {name}" if name.startswith("a line") else f"a field that depends on {name}"
 
 
-def _common_scale(
-    fit: _Fit, members: list[FeatureCandidate], named: Sequence[FeatureCandidate]
-) -> list[FeatureCandidate]:
-    """Members with a temperature in place of scales that are nearly alike; their difference is left to the machine."""
-    scales = next((item for item in members if item.name == SCALES), None)
-    warm = next((item for item in named if item.name == "part_temperature"), None)
-    if scales is None or warm is None or warm in members:
-        return members
-    columns = np.hstack([fit.base, *(one.columns for one in members if one is not scales), scales.columns])
-    size = np.linalg.norm(columns, axis=0)
-    value = np.linalg.lstsq(columns / np.where(size > 1e-12, size, 1.0), fit.f.deviation_mm, rcond=1e-8)[0]
-    value = (value / np.where(size > 1e-12, size, 1.0))[-scales.columns.shape[1] :]
-    if float(np.abs(value - value.mean()).max()) > COMMON * abs(float(value.mean())):
-        return members
-    fit.base = np.hstack([fit.base, scales.columns[:, 1:]])
-    return [warm, *(one for one in members if one is not scales)]
+def _common(search: FeatureSearch, members: Sequence[int], member: int) -> bool:
+    """Whether the scales of all axes are nearly alike: otherwise they are errors of the machine, and it is no temperature."""
+    f, rest = search.f, search.columns_of([k for k in members if k != member])
+    each = scales_of(f) * search.scale[:, None]
+    wide = np.hstack([pose_of(f) * search.scale[:, None], rest, each])
+    size = np.linalg.norm(wide, axis=0)
+    value = np.linalg.lstsq(wide / np.where(size > 1e-12, size, 1.0), search.y, rcond=1e-8)[0][-each.shape[1] :]
+    scales = value / size[-each.shape[1] :]
+    return float(np.abs(scales - scales.mean()).max()) <= COMMON * abs(float(scales.mean()))
 
 
 def _graded(
-    fit: _Fit, members: Sequence[FeatureCandidate], number: int, named: Sequence[FeatureCandidate], sigma_mm: float
+    search: FeatureSearch, always: Sequence[int], named: Sequence[int], member: int, fields: Sequence[int]
 ) -> NamedFeatureEffect:
-    item, rest = members[number], [one for k, one in enumerate(members) if k != number]
-    columns = np.hstack([fit.base, *(one.columns for one in rest), item.columns])
-    columns = columns * np.broadcast_to(fit.weight, len(columns))[:, None]
-    size = np.linalg.norm(columns, axis=0)
-    size = np.where(size > 1e-12, size, 1.0)
-    inverse = np.linalg.pinv(columns / size, rcond=1e-8) / size[:, None]
-    found = inverse @ (fit.f.deviation_mm * fit.weight)
-    u = sigma_mm * np.linalg.norm(inverse, axis=1)
-    k = item.columns.shape[1]
+    """Grade, parameters and alternatives of one of the ``named`` members; ``always`` are the others in the model."""
+    item, rest = search.of[member], [k for k in (*always, *named) if k != member]
+    value, covariance, moved = search.moves(rest, member)
+    u = np.sqrt(np.diag(covariance))
     values = tuple(
-        (name, float(v) / unit, float(w) / unit)
-        for (name, unit), v, w in zip(item.parameters, found[-k:], u[-k:], strict=True)
+        (name, float(v) / unit, float(w) / unit) for (name, unit), v, w in zip(item.parameters, value, u, strict=True)
     )
-    own = fit.criterion([*rest, item])
-    best: dict[str, float] = {}
-    for one in named:
-        if one not in rest and (one is item or fit.plausible([*rest, one])):
-            best[one.name] = min(best.get(one.name, math.inf), fit.criterion([*rest, one]))
-    weights = {name: math.exp(-0.5 * (value - own)) for name, value in best.items() if value - own < ALIAS}
-    weights[item.name] = 1.0
-    total = sum(weights.values())
+    gains, criteria = search.criteria(rest)
+    alias = search.alternatives(criteria, member, lambda k: search.plausible(rest, k))
     reasons = []
-    if max(abs(v) / w if w else math.inf for _, v, w in values) < LEAST_SIZE:
+    if not float(np.max(np.abs(value) / np.where(u > 0, u, np.inf))) >= LEAST_SIZE:
         reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
-    rival = max(
-        ((name, weight) for name, weight in weights.items() if name != item.name), key=lambda e: e[1], default=None
-    )
-    if rival is not None and rival[1] > 1.0 / 3.0:
-        reasons.append(f"{rival[0]} explains the features nearly as well")
-    before, after = _left_out(fit, rest), _left_out(fit, members)
-    if item.name != "outliers" and after[1] >= before[1]:
+    own = dict(alias)[item.name]
+    rival = next((name for name, weight in alias if name != item.name and weight > 0.5 * own), "")
+    if rival:
+        reasons.append(f"{rival} explains the features nearly as well")
+    smooth = [float(criteria[k]) for k, one in enumerate(search.candidates) if one.tier == "generic" and k not in rest]
+    if max(smooth, default=-np.inf) > float(criteria[member]) - AS_GOOD:
+        reasons.append(OF_FIELD)
+    left_over = search.gains([*rest, member])
+    limits = {
+        line: max(least, LEFT_OVER_SHARE * gains[member])
+        for line, least in ((True, LEFT_OVER_LINE), (False, LEFT_OVER))
+    }
+    for k, one in enumerate(search.candidates):
+        if one.tier == "generic" and k not in rest and left_over[k] > limits[bool(one.only_one)] and not reasons:
+            reasons.append("something without a name is left over, of which it may be a part")
+    unnamed = sum(float(search.gains([k for k in (*always, *named) if k != g])[g]) for g in fields)
+    if fields and float(gains[member]) < LEAST_OF_UNKNOWN * unnamed:
+        reasons.append("small compared with the unexplained part")
+    others = [k for k in named if k != member]
+    if item.name != "outliers" and _left_out(search, always, named)[1] >= _left_out(search, always, others)[1]:
         reasons.append("it does not hold on features left out")
-    moved = item.columns @ found[-k:]
-    largest = float(np.abs(moved).max()) if k == 1 else float(np.linalg.norm(found[-k:]))
-    alias = tuple(sorted(((name, weight / total) for name, weight in weights.items()), key=lambda e: -e[1]))
-    return NamedFeatureEffect(item, values, fit.criterion(rest) - own, alias, tuple(reasons), largest)
+    largest = float(np.abs(moved).max()) if len(value) == 1 else float(np.linalg.norm(value))
+    return NamedFeatureEffect(
+        item, values, float(gains[member]), alias, tuple(reasons), largest, float(criteria[member])
+    )
 
 
-def _left_out(fit: _Fit, members: Sequence[FeatureCandidate]) -> tuple[float, float]:
-    """RMS of features left out, one in turn, without and with the members, mm; outliers do not count."""
-    alone = {int(item.at) - 1 for item in members if item.name == "outliers"}
+def _left_out(search: FeatureSearch, always: Sequence[int], named: Sequence[int]) -> tuple[float, float]:
+    """RMS of features left out, one in turn, without and with the named members, mm; outliers do not count."""
+    alone = {int(search.of[k].at) - 1 for k in named if search.of[k].name == "outliers"}
+    predicting = [k for k in always if search.of[k].tier == "named"]
     found = []
-    for items in ([], [item for item in members if item.name != "outliers"]):
+    for items in (predicting, [*predicting, *(k for k in named if search.of[k].name != "outliers")]):
         square, count = 0.0, 0
-        for feature in np.unique(fit.f.row):
+        for feature in np.unique(search.f.row):
             if int(feature) in alone:
                 continue
-            out = fit.f.row == feature
-            keep = ~out & ~np.isin(fit.f.row, list(alone))
-            left = fit.left(items, keep)[0][out]
+            out = search.f.row == feature
+            keep = ~out & ~np.isin(search.f.row, list(alone))
+            left = search.left(items, keep)[out]
             square, count = square + float(left @ left), count + len(left)
         found.append(math.sqrt(square / max(count, 1)))
     return found[0], found[1]

@@ -17,15 +17,11 @@ from compgen.cli import cli  # noqa: E402
 from compgen.cli.common import run_command  # noqa: E402
 from compgen.data.axis_runs import AxisRuns, format_axis_runs, read_axis_runs  # noqa: E402
 from compgen.data.machine import load_machine, read_machine  # noqa: E402
-from compgen.diagnose import DiagnoseOptions, axis_model, diagnose
+from compgen.diagnose import DiagnoseOptions, diagnose, engine
 from compgen.diagnose.axis_diagnosis import _levels_off  # noqa: E402
-from compgen.diagnose.axis_model import (  # noqa: E402
-    LAMBDA,
-    NoiseGrid,
-    Search,
-    candidates_of,  # noqa: E402
-)
+from compgen.diagnose.axis_model import AxisSearch, candidates_of, noise_of  # noqa: E402
 from compgen.diagnose.axis_session import LEAST_MM, grid_step_mm, sessions_of  # noqa: E402
+from compgen.diagnose.engine import LAMBDA  # noqa: E402
 from compgen.effects import active_effects, listed  # noqa: E402
 from compgen.effects.all_effects import WHAT_TO_DO, what_to_do  # noqa: E402
 from compgen.errors import InputError  # noqa: E402
@@ -445,9 +441,9 @@ def by_covariance(found, grid, candidates, members, prior):
     terms = []
     for (phi, w), log_prior in zip(grid.points, grid.prior, strict=True):
         v = (1 - w) * phi ** np.abs(t[:, None] - t) + w * np.eye(len(t)) if phi else np.eye(len(t))
-        fixed = np.hstack([grid.cells, *(candidates[k].columns for k in members if k not in prior)])
+        fixed = np.hstack([grid.base, *(candidates[k].columns for k in members if k not in prior)])
         # free coefficients cost no more than they do with the noise alone: det(F' inv(v) F) of the noise is left out
-        inverse, cells = np.linalg.inv(v), grid.cells
+        inverse, cells = np.linalg.inv(v), grid.base
         alone = np.linalg.slogdet(fixed.T @ inverse @ fixed)[1] - np.linalg.slogdet(cells.T @ inverse @ cells)[1]
         for k, value in prior.items():
             v = v + value * candidates[k].columns @ candidates[k].columns.T
@@ -462,13 +458,13 @@ def by_covariance(found, grid, candidates, members, prior):
 
 @pytest.mark.parametrize("timed", [False, True])
 def test_what_candidates_bring_is_what_the_covariances_say(gantry, timed, monkeypatch):
-    monkeypatch.setattr(axis_model, "LEAST_SEEN", 1e-9)  # the definition leaves out nothing
+    monkeypatch.setattr(engine, "LEAST_SEEN", 1e-9)  # the definition leaves out nothing
     runs = session(23, targets=np.linspace(-700, -100, 4), effect=warmup)
     if timed:
         runs = replace(runs, covariates={"time_s": np.cumsum(np.random.default_rng(1).uniform(2, 30, len(runs)))})
     (found,) = sessions_of(gantry, runs)
-    grid, candidates = NoiseGrid(found), candidates_of(found)
-    search = Search(found, grid, candidates)
+    grid, candidates = noise_of(found), candidates_of(found)
+    search = AxisSearch(found, grid, candidates)
     names = [c.name for c in candidates]
     warm, bad = names.index("warmup_drift") + 20, names.index("bad_run")
     smooth = next(k for k, c in enumerate(candidates) if c.tier == "generic" and c.columns.shape[1] == 3)

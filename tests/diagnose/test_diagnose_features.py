@@ -13,6 +13,7 @@ from compgen.cli.common import run_command
 from compgen.data.deviations import Artefact, Part
 from compgen.diagnose import diagnose
 from compgen.diagnose.any_diagnosis import diagnose_sixdof
+from compgen.diagnose.engine import LAMBDA, Candidate, NoiseGrid, Search
 from compgen.diagnose.page import told
 from compgen.instruments.sixdof_instrument import RAD_PER_ARCSEC, read_instrument, read_sixdof
 
@@ -129,6 +130,47 @@ def test_what_has_no_name_is_unknown_and_rows_hide_a_drift(mill):
     assert not named and found["verdict"] == "unknown" and "x with y" in found["unknown"][0]["text"]
     # row after row, wear and the place change together: what is missing is said
     assert "tool_wear" in found["invisible"] and any("first feature" in text for text in found["advice"])
+
+
+def nameless(kind, rng, place):
+    """Causes that no list has, um: (features, 2)."""
+    s, v = place / np.abs(place).max(axis=0), np.array([0.8, -0.6])
+    far = np.linalg.norm(place, axis=1, keepdims=True) / np.linalg.norm(place, axis=1).max()
+    return {
+        "group": lambda: np.outer(rng.permutation(len(s)) < len(s) // 3, 15 * v),
+        "every other": lambda: np.outer(np.arange(len(s)) % 2 * 2 - 1, 6 * v),
+        "scale that grows": lambda: 20 * far**2 * place / 150,
+        "dent": lambda: np.outer(np.exp(-np.sum((s - [0.2, -0.3]) ** 2, axis=1) / 0.5), 25 * v),
+        "wave": lambda: np.outer(np.sin(4 * np.pi * np.arange(len(s)) / len(s)), 10 * v),
+    }[kind]()
+
+
+@pytest.mark.parametrize("kind", ["group", "every other", "scale that grows", "dent", "wave"])
+@pytest.mark.parametrize("seed", [51, 52])
+def test_a_cause_that_no_list_has_gets_no_name(mill, kind, seed):
+    place, nothing_um = plate(seed, columns=5, rows=5, mixed=True)
+    found, named = effects_of(mill, part_of(place, nothing_um + nameless(kind, np.random.default_rng(seed), place)))
+    assert not named and found["verdict"] == "unknown"
+
+
+def test_the_engine_is_the_likelihood_of_its_covariance():
+    """Known and unknown sigma, against the determinants and inverses of the covariance itself (REML, Patterson 1971)."""
+    rng = np.random.default_rng(8)
+    base, columns, y = (rng.normal(size=shape) for shape in ((14, 3), (14, 2), (14,)))
+    for sigma in (None, 0.7):
+        grid = NoiseGrid(np.ones(13), base, ((0.0, 0.0),), sigma)
+        search = Search(y, grid, [Candidate("field", "generic", columns, 1.0, process=True)], 1e-9)
+
+        def level(v):
+            inverse = np.linalg.inv(v)
+            middle = base.T @ inverse @ base
+            left = y - base @ np.linalg.solve(middle, base.T @ inverse @ y)
+            square = left @ inverse @ left
+            fit = 11 * np.log(square) if sigma is None else square / sigma**2  # noqa: B023 - used at once
+            return -fit - np.linalg.slogdet(v)[1] - np.linalg.slogdet(middle)[1]
+
+        expected = max(level(np.eye(14) + value * columns @ columns.T) for value in LAMBDA) - level(np.eye(14))
+        assert search.gains([])[0] == pytest.approx(expected, abs=1e-8)
 
 
 def test_too_few_features_say_what_is_missing(mill):
