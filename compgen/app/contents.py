@@ -542,57 +542,6 @@ def _degrees(text: str, field: str) -> float:
     return value
 
 
-_HEADER = re.compile(r"\s*(#\s*)?\[([\w.-]+)\]\s*(#.*)?$")
-
-
-def with_value(text: str, section: str, key: str, value: str) -> str:
-    r"""Return the text of a machine file with one key changed and its comments kept; an empty ``value`` unsets the key.
-
-    >>> print(with_value("# [a]\n# k = 1 # meaning", "a", "k", "2"), end="")
-    [a]
-    k = 2                                     # meaning
-    """
-    lines = text.splitlines()
-    heads = [(k, match) for k, line in enumerate(lines) if (match := _HEADER.match(line))]
-    start, end = 0, len(lines)
-    if section:
-        place = next((k for k, (_, match) in enumerate(heads) if match[2] == section), None)
-        if place is None:
-            lines += ["", f"[{section}]"]
-            start = end = len(lines)
-        else:
-            start = heads[place][0] + 1
-            end = heads[place + 1][0] if place + 1 < len(heads) else len(lines)
-            if value:
-                lines[start - 1] = f"[{section}]"
-    elif heads:
-        end = heads[0][0]
-    for k in range(start, end):
-        found = re.match(rf"\s*(?:#\s*)?{re.escape(key)}\s*=\s*(.*)$", lines[k])
-        if found:
-            old, remark = _parted(found[1])
-            given = f"{key} = {value}" if value else f"# {key} = {old}"
-            lines[k] = f"{given:<41} {remark}".rstrip()
-            break
-    else:
-        if value:
-            while end > start and not lines[end - 1].strip():
-                end -= 1
-            lines.insert(end, f"{key} = {value}")
-    return "\n".join(lines) + "\n"
-
-
-def _parted(text: str) -> tuple[str, str]:
-    """Split a line of TOML after the equals sign into value and comment."""
-    quote = ""
-    for k, char in enumerate(text):
-        if char in "\"'" and quote in ("", char):
-            quote = "" if quote else char
-        elif char == "#" and not quote:
-            return text[:k].strip(), text[k:]
-    return text.strip(), ""
-
-
 def open_points(control: str) -> Sequence[str]:
     """Return what no public document of the vendor settles about a control."""
     return [" ".join(text.split()) for text in load_format(control).unverified]

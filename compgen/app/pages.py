@@ -22,7 +22,7 @@ import time
 import traceback
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ from werkzeug.routing import IntegerConverter
 from werkzeug.wrappers import Response as BaseResponse
 
 from compgen.app import contents
+from compgen.app.machine_text import with_section, with_value
 from compgen.app.project import (
     DEVICES,
     GIVEN,
@@ -497,12 +498,12 @@ def describe_machine(runner: Runner, state: ProjectState) -> None:
         path = runner.project.path(summary["file"])
         text = read_text(path)
         for key, value in values.items():
-            text = contents.with_value(text, "", key, value)
+            text = with_value(text, "", key, value)
         write_file(path, text, private=True)
         load_machine(str(path))
         by_hand = [f"# in {summary['file']}: {key} = {value}" for key, value in values.items()]
         data = {"machine": summary["file"], "meaning": summary["meaning"], "by_hand": by_hand}
-        return Step(**{**step.__dict__, "data": data})
+        return replace(step, data=data)
 
     runner.start(
         "writing the machine file",
@@ -539,15 +540,14 @@ def change_settings(runner: Runner, state: ProjectState) -> None:
     if path is None or control not in CONTROLLERS:
         raise InputError("choose a machine and a control first")
     text, name = contents.machine_text(path), Path(_machine_of(state)).name
-    if f"[controllers.{control}]" not in text:
-        text = f"{text.rstrip()}\n\n[controllers.{control}]\n"
+    text = with_section(text, f"controllers.{control}")
     changed = []
     for setting in contents.settings_of(text, control):
         given = _field(setting.key, 1000)
         if given == setting.value:
             continue
         value = json.dumps(given, ensure_ascii=False) if given and setting.kind == "text" else given
-        text = contents.with_value(text, f"controllers.{control}", setting.key, value)
+        text = with_value(text, f"controllers.{control}", setting.key, value)
         changed.append(f"{setting.key} = {value or 'default'}")
     target = name if name.endswith(".toml") else f"{name}.toml"
     _store_machine(
@@ -571,7 +571,7 @@ def _without_problems(step: Step, output: str) -> Step:
     listed = json.loads(output)["files"][0]
     if listed["problems"]:
         raise InputError("\n".join(problem["text"] for problem in listed["problems"]))
-    return Step(**{**step.__dict__, "data": {**step.data, "remarks": listed["warnings"]}})
+    return replace(step, data={**step.data, "remarks": listed["warnings"]})
 
 
 @action("plan", "plan/make")
@@ -636,7 +636,7 @@ def _import_task(
         written = [Path(name).as_posix() for name in summary["files"]]
         used = written or ([] if foreign else [path])
         facts = {"file": path, "used": used, "summary": summary, "answers": list(answers), **data}
-        return Step(**{**step.__dict__, "data": facts})
+        return replace(step, data=facts)
 
     title = Path(path).name if not answers else f"{Path(path).name}: {' '.join(answers)}"
     return StepTask(Step(0, "measurement", title, [words], folder), finish, (0, 2))
@@ -1007,7 +1007,7 @@ def hand_over(runner: Runner, state: ProjectState) -> None:
         """Keep what was appended to the job file, so that it can be taken back."""
         text = read_text(path)
         added = text.removeprefix(before) if text.startswith(before) else ""
-        return Step(**{**step.__dict__, "data": {"added": added, "machine_there": name}})
+        return replace(step, data={"added": added, "machine_there": name})
 
     task = StepTask(Step(0, "recal", f"Recalibration of {name}", [words]), finish)
     runner.start("writing the job file", "project", [task])

@@ -8,7 +8,8 @@ import threading
 
 import pytest
 
-from compgen.app.contents import chain_picture, options_from, settings_of, with_value
+from compgen.app.contents import chain_picture, options_from, settings_of
+from compgen.app.machine_text import with_value
 from compgen.app.project import PROJECT, Project, StaleError, Step, file_name
 from compgen.cli import cli
 from compgen.cli.common import run_command
