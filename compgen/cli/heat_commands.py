@@ -71,9 +71,9 @@ def heat_command(machine: Machine, sessions: tuple[Path, ...], tolerance_um: flo
 
 def _data(machine: Machine, read: Sequence[DriftSession], learned: Learned, tolerance_um: float) -> dict[str, Any]:
     """Return what ``--json`` prints and ``heat.json`` has."""
-    from compgen.heat.etve import etve_figures
+    from compgen.heat.etve import etve_figures, warm_up
 
-    model = learned.model
+    model, etve = learned.model, [etve_figures(item, tolerance_um) for item in read]
     return {
         "accepted": model is not None and not learned.reasons,
         "machine": machine.name,
@@ -85,7 +85,8 @@ def _data(machine: Machine, read: Sequence[DriftSession], learned: Learned, tole
         "sessions": [dict(row) for row in learned.sessions],
         "without_sensor": dict(learned.gains),
         "hull": [] if model is None else [_range_of(item) for item in model.hull],
-        "etve": [etve_figures(item, tolerance_um) for item in read],
+        "etve": etve,
+        "warm_up": warm_up([item["wait_min"] for item in etve]),
         "files": [],
     }
 
@@ -144,6 +145,15 @@ def _lines(data: Mapping[str, Any]) -> list[str]:
         found.append(
             f"wait until the rest is below {data['tolerance_um']:g} um: {min(known):.0f} ... {max(known):.0f} min{more}"
         )
+    if (own := data["warm_up"]) is not None:
+        found.append(
+            f"warm-up: {own['mean_min']:.0f} min (standard deviation between {own['sessions']} days "
+            f"{own['s_min']:.0f} min); on 19 of 20 days "
+            f"{own['enough_min']:.0f} min are enough"
+        )
+    elif known:
+        why = "it needs two sessions" if len(waits) < 2 else "a session had not settled at its end"
+        found.append(f"warm-up: how long it takes on another day is not known: {why}")
     elif waits:
         found.append(f"no session had settled to {data['tolerance_um']:g} um at its end: how long to wait is not known")
     return found + list(data["notes"])

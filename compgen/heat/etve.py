@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,22 @@ def etve_figures(session: DriftSession, tolerance_um: float) -> dict[str, Any]:
     longest = max(waits, default=0.0)
     found["wait_min"] = longest / 60 if longest <= 0.75 * time_s[-1] else None
     return found
+
+
+def warm_up(waits_min: Sequence[float | None]) -> dict[str, Any] | None:
+    """Return how long to wait on another day, min: mean and standard deviation, and what is enough on 19 of 20 days.
+
+    ``enough_min`` is the one-sided 95 % bound of one further session, mean + t s sqrt(1 + 1/n). None where a session had
+    not settled at its end, or for less than two sessions: how days differ is then not known.
+    """
+    known = np.array([wait for wait in waits_min if wait is not None])
+    if len(known) < len(waits_min) or len(known) < 2:
+        return None
+    from scipy.stats import t
+
+    mean, s, n = float(known.mean()), float(known.std(ddof=1)), len(known)
+    enough = mean + float(t.ppf(0.95, n - 1)) * s * float(np.sqrt(1 + 1 / n))
+    return {"mean_min": mean, "s_min": s, "enough_min": enough, "sessions": n}
 
 
 def _range(values: FloatArray) -> float | None:

@@ -10,7 +10,7 @@ from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.errors import CompgenWarning, InputError
 from compgen.heat import DriftSession, Temperatures, learn_heat, read_drift, read_heat, read_temperatures
-from compgen.heat.etve import etve_figures
+from compgen.heat.etve import etve_figures, warm_up
 from compgen.heat.model import Term, lagged, states_of
 
 STEP_S = 5
@@ -295,6 +295,15 @@ def test_the_figures_of_iso_230_3():
     assert found["wait_min"] == 143
 
 
+def test_warm_up_of_another_day_by_hand():
+    """20, 30, 40 min: mean 30, s 10; t(0.95, 2) = 2.920 of the tables, so 30 + 2.920 * 10 * sqrt(4/3) = 63.7 min."""
+    found = warm_up([20.0, 30.0, 40.0])
+    assert (found["mean_min"], found["s_min"], found["sessions"]) == (30.0, 10.0, 3)
+    assert found["enough_min"] == pytest.approx(63.72, abs=0.02)
+    assert warm_up([20.0, None, 40.0]) is None
+    assert warm_up([20.0]) is None
+
+
 # --- the command -----------------------------------------------------------------------------------------------------
 
 
@@ -315,6 +324,7 @@ def test_the_command_writes_a_model_with_its_figures(tmp_path, days, capsys):
     assert data["accepted"]
     assert read_heat(tmp_path / "out" / data["files"][0]).directions == ("dy", "dz")
     assert len(data["sessions"]) == len(data["etve"]) == 4
+    assert data["warm_up"] is None or data["warm_up"]["sessions"] == 4
     assert {"heat.json", "heat.md"} < {path.name for path in (tmp_path / "out").iterdir()}
 
 
