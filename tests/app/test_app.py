@@ -311,8 +311,11 @@ def test_a_machine_file_with_problems_is_not_kept_and_all_problems_are_shown(sit
     assert len(kept.splitlines()) == len(text.splitlines())
     state = site.do("machine/settings", {"control": "fanuc-pitch", "axis_numbers": "{ X = 1, Y = 3, Z = 2 }"})
     assert "[controllers.fanuc-pitch]" in (site.project.folder / state.machine).read_text()
-    site.post("/projects/1/machine/settings", {"control": "fanuc-pitch", "detection_unit_um": "one"})
-    assert site.runner.job.problems
+    answer = site.post("/projects/1/machine/settings", {"control": "fanuc-pitch", "detection_unit_um": "one"})
+    assert answer.status_code == 409
+    assert "is no TOML value" in answer.text
+    site.post("/projects/1/machine/settings", {"control": "fanuc-pitch", "detection_unit_um": '"one"'})
+    assert any("detection_unit_um" in item for item in site.runner.job.problems)
     assert site.project.state().machine == state.machine
 
 
