@@ -51,7 +51,7 @@ class Message(str):
         made.code, made.template, made.values = code, template, values
         return made
 
-    def __getnewargs_ex__(self) -> tuple[tuple[str, str], dict[str, Any]]:  # type: ignore[override]
+    def __getnewargs_ex__(self) -> tuple[tuple[str, str], dict[str, Any]]:
         """Let worker processes send messages: values as they are shown."""
         literal = "".join(
             text.replace("{", "{{").replace("}", "}}") + (f"{{{name}}}" if name is not None else "")
@@ -100,10 +100,12 @@ def messages_of(texts: Iterable[object]) -> dict[str, Any]:
     """
     found = []
     for said in filter(None, map(message_of, texts)):
-        core = message_of(said.values.get("message")) if said.code == "at-place" else said
-        place = {"place": said.values["place"]} if said.code == "at-place" else {}
+        core = message_of(said.values["message"]) if said.code == "at-place" else said
+        where = {
+            name: said.values[name] for name in ("place", "field") if said.code == "at-place" and name in said.values
+        }
         if core is not None:
-            found.append({**core.data(), "text": str(said), "values": {**place, **core.data()["values"]}})
+            found.append({**core.data(), "text": str(said), "values": {**where, **core.data()["values"]}})
     return {"messages": found} if found else {}
 
 
@@ -151,10 +153,11 @@ class InputError(CompgenError, ValueError):
         place = visible(str(file), flat=True) if file is not None else ""
         if line is not None:
             place += f":{line}" if place else f"line {line}"
-        if field:
-            place += f": {field}" if place else field
-        #: The whole sentence: the message, behind the place if one is known.
-        self.said = Message("at-place", "{place}: {message}", place=place, message=message) if place else message
+        parts = {"place": place, "field": field or "", "message": message}
+        used = [name for name in parts if parts[name] or name == "message"]
+        template = ": ".join(f"{{{name}}}" for name in used)
+        #: The whole sentence: the message, behind place and field as far as they are known.
+        self.said = Message("at-place", template, **{name: parts[name] for name in used}) if len(used) > 1 else message
         super().__init__(self.said)
 
 

@@ -143,7 +143,8 @@ class Texts:
         known = self.messages.get(sentence)
         if known is None and _LETTERS.search(_PLACE.sub(" ", sentence)):  # in English, or known as parts
             return self.text(str(said))
-        values = {name: self._value(value) for name, value in said.shown().items()}
+        # the place is a path of the user's, whatever words it has
+        values = {name: value if name == "place" else self._value(value) for name, value in said.shown().items()}
         return said.filled(sentence if known is None else known, **values)
 
     def _value(self, value: str) -> str:

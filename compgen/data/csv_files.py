@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from compgen.data.arguments import path_of
 from compgen.data.files import LONGEST_LINE, decoded, read_text
 from compgen.data.names import LARGEST, SMALLEST
-from compgen.errors import CompgenWarning, InputError, doubled, nearest, visible_line
+from compgen.errors import CompgenWarning, InputError, Message, doubled, nearest, visible_line
 
 #: How much of a large file is in memory at a time, bytes.
 PART_BYTES = 1 << 22
@@ -116,15 +116,20 @@ def parse_any(source: Path, content: str) -> CsvFile:
     if not data:
         return CsvFile(0, [], [], metadata, rows=[])
     if "\0" in content:
-        raise InputError("contains NUL bytes; it is not a text file", file=source)
+        raise InputError(Message("file-binary", "contains NUL bytes; it is not a text file"), file=source)
     reader = csv.reader(data, strict=True, skipinitialspace=True)
     try:
         parsed = list(reader)
     except csv.Error as error:
         line_number = numbers[max(reader.line_num, 1) - 1]
-        raise InputError(f"is not readable as CSV: {error}", file=source, line=line_number) from error
+        raise InputError(
+            Message("csv-unreadable", "is not readable as CSV: {error}", error=error), file=source, line=line_number
+        ) from error
     if len(parsed) != len(data):
-        raise InputError("a quoted field contains a line end; write each row on one line", file=source)
+        raise InputError(
+            Message("csv-line-end-in-field", "a quoted field contains a line end; write each row on one line"),
+            file=source,
+        )
     header = [name.strip() for name in parsed[0]]
     return CsvFile(numbers[0], header, numbers[1:], metadata, rows=parsed[1:])
 
@@ -171,7 +176,7 @@ class CsvTable:
         cells = self.words(column)
         for row, cell in enumerate(cells):
             if not cell:
-                raise self.fail(row, column, "is empty; every row needs a label here")
+                raise self.fail(row, column, Message("cell-empty", "is empty; every row needs a label here"))
         return [cell[1:] if cell[0] == "'" and _FORMULA.match(cell) else cell for cell in cells]
 
     def names(self, column: str) -> list[str]:
@@ -179,7 +184,10 @@ class CsvTable:
         found = self.text(column)
         if "=" in "".join(found):
             row = next(k for k, name in enumerate(found) if "=" in name)
-            raise self.fail(row, column, f"{visible_line(found[row])[:40]!r} is not a valid name; remove the '='")
+            cell = visible_line(found[row])[:40]
+            raise self.fail(
+                row, column, Message("cell-not-name", "{cell!r} is not a valid name; remove the '='", cell=cell)
+            )
         return found
 
     def numbers(self, column: str, *, empty: float | None = None, most: float = LARGEST) -> FloatArray:
@@ -216,9 +224,23 @@ class CsvTable:
     def _bad_number(self, column: str, cells: Sequence[str]) -> InputError:
         for row, cell in enumerate(cells):
             if not _is_number(cell):
-                what = "is empty" if not cell else f"{visible_line(cell)[:40]!r} is not a number"
-                return self.fail(row, column, f"{what}; expected a number with '.' as decimal point")
-        return InputError("contains text; expected numbers", file=self.path, field=f"column {column}")
+                if not cell:
+                    return self.fail(
+                        row, column, Message("cell-no-number", "is empty; expected a number with '.' as decimal point")
+                    )
+                shown = visible_line(cell)[:40]
+                return self.fail(
+                    row,
+                    column,
+                    Message(
+                        "cell-not-number",
+                        "{cell!r} is not a number; expected a number with '.' as decimal point",
+                        cell=shown,
+                    ),
+                )
+        return InputError(
+            Message("csv-text-for-number", "contains text; expected numbers"), file=self.path, field=f"column {column}"
+        )
 
     def labels(self, column: str) -> NDArray[np.int64]:
         """Return a column of whole-number labels, shape (rows,)."""
@@ -226,7 +248,10 @@ class CsvTable:
         wrong = np.flatnonzero((values != np.round(values)) | (np.abs(values) > _LARGEST_LABEL))
         if wrong.size:
             row = int(wrong[0])
-            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a whole number below 2^53")
+            cell = self.columns[column][row]
+            raise self.fail(
+                row, column, Message("cell-not-whole", "{cell!r} is not a whole number below 2^53", cell=cell)
+            )
         return values.astype(np.int64)
 
     def signs(self, column: str) -> FloatArray:
@@ -235,7 +260,12 @@ class CsvTable:
         wrong = np.flatnonzero(~np.isin(values, (-1.0, 0.0, 1.0)))
         if wrong.size:
             row = int(wrong[0])
-            raise self.fail(row, column, f"{self.columns[column][row]!r} is not a direction; expected 1, -1 or 0")
+            cell = self.columns[column][row]
+            raise self.fail(
+                row,
+                column,
+                Message("cell-not-direction", "{cell!r} is not a direction; expected 1, -1 or 0", cell=cell),
+            )
         return values
 
 
@@ -289,12 +319,20 @@ def csv_table(
     """Read the text ``content`` of the file ``source`` as :func:`read_csv` does."""
     fields = content.count(",")
     if fields > MOST_FIELDS:
-        raise InputError(f"has {fields} fields; at most {MOST_FIELDS} are read: leave out columns or rows", file=source)
+        raise InputError(
+            Message(
+                "csv-too-large",
+                "has {fields} fields; at most {value} are read: leave out columns or rows",
+                fields=fields,
+                value=MOST_FIELDS,
+            ),
+            file=source,
+        )
     file = parse_plain(content) or parse_any(source, content)
     required = list(required)
     _check_header(source, file.header_line, file.header, required)
     if not file.lines:
-        raise InputError("has a header but no rows", file=source, line=file.header_line)
+        raise InputError(Message("csv-no-rows", "has a header but no rows"), file=source, line=file.header_line)
     _check_widths(source, file, last=file.lines[-1])
     _check_complete(source, content, file, len(file.lines))
     kept = kept_columns(source, file.header_line, file.header, required, optional, prefixes)
@@ -336,7 +374,7 @@ def csv_parts(
     if not header:
         _check_header(source, 0, [], required)
     if not count:
-        raise InputError("has a header but no rows", file=source, line=header_line)
+        raise InputError(Message("csv-no-rows", "has a header but no rows"), file=source, line=header_line)
     _check_complete(source, content, file, count)
 
 
@@ -349,7 +387,11 @@ def _parts(source: Path) -> Iterator[str]:
                 whole, end, rest = (rest + block).rpartition(b"\n")
                 if len(rest) > min(LONGEST_LINE, PART_BYTES):
                     line = lines + held.count(b"\n") + 1
-                    raise InputError("is too long for a line; is it a text file?", file=source, line=line)
+                    raise InputError(
+                        Message("file-line-too-long", "is too long for a line; is it a text file?"),
+                        file=source,
+                        line=line,
+                    )
                 if not end:
                     continue
                 if held:
@@ -357,7 +399,9 @@ def _parts(source: Path) -> Iterator[str]:
                     encoding, lines = "utf-8", lines + held.count(b"\n")
                 held = whole + end
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=source) from error
+        raise InputError(
+            Message("file-unreadable", "cannot be read: {strerror}", strerror=error.strerror or error), file=source
+        ) from error
     yield decoded(held + rest, source, encoding, lines)
 
 
@@ -379,7 +423,15 @@ def kept_columns(
         warnings.warn(f"{source}:{line}: {message}", CompgenWarning, stacklevel=5)
     if len(strange) > _NAMED:
         warnings.warn(
-            f"{source}:{line}: {len(strange) - _NAMED} more columns are ignored", CompgenWarning, stacklevel=5
+            Message(
+                "csv-columns-ignored",
+                "{source}:{line}: {strange} more columns are ignored",
+                source=source,
+                line=line,
+                strange=len(strange) - _NAMED,
+            ),
+            CompgenWarning,
+            stacklevel=5,
         )
     return {k: name for k, name in enumerate(header) if _is_allowed(name, known, patterns)}
 
@@ -404,13 +456,20 @@ def _is_allowed(name: str, known: set[str], patterns: tuple[str, ...]) -> bool:
 
 def _check_header(source: Path, line: int, header: Sequence[str], required: Iterable[str]) -> None:
     if not header:
-        raise InputError(f"is empty; expected a header line with {', '.join(required)}", file=source)
+        raise InputError(
+            Message("csv-empty", "is empty; expected a header line with {required}", required=", ".join(required)),
+            file=source,
+        )
     if len(header) > MOST_COLUMNS:
         message = f"the header has {len(header)} columns; at most {MOST_COLUMNS} are allowed: is this a table?"
         raise InputError(message, file=source, line=line)
     twice = doubled(header)
     if twice is not None:
-        raise InputError(f"the header contains {_shown(twice)!r} twice", file=source, line=line)
+        raise InputError(
+            Message("csv-column-twice", "the header contains {twice!r} twice", twice=_shown(twice)),
+            file=source,
+            line=line,
+        )
     missing = [name for name in required if name not in header]
     if missing:
         needed, present = ", ".join(required), _shown(", ".join(header))
@@ -426,7 +485,15 @@ def _check_complete(source: Path, content: str, file: CsvFile, count: int) -> No
     """
     declared, last_line = file.metadata.get("rows"), file.lines[-1]
     if declared is not None and declared != str(count):
-        raise InputError(f"declares {visible_line(declared)} rows but contains {count}: is it truncated?", file=source)
+        raise InputError(
+            Message(
+                "csv-truncated",
+                "declares {declared} rows but contains {count}: is it truncated?",
+                declared=visible_line(declared),
+                count=count,
+            ),
+            file=source,
+        )
     if content.endswith(("\n", "\r")):
         return
     if declared is not None:
@@ -451,7 +518,13 @@ def format_csv(
     digits = decimals or {}
     sizes = {len(values) for values in columns.values()}
     if len(sizes) > 1:
-        raise ValueError(f"columns differ in length: {', '.join(f'{k} {len(v)}' for k, v in columns.items())}")
+        raise ValueError(
+            Message(
+                "table-columns-differ",
+                "columns differ in length: {columns}",
+                columns=", ".join(f"{k} {len(v)}" for k, v in columns.items()),
+            )
+        )
     rows = max(sizes, default=0)
     facts = {**(metadata or {}), "rows": rows}
     noted = [f"# {visible_line(key)} = {visible_line(value)}" for key, value in facts.items()]
@@ -516,6 +589,6 @@ def fixed(value: float, digits: int) -> str:
     if math.isnan(value):
         return ""
     if math.isinf(value):
-        raise ValueError("an infinite number cannot be written to a table")
+        raise ValueError(Message("table-infinite", "an infinite number cannot be written to a table"))
     text = f"{value:.{digits}f}"
     return text[1:] if text.startswith("-") and not text.strip("-0.") else text

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from compgen.data.arguments import path_of
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 
 TEMPORARY = ".tmp"
 #: Put in front of the name of a table or program that was not accepted.
@@ -85,7 +85,9 @@ def sha256_of_file(path: str | Path) -> str:
         with Path(path).open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
+        raise InputError(
+            Message("file-unreadable", "cannot be read: {strerror}", strerror=error.strerror or error), file=path
+        ) from error
 
 
 def json_values(value: Any) -> Any:
@@ -122,15 +124,21 @@ class OutputFolder:
             while not existing.exists() and existing != existing.parent:
                 existing = existing.parent
             if existing.exists() and not existing.is_dir():
-                raise InputError("is a file; --out needs a folder", file=existing)
+                raise InputError(Message("out-is-file", "is a file; --out needs a folder"), file=existing)
             if existing.is_dir() and (
                 not existing.stat().st_mode & 0o222 or not os.access(existing, os.W_OK | os.X_OK)
             ):
                 raise InputError(
-                    "the output folder is read-only; choose another --out or make it writable", file=existing
+                    Message(
+                        "out-read-only", "the output folder is read-only; choose another --out or make it writable"
+                    ),
+                    file=existing,
                 )
         except OSError as error:
-            raise InputError(f"cannot be used: {error.strerror or error}", file=self.folder) from error
+            raise InputError(
+                Message("out-unusable", "cannot be used: {strerror}", strerror=error.strerror or error),
+                file=self.folder,
+            ) from error
 
     @property
     def contents(self) -> Mapping[str, bytes]:
@@ -179,7 +187,10 @@ class OutputFolder:
         except OSError as error:
             _remove([*temporary.values()], made)
             raise InputError(
-                f"cannot write: {error.strerror or error}; nothing was written", file=self.folder
+                Message(
+                    "out-not-written", "cannot write: {strerror}; nothing was written", strerror=error.strerror or error
+                ),
+                file=self.folder,
             ) from error
         except BaseException:
             _remove([*temporary.values()], made)
@@ -368,7 +379,7 @@ def exclusive(
     handle = os.open(path, flags, mode)
     try:
         if not stat.S_ISREG(os.fstat(handle).st_mode):
-            raise InputError("is not a file; a lock is kept here, so remove it", file=path)
+            raise InputError(Message("lock-not-a-file", "is not a file; a lock is kept here, so remove it"), file=path)
         with contextlib.suppress(ImportError):  # a system without such locks
             if not _lock(handle):
                 waiting()
@@ -390,8 +401,13 @@ def _wait_for_lock(handle: int, path: Path, wait_s: float) -> None:
     while not _lock(handle):
         if time.monotonic() >= until:
             raise InputError(
-                f"is kept by {_holder(os.pread(handle, 300, 0))}, also after {wait_s:g} s; nothing was changed here: let "
-                "that process go on, or end it, then try again",
+                Message(
+                    "lock-held",
+                    "is kept by {handle}, also after {wait_s:g} s; nothing was changed here: let that "
+                    "process go on, or end it, then try again",
+                    handle=_holder(os.pread(handle, 300, 0)),
+                    wait_s=wait_s,
+                ),
                 file=path.parent,
             ) from BlockingIOError(errno.EAGAIN, "locked by another process")
         time.sleep(LOCK_POLL_S)
@@ -464,7 +480,7 @@ def read_bytes(path: str | Path, most: int = -1) -> bytes:
     source = path_of("path", path)
     try:
         if source.is_dir():
-            raise InputError("is a folder; expected a file", file=source)
+            raise InputError(Message("file-is-folder", "is a folder; expected a file"), file=source)
         with source.open("rb") as stream:
             if most < 0:
                 return stream.read()
@@ -474,9 +490,11 @@ def read_bytes(path: str | Path, most: int = -1) -> bytes:
                 left -= len(part)
             return b"".join(parts)
     except FileNotFoundError as error:
-        raise InputError("no such file", file=source) from error
+        raise InputError(Message("file-missing", "no such file"), file=source) from error
     except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror or error}", file=source) from error
+        raise InputError(
+            Message("file-unreadable", "cannot be read: {strerror}", strerror=error.strerror or error), file=source
+        ) from error
 
 
 def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
@@ -489,7 +507,15 @@ def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
     content = b"" if too_large else read_bytes(path, most + 1)
     if too_large or len(content) > most:
         size = f"has {os.path.getsize(path) / 1e6:.0f} MB" if too_large else "is too large"
-        raise InputError(f"{size}; at most {most / 1e6:g} MB are read of such a file: is it the right one?", file=path)
+        raise InputError(
+            Message(
+                "file-too-large",
+                "{size}; at most {most:g} MB are read of such a file: is it the right one?",
+                size=size,
+                most=most / 1000000.0,
+            ),
+            file=path,
+        )
     text = decoded(content, path)
     check_lines(text, path)
     return text
@@ -514,4 +540,6 @@ def decoded(content: bytes, path: str | Path, encoding: str = "utf-8-sig", befor
         return content.decode(encoding)
     except UnicodeDecodeError as error:
         line = before + content[: error.start].count(b"\n") + 1
-        raise InputError("is not UTF-8 text; save it as UTF-8", file=path, line=line) from error
+        raise InputError(
+            Message("file-not-utf8", "is not UTF-8 text; save it as UTF-8"), file=path, line=line
+        ) from error

@@ -31,7 +31,7 @@ from compgen.data.records import (
     detect_format,
     may_be_large,
 )
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, Message
 
 #: Readings of which an identification from an archive keeps the residuals, and in which it searches for disturbances.
 SAMPLE = 20_000
@@ -153,7 +153,7 @@ def open_archive(path: str | Path) -> LengthArchive:
         with zipfile.ZipFile(source) as archive, source.open("rb") as stream:
             members = {item.filename.removesuffix(".npy"): _member(source, stream, item) for item in archive.infolist()}
     except FileNotFoundError as error:
-        raise InputError("no such file", file=source) from error
+        raise InputError(Message("file-missing", "no such file"), file=source) from error
     except InputError:
         raise
     except Exception as error:  # what reads archives raises errors of many kinds: struct, tokenize, zlib
@@ -381,7 +381,7 @@ def opened_parquet(path: Path) -> Iterator[Any]:
         with parquet.ParquetFile(path) as file:
             yield file
     except FileNotFoundError as error:
-        raise InputError("no such file", file=path) from error
+        raise InputError(Message("file-missing", "no such file"), file=path) from error
     except (pyarrow.ArrowException, OSError) as error:
         raise InputError(f"is not a Parquet file, or is damaged: {error}", file=path) from error
 

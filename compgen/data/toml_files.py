@@ -25,7 +25,7 @@ from typing import Any, Literal, TypeVar, cast, overload
 
 from compgen.data.files import read_text
 from compgen.data.names import AXES, LARGEST, SMALLEST
-from compgen.errors import CompgenWarning, InputError, nearest, visible_line
+from compgen.errors import CompgenWarning, InputError, Message, nearest, visible_line
 
 
 def option(
@@ -225,7 +225,8 @@ class Section:
             return check(self.data[key])
         except ValueError as error:
             instead = example_of(accepted(check)) if default is _REQUIRED else None
-            message = f"{error}; got {visible_line(repr(self.data[key]))[:80]}"
+            got = visible_line(repr(self.data[key]))[:80]
+            message = Message("value-refused", "{error}; got {got}", error=error, got=got)
             raise self.fail(key, message, kind="value", instead=instead) from None
 
     def section(self, key: str, *, required: bool = True) -> Section:
@@ -284,13 +285,15 @@ def read_toml(path: str | Path) -> Section:
 def parse_toml(text: str, source: Path) -> Section:
     """Read the text of the TOML file ``source`` like :func:`read_toml`."""
     if not text.strip():
-        raise InputError("is empty", file=source)
+        raise InputError(Message("value-empty", "is empty"), file=source)
     try:
         return Section(tomllib.loads(text), path=source, text=text)
     except (ValueError, RecursionError) as error:  # a ValueError also for a number of thousands of digits
         found = re.search(r"line (\d+)", str(error))
         line = int(found.group(1)) if found else len(text.splitlines())
-        raise InputError(f"is not valid TOML: {error}", file=source, line=line) from error
+        raise InputError(
+            Message("toml-invalid", "is not valid TOML: {error}", error=error), file=source, line=line
+        ) from error
 
 
 def _refusal(check: Callable[[Any], Any], value: Any) -> str:
@@ -708,9 +711,16 @@ def _place_naming(data: Any, path: Path | None, file: str | Path | None, at: Pla
 def number(value: Any) -> float:
     """A finite number: zero, or of magnitude SMALLEST to LARGEST, so that its square is finite, too."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < math.inf:
-        raise ValueError("expected a finite number")
+        raise ValueError(Message("value-not-finite", "expected a finite number"))
     if not (value == 0 or SMALLEST <= abs(value) <= LARGEST):
-        raise ValueError(f"expected a finite number: 0, or a magnitude from {SMALLEST:g} to {LARGEST:g}")
+        raise ValueError(
+            Message(
+                "value-magnitude",
+                "expected a finite number: 0, or a magnitude from {value:g} to {value2:g}",
+                value=SMALLEST,
+                value2=LARGEST,
+            )
+        )
     return float(value)
 
 
@@ -719,7 +729,7 @@ def positive(value: Any) -> float:
     """A finite number above zero."""
     result = number(value)
     if result <= 0:
-        raise ValueError("expected a number above zero")
+        raise ValueError(Message("value-not-positive", "expected a number above zero"))
     return result
 
 
@@ -729,7 +739,7 @@ def multiple_of(quantum: Decimal) -> Callable[[Any], float]:
     @accepts(accepted(positive))
     def check(value: Any) -> float:
         if Decimal(repr(positive(value))) % quantum:
-            raise ValueError(f"expected a multiple of {quantum} mm")
+            raise ValueError(Message("value-not-multiple", "expected a multiple of {quantum} mm", quantum=quantum))
         return float(value)
 
     return check
@@ -740,7 +750,7 @@ def not_negative(value: Any) -> float:
     """A finite number, zero or more."""
     result = number(value)
     if result < 0:
-        raise ValueError("expected a number that is not negative")
+        raise ValueError(Message("value-negative", "expected a number that is not negative"))
     return result
 
 
@@ -753,7 +763,7 @@ def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
         upper = math.inf if maximum is None else maximum
         if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value <= upper:
             limits = f"from {minimum} to {maximum}" if maximum is not None else f"of at least {minimum}"
-            raise ValueError(f"expected a whole number {limits}")
+            raise ValueError(Message("value-not-whole", "expected a whole number {limits}", limits=limits))
         return value
 
     return check
@@ -763,7 +773,7 @@ def whole(minimum: int, maximum: int | None = None) -> Callable[[Any], int]:
 def flag(value: Any) -> bool:
     """``true`` or ``false``."""
     if not isinstance(value, bool):
-        raise ValueError("expected true or false")
+        raise ValueError(Message("value-not-boolean", "expected true or false"))
     return value
 
 
@@ -771,7 +781,7 @@ def flag(value: Any) -> bool:
 def text(value: Any) -> str:
     """One line of text, at most 200 characters."""
     if not isinstance(value, str) or not value.strip() or len(value) > 200 or any(ord(char) < 32 for char in value):
-        raise ValueError("expected one line of text")
+        raise ValueError(Message("value-not-text", "expected one line of text"))
     return value
 
 
@@ -779,7 +789,7 @@ def text(value: Any) -> str:
 def name(value: Any) -> str:
     """A text without "=", which separates a name from its value in comments and commands."""
     if "=" in text(value):
-        raise ValueError("expected a name without '='")
+        raise ValueError(Message("value-not-name", "expected a name without '='"))
     return str(value)
 
 
@@ -787,7 +797,7 @@ def name(value: Any) -> str:
 def text_of_path(value: Any) -> str:
     """A path as text: not empty, without control characters."""
     if not isinstance(value, str) or not value.strip() or any(ord(char) < 32 for char in value):
-        raise ValueError("expected the path of a file")
+        raise ValueError(Message("value-not-path", "expected the path of a file"))
     return value
 
 
@@ -797,7 +807,7 @@ def texts_of_paths(value: Any) -> tuple[str, ...]:
     if isinstance(value, list) and value:
         return tuple(text_of_path(item) for item in value)
     if not isinstance(value, str):
-        raise ValueError("expected the path of a file, or a list of paths")
+        raise ValueError(Message("value-not-paths", "expected the path of a file, or a list of paths"))
     return (text_of_path(value),)
 
 
@@ -807,7 +817,9 @@ def choice(*allowed: str) -> Callable[[Any], str]:
     @accepts({"enum": list(allowed)})
     def check(value: Any) -> str:
         if value not in allowed:
-            raise ValueError(f"expected one of {', '.join(map(repr, allowed))}")
+            raise ValueError(
+                Message("value-not-a-choice", "expected one of {choices}", choices=", ".join(map(repr, allowed)))
+            )
         return str(value)
 
     return check
@@ -830,7 +842,7 @@ def several_of(values: Mapping[str, T], what: str) -> Callable[[Any], tuple[T, .
             or any(item not in [*values] for item in value)
             or len(set(value)) < len(value)
         ):
-            raise ValueError(f"expected a list of different {what}")
+            raise ValueError(Message("value-not-a-list", "expected a list of different {what}", what=what))
         return tuple(values[item] for item in value)
 
     return check
@@ -844,7 +856,7 @@ def bounded(expected: str, **limits: float) -> Callable[[Any], float]:
     def check(value: Any) -> float:
         result = number(value)
         if not all(holds[name](result, limit) for name, limit in limits.items()):
-            raise ValueError(f"expected {expected}")
+            raise ValueError(Message("value-unexpected", "expected {expected}", expected=expected))
         return result
 
     return check
@@ -857,7 +869,9 @@ def share(most: float, whole: str) -> Callable[[Any], float]:
     def check(value: Any) -> float:
         result = not_negative(value)
         if result > most:
-            raise ValueError(f"expected a share of {whole} from 0 to {most:g}")
+            raise ValueError(
+                Message("value-not-share", "expected a share of {whole} from 0 to {most:g}", whole=whole, most=most)
+            )
         return result
 
     return check
@@ -867,7 +881,7 @@ def share(most: float, whole: str) -> Callable[[Any], float]:
 def numbers(value: Any) -> tuple[float, ...]:
     """A list of finite numbers."""
     if not isinstance(value, list):
-        raise ValueError("expected a list of numbers")
+        raise ValueError(Message("value-not-numbers", "expected a list of numbers"))
     return tuple(number(item) for item in value)
 
 
@@ -885,7 +899,7 @@ def one_or_more(check: Callable[[Any], float]) -> Callable[[Any], float | tuple[
 def vector3(value: Any) -> tuple[float, float, float]:
     """Three finite numbers, for X, Y and Z."""
     if not isinstance(value, list) or len(value) != 3:
-        raise ValueError("expected three numbers, for X, Y and Z")
+        raise ValueError(Message("value-not-three-numbers", "expected three numbers, for X, Y and Z"))
     x, y, z = (number(item) for item in value)
     return x, y, z
 
@@ -894,7 +908,7 @@ def vector3(value: Any) -> tuple[float, float, float]:
 def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
     """A list of tool offsets, each three finite numbers."""
     if not isinstance(value, list) or not value:
-        raise ValueError("expected a list of tool offsets [[x, y, z], ...]")
+        raise ValueError(Message("value-not-offsets", "expected a list of tool offsets [[x, y, z], ...]"))
     return tuple(vector3(item) for item in value)
 
 
@@ -902,10 +916,10 @@ def vectors3(value: Any) -> tuple[tuple[float, float, float], ...]:
 def interval(value: Any) -> tuple[float, float]:
     """Two finite numbers, the lower one first."""
     if not isinstance(value, list) or len(value) != 2:
-        raise ValueError("expected two numbers [lower, upper]")
+        raise ValueError(Message("value-not-two-numbers", "expected two numbers [lower, upper]"))
     lower, upper = number(value[0]), number(value[1])
     if lower >= upper:
-        raise ValueError("expected a range [lower, upper] with the lower number first")
+        raise ValueError(Message("value-not-range", "expected a range [lower, upper] with the lower number first"))
     return lower, upper
 
 
@@ -914,7 +928,7 @@ def ascending(value: Any) -> tuple[float, ...]:
     """At least two numbers in ascending order."""
     items = numbers(value)
     if len(items) < 2 or any(b <= a for a, b in zip(items, items[1:], strict=False)):
-        raise ValueError("expected at least two numbers in ascending order")
+        raise ValueError(Message("value-not-ascending", "expected at least two numbers in ascending order"))
     return items
 
 
@@ -922,12 +936,12 @@ def ascending(value: Any) -> tuple[float, ...]:
 def table(value: Any) -> dict[str, Any]:
     """A table of keys and values."""
     if not isinstance(value, dict):
-        raise ValueError("expected a table ([section])")
+        raise ValueError(Message("value-not-section", "expected a table ([section])"))
     return value
 
 
 @accepts({"type": "array", "items": {"type": "object"}})
 def _tables(value: Any) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise ValueError("expected an array of tables ([[section]])")
+        raise ValueError(Message("value-not-sections", "expected an array of tables ([[section]])"))
     return value

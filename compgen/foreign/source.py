@@ -15,7 +15,7 @@ from compgen.data.csv_files import names_in_header
 from compgen.data.error_table import ErrorTable, about_own_lines, is_apart, read_errors
 from compgen.data.files import check_lines, read_bytes
 from compgen.data.records import ARCHIVE, HEAD_BYTES, LARGE_TEXT, PARQUET, format_of_columns, is_artefact
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.any_measurement import Measurement, MixedMeasurement, OneKind, read_measurement
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def check_size(path: Path, most: int = MOST_BYTES) -> int:
     try:
         size = os.stat(path).st_size
     except FileNotFoundError:
-        raise InputError("no such file", file=path) from None
+        raise InputError(Message("file-missing", "no such file"), file=path) from None
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror or error}", file=path) from error
     if size > most:

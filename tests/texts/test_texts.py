@@ -1,5 +1,6 @@
 """German pages and lists: every text has a translation with the same numbers, and nothing that a control reads is touched."""
 
+import ast
 import json
 import re
 import shutil
@@ -16,7 +17,8 @@ from texts.reading import left_in_english, numbers, shown
 
 import compgen
 from compgen.controls import CONTROLLERS
-from compgen.errors import InputError
+from compgen.data.csv_files import read_csv
+from compgen.errors import InputError, message_of
 from compgen.language import Texts, parts, texts_of, wrapped
 from compgen.report.html import build_report
 from compgen.resources import LANGUAGES
@@ -344,3 +346,55 @@ def test_a_catalogue_that_is_put_there_is_a_language_at_once(tmp_path):
     code = "import runpy, sys; print(runpy.run_path('compgen/resources.py')['LANGUAGES'])"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert "'xx'" in done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("folder", ["data", "neue daten fuer mich", "expected a number of rows"])
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "no such file"),
+        (
+            "point,x_mm\n1,a value in mm\n",
+            "'a value in mm' is not a number; expected a number with '.' as decimal point",
+        ),
+        ("point,x_mm\n1,\n", "is empty; expected a number with '.' as decimal point"),
+    ],
+)
+def test_words_of_the_user_do_not_keep_a_sentence_in_english(folder, content, said, catalogue, tmp_path):
+    path = tmp_path / folder / "fehlt.csv"
+    path.parent.mkdir()
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(InputError) as refused:
+        read_csv(path, required=("point", "x_mm")).numbers("x_mm")
+    message = message_of(refused.value)
+    cell = "'a value in mm'"
+    german = catalogue[None, said.replace(cell, "{cell}")].replace("{cell}", cell)
+    assert said in str(message)
+    assert texts_of("de").lines(message) == str(message).replace(said, german).replace(": column", ": Spalte")
+
+
+def test_json_has_the_code_and_the_values_of_a_message(tmp_path, capsys):
+    from compgen.cli import cli
+    from compgen.cli.common import run_command
+
+    path = tmp_path / "neue daten" / "fehlt.csv"
+    assert run_command(cli, ["fit", "zha-gantry", str(path), "--out", str(tmp_path / "out"), "--json"]) == 2
+    said = json.loads(capsys.readouterr().out)
+    (message,) = said["messages"]
+    assert message["code"] == "file-missing"
+    assert message["text"] == said["error"]
+    assert message["values"]["place"].startswith(str(path))
+
+
+def test_a_code_belongs_to_one_message():
+    found = {}
+    for path in sorted((extraction.ROOT / "compgen").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Message":
+                if path.name == "errors.py":  # its template is put together from place and field
+                    continue
+                code, template = (item.value for item in node.args)
+                assert re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", code), (path, code)
+                assert found.setdefault(code, template) == template, (path, code)
+    assert len(found) > 50
