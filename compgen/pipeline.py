@@ -542,6 +542,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     allow_misfit: bool = False,
     language: str = LANGUAGES[0],
     progress: Progress = lambda _: None,
+    beyond: Callable[[Identification], Identification] | None = None,
 ) -> RunResult:
     """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
 
@@ -564,6 +565,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
         reason to refuse the tables.
     language : of the preflight list and the page of the check program, ``"en"`` or ``"de"``.
     progress : called with the name of each step when it begins.
+    beyond : adds to the identified errors what was measured with the rotary axes of the machine.
 
     Raises
     ------
@@ -609,6 +611,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
         identification = identify_beside(machine, measurement, numbers, identify_options, active)
+        identification = identification if beyond is None else beyond(identification)
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)
     smoothing = fit_options or FitOptions()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,16 +24,15 @@ from compgen.cli.shared_options import (
 )
 from compgen.cli.terminal import progress, stdout
 from compgen.controls import ROTARY_TARGETS
-from compgen.data.error_table import SQUARENESS_APART, ErrorTable
+from compgen.data.error_table import SQUARENESS_APART
 from compgen.data.files import OutputFolder, read_bytes
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.records import detect_format
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import heads_of
 from compgen.foreign.source import open_measurement
-from compgen.identification import IdentifyOptions
+from compgen.identification import Identification, IdentifyOptions
 from compgen.identification.any_measurement import describe, evidence_files
 from compgen.identification.covariance import covariance_file_of
 from compgen.identification.options import StatedNumbers
@@ -47,8 +48,7 @@ from compgen.pipeline import (
 from compgen.report.terminal import advice_text, identification_table
 
 if TYPE_CHECKING:
-    from compgen.identification.rotary_runs import RotaryPositioning
-    from compgen.identification.spheres import SphereIdentification
+    from compgen.identification.with_rotary import RotaryResult
     from compgen.tables.active import ActiveTables
 
 
@@ -126,7 +126,8 @@ def identify_command(
         raise InputError("--workers and --cluster need --self-check: they distribute its replicates")
     OutputFolder(out)
     if any(of_rotary_axes(path) for path in measurements):
-        return _identify_spheres(machine, measurements, out, options, as_json)
+        linear = LinearAxes(instrument, stated, answers, active)
+        return _identify_rotary(machine, measurements, out, options, linear, as_json)
     with progress(quiet=as_json) as show:
         show("reading the measurement")
         measurement = open_measurement(measurements, instrument, stated=stated.errors(machine), answers=answers)
@@ -167,25 +168,31 @@ def identify_command(
     return 1 if result.details.get("disagree") else 0
 
 
-def _identify_spheres(
-    machine: Machine, measurements: tuple[Path, ...], out: Path, options: IdentifyOptions, as_json: bool
+def _identify_rotary(
+    machine: Machine,
+    measurements: tuple[Path, ...],
+    out: Path,
+    options: IdentifyOptions,
+    linear: LinearAxes,
+    as_json: bool,
 ) -> int:
-    """Identify the position errors of rotary axes, and write them with what the poses leave open."""
-    placed, turned, summary, files = _rotary_files(machine, measurements, options)
+    """Identify the errors of rotary axes, with those of linear ones in one adjustment, and write them."""
+    result, summary, files = _rotary_files(machine, measurements, options, linear)
     write_all(out, files)
     if as_json:
         print_json(summary)
     else:
-        _show_rotary(placed, turned)
+        _show_rotary(result)
         stdout.print(f"{out / 'identified.errors.csv'}, {out / 'identify.json'}")
-    return 0 if placed is None or placed.rank else 1
+    return 0 if result.placed is None or result.placed.rank else 1
 
 
 def diagnose_rotary(machine: Machine, measurements: tuple[Path, ...], out: Path, as_json: bool) -> int:
     """What spheres and runs betray before any table: the probe, a reversed axis, misfit, what cannot be told apart."""
     import json
 
-    placed, turned, summary, _ = _rotary_files(machine, measurements, IdentifyOptions())
+    result, summary, _ = _rotary_files(machine, measurements, IdentifyOptions(), LinearAxes())
+    placed, turned = result.placed, result.turned
     findings = [*(() if placed is None else placed.notes[1:]), *(() if turned is None else turned.notes)]
     apart = [] if placed is None else [f"cannot be told apart: {words}; {cure}" for words, cure in placed.inseparable]
     data = {"kind": summary["kind"], "findings": findings, "not_told_apart": apart, "evidence": summary}
@@ -194,109 +201,133 @@ def diagnose_rotary(machine: Machine, measurements: tuple[Path, ...], out: Path,
     if as_json:
         print_json(data)
     else:
-        _show_rotary(placed, turned)
+        _show_rotary(result)
         stdout.print(f"{out / 'diagnosis.json'}, {out / 'diagnosis.md'}")
     return 0
 
 
-def _show_rotary(placed: SphereIdentification | None, turned: RotaryPositioning | None) -> None:
-    """Print what spheres and runs say."""
+def _show_rotary(result: RotaryResult) -> None:
+    """Print what was read of the rotary axes, and of the linear ones with them."""
     from compgen.report.terminal import sphere_table
 
-    if placed is not None:
-        stdout.print(sphere_table(placed))
-    if turned is not None:
-        for letter, own in turned.figures.items():
+    if result.linear is not None:
+        stdout.print(identification_table(result.linear))
+    if result.placed is not None:
+        stdout.print(sphere_table(result.placed))
+    if result.turned is not None:
+        for letter, own in result.turned.figures.items():
             figures = ", ".join(f"{name.replace('_', ' ')} {value:.2f}" for name, value in own.items())
             stdout.print(f"{letter}: positioning after ISO 230-2, arcsec: {figures}")
-        for note in turned.notes:
+        for note in result.turned.notes:
             stdout.print(f"note: {note}")
 
 
 def of_rotary_axes(path: Path) -> bool:
-    """Whether a file contains centres of spheres, or positioning runs of rotary axes."""
-    from compgen.data.rotary import is_rotary_runs
+    """Whether a file says something of rotary axes: spheres, bars, runs, readings with turned axes."""
+    from compgen.data.pose_readings import rotary_kind
 
-    kind = detect_format(path) if path.suffix.lower() == ".csv" else "other"
-    return kind == "sphere" or (kind in (None, "axis") and is_rotary_runs(path))
+    return rotary_kind(path) is not None
+
+
+@dataclass(frozen=True)
+class LinearAxes:
+    """What is said of the linear axes beside the files of the rotary ones."""
+
+    instrument: Path | None = None
+    stated: StatedNumbers = StatedNumbers()
+    answers: ImportOptions = ImportOptions()
+    active: ActiveTables | None = None
+
+    def identified(self, machine: Machine, files: Sequence[Path], options: IdentifyOptions) -> Identification | None:
+        """The linear axes from their files; None if nothing was measured or stated of them."""
+        errors = self.stated.errors(machine)
+        if not files and errors is None:
+            return None
+        measurement = open_measurement(files, self.instrument, stated=errors, answers=self.answers)
+        return identify_beside(machine, measurement, self.stated, options, self.active)
 
 
 def _rotary_files(
-    machine: Machine, measurements: tuple[Path, ...], options: IdentifyOptions
-) -> tuple[SphereIdentification | None, RotaryPositioning | None, dict[str, Any], dict[str, str]]:
-    """Errors of rotary axes from spheres and from runs, their summary, and the files that say so."""
+    machine: Machine, measurements: Sequence[Path], options: IdentifyOptions, linear: LinearAxes
+) -> tuple[RotaryResult, dict[str, Any], dict[str, str | bytes]]:
+    """Errors of rotary and linear axes in one adjustment, their summary, and the files that say so."""
+    from compgen.identification.with_rotary import identify_rotary, read_rotary_files
+
+    read = read_rotary_files(machine, measurements)
+    result = identify_rotary(machine, read, options, linear.identified(machine, read.others, options))
+    return result, result.summary(), _with_summary(machine, measurements, result)
+
+
+def _with_summary(machine: Machine, measurements: Sequence[Path], result: RotaryResult) -> dict[str, str | bytes]:
+    """The files of an identification with rotary axes."""
     import json
 
-    from compgen.data.rotary import RotaryErrors, format_machine_errors, is_rotary_runs, read_rotary_runs, read_spheres
-    from compgen.identification.rotary_runs import identify_rotary_runs
-    from compgen.identification.spheres import identify_spheres
-
-    others = [path for path in measurements if not of_rotary_axes(path)]
-    if others:
-        raise InputError(
-            "contains no centres of spheres; identify the linear axes and the rotary axes separately", file=others[0]
-        )
-    runs = [path for path in measurements if is_rotary_runs(path)]
-    centres = [path for path in measurements if path not in runs]
-    turned = identify_rotary_runs(machine, read_rotary_runs(machine, runs)) if runs else None
-    known = RotaryErrors() if turned is None else turned.errors
-    placed = None
-    if centres:
-        placed = identify_spheres(machine, read_spheres(machine, centres), u_um=options.u_deviation_um, known=known)
-    own = RotaryErrors() if placed is None else placed.errors
-    errors = RotaryErrors({**own.curves, **known.curves}, own.constants, known.reversal)
-    summary = turned.summary() if placed is None and turned is not None else {}
-    if placed is not None:
-        summary = {**placed.summary(), **({} if turned is None else {"rotary_axis": turned.summary()})}
-    sources = [
-        text for text, there in (("sphere centres", placed), ("positioning runs of rotary axes", turned)) if there
-    ]
-    metadata = {"machine": machine.name, "source": ", ".join(sources)}
-    data = {**summary, "provenance": dict(provenance_of(machine.source, *measurements).inputs)}
-    return (
-        placed,
-        turned,
-        summary,
-        {
-            "identified.errors.csv": format_machine_errors(ErrorTable(), errors, metadata),
-            "identify.json": json.dumps(data, indent=2) + "\n",
-        },
-    )
+    data = {**result.summary(), "provenance": dict(provenance_of(machine.source, *measurements).inputs)}
+    return {**result.files(), "identify.json": json.dumps(data, indent=2) + "\n"}
 
 
-def run_spheres(
-    machine: Machine,
-    measurements: tuple[Path, ...],
-    controllers: tuple[str, ...],
-    out: Path,
-    options: IdentifyOptions,
-    as_json: bool,
-    allow_unverified: bool = False,
-) -> int:
-    """Identify the errors of rotary axes, and write them as parameters or tables of one control."""
-    from compgen.cli.rotary_commands import export_parameters, export_tables, pitch_format
-    from compgen.controls.rotary_parameters import target_of
+@dataclass
+class RotaryRun:
+    """``volcomp run`` for a machine with rotary axes: identified once, together with the linear ones, for all controls.
 
-    if len(set(controllers)) > 1:
-        raise InputError(
-            f"one at a time, please: {controllers[0]} takes parameters of rotary axes", field="--controller"
-        )
-    OutputFolder(out)
-    name = controllers[0]
-    _ = target_of(machine, name) if name in ROTARY_TARGETS else pitch_format(machine, name, allow_unverified)
-    placed, turned, _, files = _rotary_files(machine, measurements, options)
-    if turned is None and name not in ROTARY_TARGETS:
-        raise InputError(
-            f"contains no positioning of a rotary axis, which {name} takes; give runs (*.axis.csv)",
-            file=measurements[0],
-        )
-    write_all(out, files)
-    if not as_json:
-        _show_rotary(placed, turned)
-    errors = out / "identified.errors.csv"
-    if name in ROTARY_TARGETS:
-        return export_parameters(machine, errors, name, out, as_json)
-    return export_tables(machine, errors, name, out, as_json, allow_unverified)
+    ``added`` is what the identification of the linear axes becomes (:func:`compgen.pipeline.run`, ``beyond``).
+    """
+
+    machine: Machine
+    measurements: tuple[Path, ...]
+    controllers: tuple[str, ...]
+    out: Path
+    options: IdentifyOptions
+    linear: LinearAxes
+    allow_unverified: bool = False
+    result: RotaryResult | None = None
+
+    def check(self) -> None:
+        """Find what is wrong with the controls before the work begins; InputError."""
+        from compgen.cli.rotary_commands import pitch_format
+        from compgen.controls.rotary_parameters import target_of
+        from compgen.identification.with_rotary import read_rotary_files
+
+        self.read = read_rotary_files(self.machine, self.measurements)
+        for name in self.controllers:
+            if name in ROTARY_TARGETS:
+                target_of(self.machine, name)
+                continue
+            pitch_format(self.machine, name, self.allow_unverified)
+            if self.read.runs is None:
+                raise InputError(
+                    f"contains no positioning of a rotary axis, which {name} takes; give runs (*.axis.csv)",
+                    file=self.measurements[0],
+                )
+
+    def added(self, found: Identification) -> Identification:
+        """The linear axes with what was read at poses."""
+        from compgen.identification.with_rotary import identify_rotary
+
+        self.result = identify_rotary(self.machine, self.read, self.options, found)
+        return self.result.linear or found
+
+    def export(self, *, apart: bool, as_json: bool) -> int:
+        """Write parameters and tables of the rotary axes, each control into its own folder if there are several."""
+        from compgen.cli.rotary_commands import export_parameters, export_tables
+        from compgen.identification.with_rotary import identify_rotary
+
+        if self.result is None:
+            linear = self.linear.identified(self.machine, self.read.others, self.options)
+            self.result = identify_rotary(self.machine, self.read, self.options, linear)
+        files = _with_summary(self.machine, self.measurements, self.result)
+        if not as_json:
+            _show_rotary(self.result)
+        codes = []
+        for name in self.controllers:
+            folder = self.out / name if apart else self.out
+            write_all(folder, files)
+            errors = folder / "identified.errors.csv"
+            if name in ROTARY_TARGETS:
+                codes.append(export_parameters(self.machine, errors, name, folder, as_json))
+            else:
+                codes.append(export_tables(self.machine, errors, name, folder, as_json, self.allow_unverified))
+        return max(codes)
 
 
 @click.command("fit")

@@ -495,7 +495,7 @@ def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with
     import numpy as np
 
     from compgen.data.rotary import format_poses, read_machine_errors, read_poses
-    from compgen.identification.rotary_covariance import known_covariance, pose_uncertainty
+    from compgen.identification.rotary_covariance import joint_beside, known_covariance, pose_uncertainty
     from compgen.kinematics.rotary_chain import pose_error
 
     poses = read_poses(machine, points)
@@ -504,8 +504,11 @@ def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with
     columns = {f"e{axis}_um": error_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
     columns |= {f"e{axis}_urad": error_rad[:, k] * 1e6 for k, axis in enumerate("abc")}
     extra: dict[str, float] = {}
+    joint = None
     if with_u:
-        u_mm, u_rad = pose_uncertainty(machine, table, rotary, poses, known_covariance(errors, rotary))
+        joint = joint_beside(errors, table, rotary)
+        known = known_covariance(errors, rotary) if joint is None else joint
+        u_mm, u_rad = pose_uncertainty(machine, table, rotary, poses, known)
         columns |= {f"u_{axis}_um": u_mm[:, k] * 1e3 for k, axis in enumerate("xyz")}
         columns |= {f"u_{axis}_urad": u_rad[:, k] * 1e6 for k, axis in enumerate("abc")}
         extra = {"u_max_um": float(u_mm.max() * 1e3), "u_max_urad": float(u_rad.max() * 1e6)}
@@ -520,10 +523,17 @@ def _predict_poses(machine: Machine, errors: Path, points: Path, out: Path, with
             f"{turned:.1f} urad -> {out}"
         )
         if extra:
-            say(
-                f"largest standard uncertainty of a coordinate {extra['u_max_um']:.2f} um, of an angle "
-                f"{extra['u_max_urad']:.1f} urad; errors of linear axes that ERRORS does not list are not in it"
-            )
+            largest = f"{extra['u_max_um']:.2f} um", f"{extra['u_max_urad']:.1f} urad"
+            if joint is None:
+                say(
+                    f"largest standard uncertainty of a coordinate {largest[0]}, of an angle {largest[1]}; errors of linear axes "
+                    "that ERRORS does not list are not in it"
+                )
+            else:
+                say(
+                    f"largest standard uncertainty of a coordinate {largest[0]}, of an angle {largest[1]}; what was not measured "
+                    "of the linear axes is in it with the sizes of the prior"
+                )
     return 0
 
 

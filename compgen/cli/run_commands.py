@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
@@ -33,6 +34,7 @@ from compgen.cli.terminal import progress, say, say_paths, stdout
 from compgen.controls import HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS
 from compgen.data.files import OutputFolder
 from compgen.data.machine import Machine
+from compgen.data.pose_readings import rotary_kind
 from compgen.errors import CompgenWarning, InputError
 from compgen.fitting import FitOptions
 from compgen.foreign.answers import ImportOptions
@@ -43,6 +45,7 @@ from compgen.report.terminal import advice_text, identification_table, verificat
 from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
+    from compgen.cli.identify_commands import RotaryRun
     from compgen.report.html.folder import KnownTables
     from compgen.report.html.write import Further
     from compgen.tables.active import ActiveTables
@@ -269,10 +272,21 @@ def run_command(
         message = f"{heat[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml "
         f"--controller {heat[0]}"
         raise InputError(message, field="--controller")
-    if any(name in (*ROTARY_TARGETS, *ROTARY_PITCH) for name in controller):
-        from compgen.cli.identify_commands import run_spheres
-
-        return run_spheres(machine, measurements, controller, out, options, as_json, allow_unverified)
+    turned = _rotary_run(machine, measurements, controller, out, options, allow_unverified)
+    if turned is not None:
+        turned.linear = replace(turned.linear, instrument=instrument, stated=stated, answers=answers, active=active)
+        if as_json and (len(set(controller)) > 1):
+            raise InputError("--json is one object: give one control at a time where rotary axes are among them")
+        turned.check()
+        measurements = turned.read.others
+        controller = tuple(name for name in controller if name not in turned.controllers)
+        if not controller:
+            return turned.export(apart=len(turned.controllers) > 1, as_json=as_json)
+        if not measurements:
+            raise InputError(
+                f"says nothing of the linear axes, whose tables {controller[0]} takes; give a measurement of them as well",
+                file=turned.measurements[0],
+            )
     with progress(quiet=as_json) as show:
         result = run(
             machine,
@@ -291,6 +305,7 @@ def run_command(
             instrument=instrument,
             stated=stated,
             answers=answers,
+            beyond=None if turned is None else turned.added,
         )
         if not no_report:
             show("drawing the report")
@@ -313,4 +328,24 @@ def run_command(
             say_paths(item.paths)
         if report is not None:
             say(f"  {report}")
-    return 0 if result.accepted else 1
+    code = 0 if result.accepted else 1
+    if turned is not None and turned.controllers:
+        code = max(code, turned.export(apart=True, as_json=False))
+    return code
+
+
+def _rotary_run(
+    machine: Machine,
+    measurements: tuple[Path, ...],
+    controller: tuple[str, ...],
+    out: Path,
+    options: IdentifyOptions,
+    allow_unverified: bool,
+) -> RotaryRun | None:
+    """What is to be done about rotary axes; None if no file and no control is about them."""
+    own = tuple(name for name in dict.fromkeys(controller) if name in (*ROTARY_TARGETS, *ROTARY_PITCH))
+    if not own and not any(rotary_kind(path) for path in measurements):
+        return None
+    from compgen.cli.identify_commands import LinearAxes, RotaryRun  # another command: loaded only where it is needed
+
+    return RotaryRun(machine, measurements, own, out, options, LinearAxes(), allow_unverified)

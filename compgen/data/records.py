@@ -387,6 +387,7 @@ def _any_of(names: Iterable[str]) -> tuple[frozenset[str], ...]:
 _PLACE = frozenset(POSITION_COLUMNS)
 _SIGNATURES = (
     _Signature("sixdof", _any_of(("y_qd1_mm", "y_psd1_mm"))),
+    _Signature("bar", (frozenset({"ball_x_mm", "nominal_mm"}),), _PLACE),
     _Signature("sphere", (frozenset({"cx_mm", "cy_mm", "cz_mm"}),)),
     _Signature("sphere", tuple(frozenset({angle, "dx_um"}) for angle in ("a_deg", "b_deg", "c_deg")), _PLACE),
     _Signature("part", _any_of(MEASURED_COLUMNS), frozenset(POSITION_COLUMNS[:2])),
@@ -418,7 +419,7 @@ def detect_format(source: str | Path) -> str | None:
     """Return the kind of a measurement file from its columns.
 
     ``lengths``, ``deviations``, ``part``, ``artefact``, ``axis``, ``circle``, ``diagonals``, ``sixdof``, ``sphere``,
-    ``errors``, or None.
+    ``bar``, ``errors``, or None.
     """
     if str(source).lower().endswith((ARCHIVE, PARQUET)):
         return "lengths"

@@ -351,12 +351,7 @@ def read_spheres(machine: Machine, paths: Sequence[str | Path]) -> SphereCentres
         without the comment ``# coordinates = joints`` or ``tip``, for an angle outside the travel of its axis, an axis
         that the machine lacks, a missing column; with file, line and column.
     """
-    if not machine.rotary:
-        raise InputError(
-            f"contains poses of rotary axes, and the machine {machine.name} has none; name them in its chain, e.g. "
-            "WCAYFXZT, and describe them in [axes.A] and [axes.C]",
-            file=paths[0],
-        )
+    needs_rotary(machine, paths[0])
     parts = [_spheres_of(machine, Path(path)) for path in paths]
     if len({part.coordinates for part in parts}) > 1:
         raise InputError("some files have coordinates = joints, others tip; identify them separately", file=paths[-1])
@@ -384,24 +379,10 @@ def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
          "diameter_mm", "time_s", "run"),
         (TEMPERATURES,),
     )  # fmt: skip
-    coordinates = table.metadata.get("coordinates", "").strip().lower()
-    if coordinates not in (JOINTS, TIP):
-        stated = f"is {coordinates!r}" if coordinates else "is not stated"
-        raise InputError(
-            f"{stated}; write '# coordinates = joints' if the numbers are positions of the axes, '# coordinates = tip' "
-            "if they are positions of the tip under active kinematics (TCPC, RTCP)",
-            file=path,
-            field="coordinates",
-        )
+    coordinates = coordinates_of(table)
     count, nan = len(table), np.full(len(table), np.nan)
-    angle_deg = {letter: _angles(machine, table, letter) for letter in machine.rotary}
-    for column in ANGLE_COLUMNS:
-        letter = column[0].upper()
-        if column in table.columns and letter not in machine.rotary and np.any(table.numbers(column, empty=0.0)):
-            row = int(np.flatnonzero(table.numbers(column, empty=0.0))[0])
-            raise table.fail(
-                row, column, f"the machine {machine.name} (chain {machine.chain.name}) has no axis {letter}"
-            )
+    angle_deg = {letter: angles_of(machine, table, letter) for letter in machine.rotary}
+    check_other_angles(machine, table)
 
     def optional(name: str, read: ReadColumn = CsvTable.numbers) -> FloatArray:
         return np.asarray(read(table, name)) if name in table.columns else nan
@@ -413,7 +394,7 @@ def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
         ),
         coordinates=coordinates,
         angle_deg=angle_deg,
-        tool_mm=_tools(machine, table),
+        tool_mm=tools_of(machine, table),
         sphere=table.text("sphere") if "sphere" in table.columns else ["sphere"] * count,
         setup=table.labels("setup") if "setup" in table.columns else np.ones(count, dtype=np.int64),
         u_mm=optional("u_um", uncertainties) * MM_PER_UM,
@@ -424,7 +405,42 @@ def _spheres_of(machine: Machine, path: Path) -> SphereCentres:
     )
 
 
-def _angles(machine: Machine, table: CsvTable, letter: str) -> FloatArray:
+def needs_rotary(machine: Machine, path: str | Path) -> None:
+    """InputError for poses of rotary axes of a machine that has none."""
+    if not machine.rotary:
+        raise InputError(
+            f"contains poses of rotary axes, and the machine {machine.name} has none; name them in its chain, e.g. "
+            "WCAYFXZT, and describe them in [axes.A] and [axes.C]",
+            file=path,
+        )
+
+
+def coordinates_of(table: CsvTable) -> str:
+    """What the positions of a file are, from its comment ``# coordinates``; InputError if that is not stated."""
+    coordinates = table.metadata.get("coordinates", "").strip().lower()
+    if coordinates not in (JOINTS, TIP):
+        stated = f"is {coordinates!r}" if coordinates else "is not stated"
+        raise InputError(
+            f"{stated}; write '# coordinates = joints' if the numbers are positions of the axes, '# coordinates = tip' "
+            "if they are positions of the tip under active kinematics (TCPC, RTCP)",
+            file=table.path,
+            field="coordinates",
+        )
+    return coordinates
+
+
+def check_other_angles(machine: Machine, table: CsvTable) -> None:
+    """InputError for angles of an axis that the machine lacks, other than zero."""
+    for column in ANGLE_COLUMNS:
+        letter = column[0].upper()
+        if column in table.columns and letter not in machine.rotary and np.any(table.numbers(column, empty=0.0)):
+            row = int(np.flatnonzero(table.numbers(column, empty=0.0))[0])
+            raise table.fail(
+                row, column, f"the machine {machine.name} (chain {machine.chain.name}) has no axis {letter}"
+            )
+
+
+def angles_of(machine: Machine, table: CsvTable, letter: str) -> FloatArray:
     """Commanded angles of one axis, within its travel."""
     column = f"{letter.lower()}_deg"
     angle = table.numbers(column)
@@ -438,7 +454,7 @@ def _angles(machine: Machine, table: CsvTable, letter: str) -> FloatArray:
     return angle
 
 
-def _tools(machine: Machine, table: CsvTable) -> FloatArray:
+def tools_of(machine: Machine, table: CsvTable) -> FloatArray:
     """Offsets of the tip (n, 3): stated as a vector, or the machine's own offset and the probe along -Z."""
     own = np.tile(np.array(machine.tool_offset_mm), (len(table), 1))
     if "probe_length_mm" in table.columns:
@@ -496,7 +512,7 @@ def read_poses(machine: Machine, path: str | Path) -> Poses:
         if column in table.columns and column[0].upper() not in machine.rotary:
             raise table.fail(0, column, f"the machine {machine.name} has no axis {column[0].upper()}; omit the column")
     angle = {
-        letter: _angles(machine, table, letter)
+        letter: angles_of(machine, table, letter)
         if f"{letter.lower()}_deg" in table.columns
         else np.full(len(table), axis.reference_deg)
         for letter, axis in machine.rotary.items()

@@ -75,16 +75,17 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         found = detect_format(path)  # of a file that is no measurement, the reader of lengths says best what is missing
         kinds.setdefault(
             found
-            if found in ("part", "artefact", "axis", "circle", "deviations", "sixdof", "diagonals", "sphere")
+            if found in ("part", "artefact", "axis", "circle", "deviations", "sixdof", "diagonals", "sphere", "bar")
             else "lengths",
             [],
         ).append(path)
     if "diagonals" in kinds:
         text = "contains measured diagonals, from which no errors can be identified; use accuracy or compare"
         raise InputError(text, file=kinds["diagonals"][0])
-    if "sphere" in kinds:
-        text = "contains centres of spheres at poses of rotary axes; only volcomp identify evaluates them, alone"
-        raise InputError(text, file=kinds["sphere"][0])
+    for kind in ("sphere", "bar"):
+        if kind in kinds:
+            text = "contains readings at poses of rotary axes, which volcomp identify, run and diagnose evaluate"
+            raise InputError(text, file=kinds[kind][0])
     if "sixdof" in kinds and instrument is None:
         message = (
             "contains six-DOF readings, which require the constants of their instrument; give --instrument FILE (TOML)"

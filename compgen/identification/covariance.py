@@ -63,6 +63,7 @@ class Covariance(Displayed):
     machine, errors_sha256 : name of the machine, and SHA-256 of its errors file ("" for none).
     posterior : what is known of every error, also of those that the errors file does not list; None if it follows from
         the errors file and the prior of the machine file (:func:`posterior_with`).
+    rotary : constants of rotary axes that were adjusted together with these values: names, and their rows (m, r) of the factor.
     """
 
     error: tuple[str, ...]
@@ -73,6 +74,7 @@ class Covariance(Displayed):
     machine: str = ""
     errors_sha256: str = ""
     posterior: StoredPosterior | None = None
+    rotary: tuple[tuple[str, ...], FloatArray] | None = None
 
     @property
     def stations(self) -> tuple[str, ...]:
@@ -394,6 +396,8 @@ def format_covariance(covariance: Covariance, errors_text: str) -> bytes:
         "factor": covariance.factor,
         **({} if covariance.posterior is None else covariance.posterior.members()),
     }
+    if covariance.rotary is not None:
+        members |= {"rotary_error": np.array(covariance.rotary[0]), "rotary_factor": covariance.rotary[1]}
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, array in members.items():
@@ -491,6 +495,17 @@ def parse_covariance(content: bytes, source: Path) -> Covariance:
     return _checked(source, members)
 
 
+def _rotary_of(members: dict[str, NDArray[np.generic]]) -> tuple[tuple[str, ...], FloatArray] | None:
+    """Constants of rotary axes and their rows of the factor; None if there are none; ValueError for parts that do not match."""
+    if "rotary_error" not in members:
+        return None
+    names = tuple(str(name) for name in members["rotary_error"].ravel())
+    rows = np.asarray(members.get("rotary_factor", np.zeros((0, 0))), dtype=np.float64)
+    if rows.shape != (len(names), np.asarray(members["factor"]).shape[-1]) or not np.isfinite(rows).all():
+        raise ValueError("the rows of rotary axes do not match the others")
+    return names, rows
+
+
 def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covariance:
     try:
         covariance = Covariance(
@@ -502,6 +517,7 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
             machine=str(members["machine"]),
             errors_sha256=str(members["errors_sha256"]),
             posterior=StoredPosterior.from_members(members),
+            rotary=_rotary_of(members),
         )
     except (ValueError, TypeError) as error:
         raise InputError(

@@ -16,7 +16,9 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.rotary import Poses, RotaryErrors, si_per_unit
 from compgen.errors import InputError
-from compgen.kinematics.rotary_chain import pose_error
+from compgen.identification.covariance import Covariance, covariance_named_by
+from compgen.identification.rotary_linear import LinearState
+from compgen.kinematics.rotary_chain import linear_columns, pose_error
 
 #: Names of constants and their covariance, mm and rad.
 Known = tuple[tuple[str, ...], FloatArray]
@@ -54,26 +56,65 @@ def known_covariance(errors: Path, rotary: RotaryErrors) -> Known:
     return ((), np.zeros((0, 0))) if found is None else found
 
 
+def joint_beside(errors: Path, table: ErrorTable, rotary: RotaryErrors) -> Covariance | None:
+    """The covariance file of errors of linear and rotary axes that were adjusted together; None if there is none."""
+    if "covariance" not in table.metadata:
+        return None
+    found = covariance_named_by(errors, table)
+    if (
+        found is None
+        or found.rotary is None
+        or found.posterior is None
+        or set(found.rotary[0]) != set(rotary.constants)
+    ):
+        return None
+    return found
+
+
 def pose_uncertainty(
-    machine: Machine, table: ErrorTable, rotary: RotaryErrors, poses: Poses, known: Known
+    machine: Machine, table: ErrorTable, rotary: RotaryErrors, poses: Poses, known: Known | Covariance
 ) -> tuple[FloatArray, FloatArray]:
     """Standard uncertainties of tip (n, 3), mm, and orientation (n, 3), rad: of constants, nodes of curves, squareness.
 
-    Constants have their joint covariance; nodes of curves and errors of linear axes count as independent where their
-    uncertainty is stated.
+    Constants have their joint covariance, or that of everything (:func:`joint_beside`); nodes of curves of rotary axes, and
+    errors of linear axes without a joint covariance, count as independent where their uncertainty is stated.
     """
-    names, covariance = known
     base = _flat(machine, table, rotary, poses)
     variance = np.zeros_like(base)
-    if names:
+    if isinstance(known, Covariance):
+        spread = _joint_spread(machine, table, rotary, poses, known)
+        variance += np.einsum("ij,ij->i", spread, spread)
+    elif known[0]:
+        names, covariance = known
         columns = [_by_constant(machine, table, rotary, poses, name) for name in names]
         variance += np.einsum("ij,jk,ik->i", np.stack(columns, axis=1), covariance, np.stack(columns, axis=1))
     for changed in _nodes(rotary):
         variance += (_flat(machine, table, changed, poses) - base) ** 2
-    for other in _linear(table):
+    for other in () if isinstance(known, Covariance) else _linear(table):
         variance += (_flat(machine, other, rotary, poses) - base) ** 2
     u = np.sqrt(variance).reshape(-1, 6)
     return u[:, :3], u[:, 3:]
+
+
+def _joint_spread(
+    machine: Machine, table: ErrorTable, rotary: RotaryErrors, poses: Poses, joint: Covariance
+) -> FloatArray:
+    """What is not known of tip and orientation (6 n, r), of linear and rotary axes together, also of what was not measured."""
+    if joint.posterior is None or joint.rotary is None:
+        raise ValueError("the covariance is not one of linear and rotary axes")
+    state = LinearState.of_posterior(machine, joint.posterior.of(machine), poses.position_mm)
+    matrix = linear_columns(machine, poses.position_mm, poses.angle_deg, poses.tool_mm)
+    spread = state.at(poses.position_mm).design(matrix).reshape(6 * len(matrix), -1)
+    names, rows = joint.rotary
+    own = np.stack([_by_constant(machine, table, rotary, poses, name) for name in names], axis=1) @ rows
+    wide = max(
+        own.shape[1], spread.shape[1]
+    )  # the first columns are those of the posterior in both, the others of neither
+    first = joint.posterior.factor.shape[1]
+    total = np.zeros((len(own), wide))
+    total[:, : spread.shape[1]] = spread
+    total[:, :first] += own[:, :first]
+    return total
 
 
 def _flat(machine: Machine, table: ErrorTable, rotary: RotaryErrors, poses: Poses) -> FloatArray:

@@ -39,7 +39,7 @@ class Motions:
     ----------
     curves : motions that the readings determine, by name; ``not_told`` the names of the others.
     values, covariance : of the unknowns without motions, mm and rad.
-    residual_mm : what is left, (n, 3).
+    residual_mm : what is left, (q,).
     left_out_mm : rms distance of poses that were left out in turn.
     noise_mm, size_mm : standard deviations of a coordinate, and of a motion of one period a turn.
     gain : logarithm of how much more probable the readings are than without motions.
@@ -70,7 +70,8 @@ _SMALLER = np.repeat([1.0 / k**2 for k in _WAVES], 2)
 def find_motions(
     machine: Machine,
     angle_deg: Mapping[str, FloatArray],
-    tip_with: Callable[[Mapping[str, RotaryCurve]], FloatArray],
+    read_with: Callable[[Mapping[str, RotaryCurve]], FloatArray],
+    pose: NDArray[np.int64],
     columns: FloatArray,
     wanted: FloatArray,
     variance: FloatArray,
@@ -82,14 +83,14 @@ def find_motions(
 
     Parameters
     ----------
-    tip_with : where the sphere must be with these motions, (n, 3).
-    columns, wanted : the linear model of the other unknowns (3 n, m), and what it has to explain (3 n,), mm.
+    read_with : what the model reads with these motions, (q,); ``pose`` (q,) is the number of the pose of each reading.
+    columns, wanted : the linear model of the other unknowns (q, m), and what it has to explain (q,), mm.
     variance : of the other unknowns before the measurement, (m,); inf for what is free.
-    noise_mm : standard uncertainty of a coordinate of each pose, (n,).
+    noise_mm : standard uncertainty of each reading, (q,).
     free_noise : whether the noise is to be found, too.
     """
     names = [name for letter in machine.rotary for name in motion_names(letter)]
-    moved = _columns(machine, angle_deg, tip_with, names)
+    moved = _columns(machine, angle_deg, read_with, names)
     size = np.concatenate([_SMALLER * (1.0 if name[1] in AXES else _TILT) for name in names])
     every = np.hstack([columns, moved])
     before = np.minimum(variance, _FREE)
@@ -97,7 +98,7 @@ def find_motions(
     def prior(size_mm: float) -> FloatArray:
         return np.concatenate([before, (size_mm * size) ** 2])
 
-    noise = np.repeat(noise_mm, 3)
+    noise = noise_mm
     factors = _NOISE if free_noise else (1.0,)
     compressed = _compressed(every / noise[:, None], wanted / noise)
     plain = max(_evidence(compressed, prior(0.0), factor) for factor in factors)
@@ -112,8 +113,8 @@ def find_motions(
     mean, covariance = _posterior(every, variances, noise, wanted)
     m = columns.shape[1]
     curves, not_told = _curves(machine, angle_deg, names, mean[m:], covariance[m:, m:], variances[m:])
-    left = (wanted - every @ mean).reshape(-1, 3)
-    left_out = _left_out(every, variances, noise, wanted)
+    left = wanted - every @ mean
+    left_out = _left_out(every, variances, noise, wanted, pose)
     return Motions(
         curves,
         tuple(not_told),
@@ -130,18 +131,18 @@ def find_motions(
 def _columns(
     machine: Machine,
     angle_deg: Mapping[str, FloatArray],
-    tip_with: Callable[[Mapping[str, RotaryCurve]], FloatArray],
+    read_with: Callable[[Mapping[str, RotaryCurve]], FloatArray],
     names: list[str],
 ) -> FloatArray:
-    """Derivatives (3 n, 8 motions) of the tip by the waves of each motion."""
-    none, found = tip_with({}), []
+    """Derivatives (q, 8 motions) of the readings by the waves of each motion."""
+    none, found = read_with({}), []
     for name in names:
         axis = machine.rotary[name[-1]]
         nodes = np.unique(np.append(angle_deg[name[-1]], axis.reference_deg))
         step = 1e-3 if name[1] in AXES else 1e-6
         for wave in _waves(nodes, axis.reference_deg).T:
             curve = RotaryCurve(nodes, step * wave, np.full(len(nodes), np.nan))
-            found.append((tip_with({name: curve}) - none).ravel() / step)
+            found.append((read_with({name: curve}) - none) / step)
     return np.stack(found, axis=1)
 
 
@@ -201,13 +202,15 @@ def _curves(
     return curves, not_told
 
 
-def _left_out(columns: FloatArray, variance: FloatArray, noise: FloatArray, wanted: FloatArray) -> float:
+def _left_out(
+    columns: FloatArray, variance: FloatArray, noise: FloatArray, wanted: FloatArray, pose: NDArray[np.int64]
+) -> float:
     """Rms distance of poses that were left out of the fit in turn, mm."""
-    count = len(wanted) // 3
-    fold: NDArray[np.int64] = np.random.default_rng(0).permutation(count) % _FOLDS
+    count = int(pose.max()) + 1
+    fold: NDArray[np.int64] = (np.random.default_rng(0).permutation(count) % _FOLDS)[pose]
     total = 0.0
     for k in range(_FOLDS):
-        inside = np.repeat(fold != k, 3)
+        inside = fold != k
         mean, _ = _posterior(columns[inside], variance, noise[inside], wanted[inside])
         total += float(np.sum((wanted[~inside] - columns[~inside] @ mean) ** 2))
     return float(np.sqrt(total / count))

@@ -20,44 +20,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import Curve, ErrorTable
-from compgen.data.machine import Machine
-from compgen.data.names import AXES, COVERAGE, MM_PER_UM, SQUARENESS_NAMES
-from compgen.data.prior import CLASSES, USUAL_CLASS
-from compgen.data.rotary import (
-    JOINTS,
-    SPINDLE,
-    TIP,
-    RotaryCurve,
-    RotaryErrors,
-    SphereCentres,
-    position_names,
-    si_per_unit,
-    unit_of,
-)
 from compgen.drawing.display import Displayed, Overview
-from compgen.errors import ConvergenceError, InputError
+from compgen.data.error_table import ErrorTable
+from compgen.data.machine import Machine
+from compgen.data.names import COVERAGE, MM_PER_UM
+from compgen.data.pose_readings import Bars, PosedDeviations, PosedLengths
+from compgen.data.rotary import TIP, RotaryErrors, SphereCentres, si_per_unit, unit_of
+from compgen.errors import InputError
+from compgen.identification.posterior import Posterior, root_of
+from compgen.identification.rotary_adjustment import (
+    DETERMINED,
+    Problem,
+    Solved,
+    by_pose,
+    constants_of,
+    directions,
+    in_words,
+    left_out,
+    separated_by,
+    solve,
+    split,
+    without_errors,
+)
+from compgen.identification.rotary_linear import LinearState
+from compgen.identification.rotary_readings import PoseReadings, readings_at
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 
-#: Sizes of position errors of a machine that was set up by usual means (one standard deviation), um and urad.
-OFFSET_UM, TILT_URAD = 100.0, 300.0
-#: A combination is determined if its uncertainty is at most this share of what was assumed of it.
-DETERMINED = 1.0 / 3.0
-#: Names that appear in a combination with less than this share of the largest are left out of its words.
-_NAMED = 0.25
-_NO_PRIOR = 1e3
 #: Errors of this many times their size say that the machine is worse than its class; the sizes grow until they are not.
 _WORSE = 2.0
-_STEPS, _SETTLED = 30, 1e-4
-#: Steps of the difference quotients: mm, rad, relative.
-_STEP_MM, _STEP_RAD = 1e-3, 1e-6
 #: Times the uncertainty of the readings, and the sizes of the errors, follow the residuals.
 _ROUNDS = 8
+#: Degrees of freedom from which residuals say how small the noise is, and the smallest noise of a machine, mm.
+_FEW_FREE, _FINEST_MM = 3.0, 1e-5
 WITHOUT_EFFECT = "nothing needs to: it moves or turns the workpiece as a whole, and setting up the part removes it"
 #: A diameter changes with an angle if chance explains it with a smaller probability only (F test over sectors of 30 degrees).
 _UNLIKELY = 1e-4
-#: Groups of poses that are left out in turn.
-_FOLDS = 5
 
 
 @dataclass(frozen=True, repr=False)
@@ -77,6 +74,8 @@ class SphereIdentification(Displayed):
     left_out_um : rms of poses that were left out of the fit in turn, before and after; nan if there are too few.
     u_um : standard uncertainty of a coordinate that was used, and whether it comes from the residuals.
     sphere_mm : places of the spheres in the workpiece frame.
+    linear : what the poses say of the linear axes, with the joint covariance.
+    kinds : what was read at the poses.
     """
 
     errors: RotaryErrors
@@ -96,6 +95,8 @@ class SphereIdentification(Displayed):
     notes: tuple[str, ...] = ()
     metadata: Mapping[str, str] = field(default_factory=dict)
     motions_not_told: tuple[str, ...] = ()
+    linear: Joint | None = None
+    kinds: tuple[str, ...] = ("spheres",)
 
     @property
     def u(self) -> FloatArray:
@@ -162,80 +163,6 @@ class SphereIdentification(Displayed):
 def _unit(name: str) -> tuple[str, float]:
     """Unit in files, and its factor to mm or rad, of a position error or an offset of the spindle."""
     return unit_of(name), si_per_unit(name)
-
-
-@dataclass(frozen=True)
-class _Model:
-    """The unknowns in their order: position errors, then squareness and scales of the linear axes, places of the spheres.
-
-    On a machine with a rotary head the offset of the gauge point of the spindle (``TX``, ``TY``, ``TZ``: the pivot length) is
-    among the position errors: it turns with the head.
-    """
-
-    machine: Machine
-    spheres: SphereCentres
-    joint_mm: FloatArray
-    names: tuple[str, ...]
-    size: FloatArray
-    known: RotaryErrors = field(default_factory=RotaryErrors)
-
-    @property
-    def errors(self) -> int:
-        return len(self.names)
-
-    def tables(self, x: FloatArray) -> tuple[ErrorTable, RotaryErrors]:
-        """The errors that the unknowns ``x`` say."""
-        k = self.errors
-        squareness = {name: (float(value), 0.0) for name, value in zip(SQUARENESS_NAMES, x[k : k + 3], strict=True)}
-        curves = {}
-        for axis, scale in zip(range(3), x[k + 3 : k + 6], strict=True):
-            at = np.array(self.machine.axes[axis].range_mm)
-            value = scale * (at - self.machine.reference_point_mm[axis])
-            curves[f"E{AXES[axis]}{AXES[axis]}"] = Curve(at, value, np.zeros(2))
-        return ErrorTable(curves, squareness), RotaryErrors(
-            self.known.curves, _constants(self.names, x[:k], np.zeros(k))
-        )
-
-    def tip(self, x: FloatArray) -> FloatArray:
-        """Tip minus what an R-test read, (n, 3): where the sphere must be."""
-        tip = tip_pose(self.machine, *self.tables(x), self.joint_mm, self.spheres.angle_deg, self.spheres.tool_mm)[0]
-        return tip - np.nan_to_num(self.spheres.deviation_mm)
-
-    def columns(self, x: FloatArray) -> FloatArray:
-        """Derivatives (3 n, k + 6) of the tip by errors of the machine, central differences."""
-        found = []
-        for j in range(len(self.size)):
-            step = np.zeros(len(x))
-            step[j] = _STEP_MM if j < self.errors and _unit(self.names[j])[0] == "um" else _STEP_RAD
-            found.append((self.tip(x + step) - self.tip(x - step)).ravel() / (2 * step[j]))
-        return np.stack(found, axis=1)
-
-    def places(self) -> FloatArray:
-        """Derivatives (3 n, 3 m) of the residuals by the places of the spheres."""
-        place, names = self.spheres.places
-        pick = np.eye(len(names))[place]
-        return np.asarray(-np.einsum("nm,ij->nimj", pick, np.eye(3)).reshape(3 * len(place), 3 * len(names)))
-
-
-def _constants(names: Sequence[str], values: FloatArray, u: FloatArray) -> dict[str, tuple[float, float]]:
-    """Constants of the rotary axes by name."""
-    return {name: (float(value), float(own)) for name, value, own in zip(names, values, u, strict=True)}
-
-
-def _model(machine: Machine, spheres: SphereCentres, known: RotaryErrors, raised: float = 1.0) -> _Model:
-    joints = spheres.found_mm
-    if spheres.coordinates == TIP:
-        joints = joints_of_tip(machine, joints, spheres.angle_deg, spheres.tool_mm)
-    names = tuple(name for letter in machine.chain.rotary for name in position_names(letter))
-    if any(tool_side and letter not in AXES for letter, tool_side in machine.chain.passed):
-        names += SPINDLE
-    prior = machine.prior
-    # without a prior the sizes only keep the equations solvable
-    factor = _NO_PRIOR if prior.is_none else CLASSES[prior.stated_class]
-    usual = replace(prior, class_name=USUAL_CLASS) if prior.is_none else prior
-    sizes = [factor * (OFFSET_UM if _unit(name)[0] == "um" else TILT_URAD) * _unit(name)[1] for name in names]
-    linear = [*(usual.size(name) for name in SQUARENESS_NAMES), *(usual.scale(f"E{axis}{axis}") for axis in AXES)]
-    return _Model(machine, spheres, joints, names, np.array([*(raised * np.array(sizes)), *linear]), known)
 
 
 @dataclass(frozen=True)
@@ -306,92 +233,192 @@ def identify_spheres(
     separate: bool = True,
     known: RotaryErrors | None = None,
 ) -> SphereIdentification:
-    """Identify the position errors of all rotary axes from sphere centres.
+    """Identify the position errors of all rotary axes from sphere centres: :func:`identify_at_poses` of spheres alone."""
+    return identify_at_poses(machine, [spheres], u_um=u_um, separate=separate, known=known)
+
+
+def identify_at_poses(
+    machine: Machine,
+    read: Sequence[SphereCentres | Bars | PosedDeviations | PosedLengths],
+    *,
+    u_um: float | None = None,
+    separate: bool = True,
+    known: RotaryErrors | None = None,
+    linear: Posterior | None = None,
+) -> SphereIdentification:
+    """Identify the position errors of all rotary axes from readings at poses, of one or several kinds.
 
     Parameters
     ----------
     machine : a machine with rotary axes.
-    spheres : centres at poses, from :func:`compgen.data.rotary.read_spheres`.
-    u_um : standard uncertainty of a coordinate where the file states none; None: from the residuals.
+    read : readings at poses: spheres, bars, positions, lengths.
+    u_um : standard uncertainty of a reading where its file states none; None: from the residuals.
     separate : look for what would separate combinations that the readings cannot tell apart.
     known : error motions that were measured otherwise, such as the positioning of an axis; taken as they are.
+    linear : what is known of the linear axes from measurements of their own; None: nothing.
 
     Raises
     ------
     InputError
         for fewer than four poses of a sphere, and for an axis that turns the other way round than the machine file says.
     """
+    for item in read:
+        if isinstance(item, SphereCentres):
+            _check_spheres(machine, item)
+    parts = [readings_at(machine, item) for item in read]
+    joints = np.concatenate([part.joint_mm for part in parts])
+    state = LinearState.usual(machine) if linear is None else LinearState.of_posterior(machine, linear, joints)
+    known = RotaryErrors() if known is None else known
+    problem, solved, u, stated, scale, raised = _adjusted(machine, parts, state, known, u_um)
+    k, m, x = problem.errors, problem.machine_unknowns, solved.x
+    own = solved.covariance[:k, :k]
+    vectors, shares = directions(problem, x, u)
+    open_ = shares > DETERMINED
+    pairs = split(problem, vectors[:, open_]) if separate and open_.any() else []
+    estimated = bool(np.isnan(stated).any())
+    zero = without_errors(problem)
+    left = left_out(problem, x, u, zero)
+    found = SphereIdentification(
+        errors=RotaryErrors({}, constants_of(problem.names, x[:k], np.sqrt(np.diag(own)))),
+        names=problem.names,
+        values=x[:k],
+        covariance=own,
+        sizes=problem.size,
+        determined=tuple((np.sqrt(np.diag(own)) <= DETERMINED * problem.size).tolist()),
+        inseparable=tuple(
+            (in_words(problem, one), separated_by(problem, one, x, u) if acts else WITHOUT_EFFECT)
+            for one, acts in pairs
+        ),
+        rank=int((~open_).sum()),
+        residual_um=_figures(by_pose(problem, zero), by_pose(problem, solved.residual)),
+        left_out_um=(left[0] / MM_PER_UM, left[1] / MM_PER_UM),
+        u_um=float(np.sqrt(np.mean(u**2)) / MM_PER_UM),
+        u_from_residuals=estimated or max(scale) > 1.0,
+        poses=len(joints),
+        sphere_mm=_places(problem, read, x),
+        notes=tuple(_notes(machine, read, linear, raised, [] if estimated else scale)),
+        metadata=read[0].metadata,
+        linear=Joint(state, x[k:m], solved.covariance[:m, :m]),
+        kinds=tuple(dict.fromkeys(part.what for part in parts)),
+    )
+    if not (estimated or max(scale) > _MISFIT) or len(joints) < _MANY:
+        return found
+    return _with_motions(problem, found, x, u, np.where(np.isnan(stated), u, stated))
+
+
+@dataclass(frozen=True)
+class Joint:
+    """What the poses say of the linear axes: their unknowns (r,), and the joint covariance of the rotary errors and these."""
+
+    state: LinearState
+    unknown: FloatArray
+    covariance: FloatArray
+
+    @property
+    def root(self) -> FloatArray:
+        """A factor (k + r, q) of the joint covariance; mm, rad and plain numbers are scaled, so that none counts as rounding."""
+        size = np.sqrt(np.diag(self.covariance))
+        return np.asarray(size[:, None] * root_of(self.covariance / np.outer(size, size)))
+
+
+def _check_spheres(machine: Machine, spheres: SphereCentres) -> None:
+    """InputError for an axis that turns the other way round, or a sphere at fewer than four poses."""
     wrong = [sense.text for sense in senses(machine, spheres) if sense.verdict == "reversed"]
     if wrong:
-        text = "; ".join(wrong)
         raise InputError(
-            f"{text}. Reverse the sign of its angles in the file, or find out which way it turns",
+            f"{'; '.join(wrong)}. Reverse the sign of its angles in the file, or find out which way it turns",
             file=_file_of(spheres),
         )
-    known = RotaryErrors() if known is None else known
-    model, raised = _model(machine, spheres, known), 1.0
     place, names = spheres.places
     for k, name in enumerate(names):
         if (place == k).sum() < 4:
             raise InputError(f"{name} was found at {(place == k).sum()} poses; at least 4 are needed to say anything")
-    stated = np.where(np.isnan(spheres.u_mm), np.nan if u_um is None else u_um * MM_PER_UM, spheres.u_mm)
-    estimated = bool(np.isnan(stated).any())
-    u = np.full(len(spheres), 1e-3) if estimated else stated
-    scale = 1.0
+
+
+def _adjusted(
+    machine: Machine, parts: Sequence[PoseReadings], state: LinearState, known: RotaryErrors, u_um: float | None
+) -> tuple[Problem, Solved, FloatArray, FloatArray, list[float], float]:
+    """The problem with sizes and uncertainties that fit the readings, solved.
+
+    Returns the problem and its solution, the uncertainty of each reading (m,), the stated one (nan: none), by how much each
+    kind was widened, and by how much the sizes of the errors were raised.
+    """
+    problem, raised = Problem.of(machine, parts, state, known), 1.0
+    stated = np.concatenate([part.u_mm for part in parts])
+    stated = np.where(np.isnan(stated), np.nan if u_um is None else u_um * MM_PER_UM, stated)
+    u = np.where(np.isnan(stated), 1e-3, stated)
+    open_ = [bool(np.isnan(stated[rows]).any()) for rows in problem.rows]
+    scale = [1.0] * len(parts)
+    solved = solve(problem, u)
     for _ in range(_ROUNDS):
-        x, residual, covariance, freedom = _solve(model, u)
-        wide = float(np.sqrt(np.sum((residual / u[:, None]) ** 2) / max(freedom, 1.0)))
-        worse = float(np.sqrt(np.mean((x[: model.errors] / model.size[: model.errors]) ** 2)))
+        k, settled = problem.errors, True
+        worse = float(np.sqrt(np.mean((solved.x[:k] / problem.size) ** 2)))
+        for j, (rows, freedom) in enumerate(zip(problem.rows, solved.freedom, strict=True)):
+            wide = float(np.sqrt(np.sum((solved.residual[rows] / u[rows]) ** 2) / max(freedom, 1.0)))
+            if wide < 1.0:  # a few readings that happen to fit do not say that there is no noise
+                wide = max(wide, _FINEST_MM / float(u[rows].min())) if freedom >= _FEW_FREE else 1.0
+            if open_[j] or wide > 1.02:
+                u[rows] *= wide
+                scale[j] *= wide
+            settled = settled and (abs(wide - 1.0) < 0.02 or (not open_[j] and wide <= 1.02))
         if worse > _WORSE:
             raised *= worse
-            model = _model(machine, spheres, known, raised)
-        if estimated or wide > 1.02:
-            u, scale = u * wide, scale * wide
-        if worse <= _WORSE and abs(wide - 1.0) < 0.02 or (not estimated and wide <= 1.02 and worse <= _WORSE):
+            problem = replace(problem, size=problem.size * worse)
+        elif settled:
             break
-    k = model.errors
-    own = covariance[:k, :k]
-    directions, shares = _directions(model, x, u)
-    open_ = shares > DETERMINED
-    pairs = _split(model, directions[:, open_]) if separate and open_.any() else []
-    before = _centred(model.tip(np.zeros(k + 6)), place)
-    notes = [
-        "Squareness and scales of the linear axes have the sizes that the class of the machine says; their curves count as "
-        "noise. Measure the linear axes first: their errors are part of every pose.",
-        *_look(machine, spheres),
-    ]
+        solved = solve(problem, u, solved.x)
+    return problem, solved, u, stated, scale, raised
+
+
+def _places(
+    problem: Problem, read: Sequence[SphereCentres | Bars | PosedDeviations | PosedLengths], x: FloatArray
+) -> dict[str, tuple[float, float, float]]:
+    """Places of the spheres in the workpiece frame."""
+    found: dict[str, tuple[float, float, float]] = {}
+    for item, own in zip(read, problem.own, strict=True):
+        if isinstance(item, SphereCentres):
+            for name, (a, b, c) in zip(item.places[1], x[own].reshape(-1, 3).tolist(), strict=True):
+                found[name] = (a, b, c)
+    return found
+
+
+def _notes(
+    machine: Machine,
+    read: Sequence[SphereCentres | Bars | PosedDeviations | PosedLengths],
+    linear: Posterior | None,
+    raised: float,
+    scale: Sequence[float],
+) -> list[str]:
+    """What was assumed, what the spheres betray, and what does not fit."""
+    notes = []
+    if linear is None:
+        notes.append(
+            "Squareness and scales of the linear axes have the sizes that the class of the machine says; their curves count as "
+            "noise. Measure the linear axes first: their errors are part of every pose."
+        )
+    else:
+        notes.append(
+            "Linear and rotary axes were adjusted together: curves of the linear axes that nobody measured have the sizes of the "
+            "prior, and their uncertainty is in that of the rotary axes."
+        )
+    for item in read:
+        if isinstance(item, SphereCentres):
+            notes += _look(machine, item)
+        elif isinstance(item, Bars) and item.u_nominal_mm is None:
+            notes.append(
+                "The length of the bar was not calibrated: its mean of each set-up says nothing. If it was, write "
+                "'# u_nominal_um = ...' with its standard uncertainty."
+            )
     if raised > 1.0:
         notes.append(
             f"The rotary axes are {raised:.1f} times as far off as the class of the machine says; its sizes were raised."
         )
-    if not estimated and scale > 1.3:
+    if max(scale, default=1.0) > _MISFIT:
         notes.append(
-            f"The readings scatter {scale:.1f} times as much as they state; their uncertainty is widened. Something that no "
+            f"The readings scatter {max(scale):.1f} times as much as they state; their uncertainty is widened. Something that no "
             "position error explains is in them."
         )
-    found = SphereIdentification(
-        errors=RotaryErrors({}, _constants(model.names, x[:k], np.sqrt(np.diag(own)))),
-        names=model.names,
-        values=x[:k],
-        covariance=own,
-        sizes=model.size[:k],
-        determined=tuple((np.sqrt(np.diag(own)) <= DETERMINED * model.size[:k]).tolist()),
-        inseparable=tuple(
-            (_in_words(model, one), _separated_by(model, one, u) if acts else WITHOUT_EFFECT) for one, acts in pairs
-        ),
-        rank=int((~open_).sum()),
-        residual_um=_figures(before, residual),
-        left_out_um=_left_out(model, x, u),
-        u_um=float(np.sqrt(np.mean(u**2)) / MM_PER_UM),
-        u_from_residuals=estimated or scale > 1.0,
-        poses=len(spheres),
-        sphere_mm={name: tuple(x[k + 6 + 3 * j : k + 9 + 3 * j].tolist()) for j, name in enumerate(names)},
-        notes=tuple(notes),
-        metadata=spheres.metadata,
-    )
-    if not (estimated or scale > _MISFIT) or len(spheres) < _MANY:
-        return found
-    return _with_motions(model, found, x, u, stated if not estimated else u)
+    return notes
 
 
 #: Residuals of this many times what is stated, of this many poses, are looked at for error motions.
@@ -399,31 +426,27 @@ _MISFIT, _MANY = 1.3, 20
 
 
 def _with_motions(
-    model: _Model, found: SphereIdentification, x: FloatArray, u_mm: FloatArray, stated_mm: FloatArray
+    problem: Problem, found: SphereIdentification, x: FloatArray, u_mm: FloatArray, stated_mm: FloatArray
 ) -> SphereIdentification:
     """The result with error motions over the angle, if the readings are far more probable with them."""
     from compgen.identification.rotary_motions import find_motions
 
-    m, k, places = len(model.size), model.errors, model.places()
-    columns = np.hstack([model.columns(x[:m]), places])
-
-    def tip_with(curves: Mapping[str, RotaryCurve]) -> FloatArray:
-        return replace(model, known=RotaryErrors({**model.known.curves, **curves})).tip(x[:m])
-
+    m, k, columns = problem.machine_unknowns, problem.errors, problem.columns(x)
     motions = find_motions(
-        model.machine,
-        model.spheres.angle_deg,
-        lambda curves: -tip_with(curves),
+        problem.machine,
+        problem.angle_deg,
+        lambda curves: -problem.with_curves(curves).residual(x),
+        problem.pose,
         -columns,
-        model.tip(x[:m]).ravel() + places @ x[m:] - columns @ x,
-        np.concatenate([model.size**2, np.full(places.shape[1], np.inf)]),
+        problem.residual(x) - columns @ x,
+        problem.sizes**2,
         u_mm,
         free_noise=True,
     )
     if motions is None:
         return found
     value, own = motions.values, motions.covariance[:k, :k]
-    after = np.linalg.norm(motions.residual_mm, axis=1) / MM_PER_UM
+    after = by_pose(problem, motions.residual_mm) / MM_PER_UM
     plain = found.left_out_um[1]
     note = (
         f"Position errors alone do not explain the poses; with error motions over the angle (about "
@@ -434,12 +457,13 @@ def _with_motions(
     kept = [text for text in found.notes if "Something that no position error explains" not in text]
     if motions.noise_mm > 3.0 * float(np.median(stated_mm)) and not found.u_from_residuals:
         kept.append("The readings still scatter more than they state.")
+    places = problem.own[0]
     return replace(
         found,
-        errors=RotaryErrors(motions.curves, _constants(model.names, value[:k], np.sqrt(np.diag(own)))),
+        errors=RotaryErrors(motions.curves, constants_of(problem.names, value[:k], np.sqrt(np.diag(own)))),
         values=value[:k],
         covariance=own,
-        determined=tuple((np.sqrt(np.diag(own)) <= DETERMINED * model.size[:k]).tolist()),
+        determined=tuple((np.sqrt(np.diag(own)) <= DETERMINED * problem.size).tolist()),
         residual_um={
             **found.residual_um,
             "after_rms": float(np.sqrt(np.mean(after**2))),
@@ -449,159 +473,15 @@ def _with_motions(
         u_um=motions.noise_mm / MM_PER_UM,
         u_from_residuals=True,
         sphere_mm={
-            name: tuple(value[m + 3 * j : m + 3 + 3 * j].tolist()) for j, name in enumerate(model.spheres.places[1])
+            name: (float(a), float(b), float(c))
+            for name, (a, b, c) in zip(found.sphere_mm, value[places].reshape(-1, 3), strict=False)
         },
         notes=(*kept, note),
         motions_not_told=motions.not_told,
+        linear=None
+        if found.linear is None
+        else replace(found.linear, unknown=value[k:m], covariance=motions.covariance[:m, :m]),
     )
-
-
-def _solve(model: _Model, u_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Unknowns, residuals (n, 3), covariance, and degrees of freedom: Gauss-Newton on the exact chain with the prior."""
-    places, m = model.places(), len(model.size)
-    x = np.zeros(m)
-    root = np.repeat(1.0 / u_mm, 3)[:, None]
-    size = np.concatenate([model.size, np.ones(places.shape[1])])
-    precision = np.concatenate([np.ones(m), np.zeros(places.shape[1])])  # of the unknowns in units of their size
-    for _ in range(_STEPS):
-        jacobian = root * np.hstack([model.columns(x[:m]), places]) * size
-        at = np.zeros(places.shape[1]) if len(x) == m else x[m:]
-        residual = root[:, 0] * (model.tip(x[:m]).ravel() + places @ at)
-        full = np.concatenate([x[:m], at])
-        normal = jacobian.T @ jacobian + np.diag(precision)
-        step = np.linalg.solve(normal, -(jacobian.T @ residual) - precision * full / size)
-        x = full + step * size
-        if np.abs(jacobian @ (x / size - full / size)).max() < _SETTLED:
-            break
-    else:
-        raise ConvergenceError(
-            "the position errors of the rotary axes were not found; are the angles and the chain right?"
-        )
-    inverse = np.linalg.inv(normal)
-    residual = (model.tip(x[:m]).ravel() + places @ x[m:]).reshape(-1, 3)
-    freedom = residual.size - float(np.trace(inverse @ (jacobian.T @ jacobian)))
-    return x, residual, inverse * np.outer(size, size), freedom
-
-
-def _information(model: _Model, x: FloatArray, u_mm: FloatArray) -> FloatArray:
-    """Information of the readings alone about the position errors in units of their size, (k, k).
-
-    Places of the spheres are free, squareness and scales have their prior.
-    """
-    k, m = model.errors, len(model.size)
-    root = np.repeat(1.0 / u_mm, 3)[:, None]
-    jacobian = root * np.hstack([model.columns(x[:m]) * model.size, model.places()])
-    normal = jacobian.T @ jacobian
-    normal[np.arange(k, m), np.arange(k, m)] += 1.0
-    rest = np.linalg.solve(normal[k:, k:], normal[k:, :k])
-    return np.asarray(normal[:k, :k] - normal[:k, k:] @ rest)
-
-
-def _directions(model: _Model, x: FloatArray, u_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Combinations (k, k) of the position errors, columns, and their uncertainty after the readings over that before, (k,)."""
-    value, vector = np.linalg.eigh(_information(model, x, u_mm))
-    return vector, 1.0 / np.sqrt(1.0 + np.maximum(value, 0.0))
-
-
-def _in_words(model: _Model, direction: FloatArray) -> str:
-    largest = np.abs(direction).max()
-    named = [k for k in np.argsort(-np.abs(direction)) if abs(direction[k]) >= _NAMED * largest]
-    return " with ".join(model.names[k] for k in named)
-
-
-def _separated_by(model: _Model, direction: FloatArray, u_mm: FloatArray) -> str:
-    """What would determine a combination: a second probe length, another place of the sphere, or other poses."""
-    spheres = model.spheres
-    machine = model.machine
-    longer = replace(spheres, tool_mm=spheres.tool_mm + np.array([0.0, 0.0, -100.0]))
-    count = max(60, len(spheres))
-    many = _poses(
-        np.tile(model.joint_mm.mean(axis=0), (count, 1)),
-        _any_angles(machine, np.random.default_rng(0), count),
-        np.tile(spheres.tool_mm[0], (count, 1)),
-    )
-    moved = replace(spheres, setup=spheres.setup + 1000)
-    shift = np.array([80.0, 50.0, 30.0])
-    options = (
-        ("more poses over the whole range of all rotary axes", many, model.joint_mm.mean(axis=0), 0.0),
-        ("the same poses with a probe 100 mm longer", longer, None, 0.0),
-        ("the sphere at another place, 80 to 100 mm away", moved, None, shift),
-    )
-    base = _information(model, np.zeros(len(model.size)), u_mm)
-    for words, more, joint, offset in options:
-        joints = np.tile(joint, (len(more), 1)) if joint is not None else model.joint_mm + offset
-        other = replace(model, spheres=more, joint_mm=np.asarray(joints, dtype=float))
-        u = np.full(len(more), float(np.median(u_mm)))
-        # the places of the spheres are others: information adds up
-        total = base + _information(other, np.zeros(len(model.size)), u)
-        inside = float(direction @ np.linalg.solve(np.eye(len(total)) + total, direction))
-        if np.sqrt(inside) <= DETERMINED:
-            return words
-    return "nothing of this kind: it needs another measurement (a dial gauge on the axis, a square, an angle reference)"
-
-
-#: Effect on a part, relative to that of the errors of a combination one by one, below which the combination has none.
-_NO_EFFECT = 0.02
-
-
-def _split(model: _Model, open_: FloatArray) -> list[tuple[FloatArray, bool]]:
-    """Combinations (k,) that span the undetermined ones (k, r), and whether each has an effect on parts.
-
-    Combinations without effect move and turn the workpiece as a whole: over the travel, all angles and tools. Each is
-    written with as few errors as possible.
-    """
-    effect = _effects(model)
-    _, strength, across = np.linalg.svd(effect @ open_, full_matrices=True)
-    turned = open_ @ across.T
-    none = (
-        np.append(strength, np.zeros(turned.shape[1] - len(strength)))
-        <= _NO_EFFECT * np.linalg.norm(effect, axis=0).max()
-    )
-    return [(column, bool(acts)) for acts in (True, False) for column in _sparse(turned[:, none != acts]).T]
-
-
-def _sparse(basis: FloatArray) -> FloatArray:
-    """Columns that span the same as ``basis`` (k, r), each with a leading error that the others lack, of unit length."""
-    if not basis.shape[1]:
-        return basis
-    work, rows = basis.copy(), []
-    for _ in range(basis.shape[1]):
-        size = np.linalg.norm(work, axis=1)
-        row = int(np.argmax(size))
-        rows.append(row)
-        along = work[row] / size[row]
-        work = work - np.outer(work @ along, along)
-    found = basis @ np.linalg.inv(basis[rows])
-    return np.asarray(found / np.linalg.norm(found, axis=0))
-
-
-def _effects(model: _Model) -> FloatArray:
-    """What each position error of its size does to points of a part (3 n, k), the motion of the whole workpiece removed."""
-    machine, count = model.machine, 200
-    rng = np.random.default_rng(1)
-    lower, upper = np.maximum(machine.lower_mm, -1e3), np.minimum(machine.upper_mm, 1e3)
-    tools = model.spheres.tool_mm[0] + rng.uniform(0.0, 100.0, (count, 1)) * np.array([0.0, 0.0, -1.0])
-    anywhere = _poses(rng.uniform(lower, upper, (count, 3)), _any_angles(machine, rng, count), tools)
-    own = replace(model, spheres=anywhere, joint_mm=anywhere.found_mm)
-    x, y, z = own.tip(np.zeros(len(model.size))).T
-    zero = np.zeros(count)
-    turn = np.stack([zero, z, -y, -z, zero, x, y, -x, zero], axis=1).reshape(count, 3, 3)
-    rigid = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), turn], axis=2).reshape(3 * count, 6)
-    moved = own.columns(np.zeros(len(model.size)))[:, : model.errors] * model.size[: model.errors]
-    return np.asarray(moved - rigid @ np.linalg.lstsq(rigid, moved, rcond=None)[0])
-
-
-def _any_angles(machine: Machine, rng: np.random.Generator, count: int) -> dict[str, FloatArray]:
-    return {letter: rng.uniform(*axis.ends_deg, count) for letter, axis in machine.rotary.items()}
-
-
-def _poses(joint_mm: FloatArray, angle_deg: Mapping[str, FloatArray], tool_mm: FloatArray) -> SphereCentres:
-    """Poses of one sphere, nothing read."""
-    count, nan = len(joint_mm), np.full(len(joint_mm), np.nan)
-    return SphereCentres(
-        joint_mm, np.full((count, 3), np.nan), JOINTS, angle_deg, tool_mm, ["sphere"] * count,
-        np.zeros(count, dtype=np.int64), nan, nan, nan,
-    )  # fmt: skip
 
 
 def _centred(points: FloatArray, place: NDArray[np.int64]) -> FloatArray:
@@ -612,40 +492,13 @@ def _centred(points: FloatArray, place: NDArray[np.int64]) -> FloatArray:
 
 
 def _figures(before: FloatArray, after: FloatArray) -> dict[str, float]:
-    first, second = (np.linalg.norm(rows, axis=1) / MM_PER_UM for rows in (before, after))
+    first, second = before / MM_PER_UM, after / MM_PER_UM
     return {
         "before_rms": float(np.sqrt(np.mean(first**2))),
         "before_max": float(first.max()),
         "after_rms": float(np.sqrt(np.mean(second**2))),
         "after_max": float(second.max()),
     }
-
-
-def _left_out(model: _Model, x: FloatArray, u_mm: FloatArray) -> tuple[float, float]:
-    """Rms over poses that were left out of the fit in turn, um: with the sphere from the fitted poses, no errors and fitted.
-
-    Each fit is one linear step from the fit of all poses.
-    """
-    place, names = model.spheres.places
-    if min((place == k).sum() for k in range(len(names))) < 3 * _FOLDS:
-        return np.nan, np.nan
-    m, places = len(model.size), model.places()
-    columns = np.hstack([model.columns(x[:m]), places])
-    residual = model.tip(x[:m]).ravel() + places @ x[m:]
-    zero = model.tip(np.zeros(m))
-    prior = np.concatenate([model.size**-2.0, np.zeros(places.shape[1])])
-    fold = np.random.default_rng(0).permutation(len(place)) % _FOLDS
-    before, after = [], []
-    for k in range(_FOLDS):
-        inside = np.repeat(fold != k, 3)
-        weighted = columns[inside] * np.repeat(u_mm, 3)[inside, None] ** -2.0
-        normal = weighted.T @ columns[inside] + np.diag(prior)
-        step = np.linalg.solve(normal, -(weighted.T @ residual[inside]) - prior * x)
-        after.append((residual + columns @ step)[~inside])
-        means = np.stack([zero[(place == j) & (fold != k)].mean(axis=0) for j in range(len(names))])
-        before.append((zero - means[place])[fold == k].ravel())
-    first, second = (float(np.sqrt(3.0 * np.mean(np.concatenate(rows) ** 2)) / MM_PER_UM) for rows in (before, after))
-    return first, second
 
 
 def _look(machine: Machine, spheres: SphereCentres) -> list[str]:

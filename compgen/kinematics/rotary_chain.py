@@ -21,7 +21,7 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import OPPOSITE, ROTARY, Machine
-from compgen.data.names import AXES
+from compgen.data.names import AXES, ERROR_NAMES
 from compgen.data.rotary import RotaryErrors
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import cross_matrices, level_rotations, rotate, travel_vectors
@@ -56,8 +56,19 @@ def tip_pose(
     position_mm, angle_deg : commanded positions (n, 3), and angles (n,) of every rotary axis by letter.
     tool_mm : offset of the tip, (3,) or (n, 3); None: that of the machine file.
     """
+    return pose_of_values(machine, errors.at(position_mm), rotary, position_mm, angle_deg, tool_mm)
+
+
+def pose_of_values(
+    machine: Machine,
+    values: FloatArray,
+    rotary: RotaryErrors,
+    position_mm: FloatArray,
+    angle_deg: Mapping[str, FloatArray],
+    tool_mm: FloatArray | None = None,
+) -> tuple[FloatArray, FloatArray]:
+    """As :func:`tip_pose`, for the 21 errors of the linear axes ``values`` (n, 21) at the positions."""
     count = len(position_mm)
-    values = errors.at(position_mm)
     travel = travel_vectors(machine, values, position_mm)
     motions = rotary.motions(machine, angle_deg)
     tip = np.array(np.broadcast_to(machine.tool_offset_mm if tool_mm is None else tool_mm, (count, 3)), dtype=float)
@@ -84,6 +95,31 @@ def tip_pose(
             turned = _large(rotation, turned)
         tip = tip + point
     return tip, turned
+
+
+#: Steps of the difference quotients by errors: mm, rad.
+_STEP_MM, _STEP_RAD = 1e-3, 1e-6
+
+
+def linear_columns(
+    machine: Machine, position_mm: FloatArray, angle_deg: Mapping[str, FloatArray], tool_mm: FloatArray | None = None
+) -> FloatArray:
+    """C with six rows: derivative of tip and orientation (n, 6) by the 21 errors of the linear axes, (n, 6, 21).
+
+    Central differences of the exact chain at zero errors, mm and rad: tip in the workpiece frame, which turns with the table.
+    """
+    count = len(position_mm)
+    straight = pose_of_values(machine, np.zeros((count, 21)), RotaryErrors(), position_mm, angle_deg, tool_mm)[1]
+    columns = np.zeros((count, 6, len(ERROR_NAMES)))
+    for k, name in enumerate(ERROR_NAMES):
+        step = _STEP_MM if name[1] in AXES else _STEP_RAD
+        values, ends = np.zeros((count, 21)), []
+        for sign in (1.0, -1.0):
+            values[:, k] = sign * step
+            tip, turned = pose_of_values(machine, values, RotaryErrors(), position_mm, angle_deg, tool_mm)
+            ends.append(np.hstack([tip, rotation_between(turned, straight)]))
+        columns[:, :, k] = (ends[0] - ends[1]) / (2.0 * step)
+    return columns
 
 
 def _large(rotation: FloatArray, vectors: FloatArray) -> FloatArray:

@@ -130,9 +130,28 @@ def advice_text(result: Identification, proposed: NextBest | None) -> Group:
     return Group(*(Text(line) for line in lines))
 
 
+def _fit_lines(result: SphereIdentification) -> list[str]:
+    """What the fit leaves, and the uncertainty of the readings."""
+    figures, (without, left_out) = result.residual_um, result.left_out_um
+    before, after = um_text(figures["before_rms"]), um_text(figures["after_rms"])
+    most, least = um_text(figures["before_max"]), um_text(figures["after_max"])
+    beyond = (
+        "" if math.isnan(left_out) else f"; poses left out of the fit: {um_text(without)} -> {um_text(left_out)} um rms"
+    )
+    source = ", from the residuals" if result.u_from_residuals else ", as stated"
+    if result.kinds == ("spheres",):
+        return [
+            f"distance from the spheres {before} um rms (largest {most}) -> {after} um (largest {least} um){beyond}",
+            f"standard uncertainty of a coordinate: {um_text(result.u_um)} um{source}",
+        ]
+    return [
+        f"reading minus model {before} um rms (largest {most}) -> {after} um (largest {least} um){beyond}",
+        f"standard uncertainty of a reading: {um_text(result.u_um)} um{source}",
+    ]
+
+
 def sphere_table(result: SphereIdentification) -> Group:
     """Return the position errors of rotary axes, the fit, and what the poses cannot tell apart."""
-    figures, (without, left_out) = result.residual_um, result.left_out_um
     overview = result.overview()
     table = Table(
         title=f"{overview.title}; {result.rank} combinations determined", box=box.SIMPLE_HEAD, title_justify="left"
@@ -142,15 +161,7 @@ def sphere_table(result: SphereIdentification) -> Group:
     for row in overview.rows:
         table.add_row(*row)
     lines = [
-        f"distance from the spheres {um_text(figures['before_rms'])} um rms (largest {um_text(figures['before_max'])}) -> "
-        f"{um_text(figures['after_rms'])} um (largest {um_text(figures['after_max'])} um)"
-        + (
-            ""
-            if math.isnan(left_out)
-            else f"; poses left out of the fit: {um_text(without)} -> {um_text(left_out)} um rms"
-        ),
-        f"standard uncertainty of a coordinate: {um_text(result.u_um)} um"
-        + (", from the residuals" if result.u_from_residuals else ", as stated"),
+        *_fit_lines(result),
         *(f"cannot be told apart: {words}; {cure}" for words, cure in result.inseparable),
         *(f"note: {text}" for text in result.notes),
     ]

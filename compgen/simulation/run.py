@@ -29,6 +29,7 @@ from compgen.data.length_archive import write_archive
 from compgen.data.lengths import Lengths, format_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import SECONDS_PER_MIN
+from compgen.data.pose_readings import Bars, format_bars
 from compgen.data.records import ARCHIVE
 from compgen.data.rotary import RotaryErrors, SphereCentres, format_machine_errors, format_spheres
 from compgen.data.toml_files import part_setting, setting
@@ -37,6 +38,7 @@ from compgen.errors import InputError
 from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
 from compgen.registry import call_problem
+from compgen.simulation.bars import RotaryBallbar, read_rotary_ballbar
 from compgen.simulation.effects import (
     Displacement,
     LengthEffect,
@@ -141,7 +143,7 @@ class Instrument(Protocol):
 
 
 #: Instruments that bring the path of the machine with them, and need no trajectory.
-OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe | SphereProbe
+OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe | SphereProbe | RotaryBallbar
 AnyInstrument = Instrument | SimulatedSixDof | OwnPath
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
 INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
@@ -152,6 +154,7 @@ INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
     "ballbar": read_ballbar,
     "touch-probe": read_touch_probe,
     "sphere-probe": read_sphere_probe,
+    "rotary-ballbar": read_rotary_ballbar,
 }
 
 
@@ -302,7 +305,7 @@ class SimulatedReadings:
     """
 
     name: str
-    readings: AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres
+    readings: AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres | Bars
     truth: ErrorTable
     rotary: RotaryErrors | None = None
 
@@ -499,8 +502,8 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
             file=scenario.source,
             field="[instrument] type",
         )
-    if isinstance(instrument, SphereProbe):
-        return _found_spheres(machine, scenario, instrument, seed)
+    if isinstance(instrument, SphereProbe | RotaryBallbar):
+        return _at_poses(machine, scenario, instrument, seed)
     moving = [effect for effect in scenario.effects if not isinstance(effect, LengthEffect | RunEffect)]
 
     def measure(truth: ErrorTable, rng: np.random.Generator) -> AxisRuns | Diagonals | Circles | Artefact:
@@ -512,17 +515,19 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
     return _measured(machine, scenario, seed, measure)
 
 
-def _found_spheres(
-    machine: Machine, scenario: Scenario, instrument: SphereProbe, seed: int | None
+def _at_poses(
+    machine: Machine, scenario: Scenario, instrument: SphereProbe | RotaryBallbar, seed: int | None
 ) -> SimulatedReadings:
-    """Find the spheres; the errors of the rotary axes come from the stream of errors, after those of the linear axes."""
+    """Read at poses; the errors of the rotary axes come from the stream of errors, after those of the linear axes."""
     if scenario.effects or scenario.temperatures:
-        raise InputError("a sphere-probe takes no effects and no temperatures; omit them", file=scenario.source)
+        raise InputError(
+            "measurements at poses of rotary axes take no effects and no temperatures; omit them", file=scenario.source
+        )
     drawn: list[RotaryErrors] = []
     used_seed = scenario.seed if seed is None else seed
     own = random_stream(np.random.SeedSequence(used_seed), ROTARY_STREAM)
 
-    def measure(truth: ErrorTable, rng: np.random.Generator) -> SphereCentres:
+    def measure(truth: ErrorTable, rng: np.random.Generator) -> SphereCentres | Bars:
         drawn.append(instrument.truth(machine, own))
         return instrument.measure(machine, truth, drawn[0], rng)
 
@@ -534,7 +539,7 @@ def _measured(
     scenario: Scenario,
     seed: int | None,
     measure: Callable[
-        [ErrorTable, np.random.Generator], AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres
+        [ErrorTable, np.random.Generator], AxisRuns | Diagonals | Circles | Artefact | SixDof | SphereCentres | Bars
     ],
 ) -> SimulatedReadings:
     used_seed = scenario.seed if seed is None else seed
@@ -563,6 +568,7 @@ _FORMATS: dict[type, tuple[str, Callable[[Any], str]]] = {
     Artefact: (".artefact.csv", format_artefact),
     SixDof: (".sixdof.csv", format_sixdof),
     SphereCentres: (".sphere.csv", format_spheres),
+    Bars: (".bar.csv", format_bars),
     Lengths: (".lengths.csv", format_lengths),
 }
 

@@ -51,25 +51,17 @@ def _lengths(value: Any) -> tuple[float, ...]:
     )
 
 
-@dataclass(frozen=True)
-class SphereProbe:
-    """A touch probe that finds spheres at poses of all rotary axes, drawn evenly over their travel.
+@dataclass(frozen=True, kw_only=True)
+class RotaryTruth:
+    """The true errors of the rotary axes of a virtual machine; the same seed draws the same for every instrument.
 
     Parameters
     ----------
-    spheres_mm : places of the spheres in the workpiece frame.
-    probe_lengths_mm : lengths of the probe along -Z; every one finds every sphere at all poses.
-    poses : number of poses for each sphere and length.
-    noise_um : standard deviation of a coordinate.
     rotary_errors : true position errors by name, um and urad; those of the machine that are not named are drawn with
         standard deviations ``offset_um`` and ``tilt_urad`` unless some are named.
     motion_um, motion_urad : amplitude of the error motions, a wave of one and one of two periods a turn each.
     """
 
-    spheres_mm: tuple[Vector3, ...] = setting(toml_files.vectors3)
-    probe_lengths_mm: tuple[float, ...] = setting(_lengths, (100.0,))
-    poses: int = setting(toml_files.whole(4, 100_000), 60)
-    noise_um: float = setting(toml_files.not_negative, 2.0)
     rotary_errors: dict[str, float] | None = setting(_constants, None)
     offset_um: float = setting(toml_files.not_negative, 50.0)
     tilt_urad: float = setting(toml_files.not_negative, 100.0)
@@ -98,6 +90,24 @@ class SphereProbe:
                     f"{name} is an error of an axis that the machine {machine.name} lacks", field="rotary_errors"
                 )
         return RotaryErrors(curves, constants)
+
+
+@dataclass(frozen=True)
+class SphereProbe(RotaryTruth):
+    """A touch probe that finds spheres at poses of all rotary axes, drawn evenly over their travel.
+
+    Parameters
+    ----------
+    spheres_mm : places of the spheres in the workpiece frame.
+    probe_lengths_mm : lengths of the probe along -Z; every one finds every sphere at all poses.
+    poses : number of poses for each sphere and length.
+    noise_um : standard deviation of a coordinate.
+    """
+
+    spheres_mm: tuple[Vector3, ...] = setting(toml_files.vectors3)
+    probe_lengths_mm: tuple[float, ...] = setting(_lengths, (100.0,))
+    poses: int = setting(toml_files.whole(4, 100_000), 60)
+    noise_um: float = setting(toml_files.not_negative, 2.0)
 
     def measure(
         self, machine: Machine, errors: ErrorTable, rotary: RotaryErrors, rng: np.random.Generator
