@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray, format_csv, names_in_header, read_csv
-from compgen.drawing.display import Displayed, Overview
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
@@ -38,6 +37,7 @@ from compgen.data.rotary import (
     needs_rotary,
     tools_of,
 )
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import InputError
 
 BALL_COLUMNS = ("ball_x_mm", "ball_y_mm", "ball_z_mm")

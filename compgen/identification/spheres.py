@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.drawing.display import Displayed, Overview
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM
 from compgen.data.pose_readings import Bars, PosedDeviations, PosedLengths
 from compgen.data.rotary import TIP, RotaryErrors, SphereCentres, si_per_unit, unit_of
+from compgen.drawing.display import Displayed, Overview
 from compgen.errors import InputError
 from compgen.identification.posterior import Posterior, root_of
 from compgen.identification.rotary_adjustment import (
