@@ -76,7 +76,9 @@ from compgen.data.files import json_text, read_text, working_folder, write_file
 from compgen.data.machine import INTEGERS, load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.prior import class_named
+from compgen.data.units import UNITS, typed_mm
 from compgen.drawing.charts import LABEL
+from compgen.drawing.page_units import page_in_inch
 from compgen.errors import CompgenError, InputError, number_text, um_text, visible
 from compgen.foreign import native_format
 from compgen.identification.options import StatedNumbers
@@ -170,6 +172,7 @@ class Workbench:
 
     site: Site
     language: str = LANGUAGES[0]
+    units: str = UNITS[0]
     projects: list[Runner] = field(default_factory=list)
     ticket: str | None = field(default_factory=lambda: secrets.token_urlsafe(32))
     first_page: Path | None = None
@@ -429,8 +432,10 @@ def _field(name: str, most: int = 300) -> str:
 
 
 def _language() -> list[str]:
-    language = the_workbench().language
-    return [] if language == LANGUAGES[0] else ["--language", language]
+    """Options of a command that writes pages: its language and units are those of the workbench."""
+    language, units = the_workbench().language, the_workbench().units
+    words = [] if language == LANGUAGES[0] else ["--language", language]
+    return words if units == UNITS[0] else [*words, "--units", units]
 
 
 def _machine_of(state: ProjectState) -> str:
@@ -513,13 +518,14 @@ def describe_machine(runner: Runner, state: ProjectState) -> None:
 
 
 def _number(name: str) -> float:
-    text = _field(name, 30).replace(",", ".")
+    """A length of a form, mm; ``24in`` says its unit itself."""
+    text = _field(name, 30)
     try:
-        value = float(text)
+        value = typed_mm(text)
     except ValueError:
         value = math.nan
     if not abs(value) < 1e7:
-        raise InputError(f"{text!r} is not a number in mm", field=name)
+        raise InputError(f"{text!r} is not a length in mm; one in another unit is written 24in", field=name)
     return value
 
 
@@ -1210,6 +1216,8 @@ def _begin_request() -> None:
 
 
 def _finish(response: Response) -> Response:
+    if the_workbench().units != UNITS[0] and response.mimetype == "text/html" and not response.direct_passthrough:
+        response.set_data(page_in_inch(response.get_data(as_text=True)))
     policy = response.headers.get("Content-Security-Policy", POLICY)
     for name, value in {**HEADERS, "Content-Security-Policy": policy}.items():
         response.headers[name] = value
@@ -1313,6 +1321,7 @@ def serve(
     *,
     keep_open: bool = False,
     language: str = LANGUAGES[0],
+    units: str = UNITS[0],
     browse: Callable[[str], object] | None = None,
 ) -> None:
     """Serve on this computer until the last page is closed, or Ctrl-C.
@@ -1327,7 +1336,7 @@ def serve(
     """
     import _thread
 
-    workbench = Workbench(LocalSite(port), language)
+    workbench = Workbench(LocalSite(port), language, units)
     if folder is not None:
         workbench.open(folder)
     server = make_server(workbench)

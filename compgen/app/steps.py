@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from compgen.data.toml_files import Section, flag, not_negative, whole
+from compgen.data.units import UNITS
 from compgen.errors import InputError, visible_line
 from compgen.fitting.bounds import FitOptions
 from compgen.foreign import ImportOptions
@@ -102,6 +103,13 @@ def language(value: Any) -> str:
     return str(value)
 
 
+def units(value: Any) -> str:
+    """Units of the pages."""
+    if value not in UNITS:
+        raise ValueError(f"expected one of {', '.join(UNITS)}")
+    return str(value)
+
+
 # Commands: which words the pages give them.
 
 
@@ -141,7 +149,7 @@ CERTIFICATE_FIELDS = {
 #: Further fields of that form: instruments, a line for each with name; serial number; certificate, and conditions.
 CERTIFICATE_LISTS = ("instruments", "air_low", "air_high", "machine_low", "machine_high")
 _OUT: dict[str, Check | None] = {"out": inside}
-_PAGES: dict[str, Check | None] = {**_OUT, "language": language}
+_PAGES: dict[str, Check | None] = {**_OUT, "language": language, "units": units}
 _READINGS: dict[str, Check | None] = {**dict.fromkeys(NUMBERS, typed), "instrument": inside}
 _FIT: dict[str, Check | None] = {**dict.fromkeys(FIT_FIELDS, typed), "robust": None}
 _PROGRAM: dict[str, Check | None] = {
@@ -157,7 +165,7 @@ COMMANDS: Mapping[str, Syntax] = {
     "import": Syntax((inside,), {**_OUT, **dict.fromkeys(ANSWERS, typed), "machine": machine_word, "json": None}),
     "accuracy": Syntax((machine_word, inside), _PAGES),
     "identify": Syntax((machine_word, inside), {**_OUT, **_READINGS}, several=True),
-    "report": Syntax((inside,), {"language": language, "dcc": inside, "certificate": inside}),
+    "report": Syntax((inside,), {"language": language, "units": units, "dcc": inside, "certificate": inside}),
     "diagnose": Syntax((machine_word, inside), {**_PAGES, "instrument": inside}, several=True),
     "options": Syntax((machine_word, inside), _PAGES),
     "run": Syntax((machine_word, inside), {

@@ -21,6 +21,7 @@ from typing import Any
 import click
 
 from compgen.cli.common import load_for, output_options, plugin_option, run_command, with_language
+from compgen.data.units import UNITS
 from compgen.resources import LANGUAGES, cache_folder
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
@@ -221,7 +222,7 @@ def _configured() -> dict[str, Any]:
     """Return the defaults of options that the configuration file states; paths are relative to it.
 
     It is ``config.toml`` in the user's folder for settings, or the file that ``COMPGEN_CONFIG`` names (empty: none). It may only
-    state where files are, and the language of pages: nothing in it changes a number.
+    state where files are, and the language and the units of pages: nothing in it changes a number of a file.
     """
     named = os.environ.get("COMPGEN_CONFIG")
     path = Path(click.get_app_dir("compgen")) / "config.toml" if named is None else Path(named)
@@ -233,6 +234,7 @@ def _configured() -> dict[str, Any]:
     machines = root.take("machines", toml_files.texts_of_paths, ())
     certificate = root.take("certificate", toml_files.text_of_path, "")
     language = root.take("language", toml_files.choice(*LANGUAGES), "")
+    units = root.take("units", toml_files.choice(*UNITS), "")
     root.finish()
     found: dict[str, Any] = {}
     if machines:
@@ -241,6 +243,8 @@ def _configured() -> dict[str, Any]:
         found["certificate"] = str(path.parent / Path(certificate).expanduser())
     if language:
         found["language"] = language
+    if units:
+        found["units"] = units
     return found
 
 

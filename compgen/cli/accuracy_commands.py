@@ -19,7 +19,7 @@ from compgen.accuracy.compare import CompareOptions
 from compgen.accuracy.evaluate import accuracy_of_errors
 from compgen.accuracy.positioning import SetupBudget, accuracy_of_diagonals, accuracy_of_runs
 from compgen.accuracy.sides import Reader, compare_prediction, compare_sides, read_side, with_prediction
-from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option
+from compgen.cli.common import NUMBER, PATH, Command, json_option, language_option, options_of, out_option, page_shown
 from compgen.cli.identify_commands import of_rotary_axes
 from compgen.cli.shared_options import instrument_option, machine_argument, prior_option
 from compgen.cli.terminal import answer, progress
@@ -169,7 +169,7 @@ def accuracy_command(
     files = {"accuracy.txt": _plain(accuracy_table(found))}
     rows = rows_with_tolerance(found, dict(tolerances))
     if side.readings is not None or side.circles is not None:
-        files["sheet.html"] = sheet_page(machine, side, found, rows, options.edition, laboratory, language)
+        files["sheet.html"] = page_shown(sheet_page(machine, side, found, rows, options.edition, laboratory, language))
     elif click.get_current_context().get_parameter_source("certificate") is ParameterSource.COMMANDLINE:
         raise InputError(
             "applies to the sheet of axis runs or circles, which this file does not contain", field="--certificate"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from compgen.cli.common import PATH, language_option
+from compgen.cli.common import PATH, language_option, shown_units
 from compgen.cli.terminal import say
 from compgen.errors import InputError
 
@@ -38,5 +38,5 @@ def app_command(folder: Path | None, port: int, no_browser: bool, keep_open: boo
         say(f"The workbench: {address}", "It ends when the last page is closed, or with Ctrl-C.")
 
     browse = None if no_browser else webbrowser.open
-    serve(folder, port, announce, keep_open=keep_open, language=language, browse=browse)
+    serve(folder, port, announce, keep_open=keep_open, language=language, units=shown_units(), browse=browse)
     return 0

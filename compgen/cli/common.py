@@ -20,6 +20,7 @@ import click
 
 from compgen.data.files import json_text
 from compgen.data.names import AXES
+from compgen.data.units import UNITS
 from compgen.errors import CompgenError, CompgenWarning, InputError, Message, message_of, messages_of
 from compgen.resources import LANGUAGES
 
@@ -116,6 +117,7 @@ def run_command(group: click.Group, arguments: Sequence[str] | None = None) -> i
         finally:
             if terminal := sys.modules.get("compgen.cli.terminal"):
                 terminal.speak(LANGUAGES[0])
+                terminal.measure_in(UNITS[0])
 
 
 def _fail(message: str, code: int, words: Sequence[str]) -> int:
@@ -198,6 +200,42 @@ _PAGES = (
 language_option = click.option("--language", is_eager=True, help=_PAGES, **_LANGUAGE)
 
 
+#: Key in the context of a command for the units of what it shows.
+SHOWN_UNITS = "compgen.units"
+
+
+def _set_units(context: click.Context, parameter: click.Parameter, value: str) -> None:
+    """Show tables and messages in these units at once; pages ask :func:`shown_units`."""
+    if context.resilient_parsing:
+        return
+    context.meta[SHOWN_UNITS] = value
+    if value != UNITS[0]:
+        from compgen.cli.terminal import measure_in
+
+        measure_in(value)
+
+
+units_option = click.option(
+    "--units", is_eager=True, expose_value=False, type=click.Choice(UNITS), default=UNITS[0], callback=_set_units,
+    help="Units of messages, tables and pages (default mm); inch: inch, 0.0001 inch, arcsec. Files and JSON keep mm, um, urad.",
+)  # fmt: skip
+
+
+def shown_units() -> str:
+    """Return the units of what the running command shows; those of the program outside of a command."""
+    context = click.get_current_context(silent=True)
+    return UNITS[0] if context is None else str(context.meta.get(SHOWN_UNITS, UNITS[0]))
+
+
+def page_shown(html: str) -> str:
+    """Return a finished page in the units of the running command."""
+    if shown_units() == UNITS[0]:
+        return html
+    from compgen.drawing.page_units import page_in_inch
+
+    return page_in_inch(html)
+
+
 class GroupedCommand(click.Command):
     """A command with many options: its help lists them under headings.
 
@@ -225,26 +263,33 @@ class GroupedCommand(click.Command):
 
 
 def with_language(command: click.Command) -> click.Command:
-    """Add ``--language`` for the messages of a command that does not take it for its pages."""
-    if isinstance(command, click.Group) or any(item.name == "language" for item in command.params):
+    """Add ``--units``, and ``--language`` for the messages of a command that does not take it for its pages."""
+    if isinstance(command, click.Group):
+        return command
+    command = units_option(command)
+    if any(item.name == "language" for item in command.params):
         return command
     text = "Language of messages (default en); files and JSON stay in English."
     return click.option("--language", is_eager=True, expose_value=False, help=text, **_LANGUAGE)(command)
 
 
 def for_readers(files: Mapping[str, File], language: str) -> dict[str, File]:
-    """Return files with the pages and lists for people (``*.html``, ``*.md``) in a language; the others are not changed."""
-    if language == LANGUAGES[0]:
-        return dict(files)
-    from compgen.language import texts_of, wrapped
+    """Return files with the pages and lists for people (``*.html``, ``*.md``) in a language, pages in the units of the command.
 
-    texts, made = texts_of(language), dict(files)
-    for name, content in files.items():
-        if isinstance(content, str) and name.endswith(".html"):
-            made[name] = texts.page(content)
-        elif isinstance(content, str) and name.endswith(".md"):
-            made[name] = wrapped(texts.lines(content))
-    return made
+    The others are not changed.
+    """
+    made = dict(files)
+    if language != LANGUAGES[0]:
+        from compgen.language import texts_of, wrapped
+
+        texts = texts_of(language)
+        for name, content in files.items():
+            if isinstance(content, str) and name.endswith(".html"):
+                made[name] = texts.page(content)
+            elif isinstance(content, str) and name.endswith(".md"):
+                made[name] = wrapped(texts.lines(content))
+    pages = {name: page_shown(text) for name, text in made.items() if isinstance(text, str) and name.endswith(".html")}
+    return {**made, **pages}
 
 
 def fleet_options(command: Command) -> Command:

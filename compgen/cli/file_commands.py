@@ -15,7 +15,7 @@ import click
 import numpy as np
 
 from compgen import effects
-from compgen.cli.common import json_option, print_json
+from compgen.cli.common import json_option, print_json, shown_units
 from compgen.cli.shared_options import check_settings
 from compgen.cli.terminal import answer, complain, say
 from compgen.controls import CONTROLLERS, controller_named, program_instead
@@ -37,6 +37,7 @@ from compgen.data.machine import (
 )
 from compgen.data.names import AXES
 from compgen.data.prior import CLASS_WORDS, USUAL_CLASS, class_named
+from compgen.data.units import typed_mm
 from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.job import job_of, job_schema
@@ -440,29 +441,30 @@ def _rotary(
             questions.append(
                 f"[axes.{letter}]: a travel {text} degrees is assumed; give it: --travel {letter}=-110..30"
             )
-        place = given["--point"].get(letter) or (
-            click.prompt(f"A point of the line of {letter}, all axes at zero, mm", default="0,0,0", err=True)
-            if asks
-            else None
-        )
+        place, usual = given["--point"].get(letter), "mm"
+        if place is None and asks:
+            usual = shown_units()
+            place = click.prompt(
+                f"A point of the line of {letter}, all axes at zero, {usual}", default="0,0,0", err=True
+            )
         if place is None:
             place = "0,0,0"
             questions.append(
                 f"[axes.{letter}] point_mm: [0, 0, 0] is assumed; where is its axis line with all axes at zero? "
                 f"--point {letter}=0,0,-50"
             )
-        found[letter] = _rotary_axis(letter, direction, text, place, counts[letter])
+        found[letter] = _rotary_axis(letter, direction, text, (place, usual), counts[letter])
     return found, questions
 
 
-def _rotary_axis(letter: str, direction: Vector3, travel: str, point: str, nodes: int) -> RotaryAxis:
-    """One rotary axis from ``-110..30`` or ``endless`` and ``0,0,-50``."""
+def _rotary_axis(letter: str, direction: Vector3, travel: str, point: tuple[str, str], nodes: int) -> RotaryAxis:
+    """One rotary axis from ``-110..30`` or ``endless``, and ``0,0,-50`` with the unit of what has none."""
     try:
-        x, y, z = (float(part) for part in point.split(","))
+        x, y, z = (typed_mm(part, point[1]) for part in point[0].split(","))
         place = toml_files.vector3([x, y, z])
     except ValueError:
         raise InputError(
-            f"{letter}={point!r} is not of the form AXIS=X,Y,Z in mm, e.g. A=0,0,-50", field="--point"
+            f"{letter}={point[0]!r} is not of the form AXIS=X,Y,Z in mm, e.g. A=0,0,-50", field="--point"
         ) from None
     if travel.strip().lower() in ("endless", "endlos", "modulo", "360"):
         return RotaryAxis(direction, place, np.linspace(0.0, 360.0, nodes), modulo_deg=360.0)
@@ -496,6 +498,7 @@ def _by_letter(given: Sequence[str], chain: Chain, option: str) -> dict[str, str
 
 def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
     """The travel of an axis, from ``X=-800..0``."""
+    usual = shown_units()
     stated = [
         text.partition("=")[2] for part in given for text in part.split(",") if text.strip().upper().startswith(letter)
     ]
@@ -507,10 +510,15 @@ def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
     text = (
         stated[0]
         if stated
-        else _asked(f"Travel of {letter} in mm, lower and upper end (e.g. -800..0)", "--travel", asks)
+        else _asked(
+            f"Travel of {letter} in {usual}, lower and upper end (e.g. {'-30..0' if usual == 'inch' else '-800..0'})",
+            "--travel",
+            asks,
+        )
     )
     try:
-        low, high = _ends_mm(text)
+        # an option is in mm whatever a page shows; what is asked is in the unit of the question
+        low, high = _ends_mm(text, "mm" if stated else usual)
     except ValueError:
         raise InputError(
             f"{letter}={text!r} is not of the form AXIS=LOW..HIGH in mm, e.g. X=-800..0, or with a unit X=0..24in, X=24in",
@@ -522,36 +530,17 @@ def _travel(letter: str, given: Sequence[str], asks: bool) -> Interval:
         raise InputError(f"{letter}={text!r}: {error}", field="--travel") from None
 
 
-_END = re.compile(r"\s*([-+]?\d*[.,]?\d+(?:[eE][-+]?\d+)?)\s*([a-zA-Z\"\u2033]*)\s*")
-_MM = {
-    "": 1.0,
-    "mm": 1.0,
-    "cm": 10.0,
-    "m": 1e3,
-    "in": 25.4,
-    "inch": 25.4,
-    "inches": 25.4,
-    '"': 25.4,
-    "\u2033": 25.4,
-    "ft": 304.8,
-}
-
-
-def _ends_mm(text: str) -> tuple[float, float]:
+def _ends_mm(text: str, usual: str = "mm") -> tuple[float, float]:
     """Return both ends of a travel in mm; one length alone counts from 0, and a unit behind the last end is that of both.
 
-    >>> _ends_mm("-800..0"), _ends_mm("24in"), _ends_mm("-30..0 in"), _ends_mm("0mm..0.6m")
-    ((-800.0, 0.0), (0.0, 609.6), (-762.0, 0.0), (0.0, 600.0))
+    >>> _ends_mm("-800..0"), _ends_mm("24in"), _ends_mm("-30..0 in"), _ends_mm("0mm..0.6m"), _ends_mm("-30..0", "inch")
+    ((-800.0, 0.0), (0.0, 609.6), (-762.0, 0.0), (0.0, 600.0), (-762.0, 0.0))
     """
-    found = [_END.fullmatch(part) for part in re.split(r"\.\.+|:|\bto\b|\bbis\b", text)]
-    if not 1 <= len(found) <= 2 or None in found or (len(found) == 1 and not (found[0] and found[0][2])):
+    parts = re.split(r"\.\.+|:|\bto\b|\bbis\b", text)
+    stated = re.search(r"[a-zA-Z\"\u2033]+\s*$", parts[-1])
+    if not 1 <= len(parts) <= 2 or (len(parts) == 1 and not stated):
         raise ValueError(text)
-    parts = [(float(match[1].replace(",", ".")), match[2].lower()) for match in found if match]
-    unit = parts[-1][1]
-    if any(name not in _MM for _, name in parts):
-        raise ValueError(text)
-    # rounded: 24 * 25.4 is 609.5999999999999
-    ends = [round(value * _MM[name or unit], 9) for value, name in parts]
+    ends = [typed_mm(part, stated[0].strip().lower() if stated else usual) for part in parts]
     return (ends[0], ends[1]) if len(ends) == 2 else (min(0.0, ends[0]), max(0.0, ends[0]))
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from compgen.cli.common import PATH, Command, json_option, language_option, options_of, stopped_by_signals
+from compgen.cli.common import PATH, Command, json_option, language_option, options_of, page_shown, stopped_by_signals
 from compgen.cli.shared_options import (
     covariance_of,
     machine_argument,
@@ -734,7 +734,7 @@ def part_command(
         folder.add("part.json", json_text(data))
         from compgen.report.part_page import part_page
 
-        folder.add("part.html", part_page(found, ranked, language))
+        folder.add("part.html", page_shown(part_page(found, ranked, language)))
         paths = list(folder.commit().values())
     shown = [_figures_table(found, controller), *([_ranking_table(ranked)] if ranked else [])]
     columns = columns_of(found.features)

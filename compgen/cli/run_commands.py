@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from compgen.cli.common import PATH, GroupedCommand, json_option, language_option, out_option, print_json
+from compgen.cli.common import PATH, GroupedCommand, json_option, language_option, out_option, page_shown, print_json
 from compgen.cli.shared_options import (
     active_options,
     answer_options,
@@ -111,7 +111,7 @@ def report_command(  # noqa: PLR0913  (options of the command)
     also, remark = _dcc(folder, certificate, schema, handed)
     with progress(quiet=as_json) as show:
         show("drawing the report")
-        report, paths = write_report(folder, out, also, language, certificate=handed or certificate)
+        report, paths = write_report(folder, out, also, language, certificate=handed or certificate, shown=page_shown)
         if as_pdf:
             from compgen.report.pdf import pdf_of
 
@@ -165,7 +165,9 @@ def report_written(
     from compgen.report.html import write_report
 
     try:
-        return write_report(folder, language=language, known=known, certificate=certificate)[1]["report.html"]
+        return write_report(folder, language=language, known=known, certificate=certificate, shown=page_shown)[1][
+            "report.html"
+        ]
     except InputError as error:
         warnings.warn(f"the report could not be made: {error}", CompgenWarning, stacklevel=2)
         return None
@@ -184,7 +186,7 @@ class _Run(GroupedCommand):
         "Identification": ("options__", "prior"),
         "Smoothing and bounds of the tables": ("fitting__", "zone", "tools", "limits__"),
         "Tables on the control": ("active", "template_from", "style_from", "templates", "allow_unverified", "sample"),
-        "Verdict and output": ("allow_misfit", "explain", "no_report", "certificate", "language", "as_json"),
+        "Verdict and output": ("allow_misfit", "explain", "no_report", "certificate", "language", "units", "as_json"),
     }
 
 
@@ -327,7 +329,7 @@ def run_command(
         for item in result.results:
             say_paths(item.paths)
         if report is not None:
-            say(f"  {report}")
+            say_paths([report])
     code = 0 if result.accepted else 1
     if turned is not None and turned.controllers:
         code = max(code, turned.export(apart=True, as_json=False))

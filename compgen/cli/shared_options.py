@@ -16,7 +16,17 @@ from compgen import effects
 from compgen.cli.common import PATH, Command, options_of
 from compgen.controls import CONTROLLERS, HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS, controller_named
 from compgen.data.error_table import ErrorTable
-from compgen.data.machine import MOST_ZONE_WEIGHT, ZONE_WEIGHT, Emphasis, Machine, Vector3, load_machine, zone_of
+from compgen.data.machine import (
+    FEW_MM,
+    MOST_ZONE_WEIGHT,
+    ZONE_WEIGHT,
+    Emphasis,
+    Machine,
+    Vector3,
+    load_machine,
+    zone_of,
+)
+from compgen.data.names import AXES
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.foreign.answers import ImportOptions
 from compgen.identification import Covariance, IdentifyOptions, read_covariance, read_stations
@@ -95,7 +105,12 @@ def machine_argument(command: Command) -> Command:
     @functools.wraps(command)
     def wrapper(*args: Any, machine: str, machines: tuple[Path, ...], **options: Any) -> Any:
         used = (*_names(options.get("controller")), options.get("active_controller"))
-        return command(*args, machine=open_machine(machine, machines, used=used), **options)
+        opened = open_machine(machine, machines, used=used)
+        if all(axis.length_mm < FEW_MM for axis in opened.axes):
+            travel = ", ".join(f"{letter} {axis.length_mm:g}" for letter, axis in zip(AXES, opened.axes, strict=True))
+            text = f"the travel of the machine is {travel} mm: was it meant in inch? `volcomp check` asks for each axis"
+            warnings.warn(text, CompgenWarning, stacklevel=2)
+        return command(*args, machine=opened, **options)
 
     help_text = "Additional folder with machine files (may be given several times)."
     option = click.option("--machines", multiple=True, type=click.Path(path_type=Path), help=help_text)

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.cli.common import VERBOSE, print_json
+from compgen.data.units import UNITS, Inch, units_of_cells
 from compgen.errors import visible
 from compgen.resources import LANGUAGES
 
@@ -30,14 +31,20 @@ PIPE_WIDTH = None if sys.stdout.isatty() else 130
 class Terminal(Console):
     """A console that escapes control characters in names, reasons and files: no text may control the terminal.
 
-    What it prints is shown in the language of ``texts``, in English without them.
+    What it prints is shown in the language of ``texts``, in English without them, and in the units of ``inch``, without it in
+    mm, um and urad.
     """
 
     texts: Texts | None = None
+    inch: Inch | None = None
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print texts and tables in the language of the command."""
-        super().print(*(objects if self.texts is None else (_said(item, self.texts) for item in objects)), **options)
+        """Print texts and tables in the language and the units of the command."""
+        units = [None if self.inch is None else _units_of(item) for item in objects]
+        said = list(objects) if self.texts is None else [_said(item, self.texts) for item in objects]
+        if self.inch is not None:
+            said = [_measured(item, known, self.inch) for item, known in zip(said, units, strict=True)]
+        super().print(*said, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Convert text to what is shown; printing and the cells of tables use it."""
@@ -67,6 +74,62 @@ def _said(shown: Any, texts: Texts) -> Any:
     return shown
 
 
+def _units_of(shown: Any) -> Any:
+    """Return the units of the cells of a table, by rows, which its English headings state; of a group those of each part."""
+    if isinstance(shown, Group):
+        return [_units_of(item) for item in shown.renderables]
+    if isinstance(shown, Padding):
+        return _units_of(shown.renderable)
+    if isinstance(shown, Table):
+        cells = [[_plain(cell) for cell in column._cells] for column in shown.columns]
+        return units_of_cells(
+            _plain(shown.title), [_plain(column.header) for column in shown.columns], list(zip(*cells, strict=True))
+        )
+    return None
+
+
+def _plain(cell: Any) -> str:
+    return cell.plain if isinstance(cell, Text) else str(cell or "")
+
+
+def _measured(shown: Any, units: Any, inch: Inch) -> Any:
+    """Return what is printed in inch; tables are changed in place, as by :func:`_said`."""
+    if isinstance(shown, str):
+        return inch.text(shown)
+    if isinstance(shown, Text):
+        return Text(inch.text(shown.plain), style=shown.style, overflow=shown.overflow)
+    if isinstance(shown, Group):
+        return Group(*(_measured(item, own, inch) for item, own in zip(shown.renderables, units, strict=True)))
+    if isinstance(shown, Padding):
+        shown.renderable = _measured(shown.renderable, units, inch)
+    if isinstance(shown, Table):
+        shown.title = shown.title and _measured(shown.title, None, inch)
+        for k, column in enumerate(shown.columns):
+            column.header = _measured(column.header, None, inch)
+            column._cells = [_cell_measured(cell, row[k], inch) for cell, row in zip(column._cells, units, strict=True)]
+    return shown
+
+
+def _cell_measured(cell: Any, unit: str, inch: Inch) -> Any:
+    if isinstance(cell, Text):
+        return Text(inch.cell(cell.plain, unit), style=cell.style, overflow=cell.overflow)
+    return inch.cell(cell, unit) if isinstance(cell, str) else _measured(cell, None, inch)
+
+
+def measure_in(units: str) -> None:
+    """Show lengths, deviations and angles in these units from now on, in the language that is printed.
+
+    Warnings and errors speak of files and options in the units in which these are written. As in :func:`speak`, what a
+    program reads stays as it is.
+    """
+    read_by_program = os.environ.get("COMPGEN_MESSAGES") == LANGUAGES[0]
+    stdout.inch = None if units == UNITS[0] or read_by_program else Inch(_language())
+
+
+def _language() -> str:
+    return LANGUAGES[0] if stdout.texts is None else stdout.texts.language
+
+
 def speak(language: str) -> None:
     """Print in a language from now on, unless COMPGEN_MESSAGES asks for English: a program reads the messages then."""
     texts = None
@@ -75,6 +138,8 @@ def speak(language: str) -> None:
 
         texts = texts_of(language)
     stdout.texts = stderr.texts = texts
+    if stdout.inch is not None:
+        measure_in(UNITS[1])
 
 
 def say(*lines: str, style: str | None = None) -> None:
@@ -84,8 +149,12 @@ def say(*lines: str, style: str | None = None) -> None:
 
 
 def say_paths(paths: Iterable[object]) -> None:
-    """Print the files that were written."""
-    say(*(f"  {path}" for path in paths))
+    """Print the files that were written; a name that looks like a quantity stays as it is."""
+    inch, stdout.inch = stdout.inch, None
+    try:
+        say(*(f"  {path}" for path in paths))
+    finally:
+        stdout.inch = inch
 
 
 def answer(as_json: bool, data: Any, *shown: Any) -> None:

@@ -11,17 +11,20 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
+import re
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from html import unescape
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
 
+from compgen.data.units import Inch, factor_of, unit_in
 from compgen.resources import data_folder
 
 #: Roles of colours.
@@ -121,8 +124,9 @@ class Plot:
 
     @property
     def data(self) -> dict[str, Any]:
-        """Place of the axes in the picture and their limits, for the script of the page."""
-        return {"frame": list(self.box), "limits": [*self.x, *self.y]}
+        """Place of the axes in the picture, their limits and the units of these, for the script of the page."""
+        found = {"frame": list(self.box), "limits": [*self.x, *self.y]}
+        return found if self.bare else {**found, "units": [unit_in(label) for label in self.labels[:2]]}
 
     def _px(self, x: ArrayLike, y: ArrayLike) -> tuple[Values, Values]:
         (x0, x1), (y0, y1), (left, top, right, bottom) = self.x, self.y, self.box
@@ -208,11 +212,19 @@ class Plot:
                 self.drawn[-1] = self.drawn[-1].replace("var(--ink)", "#" + bytes(rgb.tolist()).hex())
 
     def text(
-        self, x: float, y: float, text: str, *, anchor: str = "start", shift: tuple[float, float] = (0, 0)
+        self,
+        x: float,
+        y: float,
+        text: str,
+        *,
+        anchor: str = "start",
+        shift: tuple[float, float] = (0, 0),
+        unit: str = "",
     ) -> None:
-        """Write a text at a point, moved by ``shift`` units of the picture."""
+        """Write a text at a point, moved by ``shift`` units of the picture; ``unit`` is that of bare numbers in it."""
         px, py = self._px(x, y)
-        self.drawn.append(_text(float(px) + shift[0], float(py) + shift[1], text, anchor))
+        more = f' data-unit="{unit}"' if unit else ""
+        self.drawn.append(_text(float(px) + shift[0], float(py) + shift[1], text, anchor, more))
 
     def layer(self, name: str, start: int) -> None:
         """Turn what was drawn since ``start`` (an earlier ``len(drawn)``) into a layer that the page can show and hide."""
@@ -223,7 +235,10 @@ class Plot:
         left, top, right, bottom = self.box
         x_label, y_label, title = self.labels
         head = ' data-bare="1"' if self.bare else ' data-fixed="1"' if any(self.ticks) else ""
-        head += "".join(f' data-{key}="{" ".join(f"{v:.9g}" for v in part)}"' for key, part in self.data.items())
+        head += _numbers_of_axes(self.box, (*self.x, *self.y))
+        if not self.bare:
+            auto = [name if given is None else "" for name, given in zip(self.data["units"], self.ticks, strict=True)]
+            head += f' data-units="{",".join(self.data["units"])}" data-scaled="{",".join(auto)}"'
         size = f'x="{left:g}" y="{top:g}" width="{right - left:g}" height="{bottom - top:g}"'
         view = f'viewBox="{left:g} {top:g} {right - left:g} {bottom - top:g}"'
         parts = [f'<g class="axes"{head}>', *([] if self.bare else [f'<g class="scale">{self._scale()}</g>'])]
@@ -245,21 +260,114 @@ class Plot:
         """Grid, ticks with their numbers, and the lines left and below."""
         left, top, right, bottom = self.box
         x_ticks, y_ticks = (
-            _labelled(given, limits, room) for given, limits, room in zip(
-                self.ticks, (self.x, self.y), ((right - left) / 40, (bottom - top) / 24), strict=True
-            )
-        )  # fmt: skip
+            _labelled(given, limits, room)
+            for given, limits, room in zip(self.ticks, (self.x, self.y), _rooms(self.box), strict=True)
+        )
         across = [(float(self._px(value, self.y[0])[0]), text) for value, text in x_ticks]
         up = [(float(self._px(self.x[0], value)[1]), text) for value, text in y_ticks]
-        grid = "".join(f"M{a:.1f} {top:g}V{bottom:g}" for a, _ in across) + "".join(
-            f"M{left:g} {b:.1f}H{right:g}" for b, _ in up
-        )
         return (
-            f'<path d="{grid}" fill="none" style="stroke:var(--grid);stroke-width:.6"/>'
+            f'<path d="{_grid_across(self.box, across)}{_grid_up(self.box, up)}" fill="none" '
+            'style="stroke:var(--grid);stroke-width:.6"/>'
             f'<path d="M{left:g} {top:g}V{bottom:g}H{right:g}" fill="none" style="stroke:var(--muted);stroke-width:.7"/>'
-            + "".join(_text(a, bottom + 1.2 * FONT, text, "middle") for a, text in across)
-            + "".join(_text(left - 4.0, b + 0.35 * FONT, text, "end") for b, text in up)
+            + _texts_across(self.box, across)
+            + _texts_up(self.box, up)
         )
+
+
+Box = tuple[float, float, float, float]
+
+
+def _rooms(box: Box) -> tuple[float, float]:
+    """How many ticks the two axes have room for."""
+    return (box[2] - box[0]) / 40, (box[3] - box[1]) / 24
+
+
+def _numbers_of_axes(box: Sequence[float], limits: Sequence[float]) -> str:
+    """Attributes with the place of axes in the picture, and their limits."""
+    return "".join(
+        f' data-{key}="{" ".join(f"{v:.9g}" for v in part)}"' for key, part in (("frame", box), ("limits", limits))
+    )
+
+
+def _grid_across(box: Box, places: Sequence[tuple[float, str]]) -> str:
+    return "".join(f"M{a:.1f} {box[1]:g}V{box[3]:g}" for a, _ in places)
+
+
+def _grid_up(box: Box, places: Sequence[tuple[float, str]]) -> str:
+    return "".join(f"M{box[0]:g} {b:.1f}H{box[2]:g}" for b, _ in places)
+
+
+def _texts_across(box: Box, places: Sequence[tuple[float, str]]) -> str:
+    return "".join(_text(a, box[3] + 1.2 * FONT, text, "middle") for a, text in places)
+
+
+def _texts_up(box: Box, places: Sequence[tuple[float, str]]) -> str:
+    return "".join(_text(box[0] - 4.0, b + 0.35 * FONT, text, "end") for b, text in places)
+
+
+# Pictures in other units: what is drawn stays, the numbers of its axes become round ones of the unit that is shown.
+
+_AXES = re.compile(
+    r'(?P<head><g class="axes"[^>]*? data-frame=")(?P<frame>[^"]*)(?P<mid>" data-limits=")(?P<limits>[^"]*)'
+    r'(?P<tail>" data-units="[^"]*" data-scaled="(?P<scaled>[^"]*)"[^>]*><g class="scale">)(?P<scale>.*?)(?P<end></g>)'
+)
+_BAR = re.compile(r'(<g class="bar" data-frame="([^"]*)" data-limits="([^"]*)" data-units="([^"]*)">).*?(</g>)')
+_SVG_TEXT = re.compile(r"(<text(?P<head>[^>]*)>)(?P<text>[^<]*)(?=</text>)")
+
+
+def rescaled(svg: str, inch: Inch) -> str:
+    """Return a finished picture with its axes, scales of colours and texts in inch."""
+    kept: list[str] = []  # numbers of axes, which are no texts that state a unit
+
+    def keep(markup: str) -> str:
+        kept.append(markup)
+        return f"\0{len(kept) - 1}\0"
+
+    def axes(found: re.Match[str]) -> str:
+        box, limits = (tuple(map(float, found[key].split())) for key in ("frame", "limits"))
+        x, y = (factor_of(name) for name in found["scaled"].split(","))
+        given = [value * by for value, by in zip(limits, (x, x, y, y), strict=True)]
+        scale = _scale_of(found["scale"], box, given, [bool(name) for name in found["scaled"].split(",")])  # type: ignore[arg-type]
+        stated = " ".join(f"{value:.9g}" for value in given)
+        return f"{found['head']}{found['frame']}{found['mid']}{stated}{found['tail']}{keep(scale)}{found['end']}"
+
+    def bar(found: re.Match[str]) -> str:
+        left, top, bottom = map(float, found[2].split())
+        limits = [float(value) * factor_of(found[4]) for value in found[3].split()]
+        return found[1] + keep(_bar_numbers(left, top, bottom, (limits[0], limits[1]))) + found[5]
+
+    def text(found: re.Match[str]) -> str:
+        stated = re.search(r'data-unit="(\w+)"', found["head"])
+        plain = unescape(found["text"])
+        return found[1] + escape(inch.numbers(plain, stated[1]) if stated else inch.text(plain))
+
+    made = _SVG_TEXT.sub(text, _BAR.sub(bar, _AXES.sub(axes, svg)))
+    made = re.sub(
+        r"(<title[^>]*>)([^<]*)", lambda found: found[1] + escape(inch.text(unescape(found[2]))), made, count=1
+    )
+    return re.sub("\0(\\d+)\0", lambda found: kept[int(found[1])], made)
+
+
+def _scale_of(scale: str, box: Box, limits: Sequence[float], fresh: Sequence[bool]) -> str:
+    """Return the markup of ticks with round numbers between other limits; axes that are not ``fresh`` keep theirs."""
+    path = re.match(r'<path d="([^"]*)"', scale)
+    assert path is not None
+    grid, texts = re.findall(r"M[\d.-]+ [\d.-]+[VH][\d.-]+", path[1]), re.findall(r"<text.*?</text>", scale)
+    parts = []
+    for axis, (letter, anchor) in enumerate((("V", "middle"), ("H", "end"))):
+        low, high = limits[2 * axis : 2 * axis + 2]
+        lines, numbers = [part for part in grid if letter in part], [part for part in texts if f'"{anchor}"' in part]
+        if fresh[axis]:
+            ends = (box[0], box[2]) if axis == 0 else (box[3], box[1])
+            places = [
+                (ends[0] + (value - low) / (high - low) * (ends[1] - ends[0]), shown)
+                for value, shown in _labelled(None, (low, high), _rooms(box)[axis])
+            ]
+            lines = [(_grid_across, _grid_up)[axis](box, places)]
+            numbers = [(_texts_across, _texts_up)[axis](box, places)]
+        parts.append(("".join(lines), "".join(numbers)))
+    rest = re.sub(r"<text.*?</text>", "", scale[path.end() :])
+    return f'<path d="{"".join(lines for lines, _ in parts)}"{rest}{"".join(numbers for _, numbers in parts)}'
 
 
 def svg(key: str, title: str, plots: Sequence[Plot], size: tuple[float, float] = SIZE, more: str = "") -> Markup:
@@ -295,11 +403,17 @@ def colour_bar(
     """Return an upright scale of colours with round numbers and their unit, as SVG."""
     bar = Plot((0.0, 1.0), limits, (left, top, left + 8.0, bottom), bare=True)
     bar.heat((0.0, 1.0), limits, np.linspace(0.0, 1.0, 32)[:, None], colours)
-    marks = _labelled(None, limits, (bottom - top) / 24)
-    places = [(float(bar._px(0.0, value)[1]), text) for value, text in marks]
-    numbers = "".join(_text(left + 11.0, place + 0.35 * FONT, text, "start") for place, text in places)
+    stated = f'data-frame="{left:g} {top:g} {bottom:g}" data-limits="{limits[0]:.9g} {limits[1]:.9g}"'
+    numbers = f'<g class="bar" {stated} data-units="{unit_in(label)}">{_bar_numbers(left, top, bottom, limits)}</g>'
     # Only an image of the bar: it has no axes to zoom.
     return "".join(bar.drawn) + numbers + _text(left + 4.0, top - 3.0, label, "middle")
+
+
+def _bar_numbers(left: float, top: float, bottom: float, limits: tuple[float, float]) -> str:
+    """The round numbers beside a scale of colours."""
+    marks = _labelled(None, limits, (bottom - top) / 24)
+    places = [(bottom - (value - limits[0]) / (limits[1] - limits[0]) * (bottom - top), text) for value, text in marks]
+    return "".join(_text(left + 11.0, place + 0.35 * FONT, text, "start") for place, text in places)
 
 
 def picture_grid(pictures: Sequence[Picture], kind: str = "") -> str:

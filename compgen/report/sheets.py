@@ -218,7 +218,7 @@ def draw_positioning(
             ranges.line((place + 0.3, place + 0.7), (value, value), "ink", width=1.0)
             plot.across(value, "grid", dash=DASHED)
         ranges.spread([place + 0.5], [low], [high], "ink")
-        ranges.text(place + 0.5, high, f"{name} {high - low:.1f}", anchor="middle", shift=(0.0, -4.0))
+        ranges.text(place + 0.5, high, f"{name} {high - low:.1f}", anchor="middle", shift=(0.0, -4.0), unit="um")
     if np.isfinite(targets["B_um"]).all():
         at = int(np.argmax(np.abs(targets["B_um"])))
         plot.spread(x[[at]] - 3 * shift, [means["up"][at]], [means["down"][at]], "ink", width=1.6)

@@ -92,8 +92,8 @@ def identification_table(result: Identification, *, assumed: bool = True) -> Gro
     ]
     if result.stations:
         places = {item.station: ", ".join(f"{value:.0f}" for value in item.position_mm) for item in result.stations}
-        found = "; ".join(f"{name} ({place})" for name, place in places.items())
-        lines.append(f"stations found at X, Y, Z in mm: {found}")
+        found = "; ".join(f"{name} ({place}) mm" for name, place in places.items())
+        lines.append(f"stations found at X, Y, Z: {found}")
         lines.append("are they really there? Lengths alone cannot show that an axis is mirrored")
     lines += [segment.text for segment in result.segments[:MOST_VERDICT_REASONS]]
     lines += [

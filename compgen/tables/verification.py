@@ -282,7 +282,7 @@ class ProbableGain:
     def text(self) -> str:
         """Before and after with their limits, in one clause."""
         before, low, high, after, most = self.rounded
-        return f"before {before} um rms ({low} to {high}), after {after}, at most {most}"
+        return f"before {before} um rms ({low} to {high} um), after {after} um, at most {most} um"
 
     @property
     def rounded(self) -> tuple[str, str, str, str, str]:
@@ -995,7 +995,7 @@ class Verification(Drawable, Tabular):
         """What the tables do with the reference point fixed."""
         if self.gain is not None:
             before, low, high, after, most = self.gain.rounded
-            return f"the error over the volume goes from {before} um rms ({low} to {high}) to {after}, at most {most}"
+            return f"the error over the volume goes from {before} um rms ({low} to {high} um) to {after} um, at most {most} um"
         change = f"{um_text(self.before.rms_um)} to {um_text(self.after.rms_um)} um rms"
         known = "not known" if self.uncertainty is None else f"{um_text(self.uncertainty.rms_um)} um"
         bounds = f"uncertainty of the measurement U = {known}" + ("" if self.uncertainty is None else ", k = 2")

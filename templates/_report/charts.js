@@ -7,6 +7,8 @@
   var source = document.getElementById("data");
   var data = source ? JSON.parse(source.textContent) : {};
   var tip = document.getElementById("tip");
+  // units of what is shown; a page in inch states others
+  var LENGTH = root.dataset.length || "mm", DEVIATION = root.dataset.deviation || "\u00b5m";
   root.classList.add("script");
 
   function make(name, attributes, parent, text) {
@@ -140,7 +142,7 @@
     return series.control === undefined || !chosen || chosen === "all" || chosen === String(series.control);
   }
   Picture.prototype.sayCurve = function (index, x, y) {
-    var first = this.item.series[0], at = first.x[index], lines = [number(at) + " mm"];
+    var first = this.item.series[0], at = first.x[index], lines = [number(at) + " " + (this.item.units && this.item.units[0] === "mm" ? LENGTH : "")];
     this.item.series.forEach(function (series) {
       var k = series.x.findIndex(function (other) { return Math.abs(other - at) < 1e-6; });
       if (k < 0 || series.y[k] === null || !isShown(series)) { return; }
@@ -156,8 +158,8 @@
     var j = between(Math.floor((value[1] - l[2]) / (l[3] - l[2]) * n[1]), 0, n[1] - 1);
     var v = this.item.values[j * n[0] + i];
     var across = l[0] + (i + 0.5) / n[0] * (l[1] - l[0]), up = l[2] + (j + 0.5) / n[1] * (l[3] - l[2]);
-    this.say(this.placeOf(across, up), axes[0] + " " + number(across) + ", " + axes[1] + " " + number(up) + " mm\n" +
-      number(Math.hypot(v[0], v[1], v[2])) + " \u00b5m: X " + number(v[0]) + ", Y " + number(v[1]) + ", Z " + number(v[2]), x, y);
+    this.say(this.placeOf(across, up), axes[0] + " " + number(across) + ", " + axes[1] + " " + number(up) + " " + LENGTH + "\n" +
+      number(Math.hypot(v[0], v[1], v[2])) + " " + DEVIATION + ": X " + number(v[0]) + ", Y " + number(v[1]) + ", Z " + number(v[2]), x, y);
   };
 
   Picture.prototype.listen = function () {

@@ -3,6 +3,7 @@
 // each times its share. The first drawing is that of compgen/planning/gauges.py.
 (function () {
   var root = document.documentElement;
+  var DEVIATION = root.dataset.deviation || "\u00b5m", PER_UM = Number(root.dataset.perUm || 1);
   root.classList.add("script");
   var data = JSON.parse(document.getElementById("data").textContent);
   var sliders = Array.prototype.slice.call(document.querySelectorAll("input[data-error]"));
@@ -14,14 +15,17 @@
   }
   function point(x, y) { return x.toFixed(2) + " " + y.toFixed(2); }
 
-  // A round number at or above a length, as ticks of charts.py with one division.
+  // A round number of the unit that is shown, in um, at or above a length, as ticks of charts.py with one division.
   function rounded(um) {
+    return roundedUp(um * PER_UM) / PER_UM;
+  }
+  function roundedUp(um) {
     um = Math.max(um, 0.1);
     var power = Math.pow(10, Math.floor(Math.log10(um)));
     var step = power * [1, 2, 5, 10].find(function (factor) { return factor * power >= 0.999 * um; });
     return Math.ceil(um / step - 1e-9) * step;
   }
-  function text(um) { return String(Number(um.toPrecision(3))); }
+  function text(um) { return String(Number((um * PER_UM).toPrecision(3))); }
 
   // sums of all responses: numbers for a circle, pairs for an artefact
   function sums(item, share) {
@@ -55,8 +59,8 @@
       var item = data[key], figure = document.getElementById("figure-" + key), found = sums(item, share);
       var step = rounded(Math.max.apply(null, found.map(function (um) { return Math.hypot(um[0], um[1]); })));
       var labels = figure.querySelectorAll(".layer-scale text"), paths = figure.querySelectorAll(".layer-shown path");
-      labels[0].textContent = (item.circle ? "\u2212" : "") + text(step) + " \u00b5m";
-      if (item.circle) { labels[1].textContent = "+" + text(step) + " \u00b5m"; }
+      labels[0].textContent = (item.circle ? "\u2212" : "") + text(step) + " " + DEVIATION;
+      if (item.circle) { labels[1].textContent = "+" + text(step) + " " + DEVIATION; }
       Array.prototype.forEach.call(paths, function (path, k) {
         var scale = item.step / step;
         path.setAttribute("d", item.circle ? circlePath(item, found, scale) : arrowPath(item, found, scale, k));

@@ -2,6 +2,8 @@
 // The path of the tool in three dimensions: grey as programmed, coloured by its deviation, with arrows to where the tool goes.
 (() => {
   document.documentElement.classList.add("script");
+  // units of what is shown; a page in inch states others
+  const { length: LENGTH = "mm", deviation: DEVIATION = "µm", perMm = 1, perUm = 1 } = document.documentElement.dataset;
   const data = JSON.parse(document.getElementById("data").textContent);
   const canvas = document.getElementById("part"), draw = canvas.getContext("2d");
   const slider = document.getElementById("scale"), says = document.getElementById("says"), view = document.getElementById("view");
@@ -82,14 +84,14 @@
     for (let k = 0; k < bar; k++) { draw.fillStyle = colour(k / bar); draw.fillRect(left, top + bar - k, 16, 1.5); }
     draw.fillStyle = draw.strokeStyle = ink;
     draw.textAlign = "right";
-    for (const share of [0, 0.5, 1]) draw.fillText((share * most).toPrecision(3) + " µm", left - 6, top + bar * (1 - share));
-    const onePixel = 1 / (scale * factor * 1e-3), deviation = round(90 * onePixel), length = round(110 / scale);
+    for (const share of [0, 0.5, 1]) draw.fillText((share * most * perUm).toPrecision(3) + ` ${DEVIATION}`, left - 6, top + bar * (1 - share));
+    const onePixel = 1 / (scale * factor * 1e-3), deviation = round(90 * onePixel * perUm) / perUm, length = round((110 / scale) * perMm) / perMm;
     if (factor > 0) {
       arrow(wide - 14 - deviation / onePixel, tall - 44, wide - 14, tall - 44, 7);
-      draw.fillText(`${Number(deviation.toPrecision(2))} µm`, wide - 22 - deviation / onePixel, tall - 44);
+      draw.fillText(`${Number((deviation * perUm).toPrecision(2))} ${DEVIATION}`, wide - 22 - deviation / onePixel, tall - 44);
     }
     draw.fillRect(wide - 14 - length * scale, tall - 21, length * scale, 3);
-    draw.fillText(`${Number(length.toPrecision(2))} mm`, wide - 22 - length * scale, tall - 20);
+    draw.fillText(`${Number((length * perMm).toPrecision(2))} ${LENGTH}`, wide - 22 - length * scale, tall - 20);
     draw.textAlign = "left";
     says.textContent = `${factor.toPrecision(2) >= 1 ? Number(factor.toPrecision(2)) : factor.toPrecision(2)} ${canvas.dataset.times}`;
   };

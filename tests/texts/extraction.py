@@ -52,6 +52,7 @@ READERS = (
     "display.py",
     "heat_outputs.py",
     "heat_programs.py",
+    "units.py",
 )
 #: Calls whose texts are for help, or are no texts.
 NOT_SHOWN = re.compile(
@@ -116,7 +117,8 @@ NO_TEXT = re.compile(
     r"-src '|-ancestors|^; script-src|filename=|^# |^\[controllers|^set -e$|\$\? -eq|<Controls|never ends|in line 0$|"
     r"[Dd]efault: |\(default |\(may be given |\(several times |^Print (no|each) |^Scheduler of |"
     r"^(Axis|Standard uncertainty) of (an inst|meas)|"
-    r"^Tool offset of the model|^[*]\.reversal|^(x|viewBox|transform)=\"|^(cd|volcomp) \{|^What was done in this project, by|"
+    r"^Tool offset of the model|^[*]\.reversal|^(x|viewBox|transform|data-[a-z]+)=\"|"
+    r"^(cd|volcomp) \{|^What was done in this project, by|"
     r"^([Mm]easurement|target|serial|version|[Ss]ample|mat temp) (date|id|no|\d)$|^(file type|exp coeff|air temp|measured at)$|"
     r"^(test date|date time|date of measurement|start time|actual sample rate|[Ss]ample rate|trigger interval)$|"
     r"^error: internal| \| [A-Z]|^run target data$|^Tool lengths: CSV|"

@@ -507,8 +507,8 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     if "as_it_stands" in best["limits"]:
         one, low, high, left, most = best["limits"]["as_it_stands"]
         text = (
-            f"{name} error of the tool tip over the volume goes from {one} µm rms ({low} to {high}) to {left}, at most "
-            f"{most}, with the reference point fixed; 97.5 % limits, with what was not measured."
+            f"{name} error of the tool tip over the volume goes from {one} µm rms ({low} to {high} µm) to {left} µm, at most "
+            f"{most} µm, with the reference point fixed; 97.5 % limits, with what was not measured."
         )
         return text if best["volumetric"] else f"{text} What was measured: {best['measured']}."
     known = um(best["uncertainty"].get("U_rms_um")) if best["uncertainty"] else ""
@@ -991,11 +991,12 @@ def write_report(
     language: str = LANGUAGES[0],
     known: KnownTables | None = None,
     certificate: str | Path | None = None,
+    shown: Callable[[str], str] = str,
 ) -> tuple[Report, dict[str, Path]]:
     """Make the report of ``folder`` and write its files there, or to ``out``: all or none.
 
     ``also`` makes additional files, by name, from the numbers of the report. ``language`` is that of the page;
-    ``known`` and ``certificate``: see :func:`build_report`.
+    ``known`` and ``certificate``: see :func:`build_report`; ``shown`` makes the finished page one in other units.
     """
     target = OutputFolder(out if out is not None else folder)
     report = build_report(folder, language, known, certificate)
@@ -1004,7 +1005,7 @@ def write_report(
         for name, text in certificate_copies(Path(certificate)).items():
             target.add(name, text)
     for name, text in report.files.items():
-        target.add(name, text)
+        target.add(name, shown(text) if name.endswith(".html") else text)
     for name, document in documents.items():
         target.add(name, document)
     return report, target.commit()
