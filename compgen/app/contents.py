@@ -51,6 +51,7 @@ from compgen.report.html.pictures import (
 )
 from compgen.report.html.write import assumptions_of, judged, proposed_rows
 from compgen.report.pdf import browser
+from compgen.report.summary import Summary, draw_summary, summary_of
 from compgen.tables import load_format
 from compgen.tables.verification import MISFIT_CODES
 
@@ -594,6 +595,19 @@ def _volume_drawn(paths: Sequence[Path], _stamps: tuple[tuple[int, int], ...], n
     return () if grid is None else (draw_space(grid, number), *draw_slices(grid, number, {}))
 
 
+def summary_shown(files: Mapping[str, Path], facts: Mapping[str, Any]) -> Summary | None:
+    """Return what matters of an identification; None if its machine or errors cannot be read."""
+    machine, errors = files.get("machine.toml"), files.get("identified.errors.csv")
+    if machine is None or errors is None:
+        return None
+    try:
+        with warnings.catch_warnings():  # the command that wrote the files showed them
+            warnings.simplefilter("ignore", CompgenWarning)
+            return summary_of(read_machine(machine), read_errors(errors), facts)
+    except (OSError, ValueError, LookupError, CompgenError):
+        return None
+
+
 def squareness_rows(path: Path) -> list[tuple[str, float, float]]:
     """Return name, value and standard uncertainty (urad, nan if unknown) of the squareness errors of a file."""
     return [(name, 1e6 * value, 1e6 * u) for name, (value, u) in read_errors(path).squareness.items()]
@@ -764,7 +778,9 @@ def result_page(project: Project, state: ProjectState) -> dict[str, Any]:
     volume = () if shown is None else volume_pictures(shown, project.path(shown.folder))
     applied = found is not None and state.machine == f"{found.folder}/extended.toml"
     earlier = project.facts(before[-1], "identify.json") if before and applied else {}
+    seen = summary_shown(files, project.facts(step, "identify.json")) if step else None
     return {
+        "summary": seen, "summary_pictures": [] if seen is None else draw_summary(seen),
         "step": step, "facts": project.facts(step, "identify.json"), "errors": errors, "earlier": earlier,
         "assumed": assumptions_of(project.facts(step, "identify.json")) if step else [],
         "pictures": (drawn := error_pictures(errors) if errors else []),

@@ -76,7 +76,6 @@ from compgen.data.files import json_text, read_text, working_folder, write_file
 from compgen.data.machine import INTEGERS, load_machine, machine_files
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.prior import class_named
-from compgen.data.units import UNITS, typed_mm
 from compgen.drawing.charts import LABEL
 from compgen.drawing.page_units import page_in_inch
 from compgen.errors import CompgenError, InputError, number_text, um_text, visible
@@ -89,6 +88,7 @@ from compgen.report.html.pictures import describe_error, thousands
 from compgen.report.html.write import markdown
 from compgen.report.pdf import pdf_of
 from compgen.resources import LANGUAGES, cache_folder, data_folder
+from compgen.units import UNITS, typed_mm
 from compgen.web.connections import LARGEST_BODY, bounded, small_for
 from compgen.web.guard import (
     HEADERS,

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from compgen.data.toml_files import Section, flag, not_negative, whole
-from compgen.data.units import UNITS
 from compgen.errors import InputError, visible_line
 from compgen.fitting.bounds import FitOptions
 from compgen.foreign import ImportOptions
 from compgen.resources import LANGUAGES
+from compgen.units import UNITS
 
 Check = Callable[[Any], Any]
 

@@ -21,8 +21,8 @@ from typing import Any
 import click
 
 from compgen.cli.common import load_for, output_options, plugin_option, run_command, with_language
-from compgen.data.units import UNITS
 from compgen.resources import LANGUAGES, cache_folder
+from compgen.units import UNITS
 
 #: Every command by the module that holds it as ``<name>_command``, with its line in ``volcomp --help``.
 _COMMANDS = {

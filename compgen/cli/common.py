@@ -20,9 +20,9 @@ import click
 
 from compgen.data.files import json_text
 from compgen.data.names import AXES
-from compgen.data.units import UNITS
 from compgen.errors import CompgenError, CompgenWarning, InputError, Message, message_of, messages_of
 from compgen.resources import LANGUAGES
+from compgen.units import UNITS
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 File = TypeVar("File", str, str | bytes)

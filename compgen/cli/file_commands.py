@@ -37,7 +37,6 @@ from compgen.data.machine import (
 )
 from compgen.data.names import AXES
 from compgen.data.prior import CLASS_WORDS, USUAL_CLASS, class_named
-from compgen.data.units import typed_mm
 from compgen.effects.active import effects_schema
 from compgen.errors import CompgenWarning, InputError
 from compgen.fleet.job import job_of, job_schema
@@ -45,6 +44,7 @@ from compgen.instruments.sixdof_instrument import instrument_of, instrument_sche
 from compgen.new_machine import chains_of, in_words, machine_text, rotary_directions, usual_nodes
 from compgen.simulation.run import Scenario, scenario_of
 from compgen.tables import load_format
+from compgen.units import typed_mm
 
 # The kinds of TOML files: how each is detected, read, and described.
 

@@ -45,7 +45,7 @@ from compgen.pipeline import (
     proposed_keys,
     provenance_of,
 )
-from compgen.report.terminal import advice_text, identification_table
+from compgen.report.terminal import advice_text, identification_table, what_matters
 
 if TYPE_CHECKING:
     from compgen.identification.with_rotary import RotaryResult
@@ -160,6 +160,7 @@ def identify_command(
         print_json({**result.summary(), **proposed_keys(proposed), **more})
     else:
         stdout.print(identification_table(result))
+        stdout.print(what_matters(machine, result))
         stdout.print(advice_text(result, proposed))
         if checked:
             text = f"self-check, {checked.replicates} replicates: standard deviation over stated uncertainty "

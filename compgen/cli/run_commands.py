@@ -41,7 +41,7 @@ from compgen.foreign.answers import ImportOptions
 from compgen.identification import IdentifyOptions
 from compgen.identification.options import StatedNumbers
 from compgen.pipeline import run
-from compgen.report.terminal import advice_text, identification_table, verification_table
+from compgen.report.terminal import advice_text, identification_table, verification_table, what_matters
 from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
@@ -324,6 +324,7 @@ def run_command(
         print_json({**result.summary(), "report": None if report is None else str(report)})
     else:
         stdout.print(identification_table(result.identification, assumed=False))
+        stdout.print(what_matters(machine, result.identification))
         stdout.print(verification_table([item.verification for item in result.results], result.failed))
         stdout.print(advice_text(result.identification, result.next_best))
         for item in result.results:

@@ -17,9 +17,9 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.cli.common import VERBOSE, print_json
-from compgen.data.units import UNITS, Inch, units_of_cells
 from compgen.errors import visible
 from compgen.resources import LANGUAGES
+from compgen.units import UNITS, Inch, units_of_cells
 
 if TYPE_CHECKING:
     from compgen.language import Texts

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.names import MM_PER_UM
 from compgen.data.records import DIRECTION, RUN_DEVIATION, Field, Schema, one_of, uncertainties, within
 from compgen.drawing.display import Displayed, Overview, Tabular
 from compgen.errors import InputError
@@ -179,3 +180,43 @@ def join_circles(parts: Sequence[Circles]) -> Circles:
 def format_circles(circles: Circles) -> str:
     """Return the text of a ``*.circle.csv`` file: angles in degrees with 6 decimals, deviations in um with 4."""
     return _CIRCLES.format(circles, circles.metadata)
+
+
+#: Columns of a polar diagram.
+DIAGRAM = ("plane", "angle_deg", "radius_mm", "direction", "run", "setup", "deviation_um")
+
+
+def circle_columns(circles: Circles) -> dict[str, Sequence[str] | FloatArray]:
+    """Return what a polar diagram needs of circles, by column, each (n,)."""
+    numbers = {
+        "angle_deg": np.degrees(circles.angle_rad),
+        "radius_mm": circles.radius_mm,
+        "direction": circles.direction.astype(np.float64),
+        "run": circles.run.astype(np.float64),
+        "setup": circles.setup.astype(np.float64),
+        "deviation_um": circles.deviation_mm / MM_PER_UM,
+    }
+    names = list(PLANES)
+    return {"plane": [names[k] for k in circles.plane.tolist()], **numbers}
+
+
+def circles_of_columns(table: CsvTable) -> Circles | None:
+    """Return circles from the columns of :func:`circle_columns`; None if the table has none or another plane."""
+    if any(name not in table.columns for name in DIAGRAM):
+        return None
+    planes, names = table.text("plane"), list(PLANES)
+    if not planes or any(name not in names for name in planes):
+        return None
+    whole = {name: table.numbers(name).astype(np.int64) for name in ("direction", "run", "setup")}
+    unknown = np.full(len(planes), np.nan)
+    return Circles(
+        np.array([names.index(name) for name in planes]),
+        np.radians(table.numbers("angle_deg")),
+        table.numbers("radius_mm"),
+        table.numbers("deviation_um") * MM_PER_UM,
+        whole["direction"],
+        whole["run"],
+        whole["setup"],
+        np.full((len(planes), 3), np.nan),
+        unknown,
+    )

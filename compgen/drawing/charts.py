@@ -24,8 +24,8 @@ import numpy as np
 from markupsafe import Markup, escape
 from numpy.typing import ArrayLike, NDArray
 
-from compgen.data.units import Inch, factor_of, unit_in
 from compgen.resources import data_folder
+from compgen.units import Inch, factor_of, unit_in
 
 #: Roles of colours.
 ROLES = ("ink", "muted", "grid", "line", "band", "fit", "table", "before", "after", "c0", "c1", "c2", "c3", "c4", "c5")
@@ -339,11 +339,11 @@ def rescaled(svg: str, inch: Inch) -> str:
     def text(found: re.Match[str]) -> str:
         stated = re.search(r'data-unit="(\w+)"', found["head"])
         plain = unescape(found["text"])
-        return found[1] + escape(inch.numbers(plain, stated[1]) if stated else inch.text(plain))
+        return f"{found[1]}{escape(inch.numbers(plain, stated[1]) if stated else inch.text(plain))}"
 
     made = _SVG_TEXT.sub(text, _BAR.sub(bar, _AXES.sub(axes, svg)))
     made = re.sub(
-        r"(<title[^>]*>)([^<]*)", lambda found: found[1] + escape(inch.text(unescape(found[2]))), made, count=1
+        r"(<title[^>]*>)([^<]*)", lambda found: f"{found[1]}{escape(inch.text(unescape(found[2])))}", made, count=1
     )
     return re.sub("\0(\\d+)\0", lambda found: kept[int(found[1])], made)
 

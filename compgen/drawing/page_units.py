@@ -1,4 +1,4 @@
-"""A finished page in inch: its texts, tables, pictures, and the data for its scripts (:mod:`compgen.data.units`)."""
+"""A finished page in inch: its texts, tables, pictures, and the data for its scripts (:mod:`compgen.units`)."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from html import escape, unescape
 from typing import Any
 
 from compgen.drawing.charts import rescaled
-from compgen.data.units import Inch, cell_unit, column_unit, factor_of, unit_in
 from compgen.resources import LANGUAGES
+from compgen.units import Inch, cell_unit, column_unit, factor_of, unit_in
 
 #: What a page in inch says of its units, below its first heading.
 SAID = "Lengths in inch, deviations in 0.0001 inch, angles in arcsec. Files and fields keep the unit that they name."

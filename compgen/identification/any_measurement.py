@@ -440,9 +440,11 @@ MEASURED_WITH = ("instrument", "serial_number", "operator")
 def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, result: Identification) -> str:
     """Return the text of ``residuals.csv``: measurement minus model of every reading, um, in the order of the files.
 
-    ``used`` is 0 for rejected readings; lengths have columns for station and commanded position. Comments of the
-    measurement about instrument and operator are kept.
+    ``used`` is 0 for rejected readings; lengths have columns for station and commanded position, circles those of
+    their diagram. Comments of the measurement about instrument and operator are kept.
     """
+    from compgen.data.circles import Circles, circle_columns
+
     columns: dict[str, Sequence[str] | FloatArray] = {}
     if not isinstance(measurement, Lengths):
         from compgen.data.length_archive import LengthArchive
@@ -452,9 +454,12 @@ def format_residuals(machine: Machine, measurement: Measurement | ErrorTable, re
     if isinstance(measurement, Lengths) and len(measurement) == len(result.residual_mm):
         columns["station"] = [measurement.stations[k] for k in measurement.station.tolist()]
         columns |= {f"{axis}_mm": measurement.position_mm[:, k] for k, axis in enumerate("xyz")}
+    if isinstance(measurement, Circles) and len(measurement) == len(result.residual_mm):
+        columns |= circle_columns(measurement)
     columns["residual_um"] = -result.residual_mm / MM_PER_UM
     columns["used"] = result.accepted.astype(np.float64)
-    digits = {"x_mm": 3, "y_mm": 3, "z_mm": 3, "residual_um": 4, "used": 0}
+    whole = dict.fromkeys(("used", "direction", "run", "setup"), 0)
+    digits = {"x_mm": 3, "y_mm": 3, "z_mm": 3, "residual_um": 4, "deviation_um": 4, **whole}
     described = measurement.first() if isinstance(measurement, MixedMeasurement) else measurement
     metadata = {} if described is None else described.metadata
     stated = {key: metadata[key] for key in MEASURED_WITH if metadata.get(key)}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from compgen.accuracy.compare import Comparison
     from compgen.accuracy.evaluate import Accuracy
     from compgen.accuracy.field import ComparedFigure, Figure
+    from compgen.data.machine import Machine
     from compgen.fitting import FitResult
     from compgen.identification import Identification
     from compgen.identification.spheres import SphereIdentification
@@ -111,6 +112,14 @@ def identification_table(result: Identification, *, assumed: bool = True) -> Gro
         worst = max(result.details["en"].items(), key=lambda item: item[1])
         lines.append(f"merged with six-DOF readings; largest En {worst[1]:.2f} ({worst[0]}), 1 is the limit")
     return Group(Text("\n".join([*lines, *(_assumed(result) if assumed else [])])), _errors_table(result))
+
+
+def what_matters(machine: Machine, result: Identification) -> Group:
+    """Return the first screen of a result in lines: largest error, squareness, backlash, what was not measured."""
+    from compgen.report.summary import summary_of
+
+    found = summary_of(machine, result.errors, result.summary())
+    return Group(*(Text(line, style="bold" if k == 0 else "") for k, line in enumerate(found.lines if found else ())))
 
 
 def _assumed(result: Identification) -> list[str]:

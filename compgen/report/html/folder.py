@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.controls.shared.base import Term
+from compgen.data.circles import DIAGRAM, Circles, circles_of_columns
 from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_bytes, read_text, sha256_of
@@ -108,6 +109,7 @@ class ReadingResiduals:
     station: tuple[str, ...] = ()
     position_mm: FloatArray | None = None
     stated: Mapping[str, str] = field(default_factory=dict)
+    circles: Circles | None = None
 
 
 @dataclass(frozen=True)
@@ -247,12 +249,12 @@ def _machine(base: Path, notes: list[str]) -> Machine | None:
 def _residuals(path: Path) -> ReadingResiduals | None:
     if not path.is_file():
         return None
-    table = read_csv(path, ("residual_um", "used"), ("station", "x_mm", "y_mm", "z_mm"))
+    table = read_csv(path, ("residual_um", "used"), ("station", "x_mm", "y_mm", "z_mm", *DIAGRAM))
     used = table.numbers("used") > 0.5
     residual_mm = table.numbers("residual_um") * 1e-3
     stated = {key: table.metadata[key] for key in MEASURED_WITH if table.metadata.get(key)}
     if "station" not in table.columns:
-        return ReadingResiduals(residual_mm, used, stated=stated)
+        return ReadingResiduals(residual_mm, used, stated=stated, circles=circles_of_columns(table))
     position_mm = np.column_stack([table.numbers(f"{axis}_mm") for axis in "xyz"])
     return ReadingResiduals(residual_mm, used, tuple(table.text("station")), position_mm, stated)
 

@@ -9,10 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from compgen.accuracy.circularity import about_centre, circle_groups
+from compgen.data.circles import PLANES, Circles, arcs_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
-from compgen.data.names import AXES, COVERAGE, error_named
+from compgen.data.names import AXES, COVERAGE, MM_PER_UM, error_named
 from compgen.drawing.charts import (
     BOX,
     CYCLE,
@@ -157,6 +160,55 @@ def draw_squareness(identified: ErrorTable) -> list[Picture]:
     plot.across(0.0)
     drawn = svg("squareness", "Squareness errors in µrad with expanded uncertainty", [plot])
     return [Picture("squareness", "Squareness", drawn, note="bars: U (k = 2)")]
+
+
+# Polar diagrams of circular tests.
+
+
+#: Picture of a circle, and the part of it for the polar diagram.
+ROUND, ROUND_BOX = (680.0, 420.0), (130.0, 5.0, 540.0, 415.0)
+#: Share of the radius of the picture at which the nominal circle is drawn.
+NOMINAL = 0.62
+
+
+def draw_circle(name: str, circles: Circles, own: NDArray[np.bool_]) -> Picture:
+    """Return the polar diagram: radial deviations about the least-squares centre, enlarged, over the nominal circle."""
+    radial = about_centre(circles, own) / MM_PER_UM
+    angle, direction, run = circles.angle_rad[own], circles.direction[own], circles.run[own]
+    # a round number of um for a division, three of which contain all readings
+    third = float(np.max(np.abs(radial))) / 3.0 or 1.0
+    power = 10.0 ** math.floor(math.log10(third))
+    step = next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= 0.999 * third)
+    per_um = (0.88 - NOMINAL) / (3.0 * step)
+    plot = Plot((-1.0, 1.0), (-1.0, 1.0), ROUND_BOX, bare=True)
+    turn = np.linspace(0.0, 2.0 * np.pi, 361)
+    for division in range(-3, 4):
+        radius = NOMINAL + division * step * per_um
+        role, width = ("muted", 1.1) if division == 0 else ("grid", 0.6)
+        plot.line(radius * np.cos(turn), radius * np.sin(turn), role, width=width)
+    first, second = (AXES[k] for k in PLANES[name.split()[0]])
+    for text, x, y in ((f"+{first}", 1, 0), (f"−{first}", -1, 0), (f"+{second}", 0, 1), (f"−{second}", 0, -1)):
+        plot.line((0.0, 0.9 * x), (0.0, 0.9 * y), "grid", width=0.6)
+        plot.text(0.95 * x, 0.95 * y, text, anchor="middle", shift=(0.0, 3.0))
+    for sign, role in ((1, "c0"), (-1, "c1")):
+        for number in np.unique(run[direction == sign]).tolist():
+            for arc in arcs_of(angle, np.flatnonzero((direction == sign) & (run == number))):
+                place = NOMINAL + radial[arc] * per_um
+                plot.line(place * np.cos(angle[arc]), place * np.sin(angle[arc]), role, width=1.3)
+    for division in (-3, 0, 3):  # on top of the lines
+        at = (NOMINAL + division * step * per_um) * math.sqrt(0.5)
+        plot.text(at, at, f"{division * step:+g} µm" if division else "0", shift=(2.0, -2.0))
+    drawn = [(1, ("c0", "counter-clockwise")), (-1, ("c1", "clockwise"))]
+    names = legend(8.0, 20.0, [item for sign, item in drawn if (direction == sign).any()])
+    magnification = per_um / MM_PER_UM * float(circles.radius_mm[own][0]) / NOMINAL
+    scale = f"about the centre of least squares, {step:g} µm per division, magnification {magnification:.0f}"
+    key, title = f"circle-{name.replace(' ', '-')}", f"Radial deviation {name}"
+    return Picture(key, title, svg(key, f"{title}, {scale}", [plot], ROUND, more=names), note=scale)
+
+
+def draw_circles(circles: Circles | None) -> list[Picture]:
+    """Return the polar diagram of each plane and set-up; nothing without circles."""
+    return [] if circles is None else [draw_circle(name, circles, own) for name, own in circle_groups(circles).items()]
 
 
 # Pictures of the volume: the moved grid in space before and after, and slices through the middle.

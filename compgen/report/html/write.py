@@ -40,6 +40,7 @@ from compgen.report.html.folder import (
 )
 from compgen.report.html.pictures import (
     describe_error,
+    draw_circles,
     draw_curve,
     draw_proposed,
     draw_residuals,
@@ -52,6 +53,7 @@ from compgen.report.html.pictures import (
     thousands,
     uncertainty_um,
 )
+from compgen.report.summary import Summary, draw_summary, summary_of
 from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
 from compgen.tables.render import KeptTemplates
@@ -283,6 +285,7 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "title": title,
         "verdict": _verdict(source, controls),
         "controls": controls,
+        "summary": None if (seen := _summary(source)) is None else seen.as_dict(),
         "errors": _errors(source.identified, in_part_of(identify)),
         "assumed": assumptions_of(identify) if identify and identify.get("identified") is not False else [],
         "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
@@ -306,6 +309,14 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "limitations": limitations(source),
         "notes": list(source.notes),
     }
+
+
+def _summary(source: ResultFolder) -> Summary | None:
+    """What matters of the errors of a folder; None if it has none, or errors of another machine."""
+    try:
+        return summary_of(source.machine, source.identified, source.identify)
+    except (CompgenError, ValueError, LookupError):
+        return None
 
 
 def _proposed(source: ResultFolder) -> dict[str, Any]:
@@ -1028,6 +1039,9 @@ def draw(source: ResultFolder, data: Mapping[str, Any]) -> dict[str, list[Pictur
     errors = source.fitted or source.identified
     tables: dict[str, tuple[TableCurve, ...]] = {item.name: table_curves(errors, item) for item in source.controls}
     found: dict[str, list[Picture]] = {"curves": [], "squareness": [], "measurement": []}
+    seen = _summary(source)
+    found["summary"] = [] if seen is None else draw_summary(seen)
+    found["circles"] = draw_circles(None if source.residuals is None else source.residuals.circles)
     if source.identified is not None:
         found["curves"] = [
             draw_curve(name, source.identified, source.fitted, tables)
