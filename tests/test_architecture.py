@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 #: The stages in the order of the pipeline; those of one line may import each other.
 ORDER = (
-    ("errors", "resources", "registry", "drawing", "language"),
+    ("errors", "resources", "registry", "units", "drawing", "language"),
     ("data",),
     ("new_machine",),
     ("kinematics",),
