@@ -1,4 +1,4 @@
-"""Three skew factors of open firmware: ``klipper``, ``marlin``, ``reprapfirmware`` and ``ucnc`` hold squareness alone."""
+"""Linear maps about machine zero: skew factors (``klipper``, ``marlin``, ``reprapfirmware``, ``ucnc``), a matrix (LinuxCNC)."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from compgen.data.toml_files import Section, choice, setting
 from compgen.errors import InputError
 from compgen.kinematics.first_order import coefficients
 
-# All four shear the commanded position about machine zero and then move the motors there:
+# All map the commanded position linearly about machine zero and then move the motors there:
 #
 #   Klipper, Marlin    x' = x - xy y - (xz - xy yz) z,  y' = y - yz z
 #   RepRapFirmware     x' = x + XY y + XZ z,  y' = y + YZ z;  with P1 x' = x + XZ z,  y' = y + XY x' + YZ z
 #   uCNC               x' = x - xy y - (xy - xz yz) z,  y' = y - yz z: xz has next to no effect, see format.toml
+#   LinuxCNC           (x', y', z') = C (x, y, z), the module matrixkins
 #
 # A squareness EC0Y > 0 moves the tool by -EC0Y y in X (model: E = EC0Y z^ x y y^ + ...), so the control must add
-# +EC0Y y: xy = -EC0Y for the first two, XY = +EC0Y for the third.
+# +EC0Y y: xy = -EC0Y for the first two, XY = +EC0Y for the third, C_xy = +EC0Y for the matrix.
 
 #: Decimals of a factor; RepRapFirmware gets deviations in mm over ``HEIGHT_MM``.
 DECIMALS = 9
@@ -49,6 +50,7 @@ _MOST_CHARACTERS = 20_000_000
 _FLOAT32 = float(np.finfo(np.float32).eps)
 
 Settings = TypeVar("Settings")
+Factors = TypeVar("Factors")
 
 
 @dataclass(frozen=True)
@@ -64,21 +66,23 @@ class SkewFactors:
     along_y: bool = False
 
 
-class SkewControl(Controller[Settings, SkewFactors]):
-    """What the four have in common: shears about machine zero, which hold squareness and nothing else."""
+class LinearControl(Controller[Settings, Factors]):
+    """What these controls have in common: factors of a linear map about machine zero, which hold no curve."""
 
     anchored = True
-    #: Output axis and base axis of each shear that the control has.
+    #: Output axis and base axis of each factor that an export fits; the same axis twice is a scale.
     shears: tuple[tuple[int, int], ...] = ((0, 1), (0, 2), (1, 2))
-    #: How a file of this firmware marks a comment.
-    comment = ";"
+    #: How a file of this control marks a comment; how many decimals of a factor it has.
+    comment, decimals = ";", DECIMALS
+    #: Axes that a factor may move.
+    moved = "XY"
 
     @abstractmethod
-    def shifted(self, factors: SkewFactors, position_mm: FloatArray) -> FloatArray:
+    def shifted(self, factors: Factors, position_mm: FloatArray) -> FloatArray:
         """Return the positions (n, 3) to which the control drives its motors for commands (n, 3), mm: its formula."""
 
     @abstractmethod
-    def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> SkewFactors:
+    def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> Factors:
         """Return the factors that add ``slopes[output, base]`` times the base axis' position to the output axis."""
 
     @abstractmethod
@@ -87,22 +91,30 @@ class SkewControl(Controller[Settings, SkewFactors]):
 
     @abstractmethod
     def words_of(self, source: SourceFile, strict: bool) -> Iterator[tuple[int, str, str]]:
-        """Yield line, key (``xy``, ``xz``, ``yz`` or another) and text of each number; ``strict``: nothing else may be there."""
+        """Yield line, key and text of each number; ``strict``: nothing else may be there."""
 
-    def factors_from(self, values: Mapping[str, float]) -> SkewFactors:
+    @abstractmethod
+    def factors_from(self, values: Mapping[str, float]) -> Factors:
         """Return the factors from the numbers of a file, by key."""
-        return SkewFactors(values["xy"], values.get("xz", 0.0), values.get("yz", 0.0))
 
+    @abstractmethod
     def required_keys(self) -> tuple[str, ...]:
         """Return the keys that a file must have."""
-        return ("xy", "xz", "yz")
 
-    def shown(self, factors: SkewFactors) -> dict[str, float]:
+    @abstractmethod
+    def shown(self, factors: Factors) -> dict[str, float]:
         """Return the numbers as written, by key."""
-        return {key: getattr(factors, key) for key in ("xy", "xz", "yz")}
+
+    @abstractmethod
+    def largest(self, factors: Factors) -> float:
+        """Return the largest factor: how far, per mm of one axis, the map is from leaving everything where it is."""
+
+    @abstractmethod
+    def rounded(self, factors: Factors) -> Factors:
+        """Return the factors as read back from the file."""
 
     def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return one constant per shear, in rad: what is added per mm of the base axis."""
+        """Return one constant per factor, in rad: what is added per mm of the base axis."""
         starts = dict.fromkeys(self.shears, 0.0)
         for part in coefficients(self.machine.chain, self.machine.squareness_reference):
             key = part.output, part.lever
@@ -113,13 +125,11 @@ class SkewControl(Controller[Settings, SkewFactors]):
             for key, start in starts.items()
         ]
 
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> SkewFactors:
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> Factors:
         """Return the factors, rounded as written."""
-        factors = self.factors_for({key: float(values[shear_name(*key)][0]) for key in self.shears})
-        xy, xz, yz = (float(fixed(value, DECIMALS)) for value in (factors.xy, factors.xz, factors.yz))
-        return replace(factors, xy=xy, xz=xz, yz=yz)
+        return self.rounded(self.factors_for({key: float(values[shear_name(*key)][0]) for key in self.shears}))
 
-    def context(self, tables: SkewFactors) -> dict[str, Any]:
+    def context(self, tables: Factors) -> dict[str, Any]:
         """Return the numbers as written, the sign with a worked position, and the range that the axes need."""
         return {
             "sign_statement": self._sign_statement(tables),
@@ -127,11 +137,10 @@ class SkewControl(Controller[Settings, SkewFactors]):
             "warnings": [SHEAR_WARNING],
             "factors": self.shown(tables),
             "checks": self._checks(tables),
-            "in_y": tables.along_y,
             "settings": self.settings,
         }
 
-    def parameters(self, tables: SkewFactors) -> list[dict[str, str]]:
+    def parameters(self, tables: Factors) -> list[dict[str, str]]:
         """Return what must be set on the control besides the factors."""
         reached = self._reached_mm(tables)
         return [
@@ -140,18 +149,18 @@ class SkewControl(Controller[Settings, SkewFactors]):
                 f"{fixed(float(low), 3)} ... {fixed(float(high), 3)} mm, or more",
                 f"where {letter} goes for commands within its travel",
             )
-            for letter, low, high in zip("XY", reached.min(axis=0), reached.max(axis=0), strict=False)
+            for letter, low, high in zip(self.moved, reached.min(axis=0), reached.max(axis=0), strict=False)
         ]
 
-    def parse(self, files: Sequence[SourceFile]) -> SkewFactors:
+    def parse(self, files: Sequence[SourceFile]) -> Factors:
         """Read the factors strictly: each once, and nothing else in the file."""
         return self._read(files, strict=True)[0]
 
-    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[SkewFactors, list[str]]:
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[Factors, list[str]]:
         """Read the factors from a file of the control with anything else in it; of several the last one acts."""
         return self._read(files, strict=False)
 
-    def _read(self, files: Sequence[SourceFile], *, strict: bool) -> tuple[SkewFactors, list[str]]:
+    def _read(self, files: Sequence[SourceFile], *, strict: bool) -> tuple[Factors, list[str]]:
         values: dict[str, float] = {}
         remarks = []
         for source in files:
@@ -167,7 +176,7 @@ class SkewControl(Controller[Settings, SkewFactors]):
             message = f"no factor {', '.join(missing)} was found; is it the right file, or is it truncated?"
             raise files[0].fail(message, 1) if files else InputError(message)
         factors = self.factors_from(values)
-        largest = max(abs(factors.xy), abs(factors.xz), abs(factors.yz))
+        largest = self.largest(factors)
         if not largest <= LARGEST_SKEW:
             message = (
                 f"gives a skew factor of {largest:g}; no machine has one above {LARGEST_SKEW:g}: check number and unit"
@@ -175,22 +184,83 @@ class SkewControl(Controller[Settings, SkewFactors]):
             raise files[0].fail(message, 1)
         return factors, remarks
 
-    def emulate(self, tables: SkewFactors, points: Points) -> FloatArray:
+    def emulate(self, tables: Factors, points: Points) -> FloatArray:
         """Return what the shears add to the commanded positions."""
         return self.shifted(tables, points.position_mm) - points.position_mm
 
-    def violations(self, tables: SkewFactors) -> list[str]:
-        """Return none: a shear acts everywhere."""
+    def violations(self, tables: Factors) -> list[str]:
+        """Return none: a linear map acts everywhere."""
         return []
 
     def anchor_mm(self) -> FloatArray:
-        """Return machine zero, where a shear adds nothing."""
+        """Return machine zero, where a linear map adds nothing."""
         return np.zeros(3)
 
     def resolution_mm(self) -> float:
+        """Half of the last decimal of two factors at the ends of the travel."""
+        return self._reach_of_two_mm() * 0.5 * 10.0**-self.decimals
+
+    def _reach_of_two_mm(self) -> float:
+        """Sum of the two largest distances from machine zero that the axes have, mm."""
+        return float(np.sort(np.abs([self.machine.lower_mm, self.machine.upper_mm]).max(axis=0))[-2:].sum())
+
+    def _reached_mm(self, tables: Factors) -> FloatArray:
+        """Where the axes go for commands at the corners of the travel: it adds most there."""
+        return self.shifted(tables, np.array(list(product(*(axis.range_mm for axis in self.machine.axes)))))
+
+    def _checks(self, tables: Factors) -> list[dict[str, str]]:
+        """What each factor does over the whole travel of its base axis, for the check at the machine."""
+        found = []
+        for output, base in self.shears:
+            ends = np.tile(0.5 * (self.machine.lower_mm + self.machine.upper_mm), (2, 1))
+            ends[:, base] = self.machine.axes[base].range_mm
+            change = float(np.diff((self.shifted(tables, ends) - ends)[:, output])[0])
+            low, high = (fixed(float(end), 3) for end in ends[:, base])
+            found.append(
+                {"base": AXES[base], "low": low, "high": high, "output": AXES[output], "change": f"{change:+.4f}"}
+            )
+        return found
+
+    def _sign_statement(self, tables: Factors) -> str:
+        corners = np.array(list(product(*(axis.range_mm for axis in self.machine.axes))))
+        added = self._reached_mm(tables) - corners
+        k = int(np.argmax(np.abs(added).max(axis=1)))
+        to = ", ".join(f"{letter} {fixed(float(v), 4)}" for letter, v in zip(AXES, (corners + added)[k], strict=True))
+        at = ", ".join(f"{letter} {fixed(float(v), 4)}" for letter, v in zip(AXES, corners[k], strict=True))
+        return f"For the command {at} mm (machine coordinates) the motors go to {to} mm."
+
+
+class SkewControl(LinearControl[Settings, SkewFactors]):
+    """A firmware with three skew factors in single precision, which hold squareness and nothing else."""
+
+    def factors_from(self, values: Mapping[str, float]) -> SkewFactors:
+        """Return the factors from the numbers of a file, by key."""
+        return SkewFactors(values["xy"], values.get("xz", 0.0), values.get("yz", 0.0))
+
+    def required_keys(self) -> tuple[str, ...]:
+        """Return the keys that a file must have."""
+        return ("xy", "xz", "yz")
+
+    def shown(self, factors: SkewFactors) -> dict[str, float]:
+        """Return the numbers as written, by key."""
+        return {key: getattr(factors, key) for key in ("xy", "xz", "yz")}
+
+    def largest(self, factors: SkewFactors) -> float:
+        """Return the largest of the three."""
+        return max(abs(factors.xy), abs(factors.xz), abs(factors.yz))
+
+    def rounded(self, factors: SkewFactors) -> SkewFactors:
+        """Return the factors with the decimals of the file."""
+        xy, xz, yz = (float(fixed(value, self.decimals)) for value in (factors.xy, factors.xz, factors.yz))
+        return replace(factors, xy=xy, xz=xz, yz=yz)
+
+    def context(self, tables: SkewFactors) -> dict[str, Any]:
+        """Return also whether the XY factor moves Y."""
+        return {**super().context(tables), "in_y": tables.along_y}
+
+    def resolution_mm(self) -> float:
         """Half of the last decimal of two factors at the ends of the travel, and rounding of factors to float32."""
-        reach = np.sort(np.abs([self.machine.lower_mm, self.machine.upper_mm]).max(axis=0))[-2:].sum()
-        return float(reach) * (0.5 * 10.0**-DECIMALS + 0.02 * _FLOAT32)
+        return super().resolution_mm() + self._reach_of_two_mm() * 0.02 * _FLOAT32
 
     def left_out(self, errors: ErrorTable) -> list[str]:
         """Say that curves stay, and a squareness to which no shear belongs."""
@@ -213,31 +283,6 @@ class SkewControl(Controller[Settings, SkewFactors]):
                     else f"{text}, which this control cannot correct"
                 )
         return found
-
-    def _reached_mm(self, tables: SkewFactors) -> FloatArray:
-        """Where the axes go for commands at the corners of the travel: a shear is largest there."""
-        return self.shifted(tables, np.array(list(product(*(axis.range_mm for axis in self.machine.axes)))))
-
-    def _checks(self, tables: SkewFactors) -> list[dict[str, str]]:
-        """What each shear does over the whole travel of its base axis, for the check at the machine."""
-        found = []
-        for output, base in self.shears:
-            ends = np.tile(0.5 * (self.machine.lower_mm + self.machine.upper_mm), (2, 1))
-            ends[:, base] = self.machine.axes[base].range_mm
-            change = float(np.diff((self.shifted(tables, ends) - ends)[:, output])[0])
-            low, high = (fixed(float(end), 3) for end in ends[:, base])
-            found.append(
-                {"base": AXES[base], "low": low, "high": high, "output": AXES[output], "change": f"{change:+.4f}"}
-            )
-        return found
-
-    def _sign_statement(self, tables: SkewFactors) -> str:
-        corners = np.array(list(product(*(axis.range_mm for axis in self.machine.axes))))
-        added = self._reached_mm(tables) - corners
-        k = int(np.argmax(np.abs(added).max(axis=1)))
-        to = ", ".join(f"{letter} {fixed(float(v), 4)}" for letter, v in zip(AXES, (corners + added)[k], strict=True))
-        at = ", ".join(f"{letter} {fixed(float(v), 4)}" for letter, v in zip(AXES, corners[k], strict=True))
-        return f"For the command {at} mm (machine coordinates) the motors go to {to} mm."
 
 
 def shear_name(output: int, base: int) -> str:
@@ -586,3 +631,108 @@ class Ucnc(SkewControl[UcncSettings]):
             elif strict or re.match(r"\s*\$(37|38|39)\b", raw):
                 expected = ", ".join(f"${number}" for number, key in self.KEYS.items() if key in self.required_keys())
                 raise source.fail(f"expected {expected} with a number, got {raw.strip()[:40]!r}", line)
+
+
+@dataclass(frozen=True)
+class MatrixkinsSettings:
+    """Settings ``[controllers.linuxcnc-matrixkins]``."""
+
+    scales: bool = setting(
+        toml_files.flag,
+        True,
+        meaning="fit the mean scale of each axis, too; false: only the squarenesses, beside COMP_FILEs, which have the scale",
+    )
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """The matrix of the kinematics, shape (3, 3): joint positions are ``matrix @ axis positions``."""
+
+    matrix: FloatArray
+
+
+class LinuxcncMatrixkins(LinearControl[MatrixkinsSettings, Matrix]):
+    """``linuxcnc-matrixkins``: the parameters C_xx ... C_zz of the kinematics module of LinuxCNC."""
+
+    name = "linuxcnc-matrixkins"
+    settings_class = MatrixkinsSettings
+    comment, decimals, moved = "#", 12, "XYZ"
+    KEYS = tuple(f"{row}{column}" for row in "xyz" for column in "xyz")
+
+    def __init__(self, machine: Machine, settings: MatrixkinsSettings | None = None) -> None:
+        super().__init__(machine, settings)
+        first = (1, 0) if machine.squareness_reference == "Y" else (0, 1)
+        scales = ((0, 0), (1, 1), (2, 2)) if self.settings.scales else ()
+        self.shears = (first, (0, 2), (1, 2), *scales)
+
+    def shifted(self, factors: Matrix, position_mm: FloatArray) -> FloatArray:
+        """Apply ``kinematicsInverse`` of src/hal/components/matrixkins.comp."""
+        return np.asarray(position_mm @ factors.matrix.T)
+
+    def limits_of(self, letter: str) -> str:
+        """Return the limits of the joints: those of the axes stay."""
+        return f"[JOINT_{AXES.index(letter)}] MIN_LIMIT ... MAX_LIMIT"
+
+    def factors_for(self, slopes: Mapping[tuple[int, int], float]) -> Matrix:
+        """Return the identity with the slopes added."""
+        matrix = np.eye(3)
+        for key, slope in slopes.items():
+            matrix[key] += slope
+        return Matrix(matrix)
+
+    def factors_from(self, values: Mapping[str, float]) -> Matrix:
+        """Return the matrix of nine numbers; one that a file does not set is that of the identity."""
+        start = dict(zip(self.KEYS, np.eye(3).ravel().tolist(), strict=True)) | dict(values)
+        return Matrix(np.array([start[key] for key in self.KEYS]).reshape(3, 3))
+
+    def required_keys(self) -> tuple[str, ...]:
+        """Return all nine: the module keeps what is not set at its start value, or at that of an old file."""
+        return self.KEYS
+
+    def shown(self, factors: Matrix) -> dict[str, float]:
+        """Return the nine numbers by their letters."""
+        return dict(zip(self.KEYS, factors.matrix.ravel().tolist(), strict=True))
+
+    def largest(self, factors: Matrix) -> float:
+        """Return the largest difference from the identity."""
+        return float(np.abs(factors.matrix - np.eye(3)).max())
+
+    def rounded(self, factors: Matrix) -> Matrix:
+        """Return the matrix with the decimals of the file."""
+        words = [float(fixed(value, self.decimals)) for value in factors.matrix.ravel().tolist()]
+        return Matrix(np.array(words).reshape(3, 3))
+
+    def words_of(self, source: SourceFile, strict: bool) -> Iterator[tuple[int, str, str]]:
+        """Yield the numbers of lines such as ``setp matrixkins.C_xy 0.0029``; other lines of a HAL file are passed over."""
+        lines = content_lines(source, self.comment) if strict else list(enumerate(source.text.splitlines(), start=1))
+        for line, raw in lines:
+            text = raw.partition(self.comment)[0].strip()
+            found = re.fullmatch(r"setp\s+matrixkins\.C_([xyz]{2})\s+(\S{1,40})", text)
+            if found:
+                yield line, found.group(1), found.group(2)
+            elif strict or "matrixkins.C_" in text:
+                raise source.fail(f"expected setp matrixkins.C_xx ... C_zz with a number, got {text[:40]!r}", line)
+
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[Matrix, list[str]]:
+        """Read the matrix from HAL files with anything else in them; a number that is not set is that of the identity."""
+        text = "\n".join(source.text for source in files)
+        absent = [key for key in self.KEYS if f"matrixkins.C_{key}" not in text]
+        if len(absent) == len(self.KEYS):
+            return super().parse_foreign(files)  # which says what is missing
+        filled = "".join(f"setp matrixkins.C_{key} {float(key[0] == key[1]):g}\n" for key in absent)
+        before = [SourceFile(files[0].path, filled)] if filled else []
+        matrix, remarks = super().parse_foreign([*before, *files])
+        if absent:
+            names = ", ".join(f"C_{key}" for key in absent)
+            remarks.append(f"{names}: not set, so 1 in the diagonal and 0 beside it, as at the start of the module")
+        return matrix, remarks
+
+    def left_out(self, errors: ErrorTable) -> list[str]:
+        """Say what of the curves stays."""
+        if not errors.curves:
+            return []
+        held = "squareness and the mean scale of each axis" if self.settings.scales else "squareness"
+        return [
+            f"a matrix holds {held}: all else of the curves ({', '.join(errors.curves)}) stays as it is; "
+            "linuxcnc-comp holds positioning, linuxcnc-volumetric all of it"
+        ]

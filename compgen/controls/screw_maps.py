@@ -1,4 +1,4 @@
-"""Positioning tables of small controls: ``smoothieware``, ``ecmc``, ``aerotech``, ``weihong``, ``mach4``, ``fagor-8055``."""
+"""Positioning tables of small controls: screws of Smoothieware, ecmc, Aerotech, Weihong, Mach4, Fagor and Centroid."""
 
 from __future__ import annotations
 
@@ -367,6 +367,172 @@ class Weihong(StatedSign[WeihongSettings]):
                 if rows and position <= rows[-1][0]:
                     raise source.fail(f"the position {position:g} is not above {rows[-1][0]:g} before it", line)
                 rows.append((position, positive, negative))
+        return found
+
+
+@dataclass(frozen=True)
+class CentroidSettings:
+    """Settings ``[controllers.centroid]``."""
+
+    sign: str = sign_setting("values of the table")
+    values: str = setting(
+        choice("mm", "counts"),
+        meaning='unit of the values: "mm", as the positions, or "counts" of the encoder; no document that we have states it '
+        "for version 3",
+    )
+    counts_per_mm: tuple[float, float, float] = axis_setting(
+        toml_files.positive,
+        (0.0, 0.0, 0.0),
+        meaning="encoder counts per mm of each axis; needed for values in counts",
+    )
+    most_points: int = setting(
+        whole(2, 1000), 200, meaning="most points of one axis; no document that we have states a limit"
+    )
+    loss_mm: float = loss_setting()
+
+
+class Centroid(StatedSign[CentroidSettings]):
+    """``centroid``: laser compensation of CNC10, CNC11 and CNC12, version 3 of the .tab files, one for each axis."""
+
+    name = "centroid"
+    settings_class = CentroidSettings
+    even, digits, table_name = True, 6, "compensation table"
+    HEAD = "CNC10 TAB FILE VERSION 3"
+    KEYS = ("AXIS", "UNITS", "INTERVAL", "ENTRIES")
+
+    @classmethod
+    def settings_section(cls, machine: Machine) -> Section:
+        """Return the section, which must state sign and unit of the values."""
+        section = super().settings_section(machine)
+        if "values" not in section:
+            raise section.fail(
+                "values",
+                'is missing: no document that we have states the unit of the values; set values = "mm" or "counts" as your '
+                "control's own file of a measured axis shows it (whole numbers of tens and hundreds are counts)",
+                kind="missing",
+                instead="mm",
+            )
+        return section
+
+    @classmethod
+    def check_settings(cls, settings: CentroidSettings, section: Section, machine: Machine) -> CentroidSettings:
+        """Ask for the counts per mm where the values are counts."""
+        if settings.values == "counts" and 0.0 in settings.counts_per_mm:
+            raise section.fail(
+                "counts_per_mm",
+                "is missing: values in counts need it for all axes, e.g. counts_per_mm = { X = 2000, Y = 2000, Z = 2000 }",
+                kind="missing",
+                instead=dict.fromkeys(AXES, 2000.0),
+            )
+        return settings
+
+    def mm_per_value(self, axis: int) -> float:
+        """Return the size of one value, mm."""
+        return 1.0 if self.settings.values == "mm" else 1.0 / self.settings.counts_per_mm[axis]
+
+    def nodes_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
+        """Return positions from one end of the travel to the other: the control counts them from where the axis is homed."""
+        most, loss_mm = self.most_points, self.settings.loss_mm
+        return equidistant_grid(self.machine, errors, axis, most=most, loss_mm=loss_mm, anchor=False).nodes_mm
+
+    def resolution_mm(self) -> float:
+        """Half of a count, or of the last decimal in mm."""
+        if self.settings.values == "mm":
+            return super().resolution_mm()
+        return 0.5 * max(self.mm_per_value(axis) for axis in range(3))
+
+    def as_written(self, axis: int, values_mm: FloatArray) -> FloatArray:
+        """Return values in mm as they come back from the file: whole counts, or with its decimals."""
+        if self.settings.values == "mm":
+            return rounded(values_mm, self.digits)
+        return np.round(values_mm / self.mm_per_value(axis)) * self.mm_per_value(axis)
+
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
+        """Return the values as written, the same in both directions."""
+        maps = super().build(basis, values).maps
+        return ScrewMaps({axis: self._written(axis, table) for axis, table in maps.items()})
+
+    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
+        """Return the tables with the reversal, as written."""
+        maps = super().with_reversal(tables, reversal).maps
+        return ScrewMaps({axis: self._written(axis, table) for axis, table in maps.items()})
+
+    def _written(self, axis: int, table: ScrewMap) -> ScrewMap:
+        return replace(
+            table, positive=self.as_written(axis, table.positive), negative=self.as_written(axis, table.negative)
+        )
+
+    def context(self, tables: ScrewMaps) -> dict[str, Any]:
+        """Return the rows in the order of the file: from the end that is nearer to machine zero, where the axis is homed."""
+        digits = self.digits if self.settings.values == "mm" else 0
+        shown = []
+        for axis, table in sorted(tables.maps.items()):
+            columns = (
+                table.position_mm,
+                *(part / self.mm_per_value(axis) for part in (table.positive, table.negative)),
+            )
+            rows = list(zip(*(column.tolist() for column in columns), strict=True))
+            outward = abs(table.position_mm[0]) <= abs(table.position_mm[-1])
+            interval = (table.position_mm[-1] - table.position_mm[0]) / (len(rows) - 1)
+            shown.append({"letter": AXES[axis], "interval": interval, "rows": rows if outward else rows[::-1]})
+        return {**super().context(tables), "tables": {part["letter"]: part for part in shown}, "digits": digits}
+
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Read the four lines of the head, then rows of position, forward and reverse value, rising or falling."""
+        lines = content_lines(source, "//")
+        if lines[0][1].upper() != self.HEAD:
+            raise source.fail(
+                f"expected {self.HEAD!r}, got {lines[0][1][:40]!r}; other versions are not read", lines[0][0]
+            )
+        keys: dict[str, tuple[int, str]] = {}
+        rows: list[tuple[float, float, float]] = []
+        axis, size = 0, 1.0
+        for line, text in lines[1:]:
+            words = text.split()
+            if len(keys) < len(self.KEYS):
+                expected = self.KEYS[len(keys)]
+                if len(words) != 2 or words[0].upper() != expected:
+                    raise source.fail(f"expected {expected} with its value, got {text[:40]!r}", line)
+                keys[expected] = line, words[1]
+                if expected == "AXIS":
+                    axis = axis_named(source, line, words[1])
+                    size = self.mm_per_value(axis)
+                elif expected == "UNITS" and words[1].upper() != "MM":
+                    raise source.fail(f"UNITS {words[1][:20]}: only files in MM are read", line)
+                continue
+            if len(words) != 3:
+                raise source.fail(f"expected position, forward and reverse value, got {len(words)} columns", line)
+            position, positive, negative = (float(fixed_point(source, line, word, "a number")) for word in words)
+            if self.settings.values == "counts" and not (positive.is_integer() and negative.is_integer()):
+                raise source.fail(f"{text[:40]!r}: counts are whole numbers; are the values in mm?", line)
+            rows.append((position, positive * size, negative * size))
+        self._check_head(source, keys, [row[0] for row in rows])
+        falling = len(rows) > 1 and rows[1][0] < rows[0][0]
+        return {axis: rows[::-1] if falling else rows}
+
+    def _check_head(self, source: SourceFile, keys: Mapping[str, tuple[int, str]], positions: Sequence[float]) -> None:
+        """Check ENTRIES and INTERVAL of the head against the positions of the rows, mm."""
+        if len(keys) < len(self.KEYS):
+            raise source.fail(f"{self.KEYS[len(keys)]} is missing: the file is truncated")
+        line, word = keys["ENTRIES"]
+        if whole_number(word, 6) != len(positions):
+            raise source.fail(
+                f"declares {word[:20]} entries but has {len(positions)}: it is truncated or was edited", line
+            )
+        line, word = keys["INTERVAL"]
+        interval = float(fixed_point(source, line, word, "INTERVAL"))
+        if len(positions) > 1 and np.any(np.abs(np.abs(np.diff(positions)) - interval) > 4.0 * 10.0**-POSITION_DIGITS):
+            raise source.fail(f"INTERVAL {interval:g} is not the distance between the positions", line)
+
+    def reservations(self, tables: ScrewMaps) -> list[str]:
+        """Say also where the table does not begin at machine zero, as the only file seen does."""
+        found = super().reservations(tables)
+        for axis, table in sorted(tables.maps.items()):
+            if not np.isclose(np.abs(table.position_mm[[0, -1]]).min(), 0.0, atol=10.0**-POSITION_DIGITS):
+                found.append(
+                    f"the table of {AXES[axis]} does not begin at machine zero, where the axis is homed, as the only public file "
+                    "does: check that the control takes its positions"
+                )
         return found
 
 

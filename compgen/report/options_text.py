@@ -233,9 +233,12 @@ def options_markdown(result: Capability) -> str:
 
 #: An error counts as corrected, at least in part, if less than this share of it remains.
 LEAST_HELP = 0.9
+#: Levels of controls with a linear map, which are on the way to no other level.
+LINEAR = ("skew", "matrix")
 #: What a control of each level corrects, in words.
 CORRECTS = {
     "skew": SQUARENESS_ALONE,
+    "matrix": "squareness and the mean scale of each axis",
     "pitch": "positioning along each axis",
     "squareness": "positioning, straightness and squareness",
     "products": "positioning, straightness, squareness, and angles as products of tables",
@@ -268,7 +271,7 @@ def explanation_markdown(item: Explanation) -> str:
     table = markdown_table(["error", "left, um", "why"], rows) if rows else f"Nothing above {CORRECTED_UM:g} um.\n"
     notes = "".join(f"\n{note[0].upper()}{note[1:]}.\n" for note in item.notes)
     other = ""
-    if item.level not in ("volumetric", "skew"):
+    if item.level not in ("volumetric", *LINEAR):
         results = zip(item.options.tools_mm, _level(item).by_tool, strict=True)
         tools = [
             f"{_of_largest(item.options, left.after.max_um)} um at {tool_name(tool) if any(tool) else 'no offset'}"
@@ -291,8 +294,8 @@ def _known_after(options: Capability, left: Left) -> str:
 
 
 def _level(item: Explanation) -> LevelResult:
-    """The level that the control reaches; skew factors are on the way to none of them."""
-    return item.options.level("nothing" if item.level == "skew" else item.level)
+    """The level that the control reaches; linear maps are on the way to none of them."""
+    return item.options.level("nothing" if item.level in LINEAR else item.level)
 
 
 def _next(item: Explanation) -> str:

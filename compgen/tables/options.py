@@ -200,11 +200,14 @@ def levels_of(machine: Machine, errors: ErrorTable, reversal: ReversalCurves | N
 
 
 def level_key(basis: Sequence[Term]) -> str:
-    """Return the level that a control's tables belong to, from its basis; ``"skew"``, which is none, for shears alone."""
+    """Return the level that a control's tables belong to, from its basis.
+
+    ``"skew"`` (shears alone) and ``"matrix"`` (with scales) are on the way to none of them.
+    """
     if any(term.name in ERROR_NAMES for term in basis):
         return "volumetric"
     if all(term.axis is None for term in basis):
-        return "skew"
+        return "matrix" if any(part.lever == part.output for term in basis for part in term.carrier) else "skew"
     if any(part.lever is not None for term in basis for part in term.carrier):
         return "products"
     if any(part.output != term.axis for term in basis for part in term.carrier):
@@ -721,6 +724,8 @@ def _why(name: str, level: str) -> str:
     error = error_named(name)
     if level == "skew":
         return "skew factors hold squareness alone, as far as the control has them"
+    if level == "matrix":
+        return "a matrix holds squareness and the mean scale of each axis"
     if level in ("products", "volumetric"):
         return "the nodes of the tables do not follow it closely"
     if error.kind == "angular":

@@ -124,7 +124,7 @@ def test_what_is_parsed_renders_to_the_same_bytes(name, machine, errors, exporte
 #: Formats that hold samples of the tables, between which they lose up to ``loss_um``.
 SAMPLED = ("neutral",)
 #: Controls that hold squareness alone, which is a few micrometres on these machines.
-SHEARS = ("klipper", "marlin", "reprapfirmware", "ucnc")
+SHEARS = ("klipper", "linuxcnc-matrixkins", "marlin", "reprapfirmware", "ucnc")
 STEEPEST = 3e-4  # change of the correction per length on these machines
 
 

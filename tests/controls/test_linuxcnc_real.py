@@ -29,6 +29,7 @@ from compgen.controls import SourceFile, controller_named
 from compgen.controls.heat_outputs import output_of
 from compgen.controls.linuxcnc_comp import standstill_outcome
 from compgen.data.error_table import Curve, ReversalCurves
+from compgen.data.lengths import Points
 from compgen.heat import HeatModel, Temperatures
 from compgen.heat.model import Range, Term
 from compgen.kinematics.exact_chain import exact_error
@@ -962,3 +963,22 @@ def test_a_day_of_heat_in_a_running_control_is_taken_away_at_a_limited_rate(work
     assert set(rows["volheat.fault-code"][count + 1 :].tolist()) == {1.0}
     assert rows["volheat.at-zero"][-1]
     assert not offset[-1].any()
+
+
+# --- matrixkins: a module of LinuxCNC itself, from the release on that has it ----------------------------------------
+
+MATRIXKINS = Path("/usr/lib/linuxcnc/modules/matrixkins.so")
+
+
+@pytest.mark.skipif(not MATRIXKINS.is_file(), reason="the installed LinuxCNC has no module matrixkins")
+def test_matrixkins_moves_the_joints_where_the_emulation_says(workshop, small_machine, small_errors):
+    made = compgen.export(small_machine, small_errors, "linuxcnc-matrixkins")
+    control = controller_named("linuxcnc-matrixkins")(small_machine)
+    tables = control.parse([SourceFile(Path(name), text) for name, text in made.files.items()])
+    wiring = "".join(LOOP.format(k=k) for k in range(3)) + made.files["matrixkins.hal"]
+    done = session(workshop, [{"mdi": line} for line in MOVES], [*VOLKINS_PINS], kinematics="matrixkins", hal=wiring)
+    command, joints, _ = moved_samples(done)
+    assert np.ptp(command, axis=0).min() > 100.0
+    added = control.emulate(tables, Points(command))
+    assert np.max(np.abs(added)) > 0.01
+    assert np.max(np.abs(joints - command - added)) < AGREEMENT_MM

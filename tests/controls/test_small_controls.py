@@ -15,7 +15,7 @@ from compgen.errors import InputError
 from compgen.kinematics.exact_chain import exact_error
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden"
-SKEWS = ("klipper", "marlin", "reprapfirmware")
+SKEWS = ("klipper", "marlin", "reprapfirmware", "linuxcnc-matrixkins")
 SQUARENESS = {"EC0Y": (310e-6, 0.0), "EB0Z": (-140e-6, 0.0), "EA0Z": (85e-6, 0.0)}
 FLOAT32_MM = 6e-5  # of a position of 400 mm
 NANOMETRE = 1e-6
@@ -219,6 +219,38 @@ def test_the_last_command_of_a_start_program_acts():
     assert "line 4: xy is given again" in remarks[0]
 
 
+MATRIX_JOINTS = [[100.575, 199.995, 50.0], [-348.762, 419.904, -180.0]]
+
+
+def test_a_matrix_moves_the_joints_to_what_its_manual_says():
+    control = CONTROLLERS["linuxcnc-matrixkins"](machine_with())
+    path = GOLDEN / "linuxcnc-matrixkins" / "machine.hal"
+    tables, remarks = control.parse_foreign([SourceFile(path, path.read_text())])
+    assert np.allclose(moved_to(control, tables, COMMANDS[:2]), MATRIX_JOINTS, rtol=0, atol=1e-12)
+    assert remarks == ["C_zz: not set, so 1 in the diagonal and 0 beside it, as at the start of the module"]
+
+
+def test_the_matrix_has_the_squarenesses_with_their_sign_and_the_mean_scales():
+    """X is 40 um per m too long: its joint must go 40 um less; Y leans by EC0Y towards -X: the joint of X goes further.
+
+    The columns of ``moves`` are where the tool goes per mm of each joint, so the matrix is its inverse.
+    """
+    machine = machine_with()
+    nodes = machine.axes[0].nodes_mm
+    scale = Curve(nodes, 40e-6 * nodes, np.full(len(nodes), np.nan))
+    made = compgen.export(machine, ErrorTable({"EXX": scale}, SQUARENESS), "linuxcnc-matrixkins")
+    files = [SourceFile(Path(name), text) for name, text in made.files.items()]
+    matrix = CONTROLLERS["linuxcnc-matrixkins"](machine).parse(files).matrix
+    along_y = [-np.sin(310e-6), np.cos(310e-6), 0.0]
+    along_z = [np.sin(-140e-6), -np.sin(85e-6), np.cos(np.hypot(140e-6, 85e-6))]
+    moves = np.array([[1.0 + 40e-6, 0.0, 0.0], along_y, along_z]).T
+    assert np.allclose(matrix, np.linalg.inv(moves), rtol=0, atol=2e-10)
+    assert np.allclose(matrix, np.eye(3) + [[-40e-6, 310e-6, 140e-6], [0, 0, 85e-6], [0, 0, 0]], rtol=0, atol=1e-7)
+    alone = machine_with(linuxcnc_matrixkins={"scales": False})
+    made = compgen.export(alone, ErrorTable({"EXX": scale}, SQUARENESS), "linuxcnc-matrixkins")
+    assert "setp matrixkins.C_xx 1.000000000000\n" in made.files["matrixkins.hal"]
+
+
 # --- screw maps ------------------------------------------------------------------------------------------------------
 
 
@@ -266,6 +298,7 @@ def test_the_sign_of_ecmc_follows_its_release():
 
 def test_a_sign_or_release_that_is_not_stated_is_asked_for_with_the_reason():
     asked = {"ecmc": "version: is missing: release 10.0.0 reversed", "ucnc": "build: is missing: a factor acts"}
+    asked |= {"centroid": 'sign: is missing'}
     asked |= dict.fromkeys(("weihong", "mach4", "fagor-8055"), 'sign: is missing: .* set sign = "error"')
     for name, words in asked.items():
         with pytest.raises(InputError, match=words):
@@ -307,6 +340,36 @@ def test_the_stated_sign_turns_the_values_and_a_reversal_leaves_nothing(name, si
     mean = 0.5 * (tables.maps[0].positive + tables.maps[0].negative)
     wanted = errors.curves["EXX"].at(tables.maps[0].position_mm) * (1.0 if sign == "error" else -1.0)
     assert np.corrcoef(mean, wanted)[0, 1] > 0.7
+
+
+def test_the_constructed_file_of_centroid_in_counts_and_in_mm():
+    counts = {"sign": "correction", "values": "counts", "counts_per_mm": {"X": 2000.0, "Y": 2000.0, "Z": 2000.0}}
+    control, tables = read("centroid", machine_with(centroid=counts), GOLDEN / "centroid" / "cnc-x.tab")
+    for position, direction, expected in (
+        (-12.5, 1.0, 0.0025), (-12.5, -1.0, 0.0), (-40.0, 1.0, -0.004), (-90.0, -1.0, -0.015)
+    ):  # fmt: skip
+        moved = moved_to(control, tables, [[position, 0.0, 0.0]], direction)
+        assert np.allclose(moved - [[position, 0.0, 0.0]], [[expected, 0.0, 0.0]], rtol=0, atol=1e-12)
+    error = machine_with(centroid={"sign": "error", "values": "mm"})
+    text = "CNC10 TAB FILE VERSION 3\nAXIS Y\nUNITS MM\nINTERVAL 100\nENTRIES 2\n0 0.010 0.014\n100 0.030 0.034\n"
+    tables = text_of("centroid", error, text, "cnc-y.tab")
+    moved = moved_to(CONTROLLERS["centroid"](error), tables, [[0.0, 50.0, 0.0]])
+    assert np.allclose(moved, [[0.0, 49.980, 0.0]], rtol=0, atol=1e-12)
+
+
+def test_the_rows_of_centroid_go_outward_from_where_the_axis_is_homed():
+    """The travel of Z is -180 ... 10 mm: its end at 10 is nearer to machine zero, where the rows begin."""
+    machine = machine_with(centroid={"sign": "correction", "values": "mm"})
+    nodes = machine.axes[2].nodes_mm
+    errors = ErrorTable({"EZZ": Curve(nodes, 1e-4 * nodes, np.full(len(nodes), np.nan))})
+    made = compgen.export(machine, errors, "centroid", allow_unverified=True)
+    rows = {name: [line.split("\t") for line in text.splitlines()[5:]] for name, text in made.files.items()}
+    assert (rows["cnc-z.tab"][0][0], rows["cnc-z.tab"][-1][0]) == ("10.000000", "-180.000000")
+    assert (rows["cnc-y.tab"][0][0], rows["cnc-y.tab"][-1][0]) == ("0.000000", "1200.000000")
+    assert float(rows["cnc-z.tab"][-1][1]) == pytest.approx(0.018 / 1.0001, abs=5e-7)  # minus EZZ there
+    control = CONTROLLERS["centroid"](machine)
+    tables = control.parse([SourceFile(Path(name), text) for name, text in made.files.items()])
+    assert any("Z does not begin at machine zero" in text for text in control.reservations(tables))
 
 
 def test_a_negative_column_of_zeros_means_both_directions_on_a_fagor():
@@ -395,6 +458,7 @@ def test_kmotion_in_inches_does_the_same_in_another_file(make_errors):
 EVERY = {
     "smoothieware": {}, "ecmc": {"version": "9.6.8"}, "aerotech": {}, "aerotech-2d": {}, "kmotion": {},
     "weihong": {"sign": "correction"}, "mach4": {"sign": "error"}, "fagor-8055": {"sign": "correction"},
+    "centroid": {"sign": "error", "values": "mm"},
 }  # fmt: skip
 
 
@@ -416,6 +480,11 @@ def test_the_machine_with_the_table_comes_closer(name, chain):
 
 
 # --- malformed files -------------------------------------------------------------------------------------------------
+
+
+MATRIX = "".join(f"setp matrixkins.C_{a}{b} {int(a == b)}\n" for a in "xyz" for b in "xyz")
+CENTROID = {"sign": "correction", "values": "mm"}
+TAB = "CNC10 TAB FILE VERSION 3\nAXIS X\nUNITS MM\nINTERVAL 25\nENTRIES 2\n0 0 0\n-25 1 2\n"
 
 
 @pytest.mark.parametrize(
@@ -447,6 +516,24 @@ def test_the_machine_with_the_table_comes_closer(name, chain):
         ("kmotion", {}, "2,2\n1,1\n0,0\n0,0,0,0,0\n", "need 20"),
         ("kmotion", {}, "2,2\n1,1\n0,0\n" + 4 * "0,0,0,0,0\n", "second time"),
         ("smoothieware", {}, "A 1 1\n", "not an axis"),
+        ("linuxcnc-matrixkins", {}, "setp matrixkins.C_xx 1\n", "no factor xy"),
+        ("linuxcnc-matrixkins", {}, "setp matrixkins.C_xw 1\n", "expected setp"),
+        ("linuxcnc-matrixkins", {}, "loadrt matrixkins\n", "expected setp"),
+        ("linuxcnc-matrixkins", {}, MATRIX.replace("C_yy 1", "C_yy 25.4"), "skew factor of 24.4"),
+        ("linuxcnc-matrixkins", {}, MATRIX + "setp matrixkins.C_zz 1\n", "second time"),
+        ("centroid", CENTROID, TAB.replace("VERSION 3", "VERSION 2"), "other versions"),
+        ("centroid", CENTROID, TAB.replace("MM", "INCH"), "only files in MM"),
+        ("centroid", CENTROID, TAB.replace("ENTRIES 2", "ENTRIES 3"), "declares 3 entries but has 2"),
+        ("centroid", CENTROID, TAB.replace("INTERVAL 25", "INTERVAL 20"), "INTERVAL 20 is not"),
+        ("centroid", CENTROID, TAB.replace("AXIS X\n", ""), "expected AXIS"),
+        ("centroid", CENTROID, TAB.replace("-25 1 2", "-25 1"), "2 columns"),
+        (
+            "centroid",
+            {**CENTROID, "values": "counts", "counts_per_mm": {"X": 1.0, "Y": 1.0, "Z": 1.0}},
+            TAB.replace("-25 1 2", "-25 1 0.5"),
+            "whole numbers",
+        ),
+        ("centroid", {"sign": "error", "values": "counts"}, TAB, "counts_per_mm"),
     ],
 )
 def test_a_malformed_file_is_refused_with_its_line(name, settings, text, words):

@@ -124,7 +124,7 @@ def dense_columns(basis, position_mm, tool_mm):
 
 
 #: Controls that hold squareness alone, as shears about machine zero.
-SHEARS = ("klipper", "marlin", "reprapfirmware", "ucnc")
+SHEARS = ("klipper", "linuxcnc-matrixkins", "marlin", "reprapfirmware", "ucnc")
 
 
 @pytest.mark.parametrize("name", sorted(CONTROLLERS))
