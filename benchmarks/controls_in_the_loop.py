@@ -239,9 +239,8 @@ def grbl_positions(program: Path, folder: Path, text: str) -> Array:
     )
     values = np.array(rows, dtype=np.float64)
     values = values[np.argmax(np.any(values[:, 1:] != 0.0, axis=1)) :]  # before them the motors wait at the start
-    # a row after a rest still has the position of the rest
-    rests = np.append(np.diff(values[:, 0]) > GAP_S, True)
-    return GRBL_STEP_MM * np.vstack([values[1:][rests[:-1], 1:], values[-1:, 1:]])
+    # a row after a rest still has the position of the rest, and the program ends with one
+    return GRBL_STEP_MM * values[1:, 1:][np.diff(values[:, 0]) > GAP_S]
 
 
 def with_grblhal(program: Path, folder: Path) -> list[list[str]]:
@@ -291,7 +290,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 rows += run(Path(name))
     if not rows:
         parser.error("nothing to run: give --klipper or --grblhal")
-    print_table(["", "positions", "X um", "Y um", "Z um", "step um"], rows)
+    print_table([["", "positions", "X um", "Y um", "Z um", "step um"], *rows])
 
 
 if __name__ == "__main__":

@@ -298,7 +298,7 @@ def test_the_sign_of_ecmc_follows_its_release():
 
 def test_a_sign_or_release_that_is_not_stated_is_asked_for_with_the_reason():
     asked = {"ecmc": "version: is missing: release 10.0.0 reversed", "ucnc": "build: is missing: a factor acts"}
-    asked |= {"centroid": 'sign: is missing'}
+    asked |= {"centroid": "sign: is missing"}
     asked |= dict.fromkeys(("weihong", "mach4", "fagor-8055"), 'sign: is missing: .* set sign = "error"')
     for name, words in asked.items():
         with pytest.raises(InputError, match=words):
