@@ -14,7 +14,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from gettext import GNUTranslations
 from html import escape, unescape
 from typing import TYPE_CHECKING, Any
@@ -274,20 +274,6 @@ class Texts:
                     cells[k + 1] = " " * max(len(cells[k + 1]) + len(given) - len(cells[k]), 2)
             found.append(marker[0] + "".join(cells))
         return "\n".join(found)
-
-    def question(self, english: str) -> str:
-        """Return what a file leaves open in this language: a message without what answers it."""
-        return self._asking.label(english)
-
-    @cached_property
-    def _asking(self) -> Texts:
-        found = dict(self.messages)
-        for end in ("; give ", "; write "):
-            for english, text in self.messages.items():
-                asked, given, _ = english.partition(end)
-                if given and "\x04" not in english and len(_PLACE.sub("", asked)) > 2 * _SURE:
-                    found.setdefault(asked, ";".join(text.split(";")[: asked.count(";") + 1]))
-        return Texts(found, self.language)
 
     def _named(self, english: str) -> str:
         """Return a cell of a table, a name and its value, or a message and its kind, in this language."""

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
+from compgen.app.asked import columns_shown, questions_shown
 from compgen.app.project import Measurement, Project, ProjectState
-from compgen.app.steps import ANSWERS, CERTIFICATE_FIELDS, PROGRAM_FIELDS, Step, command_line
+from compgen.app.steps import CERTIFICATE_FIELDS, PROGRAM_FIELDS, Step, command_line
 from compgen.controls import CONTROLLERS
 from compgen.data import toml_files
 from compgen.data.axis_runs import AxisRuns
@@ -27,7 +28,7 @@ from compgen.data.deviations import Artefact, Deviations
 from compgen.data.error_table import ErrorTable, read_errors
 from compgen.data.files import read_text
 from compgen.data.machine import CHAINS, ROTARY, Chain, machine_files, read_machine
-from compgen.data.names import AXES, CURVE_NAMES, SQUARENESS_NAMES, error_named
+from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.prior import CLASS_WORDS
 from compgen.drawing.charts import BOX, CYCLE, Picture, Plot, limits_of, svg
 from compgen.drawing.display import Displayed, Overview
@@ -41,7 +42,6 @@ from compgen.programs.dialects import DIALECTS
 from compgen.report.html.folder import read_volume
 from compgen.report.html.pictures import (
     VolumeOnGrid,
-    describe_error,
     draw_curve,
     draw_proposed,
     draw_slices,
@@ -233,135 +233,6 @@ def options_from(answers: Sequence[str]) -> ImportOptions:
         else:
             given[name] = float(value) if name in ("radius_mm", "base_length_mm") else value
     return ImportOptions(**given)
-
-
-@dataclass(frozen=True)
-class AnswerChoice:
-    """One answer: the word that the command takes, how it is called, and the picture of what it would mean."""
-
-    word: str
-    label: str
-    pictures: Sequence[Picture]
-
-
-@dataclass(frozen=True)
-class Question:
-    """What a file leaves open: its words, the option that answers it, and choices; without choices one types it."""
-
-    text: str
-    option: str
-    choices: Sequence[AnswerChoice]
-
-
-_OPTION = re.compile(rf"--({'|'.join(ANSWERS)})\b")
-_FIXED = {
-    "axis": AXES,
-    "dates": ("dmy", "mdy", "ymd"),
-    "decimal": ("comma", "point"),
-    "zero-runs": ("drop", "keep"),
-    "plane": tuple(PLANES),
-    "directions": ("labels", "motion", "alternate"),
-}
-_SIGNS = ("error", "correction", "angle-above-90", "angle-below-90", "rotation")
-_WORDS = {
-    "angle-above-90": "positive: the angle between the positive axes is above 90°",
-    "angle-below-90": "positive: the angle between the positive axes is below 90°",
-    "rotation": "the numbers are EC0Y, EB0Z, EA0Z of ISO 230-1",
-    "error": "error: measured minus commanded",
-    "correction": "correction: what has to be added",
-    "dmy": "day, month, year",
-    "mdy": "month, day, year",
-    "ymd": "year, month, day",
-    "drop": "not measured: leave these runs out",
-    "keep": "measured: zero is the result",
-    "labels": "as the file labels them",
-    "motion": "from the order of the rows",
-    "alternate": "odd runs upwards, even runs downwards",
-}
-
-
-def _angle_picture(word: str, lean: float) -> Picture:
-    """Two axes whose angle is not 90 degrees, much enlarged."""
-    plot = Plot((-0.9, 1.5), (-0.25, 1.2), (5.0, 5.0, 243.0, 145.0), bare=True)
-    turn = np.linspace(0.0, np.pi / 2 + lean, 30)
-    tip = np.array([np.cos(turn[-1]), np.sin(turn[-1])])
-    plot.line([0.0, 1.0], [0.0, 0.0], "ink")
-    plot.line([0.0, 0.0], [0.0, 1.0], "grid", dash="4 3")
-    plot.line([0.0, tip[0]], [0.0, tip[1]], "ink")
-    plot.line(0.3 * np.cos(turn), 0.3 * np.sin(turn), "c0")
-    for x, y, text in (
-        (1.1, 0.0, "+"),
-        (1.1 * tip[0], 1.1 * tip[1], "+"),
-        (0.55, 0.35, "> 90°" if lean > 0 else "< 90°"),
-    ):
-        plot.text(x, y, text)
-    return Picture(f"sign-{word}", "Positive number", svg(f"sign-{word}", "Angle of the axes", [plot]))
-
-
-#: Signs of squareness whose meaning is drawn.
-SIGNS_DRAWN = {
-    "angle-above-90": (_angle_picture("above", 0.2),),
-    "angle-below-90": (_angle_picture("below", -0.2),),
-    "rotation": (),
-}
-
-
-def questions_of(
-    path: Path, doubts: Sequence[str], answers: Sequence[str], key: str, axis: str | None = None
-) -> list[Question]:
-    """Return what a file leaves open as questions, each with the picture that every answer would give."""
-    found: dict[str, Question] = {}
-    before: list[str] = []  # what is open, if the next text says how all of it is answered
-    for number, doubt in enumerate(doubts):
-        match = _OPTION.search(doubt)
-        if match is None:
-            before.append(doubt)
-            continue
-        option, words = match[1], list(_answers(match[1], doubt, axis))
-        choices = [
-            AnswerChoice(
-                f"--{option}={word}",
-                _label(word),
-                SIGNS_DRAWN[word]
-                if word in SIGNS_DRAWN
-                else measurement_shown(path, (*answers, f"--{option}={word}"), f"{key}-{number}-{k}")[0],
-            )
-            for k, word in enumerate(words)
-        ]
-        text = doubt[: match.start()].rstrip(" ;,").removesuffix("give").rstrip(" ;,") or doubt
-        if text.startswith("or answer") and before:
-            text = "; ".join(re.sub(r"; write .*", "", part) for part in before)
-        before.clear()
-        found.setdefault(
-            f"{option} {match.end()}" if option in ("map", "ignore") else option, Question(text, option, choices)
-        )
-    return list(found.values())
-
-
-def _label(word: str) -> str:
-    """Return an answer in words."""
-    if word in CURVE_NAMES:
-        return f"{word}: {describe_error(word)}"
-    return _WORDS.get(word, word.partition("=")[2] or word)
-
-
-def _answers(option: str, doubt: str, axis: str | None) -> Sequence[str]:
-    """Return the answers that a question allows, none for free text."""
-    if option in _FIXED:
-        said = [word for word in _FIXED[option] if re.search(rf"\b{word}\b", doubt.partition("--")[2])]
-        return said or _FIXED[option]
-    if option == "sign":
-        return [word for word in _SIGNS if word in doubt.partition("--")[2]] or _SIGNS[:2]
-    if option == "unit":
-        field = re.search(r"--unit (\w+)=", doubt)
-        angular = re.search(r"\b(urad|mrad|arcsec|deg)\b", doubt) is not None
-        units = ("urad", "arcsec", "mrad") if angular else ("um", "mm", "in")
-        return [f"{field[1]}={unit}" if field else unit for unit in units]
-    if option == "error":
-        angular = "EA" in doubt
-        names = [name for name in CURVE_NAMES if (error_named(name).kind == "angular") == angular]
-        return [name for name in names if axis not in AXES or name.endswith(axis or "")]
-    return ()
 
 
 # The machine: its chain as a drawing, the settings of its controls, and its file with some values changed.
@@ -735,6 +606,10 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
         if item.after != after:
             continue
         path, key, answers = project.path(item.file), f"m{item.number}", item.step.data["answers"]
+
+        def given(word: str, name: str, path: Path = path, answers: Sequence[str] = answers) -> Sequence[Picture]:
+            return measurement_shown(path, (*answers, word), name)[0]
+
         pictures, overview = ((), None) if item.questions else measurement_shown(path, answers, key)
         shown.append(
             {
@@ -745,13 +620,8 @@ def shown_measurements(project: Project, state: ProjectState, *, after: bool) ->
                 "sheet": next(
                     (step for step in reversed(state.steps) if step.data.get("sheet_of") == item.step.number), None
                 ),
-                "questions": questions_of(
-                    path,
-                    item.questions,
-                    answers,
-                    f"q{item.number}",
-                    item.step.data["summary"]["understood"].get("axis"),
-                ),
+                "questions": questions_shown(item.step.data["summary"], f"q{item.number}", given),
+                "columns": columns_shown(path, answers, item.step.data["summary"]),
             }
         )
     return shown

@@ -45,7 +45,7 @@ from werkzeug.exceptions import Forbidden, HTTPException
 from werkzeug.routing import IntegerConverter
 from werkzeug.wrappers import Response as BaseResponse
 
-from compgen.app import contents
+from compgen.app import asked, contents
 from compgen.app.machine_text import with_section, with_value
 from compgen.app.project import (
     DEVICES,
@@ -74,7 +74,7 @@ from compgen.app.steps import (
 from compgen.controls import CONTROLLERS
 from compgen.data.files import json_text, read_text, working_folder, write_file
 from compgen.data.machine import INTEGERS, load_machine, machine_files
-from compgen.data.names import AXES, SQUARENESS_NAMES
+from compgen.data.names import AXES, SQUARENESS_NAMES, describe_error
 from compgen.data.prior import class_named
 from compgen.drawing.charts import LABEL
 from compgen.drawing.page_units import page_in_inch
@@ -84,7 +84,7 @@ from compgen.identification.options import StatedNumbers
 from compgen.language import texts_of
 from compgen.new_machine import chains_of, in_words
 from compgen.programs.dialects import DIALECTS
-from compgen.report.html.pictures import describe_error, thousands
+from compgen.report.html.pictures import thousands
 from compgen.report.html.write import markdown
 from compgen.report.pdf import pdf_of
 from compgen.resources import LANGUAGES, cache_folder, data_folder
@@ -658,7 +658,31 @@ def answer_questions(runner: Runner, state: ProjectState, item: int) -> str | No
         for name in request.form
         if name.startswith("typed-") and _field(name)
     ]
+    places = [f"{name[5:]}={_number(name):g}" for name in request.form if name.startswith("line-") and _field(name)]
+    typed += [f"--line={','.join(places)}"] * bool(places)
     answers = [*found.step.data["answers"], *(word for word in given if word), *typed]
+    for word in answers:
+        _checked_answer(word)
+    folder = runner.project.new_folder("measurement")
+    data = {"after": found.after, "answers_to": found.number}
+    task = _import_task(runner.project, state, found.file, folder, list(dict.fromkeys(answers)), data)
+    runner.start("reading the file again", "after" if found.after else "measurement", [task])
+    return "after" if found.after else None
+
+
+@action("measurement", f"measurement/<{_NUMBER}:item>/columns")
+def choose_columns(runner: Runner, state: ProjectState, item: int) -> str | None:
+    """Read a file again with what its columns are, as the chooser says it."""
+    found = _measurement(state, item)
+    answers = list(found.step.data["answers"])
+    chooser = asked.columns_shown(runner.project.path(found.file), answers, found.step.data["summary"])
+    if chooser is None:
+        raise InputError("this file has no columns to choose")
+    for k, column in enumerate(chooser.columns):
+        field_, unit = _field(f"field-{k}", 40), _field(f"unit-{k}", 20)
+        if field_ not in (*dict(chooser.fields), "ignore", "") or unit not in ("", *asked.COLUMN_UNITS):
+            raise InputError("choose one of the answers")
+        answers = asked.with_column(answers, column, field_, unit)
     for word in answers:
         _checked_answer(word)
     folder = runner.project.new_folder("measurement")
@@ -1167,7 +1191,6 @@ def make_app(workbench: Workbench) -> Flask:
     app.jinja_env.filters.update(
         word=str,
         lines=str,
-        asked=str,
         drawn=lambda svg: svg,
         figure=_figure,
         unit=lambda text: LABEL.get(text, text),
@@ -1182,7 +1205,7 @@ def make_app(workbench: Workbench) -> Flask:
     if workbench.language != LANGUAGES[0]:
         texts = texts_of(workbench.language)
         texts.translate(app.jinja_env, html=True).filters.update(
-            drawn=lambda svg: Markup(texts.drawn(svg)), lines=texts.lines, asked=texts.question
+            drawn=lambda svg: Markup(texts.drawn(svg)), lines=texts.lines
         )
     app.url_map.converters["number"] = StepNumber
     app.extensions["compgen"] = workbench

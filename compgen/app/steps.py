@@ -302,9 +302,23 @@ def summary(value: Any) -> Any:
         raise ValueError("expected what was understood of the file, as a table")
     if machine is not None:
         listed(text)(machine.get("outside", []))
+    listed(_question)(value.get("questions", []))
     if not isinstance(understood.get("columns", {}), dict):
         raise ValueError("expected the columns of the file as a table")
     return anything(value)
+
+
+def _question(value: Any) -> Any:
+    """A question about a file as ``volcomp import --json`` writes it; its answers are options of that command."""
+    if not isinstance(value, dict) or not isinstance(value.get("required"), bool):
+        raise ValueError("expected a question about a file")
+    for key in ("reason", "option", "key", "default", "picture"):
+        text(value.get(key))
+    for choice in listed(_table)(value.get("choices")):
+        text(choice.get("value"))
+        text(choice.get("meaning"))
+        answer(choice.get("word"))
+    return value
 
 
 def answer(value: Any) -> str:

@@ -34,6 +34,7 @@ from compgen.effects.active import STATION_NAME
 from compgen.errors import CompgenWarning, InputError, nearest
 from compgen.foreign import ImportOptions, describe_native, import_file, native_format
 from compgen.foreign.heads import heads_of, with_head
+from compgen.foreign.questions import OpenColumnsError, Question
 from compgen.kinematics import modelled_errors
 from compgen.plugins import CONTROLS, EFFECT_FAMILIES, SIMULATED_EFFECTS, SIMULATED_INSTRUMENTS
 from compgen.registry import Kind
@@ -248,9 +249,15 @@ def import_command(
         understood, data = describe_native(file, kind)
         note = "is already in the native format: the other commands read it directly"
         summary: dict[str, Any] = {"file": str(file), "format": "compgen", "kind": kind, "understood": understood, "doubts": [],
-                   "notes": [note]}  # fmt: skip
+                   "questions": [], "notes": [note]}  # fmt: skip
     else:
-        item = import_file(file, given)
+        try:
+            item = import_file(file, given)
+        except OpenColumnsError as error:
+            if as_json:
+                print_json(open_columns(file, error))
+                return 2
+            raise
         summary, data = item.summary(), item.data
     against = [] if known is None else outside_travel(known, data)
     named = None if known is None else {"name": known.name, "outside": list(against)}
@@ -272,13 +279,24 @@ def import_command(
             say(f"note: {_printable(text)}")
         for text in against:
             say(f"outside: {text}", style="red")
-        for text in summary["doubts"]:
-            say(f"open: {_printable(text)}", style="yellow")
+        for asked in summary["questions"]:
+            say(f"{'open' if asked['required'] else 'not stated'}: {_printable(asked['text'])}", style="yellow")
+            for choice in asked["choices"] if any(item["meaning"] for item in asked["choices"]) else ():
+                say(f"  {_printable(choice['word'])}  {_printable(choice['meaning'])}")
         for path in summary["files"]:
             say(f"  {path}")
         if summary["doubts"]:
             say("nothing is written while questions are open; answer them with options")
     return 2 if against or (target is not None and summary["doubts"]) else 0
+
+
+def open_columns(file: Path, error: OpenColumnsError) -> dict[str, Any]:
+    """Return the contents of ``--json`` for a table of which the user has to say which column is what."""
+    asked = Question(str(error), "columns", (), picture="columns")
+    return {
+        "file": str(file), "format": "table", "kind": "unknown", "understood": {}, "doubts": [asked.text],
+        "questions": [asked.to_dict()], "notes": [], "machine": None, "files": [], "error": str(error), "exit_code": 2,
+    }  # fmt: skip
 
 
 def outside_travel(machine: Machine, data: object) -> list[str]:

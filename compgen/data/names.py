@@ -69,3 +69,16 @@ SQUARENESS_NAMES: tuple[str, ...] = ERROR_NAMES[18:]
 def error_named(name: str) -> ErrorName:
     """Return the :class:`ErrorName` of ``name``, e.g. ``"EXX"`` or ``"EC0Y"``; KeyError if there is none."""
     return ERRORS[ERROR_INDEX[name]]
+
+
+def describe_error(name: str) -> str:
+    """Return an error in words, e.g. ``"Straightness of X in Y"``."""
+    error = error_named(name)
+    axis = AXES[error.axis]
+    if error.kind == "linear":
+        return (
+            f"Straightness of {axis} in {AXES[error.direction]}" if error.is_straightness else f"Positioning of {axis}"
+        )
+    if error.kind == "squareness":
+        return {"EC0Y": "Squareness of Y to X", "EB0Z": "Squareness of Z to X", "EA0Z": "Squareness of Z to Y"}[name]
+    return f"Roll of {axis}" if error.direction == error.axis else f"Rotation of {axis} about {AXES[error.direction]}"

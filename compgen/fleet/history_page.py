@@ -9,10 +9,9 @@ import numpy as np
 from markupsafe import Markup
 
 from compgen.data.files import OutputFolder
-from compgen.data.names import COVERAGE
+from compgen.data.names import COVERAGE, describe_error
 from compgen.drawing.charts import DASHED, DOTTED, LABEL, Picture, Plot, limits_of, page_assets, svg
 from compgen.fleet.drift import Drift, FigureDrift, following_temperature, moment_of
-from compgen.report.html.pictures import describe_error
 from compgen.report.html.write import page_environment
 from compgen.resources import LANGUAGES
 

@@ -166,7 +166,7 @@ def _asked(path: Path, given: ImportOptions) -> ImportOptions:
     answers = ImportOptions()
     while True:
         try:
-            text = " ".join(import_file(path, answers).doubts)
+            text = " ".join(question.text for question in import_file(path, answers).questions)
         except InputError as error:
             text = str(error)
         new = [name for name in given.given() if name not in answers.given() and ImportOptions.flag(name) in text]
@@ -189,7 +189,7 @@ def _measured(path: Path, kind: str | None, answers: ImportOptions) -> Sequence[
 def _settled(path: Path, answers: ImportOptions | None = None) -> Imported:
     item = import_file(path, answers)
     item.check_settled()
-    facts = "; ".join([f"{item.format}, {item.kind}", *item.notes])
+    facts = "; ".join([f"{item.format}, {item.kind}", *item.notes, *item.offers])
     warnings.warn(f"{path} was read as: {facts} ('volcomp import' shows all)", CompgenWarning, stacklevel=3)
     return item
 

@@ -26,6 +26,7 @@ from compgen.foreign.answers import ImportOptions
 from compgen.foreign.cells import CellGrid, plain_decimals
 from compgen.foreign.column_names import MM_PER_LENGTH, is_index, known_unit, split_name, unaccented
 from compgen.foreign.findings import Imported, unit_of_positions
+from compgen.foreign.questions import Asking, Choice, choices_of
 from compgen.foreign.source import Text, parse_number, shown
 
 _NOMINAL, _ACTUAL, _DEVIATION = "nominal", "actual", "deviation"
@@ -160,13 +161,12 @@ class Feature:
 
 
 @dataclass
-class Report:
+class Report(Asking):
     """The features of a file, and what it says about them."""
 
     path: Path
     features: list[Feature] = field(default_factory=list)
     understood: dict[str, Any] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     calibrated: bool | None = None
     metadata: dict[str, str] = field(default_factory=dict)
@@ -617,11 +617,13 @@ def _check_columns(report: Report, raw: Sequence[Any], options: ImportOptions) -
                     if column.role
                     else "xa, ya, za for what was measured"
                 )
-                report.doubts.append(
-                    f"the column of numbers {column.name!r} is not understood: give --map FIELD={column.name!r} ({keys}), "
-                    f"or leave it out: --ignore {column.name!r}"
+                report.ask(
+                    f"the column of numbers {column.name!r} is not understood",
+                    "ignore",
+                    (Choice(column.name, f"leave {column.name!r} out"),),
+                    f"give --map FIELD={column.name!r} ({keys}), or leave it out: --ignore {column.name!r}",
+                    picture="columns",
                 )
-    report.doubts[:] = list(dict.fromkeys(report.doubts))
 
 
 def _scales(
@@ -637,8 +639,12 @@ def _scales(
     stated = stated or (units if len(units) == 1 else set())
     given = options.given_unit("position", "x", "value", among=MM_PER_LENGTH, what="length")
     if given is None and len(stated | units) > 1 and not {c.unit for c in header.columns if c.coordinate and c.unit}:
-        report.doubts.append(
-            f"several units are stated ({', '.join(sorted(stated | units))}); give --unit position=UNIT"
+        report.ask(
+            f"several units are stated ({', '.join(sorted(stated | units))})",
+            "units",
+            choices_of(sorted(stated | units)),
+            "give --unit position=UNIT",
+            key="position",
         )
     unit = given or (next(iter(stated)) if len(stated) == 1 else None)
     if unit is None:
@@ -649,8 +655,12 @@ def _scales(
         if judged.best == "mm" and judged.shares["mm"] > 0.85:
             report.notes.append(f"the file states no unit; by the magnitude of the numbers {judged.text()}")
         else:
-            report.doubts.append(
-                f"the file states no unit of the coordinates ({judged.text()}); give --unit position=mm or in"
+            report.ask(
+                f"the file states no unit of the coordinates ({judged.text()})",
+                "units",
+                choices_of(("mm", "in")),
+                "give --unit position=mm or in",
+                key="position",
             )
     if unit not in MM_PER_LENGTH:
         raise report.fail(f"{unit} is not a unit of length; expected coordinates")
@@ -684,9 +694,11 @@ def _check_signs(
     if count and worst > 0:
         what = "have the opposite sign of" if turned <= 0 else "disagree with"
         names = [c.name for c in header.columns if c.role == _DEVIATION]
-        report.doubts.append(
-            f"the deviations {what} measured minus nominal: are the columns exchanged? Leave the wrong ones out: "
-            + " ".join(f"--ignore {name!r}" for name in names)
+        report.ask(
+            f"the deviations {what} measured minus nominal: are the columns exchanged?",
+            "ignore",
+            choices_of(names, {name: f"leave {name!r} out" for name in names}),
+            "leave the wrong ones out: " + " ".join(f"--ignore {name!r}" for name in names),
         )
     elif count:
         report.notes.append("the printed deviations agree with measured minus nominal")
@@ -733,7 +745,13 @@ def read_dmis(source: Text, options: ImportOptions) -> Report:
     given = options.given_unit("position", "value", among=MM_PER_LENGTH, what="length")
     mm = MM_PER_LENGTH[given] if given else mm
     if mm is None:
-        report.doubts.append("the file states no UNITS/; give --unit position=mm or in")
+        report.ask(
+            "the file states no UNITS/",
+            "units",
+            choices_of(("mm", "in")),
+            "give --unit position=mm or in",
+            key="position",
+        )
     for name, place, line in measured:
         if name not in nominal:
             raise report.fail(f"FA({name}) was measured, and there is no nominal feature F({name})", line)
@@ -808,7 +826,13 @@ def _qif_unit(root: ElementTree.Element, report: Report, options: ImportOptions)
         if mm:
             report.understood["unit"] = name
             return mm
-    report.doubts.append("the file states no linear unit; give --unit position=mm or in")
+    report.ask(
+        "the file states no linear unit",
+        "units",
+        choices_of(("mm", "in")),
+        "give --unit position=mm or in",
+        key="position",
+    )
     return 1.0
 
 
@@ -836,19 +860,32 @@ def imported_features(report: Report, form: str, options: ImportOptions) -> Impo
     origin = _origin(report, options)
     setup = _setups(report, options)
     if kind is None:
-        report.doubts.append(
-            "nominal and measured coordinates of features: were they made by this machine and measured elsewhere (--kind part), "
-            "or measured by this machine's own probe (--kind artefact)? The errors have opposite signs"
+        report.ask(
+            "nominal and measured coordinates of features: who measured them? The errors have opposite signs",
+            "kind",
+            (
+                Choice("part", "this machine made the part; it was measured elsewhere (CMM)"),
+                Choice("artefact", "this machine's own probe measured them"),
+            ),
+            "give --kind part (made by this machine, measured elsewhere) or --kind artefact (measured by this machine's probe)",
+            picture="measured-by",
         )
     if origin is None:
-        report.doubts.append(
-            "the file does not state where the zero of its coordinates was in the machine: give --origin X,Y,Z (machine "
-            "coordinates in mm, for example those of G54; 0,0,0 if the coordinates are machine coordinates)"
+        report.ask(
+            "the file does not state where the zero of its coordinates was in the machine (machine coordinates in mm, for "
+            "example those of G54; 0,0,0 if the coordinates are machine coordinates)",
+            "origin",
+            (),
+            "give --origin X,Y,Z",
+            picture="origin",
         )
     calibrated = {"yes": True, "no": False}.get(options.calibrated or "", report.calibrated)
     if kind == "artefact" and calibrated is None:
-        report.doubts.append(
-            "are the nominal places those of a calibration (--calibrated yes), or of a drawing (--calibrated no)?"
+        report.ask(
+            "are the nominal places those of a calibration, or of a drawing?",
+            "calibrated",
+            (Choice("yes", "of a calibration"), Choice("no", "of a drawing: nominal only")),
+            "give --calibrated yes (calibration) or --calibrated no (drawing)",
         )
     if kind == "part" and options.calibrated is not None:
         raise report.fail(
@@ -874,7 +911,7 @@ def imported_features(report: Report, form: str, options: ImportOptions) -> Impo
         "artefact" if kind == "artefact" else "part",
         data,
         report.understood,
-        tuple(report.doubts),
+        tuple(report.questions),
         notes,
     )
 
@@ -917,6 +954,9 @@ def _origin(report: Report, options: ImportOptions) -> tuple[float, float, float
     return given or next(iter(known))
 
 
+_CLAMPING = (Choice("one", "all in one set-up"), Choice("each", "each table is a set-up of its own"))
+
+
 def _setups(report: Report, options: ImportOptions) -> Any:
     """Return the number of the set-up of every feature; what the file does not show is asked."""
     features = report.features
@@ -932,9 +972,11 @@ def _setups(report: Report, options: ImportOptions) -> Any:
         return np.array([1 + blocks.index(item.block) for item in features], dtype=np.int64)
     if options.clamping is None and (len(blocks) > 1 or again):
         what = f"{len(blocks)} tables" if len(blocks) > 1 else f"feature {again[0]!r} several times"
-        report.doubts.append(
-            f"the file contains {what} and does not number the set-ups: give --clamping one (all in one set-up), --clamping each "
-            "(each table a set-up), or a column Setup"
+        report.ask(
+            f"the file contains {what} and does not number the set-ups",
+            "clamping",
+            _CLAMPING,
+            "give --clamping one (all in one set-up), --clamping each (each table a set-up), or a column Setup",
         )
     elif options.clamping is None:
         report.notes.append("one table: all features count as one set-up; number several in a column Setup")
@@ -997,10 +1039,19 @@ def merged_features(parts: Sequence[tuple[str, Imported]], options: ImportOption
         _, own = np.unique(item.data.setup, return_inverse=True)
         setups.append(own.ravel() + (1 if options.clamping == "one" else begin))
         begin += int(own.max()) + 1
-    doubts = [f"sheet {shown(name)}: {text}" for name, item in parts for text in item.doubts]
+    asking = Asking(
+        questions=[
+            replace(asked, reason=f"sheet {shown(name)}: {asked.reason}")
+            for name, item in parts
+            for asked in item.questions
+        ]
+    )
     if options.clamping is None:
-        doubts.append(
-            f"there are features on {len(parts)} sheets: give --clamping one (all in one set-up) or --clamping each (each sheet)"
+        asking.ask(
+            f"there are features on {len(parts)} sheets",
+            "clamping",
+            _CLAMPING,
+            "give --clamping one (all in one set-up) or --clamping each (each sheet)",
         )
     setup = np.concatenate(setups).astype(np.int64)
     found = [item.data for _, item in parts]
@@ -1016,7 +1067,7 @@ def merged_features(parts: Sequence[tuple[str, Imported]], options: ImportOption
         first,
         data=data,
         understood={f"sheet {name}": dict(item.understood) for name, item in parts},
-        doubts=tuple(doubts),
+        questions=tuple(asking.questions),
         notes=tuple(dict.fromkeys(text for _, item in parts for text in item.notes)),
     )
 

@@ -33,6 +33,7 @@ from compgen.foreign.column_names import (
     way,
 )
 from compgen.foreign.findings import TableFindings
+from compgen.foreign.questions import Choice, date_orders
 from compgen.foreign.source import (
     Order,
     Written,
@@ -227,7 +228,7 @@ def _of_dates(findings: TableFindings, dates: Sequence[Written]) -> tuple[FloatA
         days = sorted({tuple(sorted(day.date().isoformat() for day in date.days.values())) for date in dates})
         found = f"{shown(dates[0].text)} may be {' or '.join(dict.fromkeys(days[0]))}"
         if len(days) > 1:
-            findings.doubts.append(f"{found}; give --dates dmy, mdy or ymd")
+            findings.ask(found, "dates", date_orders(), "give --dates dmy, mdy or ymd")
             return None, None
         findings.notes.append(f"the date {found}: it is left out; give --dates dmy, mdy or ymd to keep it")
         if any(date.clock_s is None for date in dates):
@@ -594,9 +595,12 @@ class _Reader:
                 # what looks like data is never skipped without the user's consent
                 reason = "it is not understood"
                 run = " --map run1-=... (a run and its direction)," if self.kind == "axis" else ""
-                self.findings.doubts.append(
-                    f"column {shown(name)} contains numbers but is not understood; identify it with --map FIELD={name},{run} or "
-                    f"exclude it: --ignore {shown(name)}"
+                self.findings.ask(
+                    f"column {shown(name)} contains numbers but is not understood",
+                    "ignore",
+                    (Choice(name, f"leave {shown(name)} out"),),
+                    f"identify it with --map FIELD={name},{run} or exclude it: --ignore {shown(name)}",
+                    picture="columns",
                 )
             unused[name] = reason
         if unused:

@@ -7,7 +7,7 @@ and axis to native ones. What the file leaves open becomes a doubt.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -57,6 +57,7 @@ from compgen.foreign.laser_files import (
     without_runs,
 )
 from compgen.foreign.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
+from compgen.foreign.questions import AXIS, Asking, Choice, Question, directions, errors_along, unit_choices
 from compgen.foreign.source import (
     MOST_BYTES,
     MOST_CAPTURE_BYTES,
@@ -82,7 +83,7 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     """Import .rtl, .rta or .rts: axis runs, or with ``options.error`` that error over the axis."""
     found = read_renishaw(path)
     angular = found.letter == "a"
-    doubts: list[str] = []
+    asking = Asking()
     notes = list(found.notes)
     if found.zero_runs and options.zero_runs != "keep":  # some programs pad a unidirectional test with such runs
         named = f"run{'s' if len(found.zero_runs) > 1 else ''} {', '.join(map(str, found.zero_runs[:8]))}"
@@ -90,13 +91,18 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
             found = without_runs(found, found.zero_runs)
             notes.append(f"{named}: zero at every target, excluded as not measured")
         else:
-            doubts.append(f"{named}: zero at every target; give --zero-runs drop if not measured, keep if measured")
+            asking.ask(
+                f"{named}: zero at every target",
+                "zero_runs",
+                (Choice("drop", "not measured: leave these runs out"), Choice("keep", "measured: zero is the result")),
+                "give --zero-runs drop if not measured, keep if measured",
+            )
     temperatures, measured_at, about = surroundings_of(
         found.information.get("ENVIRONMENT", {}), found.keys.get("date", ""), options.dates
     )
     notes += [*about, _SIGN_NOTE]
     axis = options.axis or axis_in(found.keys.get("axis", "")) or _axis_of_name(path, notes)
-    runs, unit = _in_si(found, options, doubts, notes)
+    runs, unit = _in_si(found, options, asking, notes)
     notes += remarks(runs, axis or "", angular=angular)
     understood = {
         "axis": axis,
@@ -114,11 +120,11 @@ def import_renishaw(path: Path, options: ImportOptions) -> Imported:
     runs = replace(runs, covariates={k: np.full(len(runs.value), c) for k, c in temperatures.items()})
     error = None
     if found.letter != "l" or options.error is not None:
-        error = _error_named(path, axis, options, doubts, angular=angular)
+        error = _error_named(path, axis, options, asking, angular=angular)
     elif axis is None:
         named = f" ('{found.keys['axis']}')" if found.keys.get("axis") else ""
-        doubts.append(f"the file does not state X, Y or Z{named}; give --axis")
-    return _imported(path, "renishaw", runs, axis, error, understood, doubts, notes)
+        asking.ask(f"the file does not state X, Y or Z{named}", "axis", AXIS, "give --axis")
+    return _imported(path, "renishaw", runs, axis, error, understood, asking.questions, notes)
 
 
 def _imported(
@@ -128,14 +134,14 @@ def _imported(
     axis: str | None,
     error: str | None,
     understood: dict[str, object],
-    doubts: list[str],
+    questions: Sequence[Question],
     notes: list[str],
 ) -> Imported:
     """Readings along an axis as runs, or as the error that they are, with its reversal."""
     at, metadata = understood.get("measured_at"), {"source": path.name}
     if at:
         metadata |= {"measured_at": str(at), "date": str(at)}
-    said = (understood, tuple(doubts), tuple(notes))
+    said = (understood, tuple(questions), tuple(notes))
     if error is None:
         return Imported(path, form, "axis", runs_of({axis or "": runs}, str(path), metadata), *said)
     data, reversal = errors_of(runs, error, metadata)
@@ -150,11 +156,16 @@ def _axis_of_name(path: Path, notes: list[str]) -> str | None:
     return axis
 
 
-def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: list[str], *, angular: bool) -> str:
+def _error_named(path: Path, axis: str | None, options: ImportOptions, asking: Asking, *, angular: bool) -> str:
     """Return the error given by the user; without one a placeholder, with the doubt that prevents its use."""
     if options.error is None:
         about = "EA?, EB? or EC? with the axis in place of ?" if angular else "the straightness error, for example EYX"
-        doubts.append(f"the file does not state which error it is; give --error ({about})")
+        asking.ask(
+            "the file does not state which error it is",
+            "error",
+            errors_along(axis or "", angular=angular),
+            f"give --error ({about})",
+        )
         letter = axis or "X"
         return f"E{'B' if angular else AXES[(AXES.index(letter) + 1) % 3]}{letter}"
     try:
@@ -163,7 +174,7 @@ def _error_named(path: Path, axis: str | None, options: ImportOptions, doubts: l
         raise InputError(error.message, file=path, field="--error") from error
 
 
-def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: list[str]) -> tuple[OneAxis, str]:
+def _in_si(found: Renishaw, options: ImportOptions, asking: Asking, notes: list[str]) -> tuple[OneAxis, str]:
     """Errors in mm or rad with their directions, and the unit; that of the type is compared with the size of the numbers."""
     angular = found.letter == "a"
     units = RAD_PER_ANGLE if angular else MM_PER_LENGTH
@@ -173,8 +184,13 @@ def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: li
     weighed = {name: units[name] for name in (("urad", "mrad", "arcsec") if angular else ("um", "mm"))}
     judged = unit_of_deviations(found.runs.value, weighed, usual)
     if not given and abs(decades_off(found.runs.value, units[unit], usual)) > ABSURD_DECADES:
-        doubts.append(
-            f"such files are in {unit}, but the numbers look like {judged.best}: give --unit value={judged.best} or {unit}"
+        asking.ask(
+            f"such files are in {unit}, but the numbers look like {judged.best}",
+            "units",
+            unit_choices(judged.best, unit),
+            f"give --unit value={judged.best} or {unit}",
+            key="value",
+            default=judged.best,
         )
     elif not given:
         notes.append(f"by the magnitude of the numbers {judged.text()}")
@@ -185,12 +201,14 @@ def _in_si(found: Renishaw, options: ImportOptions, doubts: list[str], notes: li
         runs = replace(runs, direction=direction, run=cycles(direction, found.one_way), in_time=False)
     else:
         if found.sorted_rows and options.directions is None:
-            doubts.append(
-                "its flags indicate runs in both directions, but every run lists the targets in the same order; give "
-                "--directions alternate (odd runs up, even runs down) or motion"
+            asking.ask(
+                "its flags indicate runs in both directions, but every run lists the targets in the same order",
+                "directions",
+                directions("alternate", "motion"),
+                "give --directions alternate (odd runs up, even runs down) or motion",
             )
         if not runs.direction.all():
-            doubts.append("a run has a single target: its direction is unknown")
+            asking.ask("a run has a single target: its direction is unknown")
     if options.sign == "correction":
         runs = runs.negated()
         notes.append("the values are corrections, as given by --sign: their sign was reversed")
@@ -207,18 +225,19 @@ def _facts(runs: OneAxis, *, angular: bool) -> dict[str, object]:
 def import_ecmc(path: Path, options: ImportOptions) -> Imported:
     """Import an ISO 230-2 input file of the ecmc tools; it does not state its axis."""
     found = read_ecmc(path)
-    doubts, notes = [], ["deviations are reading minus target; nothing is removed from them"]
+    asking, notes = Asking(), ["deviations are reading minus target; nothing is removed from them"]
     if found.fitted:
         notes.append(
             "a gear ratio was already fitted to these readings: they do not contain the scale error of the axis"
         )
     axis = options.axis or _axis_of_name(path, notes)
     if axis is None and options.error is None:
-        doubts.append("the file does not state X, Y or Z; give --axis")
+        asking.ask("the file does not state X, Y or Z", "axis", AXIS, "give --axis")
     if abs(found.slope - 1.0) > SLOPE_TOLERANCE:
-        doubts.append(
+        asking.ask(
             f"the readings follow the targets with the slope {found.slope:.5g}, which no machine error explains: a gear ratio or "
-            "a sign is missing; correct the readings first, and state it where the result is used"
+            "a sign is missing",
+            how="correct the readings first, and state it where the result is used",
         )
     runs = found.runs
     if options.directions == "motion":
@@ -236,8 +255,8 @@ def import_ecmc(path: Path, options: ImportOptions) -> Imported:
         "offset_mm": found.offset_mm,
         "instrument": found.keys.get("REF_PV"),
     }
-    error = None if options.error is None else _error_named(path, axis, options, doubts, angular=False)
-    return _imported(path, "ecmc-iso230", runs, axis, error, understood, doubts, notes)
+    error = None if options.error is None else _error_named(path, axis, options, asking, angular=False)
+    return _imported(path, "ecmc-iso230", runs, axis, error, understood, asking.questions, notes)
 
 
 def import_exchange(path: Path, options: ImportOptions) -> Imported:
@@ -275,13 +294,13 @@ def import_exchange(path: Path, options: ImportOptions) -> Imported:
         "sign": "errors" if options.sign != "correction" else "corrections, sign reversed",
         "instrument": "laser tracer software (Etalon exchange)",
     }
-    doubts = tuple(_absurd(table, options))
-    return Imported(path, "etalon-exchange", "errors", table, understood, doubts, tuple(notes))
+    questions = tuple(_absurd(table, options))
+    return Imported(path, "etalon-exchange", "errors", table, understood, questions, tuple(notes))
 
 
-def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
+def _absurd(table: ErrorTable, options: ImportOptions) -> list[Question]:
     """Errors that are hundreds of times larger than usual are in another unit, unless given by the user."""
-    found = []
+    found, lengths, angles = [], unit_choices("mm", "um", "in"), unit_choices("rad", "urad", "arcsec")
     for name, curve in table.curves.items():
         linear = error_named(name).kind == "linear"
         usual = usual_deviation_mm(float(np.ptp(curve.position_mm))) if linear else USUAL_URAD * 1e-6
@@ -289,12 +308,24 @@ def _absurd(table: ErrorTable, options: ImportOptions) -> list[str]:
         if kind not in options.units and decades_off(curve.value, 1.0, usual) > ABSURD_DECADES:
             reach = f"{float(np.max(np.abs(curve.value))) * (1e3 if linear else 1e6):.4g} {'um' if linear else 'urad'}"
             found.append(
-                f"{name} reaches {reach}: are the numbers mm and rad? give --unit {kind}={'mm' if linear else 'rad'} or another"
+                Question(
+                    f"{name} reaches {reach}: are the numbers mm and rad?",
+                    "units",
+                    lengths if linear else angles,
+                    f"give --unit {kind}={'mm' if linear else 'rad'} or another",
+                    kind,
+                )
             )
     for name, (value, _) in table.squareness.items():
         if "angle" not in options.units and abs(value) > USUAL_URAD * 1e-6 * 10**ABSURD_DECADES:
             found.append(
-                f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad? give --unit angle=rad or another"
+                Question(
+                    f"{name} reaches {1e6 * abs(value):.4g} urad: are the numbers mm and rad?",
+                    "units",
+                    angles,
+                    "give --unit angle=rad or another",
+                    "angle",
+                )
             )
     return found
 
@@ -390,12 +421,17 @@ def _with_line(item: Imported, options: ImportOptions) -> Imported:
         raise InputError(f"the file has {', '.join(sorted(twice))} already", file=item.path, field="--line")
     runs = replace(runs, covariates={**runs.covariates, **stated})
     open_ = [AXES[axis] for axis in np.flatnonzero(np.isnan(runs.line_mm()).any(axis=0)).tolist()]
-    note = (
-        f"where {' and '.join(open_)} stood during the runs is not stated: give --line "
-        f"{','.join(f'{axis}=MM' for axis in open_)}; without it the runs count as anywhere in the travel, and angles add to "
-        "the uncertainty"
+    asked = Question(
+        f"where {' and '.join(open_)} stood during the runs is not stated: the runs count as anywhere in the travel, and angles "
+        "add to the uncertainty",
+        "line",
+        (),
+        f"give --line {','.join(f'{axis}=MM' for axis in open_)}",
+        ",".join(open_),
+        picture="line",
+        required=False,
     )
-    return replace(item, data=runs, notes=(*item.notes, note) if open_ else item.notes)
+    return replace(item, data=runs, questions=(*item.questions, asked) if open_ else item.questions)
 
 
 def import_file(path: str | Path, options: ImportOptions | None = None) -> Imported:
@@ -471,22 +507,24 @@ def _import_workbook(path: Path, options: ImportOptions) -> Imported:
         except CompgenError as error:
             reason = f"sheet skipped: {shown(name)}: {error}"
             if holds_readings(grid):
-                reason = (
-                    f"sheet {shown(name)} contains numbers that are not understood ({error}); choose one sheet with --sheet, or "
-                    f"exclude it: --ignore {shown(name)}"
+                open_sheets.append(
+                    Question(
+                        f"sheet {shown(name)} contains numbers that are not understood ({error})",
+                        "ignore",
+                        (Choice(name, f"leave sheet {shown(name)} out"),),
+                        f"choose one sheet with --sheet, or exclude it: --ignore {shown(name)}",
+                    )
                 )
-                open_sheets.append(reason)
             else:
                 reasons.append(reason)
     if not read:
-        raise InputError(
-            f"no sheet contains a table that can be read: {'; '.join([*reasons, *open_sheets])}"[:1000], file=path
-        )
+        why = "; ".join([*reasons, *(asked.text for asked in open_sheets)])
+        raise InputError(f"no sheet contains a table that can be read: {why}"[:1000], file=path)
     features = [item for item in read if item[1].kind in ("part", "artefact")]
     if features and len(features) < len(read):
         raise InputError("has features of a part and other measurements; choose one sheet with --sheet", file=path)
     item = merged_features(read, options) if len(features) > 1 else merged_sheets(read)
-    return replace(item, doubts=(*item.doubts, *open_sheets), notes=(*item.notes, *aside, *reasons))
+    return replace(item, questions=(*item.questions, *open_sheets), notes=(*item.notes, *aside, *reasons))
 
 
 def _of_grid(grid: CellGrid, options: ImportOptions, form: str) -> Imported:

@@ -29,6 +29,7 @@ from compgen.foreign.column_names import (
     unaccented,
 )
 from compgen.foreign.findings import Imported
+from compgen.foreign.questions import AXIS, Asking, Choice
 from compgen.foreign.source import parse_number, shown
 
 _PLUNGER_WORDS = r"plunger|taster|messtaster|stylus|fuhler|messuhr|dial|gauge|indicator|palpeur|tastatore"
@@ -38,10 +39,12 @@ _PLUNGER = re.compile(rf"(?:{_PLUNGER_WORDS})[^xyz+-]{{0,60}}+([+-]?)\s{{0,9}}+(
 _DIRECTION = re.compile(r"([+-])\s*([xyz])")
 _TRAVEL = re.compile(
     r"\b([xyz])[\s-]*(?:arm|schenkel|travel|achse|axis|verfahr\w*|weg|branche|braccio)\b|"
-    r"\b(?:along|entlang|travel|arm|schenkel|verfahrweg|axis|achse|le long de)\s+([xyz])\b"
+    r"\b(?:along|entlang|la?e?ngs|travel|arm|schenkel|verfahrweg|axis|achse|le long de)\s+([xyz])\b"
 )
 _TURNED = re.compile(r"reversed|turned|umgeschlagen|umschlag|gedreht|gewendet|retourne|capovolt")
-_LEVEL = re.compile(rf"(?:{_LEVEL_WORDS})\s{{0,9}}+(?:(?:along|entlang|in|le long de|lungo)\s{{0,9}}+)?+([xyz])\b")
+_LEVEL = re.compile(
+    rf"(?:{_LEVEL_WORDS})\s{{0,9}}+(?:(?:along|entlang|la?e?ngs|in|le long de|lungo)\s{{0,9}}+)?+([xyz])\b"
+)
 #: Columns of a list of arms.
 _SPAN = frozenset(
     [
@@ -446,12 +449,20 @@ def _levels(table: Table, names: Sequence[str], options: ImportOptions, form: st
     lines = unaccented(" ; ".join([f"{key} {value}" for key, value in said.items()]))
     travel = _TRAVEL.search(lines)
     axis = options.axis or (letters[0] if letters else (travel[1] or travel[2]) if travel else "")
-    doubts = [] if axis else ["the file does not state which axis moved; give --axis"]
+    asking = Asking()
+    if not axis:
+        asking.ask("the file does not state which axis moved", "axis", AXIS, "give --axis")
     side = _side(said) or options.mounted
     if side is None:
-        doubts.append(
-            "the file does not state whether the level was on the spindle side or on the table: give --mounted spindle or table "
-            "(the signs are opposite)"
+        asking.ask(
+            "the file does not state whether the level was on the spindle side or on the table (the signs are opposite)",
+            "mounted",
+            (
+                Choice("spindle", "on the spindle side: it moves with the tool"),
+                Choice("table", "on the table, with the workpiece"),
+            ),
+            "give --mounted spindle or table",
+            picture="level",
         )
     position_mm = np.array(table.numbers(place)) * _mm_of_place(table.grid, place, table.header_line)
     if len(np.unique(position_mm)) < max(2, len(position_mm)):
@@ -486,7 +497,7 @@ def _levels(table: Table, names: Sequence[str], options: ImportOptions, form: st
         else "u of a reading: a digit / sqrt(12), at least 1 urad",
     ]
     data = marked_apart(ErrorTable(curves, {}, {"source": table.grid.path.name, "instrument": "level"}))
-    return Imported(table.grid.path, form, "errors", data, understood, tuple(doubts), tuple(notes))
+    return Imported(table.grid.path, form, "errors", data, understood, tuple(asking.questions), tuple(notes))
 
 
 def _side(said: Mapping[str, str]) -> str | None:

@@ -25,6 +25,7 @@ from compgen.foreign.column_names import (
     unaccented,
 )
 from compgen.foreign.findings import USUAL_URAD, Imported, TableFindings, usual_deviation_mm
+from compgen.foreign.questions import Asking, Choice, signs
 from compgen.foreign.source import parse_number, shown
 from compgen.identification.options import LARGEST_RAD
 
@@ -33,7 +34,7 @@ def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> 
     """Return errors with a column each; those of one axis share the column of positions."""
     axes = {error_named(name).axis for name in columns if name not in SQUARENESS_NAMES}
     if len(axes) > 1 and "axis" not in findings.fields:
-        findings.doubts.append("errors of several axes share one column of positions; give one table for each axis")
+        findings.ask("errors of several axes share one column of positions: give one table for each axis")
     position = findings.positions_mm("position", findings.numbers("position"))
     order = np.argsort(position, kind="stable")
     if np.any(np.diff(position[order]) == 0):
@@ -126,7 +127,7 @@ def _finished(
     }
     words = " ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]).lower()
     if findings.options.sign is None and any(word in words for word in ("correct", "compensat", "korrektur")):
-        findings.doubts.append("the file mentions corrections; give --sign error or correction")
+        findings.ask("the file mentions corrections", "sign", signs(), "give --sign error or correction")
     turned = {name: Curve(curve.position_mm, sign * curve.value, curve.u) for name, curve in curves.items()}
     constants = {name: (sign * value, u) for name, (value, u) in squareness.items()}
     return ErrorTable(turned, constants, {"source": findings.table.grid.path.name})
@@ -274,22 +275,30 @@ def squareness_in(grid: CellGrid, options: ImportOptions, form: str) -> Imported
 
 
 @dataclass
-class SquarenessRows:
-    """Reads one row after the other; ``above`` contains the cells above each column, ``asked`` whether a sign is open."""
+class SquarenessRows(Asking):
+    """Reads one row after the other; ``above`` contains the cells above each column, ``asked`` whose signs are open."""
 
     grid: CellGrid
     options: ImportOptions
     above: dict[int, list[str]] = field(default_factory=dict)
     found: dict[str, tuple[float, float]] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
-    asked: bool = False
+    asked: list[str] = field(default_factory=list)
 
     def result(self, form: str) -> Imported:
         """Return all rows as errors, with what is open."""
         if self.asked:
-            self.doubts.append(
-                "or answer for all pairs: --sign angle-above-90 (positive: the angle between the positive axes is above 90 "
-                f"degrees), angle-below-90, or rotation (the numbers are EC0Y, EB0Z, EA0Z of ISO 230-1); {_PAGE} explains them"
+            self.ask(
+                "; ".join(self.asked),
+                "sign",
+                (
+                    Choice("angle-above-90", "positive: the angle between the positive axes is above 90°"),
+                    Choice("angle-below-90", "positive: the angle between the positive axes is below 90°"),
+                    Choice("rotation", "the numbers are EC0Y, EB0Z, EA0Z of ISO 230-1"),
+                ),
+                "write EC0Y, EB0Z, EA0Z in place of pairs; or answer for all pairs: --sign angle-above-90 (positive: the angle "
+                "between the positive axes is above 90 "
+                f"degrees), angle-below-90, or rotation (the numbers are EC0Y, EB0Z, EA0Z of ISO 230-1); {_PAGE} explains them",
+                picture="squareness",
             )
         understood = {
             "squareness_urad": {name: value / RAD_PER_URAD for name, (value, _) in self.found.items()},
@@ -298,7 +307,7 @@ class SquarenessRows:
             or "as named: EC0Y, EB0Z, EA0Z of ISO 230-1; angles near 90 degrees",
         }
         errors = ErrorTable({}, self.found, {"source": self.grid.path.name})
-        return Imported(self.grid.path, form, "errors", errors, understood, tuple(self.doubts), self.grid.notes)
+        return Imported(self.grid.path, form, "errors", errors, understood, tuple(self.questions), self.grid.notes)
 
     def name_of(self, row: Sequence[str], angles: Mapping[int, Angle]) -> tuple[str | None, bool]:
         """Return the error that the words of a row name, and whether by its name in ISO 230-1; None if none or several."""
@@ -324,7 +333,7 @@ class SquarenessRows:
             raise self.grid.fail(f"{name} is a single number, but it appears again", line)
         value, u, missing = self.number(row, line, angles)
         if missing:
-            self.doubts.append(f"line {line}: the file states no {missing} of {called}; {_EXPECTED[missing]}")
+            self.ask(f"line {line}: the file states no {missing} of {called}", how=_EXPECTED[missing])
             value, u = 0.0, float("nan")
         elif abs(value - np.pi / 2) < np.radians(_MOST_DEG):  # the angle itself
             value = _ABOVE_90[name] * (value - np.pi / 2)
@@ -341,11 +350,10 @@ class SquarenessRows:
         if by_name:
             given |= {"correction": -1.0}
         elif self.options.sign not in given:
-            self.asked = True
             side = "more" if above > 0 else "less"
-            self.doubts.append(
-                f"line {line}: the sign of {called} is not clear; write {name} instead ({name} > 0: the angle between the "
-                f"positive axes is {side} than 90 degrees)"
+            self.asked.append(
+                f"line {line}: the sign of {called} is not clear ({name} > 0: the angle between the positive axes is {side} "
+                "than 90 degrees)"
             )
         return given.get(self.options.sign or "", 1.0)
 

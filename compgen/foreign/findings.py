@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from compgen.foreign.column_names import (
     known_unit,
 )
 from compgen.foreign.laser_files import Capture, format_capture
+from compgen.foreign.questions import ANGLE_UNITS, LENGTH_UNITS, Asking, Question, unit_choices
 from compgen.foreign.source import parse_number, shown
 
 # The result of an import: the object, what was understood, and what is in doubt.
@@ -70,7 +71,7 @@ class Imported:
     kind : kind of native file.
     data : the object, mm and rad.
     understood : what was read from the file or inferred, in words and numbers.
-    doubts : open questions; until the user answers them, no other command accepts the file.
+    questions : what is open; until the user answers what is required of it, no other command accepts the file.
     notes : remarks that require no decision.
     reversal : difference of both directions, if ``data`` contains only their mean.
     other_errors : errors on other sheets of a workbook of axis runs (squareness, straightness).
@@ -81,10 +82,20 @@ class Imported:
     kind: Kind
     data: Data
     understood: Mapping[str, Any]
-    doubts: tuple[str, ...] = ()
+    questions: tuple[Question, ...] = ()
     notes: tuple[str, ...] = ()
     reversal: ReversalCurves | None = None
     other_errors: ErrorTable | None = None
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What has to be answered before the file is used, each as a line for the terminal."""
+        return tuple(question.text for question in self.questions if question.required)
+
+    @property
+    def offers(self) -> tuple[str, ...]:
+        """What may be answered and need not, each as a line for the terminal."""
+        return tuple(question.text for question in self.questions if not question.required)
 
     @property
     def file_name(self) -> str:
@@ -117,6 +128,7 @@ class Imported:
             "kind": self.kind,
             "understood": dict(self.understood),
             "doubts": list(self.doubts),
+            "questions": [question.to_dict() for question in self.questions],
             "notes": list(self.notes),
         }
 
@@ -271,7 +283,7 @@ _ANGLES = {name: RAD_PER_ANGLE[name] for name in ("urad", "mrad", "arcsec", "deg
 
 
 @dataclass
-class TableFindings:
+class TableFindings(Asking):
     """One table being read; ``fields`` holds its columns by field, ``used`` the names of used columns.
 
     ``letter`` is the axis by the names of the columns. ``checked_sign`` is True if a second column confirmed the sign
@@ -282,7 +294,6 @@ class TableFindings:
     fields: Mapping[str, NamedColumn]
     options: ImportOptions
     understood: dict[str, Any] = field(default_factory=dict)
-    doubts: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     used: set[str] = field(default_factory=set)
     letter: str | None = None
@@ -312,10 +323,14 @@ class TableFindings:
             said |= {shown(column.name): column.unit for column in self.fields.values() if column.unit}
             inches = next((key for key, unit in said.items() if unit in ("in", "mil")), None)
             if inches and judged.best != "in":
-                self.doubts.append(
-                    f"{inches} is in inches, and the file states no unit of {key}; give --unit {key}=in or mm"
+                self.ask(
+                    f"{inches} is in inches, and the file states no unit of {key}",
+                    "units",
+                    unit_choices("in", "mm"),
+                    f"give --unit {key}=in or mm",
+                    key=key,
                 )
-            unit = judged.best if inches else self._weighed(f"unit of {key}", judged)
+            unit = judged.best if inches else self._weighed(key, judged, ("mm", "in", "m"))
         if unit not in MM_PER_LENGTH:
             message = f"{unit} is not a unit of length; expected positions of a linear axis"
             raise self.table.grid.fail(message, None, self.fields[key].name)
@@ -339,23 +354,35 @@ class TableFindings:
             found = {known_unit(part) for part in parts}
             unit = found.pop() if len(found) == 1 else None
         judged = unit_of_deviations(values, _ANGLES if angular else _LENGTHS, usual_si)
+        among = ANGLE_UNITS if angular else LENGTH_UNITS
         if unit is None:
-            unit = self._weighed(f"unit of {key}", judged)
+            unit = self._weighed(key, judged, among)
         elif unit not in units:
             raise InputError(
                 f"{name!r} is in {unit}; expected a unit of {'angle' if angular else 'length'}", field="--unit"
             )
         elif given is None and abs(decades_off(values, units[unit], usual_si)) > ABSURD_DECADES and judged.best != unit:
-            self.doubts.append(
-                f"{name!r} states {unit}, but the numbers look like {judged.best}; give --unit {key}=..."
+            self.ask(
+                f"{name!r} states {unit}, but the numbers look like {judged.best}",
+                "units",
+                unit_choices(*dict.fromkeys((unit, judged.best, *among))),
+                f"give --unit {key}=...",
+                key=key,
+                default=judged.best,
             )
         self.understood["unit"] = unit
         return values * units[unit]
 
-    def _weighed(self, what: str, judged: UnitVerdict) -> str:
-        key = what.rpartition(" ")[2]
+    def _weighed(self, key: str, judged: UnitVerdict, among: Sequence[str]) -> str:
         if judged.sure:
-            self.notes.append(f"the file states no {what}; by the magnitude of the numbers {judged.text()}")
+            self.notes.append(f"the file states no unit of {key}; by the magnitude of the numbers {judged.text()}")
         else:
-            self.doubts.append(f"the file states no {what} ({judged.text()}); give --unit {key}=...")
+            self.ask(
+                f"the file states no unit of {key} ({judged.text()})",
+                "units",
+                unit_choices(*dict.fromkeys((judged.best, *among))),
+                f"give --unit {key}=...",
+                key=key,
+                default=judged.best,
+            )
         return judged.best

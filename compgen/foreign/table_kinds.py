@@ -66,6 +66,17 @@ from compgen.foreign.one_axis import (
     motion,
     remarks,
 )
+from compgen.foreign.questions import (
+    AXIS,
+    Asking,
+    Choice,
+    OpenColumnsError,
+    choices_of,
+    directions,
+    errors_along,
+    signs,
+    unit_choices,
+)
 from compgen.foreign.source import parse_number, shown
 from compgen.identification.axis_tests import POSITIONING, SAME_TARGET_MM, two_way_mean
 
@@ -134,10 +145,10 @@ def _rows(findings: TableFindings) -> _Rows:
         raise InputError(f"columns of runs are given, and {fields[key].name!r} contains {key}s: exclude it with --ignore",
                          file=findings.table.grid.path, field="--map")  # fmt: skip
     if key is None and not wide:
-        raise findings.table.grid.fail(
+        raise open_columns(
+            findings,
             f"has positions but no deviations or readings; the header has {shown(', '.join(header), 200)}; "
             "give --map deviation=COLUMN, or --map run1+=COLUMN, run1-=COLUMN ... for one column per run",
-            findings.table.header_line,
         )
     if key is None:
         return _wide(findings, wide)
@@ -222,7 +233,12 @@ def _compared(findings: TableFindings, key: str) -> str:
             continue
         what = "has the opposite sign of" if found else "disagrees with"
         pair = f"{counting!r} minus target" if key == "actual" else repr(counting)
-        findings.doubts.append(f"{name!r} {what} {pair}; exclude the wrong one: --ignore COLUMN")
+        findings.ask(
+            f"{name!r} {what} {pair}",
+            "ignore",
+            choices_of((name, counting)),
+            "exclude the wrong one: --ignore COLUMN",
+        )
     return key
 
 
@@ -309,10 +325,13 @@ def _statistics(findings: TableFindings, columns: Sequence[RunColumn]) -> None:
         away = np.where(known, np.abs(printed * scale - runs.mean(axis=1)), 0.0)
         if away.max(initial=0.0) > allowed:
             k = int(np.argmax(away))
-            findings.doubts.append(
+            findings.ask(
                 f"{name!r} states {printed[k]:g} in line {findings.table.lines[k]}, the mean of "
                 f"{', '.join(repr(column.name) for column in own[:6])} is {runs[k].mean() / scale:.6g}: is a run missing, or one "
-                f"named wrongly? If the runs are right, --ignore {shown(name)}"
+                "named wrongly?",
+                "ignore",
+                (Choice(name, f"the runs are right: leave {name!r} out"),),
+                f"if the runs are right, --ignore {shown(name)}",
             )
 
 
@@ -341,9 +360,12 @@ def _deviations(findings: TableFindings, rows: _Rows, target: FloatArray, *, ang
         if not told and len(findings.runs) > 1 and not any(word in words for word in _COUNTER):
             findings.notes.append("runs are measured: their values are assumed to be measured minus target")
         elif not told and not findings.checked_sign:
-            findings.doubts.append(
-                "it is not stated whether the values are errors (measured minus target) or corrections; give --sign error or "
-                "correction"
+            findings.ask(
+                "it is not stated whether the values are errors (measured minus target) or corrections",
+                "sign",
+                signs(),
+                "give --sign error or correction",
+                picture="position",
             )
         chosen = "error"
     findings.understood["sign"] = (
@@ -359,14 +381,12 @@ def _from_readings(findings: TableFindings, rows: _Rows, target: FloatArray) -> 
     declared = findings.options.given_unit("actual") or (column.unit if column else None)
     scale = MM_PER_LENGTH.get(declared, 1.0) if declared else 1.0 / (slope.unit_ratio or 1.0)
     if slope.unit_ratio is None:
-        findings.doubts.append(
-            f"the readings follow the targets with the slope {slope.slope:.5g}, which is not a ratio of units"
-        )
+        findings.ask(f"the readings follow the targets with the slope {slope.slope:.5g}, which is not a ratio of units")
     elif abs(scale * slope.unit_ratio - 1.0) > 0.01:
-        findings.doubts.append(f"{rows.name!r} states {declared}, but one mm of travel is {slope.unit_ratio:g} in it")
+        findings.ask(f"{rows.name!r} states {declared}, but one mm of travel is {slope.unit_ratio:g} in it")
         scale = 1.0 / slope.unit_ratio
     if slope.sign < 0:
-        findings.doubts.append("the readings decrease where the targets increase: the sign of one of them is reversed")
+        findings.ask("the readings decrease where the targets increase: the sign of one of them is reversed")
     sign = -1.0 if slope.sign < 0 and findings.options.sign == "correction" else 1.0
     offset = slope.offset * scale
     if abs(offset) > 1.0:
@@ -407,12 +427,14 @@ def _axes(findings: TableFindings, row: IntArray) -> list[str]:
         return [said.pop()] * len(row)
     if said:
         other = f"but the sheet or file is named {named}" if len(said) == 1 else "several axes"
-        findings.doubts.append(f"the lines above the table give axis {', '.join(sorted(said))}, {other}; give --axis")
+        findings.ask(
+            f"the lines above the table give axis {', '.join(sorted(said))}, {other}", "axis", AXIS, "give --axis"
+        )
         return [sorted(said)[0]] * len(row)
     if named:
         findings.notes.append(f"axis {named} by the name of the sheet or file")
         return [named] * len(row)
-    findings.doubts.append(f"the axis is not stated; give --axis {', '.join(AXES)}")
+    findings.ask("the axis is not stated", "axis", AXIS, f"give --axis {', '.join(AXES)}")
     return [""] * len(row)
 
 
@@ -432,29 +454,42 @@ def _directions(
         direction = motion(target, one_way)
         if len(findings.runs) > 1 and chosen is None:
             if _alternate(target, run, value):
-                findings.doubts.append(
-                    "no run gives a direction, and odd and even runs differ like two directions; give --directions alternate "
-                    "(odd runs up, even runs down) or motion (all in the order of the rows)"
+                findings.ask(
+                    "no run gives a direction, and odd and even runs differ like two directions",
+                    "directions",
+                    directions("alternate", "motion"),
+                    "give --directions alternate (odd runs up, even runs down) or motion (all in the order of the rows)",
                 )
             else:
                 findings.notes.append("no run gives a direction: all are assumed to be in the order of the rows")
         findings.understood.setdefault("directions_from", "the order of the rows")
         if not direction.all():
             header = shown(", ".join(findings.table.header), 200)
-            findings.doubts.append(
+            findings.ask(
                 f"there is no column of directions (the header has {header}), and the order of the rows does not show them "
-                "everywhere; give --map direction=COLUMN, or --directions alternate (odd runs up, even runs down)"
+                "everywhere",
+                "directions",
+                directions("alternate"),
+                "give --map direction=COLUMN, or --directions alternate (odd runs up, even runs down)",
             )
         return direction, cycles(direction, one_way)
     if not label.all():
-        findings.doubts.append("some columns give a direction and some do not; give --directions alternate or motion")
+        findings.ask(
+            "some columns give a direction and some do not",
+            "directions",
+            directions("alternate", "motion"),
+            "give --directions alternate or motion",
+        )
     turned = _contradicted(target, one_way, label)
     if chosen == "motion" or (turned and chosen is None):
         label = -label if turned else label
     if turned and chosen is None:
-        findings.doubts.append(
+        findings.ask(
             "the rows labelled as positive (forward) descend and the others ascend; direction follows the motion, so the labels "
-            "were swapped: confirm with --directions motion, or keep them with --directions labels"
+            "were swapped",
+            "directions",
+            directions("motion", "labels"),
+            "confirm with --directions motion, or keep them with --directions labels",
         )
     findings.understood.setdefault("directions_from", "the labels" if chosen != "motion" else "the order of the rows")
     return label, run if run.any() else cycles(
@@ -515,6 +550,22 @@ _MEANING = (
 )
 
 
+def _meanings(names: Sequence[str]) -> tuple[Choice, ...]:
+    """What a positive number may mean for errors that are named in words: the tool relative to the workpiece."""
+    said = ", ".join(_towards(name) for name in names[:3])
+    return (
+        Choice("error", f"positive: the tool {said}"),
+        Choice("correction", f"negative: the tool {said}"),
+    )
+
+
+def _towards(name: str) -> str:
+    """Return where a positive error moves or turns the tool."""
+    if name[1] in "ABC":
+        return f"turns right-handed about +{AXES['ABC'.index(name[1])]} ({name})"
+    return f"is too far towards +{name[1]} ({name})"
+
+
 def motion_columns(findings: TableFindings) -> list[MotionColumn]:
     """Return the columns of error motions, if one is named in words, or has a run or a direction; otherwise none."""
     given = {name: column.name for name, column in findings.fields.items() if name in CURVE_NAMES}
@@ -542,11 +593,12 @@ def error_motions(findings: TableFindings, columns: Sequence[MotionColumn]) -> t
     for column in columns:
         name = column.error(letter)
         if name is None or not name.endswith(letter):
-            raise findings.table.grid.fail(
+            raise OpenColumnsError(
                 f"which error of {letter} this is remains open; name it by --map E..{letter}=COLUMN (EB{letter}: rotation about "
                 f"Y, EY{letter}: straightness in Y), or exclude it: --ignore {shown(column.run.name)}",
-                findings.table.header_line,
-                column.run.name,
+                file=findings.table.grid.path,
+                line=findings.table.header_line,
+                field=f"column {column.run.name}",
             )
         found.setdefault(name, []).append(column.run)
         read += [] if column.exact or findings.options.sign else [f"{shown(column.run.name)} is {name}"]
@@ -556,13 +608,18 @@ def error_motions(findings: TableFindings, columns: Sequence[MotionColumn]) -> t
         others = [
             runs[0].name for runs in found.values() if not any(f"{shown(runs[0].name)} is" in text for text in read)
         ]
-        also = f"; --sign applies to {', '.join(map(shown, others))} as well" if others else ""
-        findings.doubts.append(
-            f"{', '.join(read)} (Z vertical; otherwise --map), but their sign is not stated; give {_MEANING}{also}"
+        also = f"; the answer applies to {', '.join(map(shown, others))} as well" if others else ""
+        kinds = {name[1] in "ABC" for name in found}
+        findings.ask(
+            f"the sign of {', '.join(read)} is not stated (Z counts as vertical){also}",
+            "sign",
+            _meanings(sorted(found)),
+            f"give {_MEANING}; where Z is not vertical, --map ERROR=COLUMN",
+            picture="" if len(kinds) > 1 else f"{'rotation' if True in kinds else 'straightness'} {min(found)}",
         )
     words = unaccented(" ".join([*findings.table.header, *findings.table.metadata, *findings.table.metadata.values()]))
     if not read and findings.options.sign is None and any(word in words for word in _COUNTER):
-        findings.doubts.append("the file mentions corrections; give --sign error or correction")
+        findings.ask("the file mentions corrections", "sign", signs(), "give --sign error or correction")
     findings.used |= {findings.fields[key].name for key in ("axis", "direction", "run") if key in findings.fields}
     results = [_over_position(findings, name, runs) for name, runs in found.items()]
     metadata = metadata_of(findings, row_data_of(findings, "errors"))
@@ -649,10 +706,7 @@ def lengths_of(findings: TableFindings) -> Lengths:
 def _positions(findings: TableFindings, keys: str) -> FloatArray:
     missing = [key for key in keys if key not in findings.fields]
     if missing:
-        raise findings.table.grid.fail(
-            f"has no column of commanded {missing[0].upper()}; give --map {missing[0]}=COLUMN",
-            findings.table.header_line,
-        )
+        raise open_columns(findings, f"has no column of commanded {missing[0].upper()}; give --map {missing[0]}=COLUMN")
     raw = [findings.numbers(key) for key in keys]
     longest = int(np.argmax([np.ptp(values) for values in raw]))
     first = findings.positions_mm(keys[longest], raw[longest])
@@ -681,14 +735,23 @@ def _length_scale(
     if declared is not None and declared not in MM_PER_LENGTH:
         raise findings.table.grid.fail(f"{declared} is not a unit of length", None, findings.fields["length"].name)
     if declared is None and unit is None:
-        findings.doubts.append(
-            "the file states no unit of the lengths, and the points do not show it; give --unit length=mm"
+        findings.ask(
+            "the file states no unit of the lengths, and the points do not show it",
+            "units",
+            unit_choices("mm", "m", "um", "in"),
+            "give --unit length=mm",
+            key="length",
         )
     elif declared is None:
         findings.notes.append(f"the lengths fit the points in {unit}")
     elif unit is not None and unit != declared:
-        findings.doubts.append(
-            f"the declared unit of the lengths is {declared}, but they fit the points in {unit}; give --unit length=..."
+        findings.ask(
+            f"the declared unit of the lengths is {declared}, but they fit the points in {unit}",
+            "units",
+            unit_choices(unit, declared),
+            "give --unit length=...",
+            key="length",
+            default=unit,
         )
     if sign < 0:
         findings.notes.append("the lengths decrease with growing distance: their sign was reversed")
@@ -790,7 +853,7 @@ def _measured(findings: TableFindings, key: str, position: FloatArray) -> FloatA
     if np.ptp(position) > 0:
         slope = slope_of(position, values * scale)
         if slope.unit_ratio != 1.0 or slope.sign < 0:
-            findings.doubts.append(f"{name!r} follows the command with the slope {slope.slope:.5g}, not 1")
+            findings.ask(f"{name!r} follows the command with the slope {slope.slope:.5g}, not 1")
     return values * scale - position
 
 
@@ -847,7 +910,13 @@ def circles_of(findings: TableFindings) -> Circles:
     unit = findings.unit("angle") or ("deg" if np.ptp(angle) > 7.0 else None)
     if unit is None:
         unit = "rad"
-        findings.doubts.append("the file states no unit of the angle; give --unit angle=rad or deg")
+        findings.ask(
+            "the file states no unit of the angle",
+            "units",
+            unit_choices("deg", "rad"),
+            "give --unit angle=rad or deg",
+            key="angle",
+        )
     given, stated = findings.options.plane, _above(findings, "plane")[0]
     if given is not None and _plane(stated) not in (-1, list(PLANES).index(given)):
         text = f"the file states the plane {shown(stated)}; give --plane {given} for files only that do not state another one"
@@ -858,8 +927,12 @@ def circles_of(findings: TableFindings) -> Circles:
         planes = [given or stated]
     plane = np.array([_plane(name) for name in planes], dtype=np.int64)
     if (plane < 0).any():
-        findings.doubts.append(
-            "the file does not state the plane as XY, YZ or ZX; give --plane, if angles count from its first axis"
+        findings.ask(
+            "the file does not state the plane as XY, YZ or ZX, in which angles count from the first axis to the second",
+            "plane",
+            choices_of(tuple(PLANES)),
+            "give --plane, if angles count from its first axis",
+            picture="plane",
         )
         plane = np.zeros(1, dtype=np.int64)
     findings.understood["plane"] = ", ".join(list(PLANES)[k] for k in np.unique(plane))
@@ -918,7 +991,7 @@ def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, Floa
     elif number is not None and unit in MM_PER_LENGTH:
         radius_mm = number * MM_PER_LENGTH[str(unit)]
     else:
-        findings.doubts.append("the file states no nominal radius with its unit; give --radius-mm")
+        findings.ask("the file states no nominal radius with its unit", "radius_mm", (), "give --radius-mm")
     if not 0.0 < radius_mm <= LARGEST_RADIUS_MM:
         raise table.grid.fail(f"{radius_mm:g} mm is not a radius; expected above 0, up to {LARGEST_RADIUS_MM:g} mm")
     findings.understood["radius_mm"] = radius_mm
@@ -958,8 +1031,12 @@ def _radial(findings: TableFindings) -> tuple[IntArray, IntArray, IntArray, Floa
         direction = np.full(len(rows), stated_turn[0])
     else:
         direction = np.ones(len(rows), dtype=np.int64)
-        findings.doubts.append(
-            "no column states the direction (CCW, CW); give --map direction=COLUMN, or add such a column"
+        findings.ask(
+            "no column states the direction (CCW, CW)",
+            "columns",
+            choices_of(table.header),
+            "give --map direction=COLUMN, or add such a column",
+            key="direction",
         )
     run = labels_of(findings, fields["run"]) if "run" in fields else np.zeros(len(rows), dtype=np.int64)
     if "deviation" in fields:
@@ -1003,9 +1080,12 @@ def _check_sense(findings: TableFindings, angle_rad: FloatArray, direction: IntA
     apart = float(np.linalg.norm(centres[0] - centres[1]))
     mirrored = float(np.linalg.norm(centres[0] - centres[1] * [1.0, -1.0]))
     if apart > _MIRRORED_UM and mirrored < _MIRRORED * apart:
-        findings.doubts.append(
+        findings.ask(
             f"the centres of both directions are mirrored ({apart:.3g} um apart): angles of one direction seem to count the "
-            "other way; correct them, or give --directions labels if they are right"
+            "other way",
+            "directions",
+            (Choice("labels", "they are right as the file has them"),),
+            "correct them, or give --directions labels if they are right",
         )
 
 
@@ -1057,7 +1137,7 @@ def import_table(grid: CellGrid, options: ImportOptions, form: str = "table") ->
         kind,
         data,
         findings.understood,
-        tuple(dict.fromkeys(findings.doubts)),
+        tuple(findings.questions),
         tuple(dict.fromkeys(findings.notes)),
         reversal,
     )
@@ -1098,20 +1178,24 @@ def _kind(findings: TableFindings) -> Kind:
     if "angle" in fields:
         return "circle"
     header = ", ".join(findings.table.header)
-    raise findings.table.grid.fail(
+    raise open_columns(
+        findings,
         f"its columns are not recognised: {shown(header)}; assign them: --map position=COLUMN --map deviation=COLUMN (axis "
         "runs), x y z length (lengths), x y z dx dy dz (deviations), error position value (errors)",
-        findings.table.header_line,
     )
+
+
+def open_columns(findings: TableFindings, message: str) -> OpenColumnsError:
+    """Return the error for columns that the user has to name, with the line of the header."""
+    return OpenColumnsError(message, file=findings.table.grid.path, line=findings.table.header_line)
 
 
 def _need(findings: TableFindings, *keys: str) -> None:
     for key in keys:
         if key not in findings.fields:
             header = ", ".join(findings.table.header)
-            raise findings.table.grid.fail(
-                f"no column is recognised as {key}; the header has {shown(header)}; give --map {key}=COLUMN",
-                findings.table.header_line,
+            raise open_columns(
+                findings, f"no column is recognised as {key}; the header has {shown(header)}; give --map {key}=COLUMN"
             )
 
 
@@ -1127,15 +1211,18 @@ def _along_axes(findings: TableFindings) -> tuple[Data, ReversalCurves | None, K
         ((letter, runs),) = found.items()
         check_error(error, letter or None, angular=angular)
         findings.understood |= _described(runs, 1e-6 if angular else MM_PER_UM)
-        findings.doubts[:] = [text for text in findings.doubts if "--axis" not in text]
+        findings.questions[:] = [asked for asked in findings.questions if asked.option != "axis"]
         table, reversal = errors_of(runs, error, metadata)
         return table, reversal, "errors"
     above = findings.table.metadata
     told = set(motions_in(" ".join([*findings.table.grid.notes[:1], path.stem, *above, *above.values()])))
     if findings.options.kind is None and told & {"straightness", "yaw", "roll"}:
-        findings.doubts.append(
-            f"the lines above the table, or a name, mention {', '.join(sorted(told))}: give --error NAME (EYX: straightness of "
-            "X in Y, ECX: yaw), or --kind axis if these are positioning deviations"
+        own = next(iter(found)) if len(found) == 1 else ""
+        findings.ask(
+            f"the lines above the table, or a name, mention {', '.join(sorted(told))}",
+            "error",
+            errors_along(own),
+            "give --error NAME (EYX: straightness of X in Y, ECX: yaw), or --kind axis if these are positioning deviations",
         )
     findings.understood["axes"] = {letter or "?": _described(runs, MM_PER_UM) for letter, runs in found.items()}
     return runs_of(found, str(path), metadata), None, "axis"
@@ -1174,7 +1261,11 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
     names = ", ".join(shown(name) for name, _ in parts)
     if len(parts) == 1:
         return first
-    doubts = [f"sheet {name}: {text}" for name, item in parts for text in item.doubts]
+    asking = Asking(
+        questions=[
+            replace(asked, reason=f"sheet {name}: {asked.reason}") for name, item in parts for asked in item.questions
+        ]
+    )
     errors = [item.data for _, item in parts if isinstance(item.data, ErrorTable)]
     other_errors = None
     if kinds == {"axis"} or kinds == {"axis", "errors"}:
@@ -1190,9 +1281,12 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
             if other_errors is not None and name in other_errors.curves:
                 mean, _, _ = two_way_mean(runs.position_mm[rows], runs.direction[rows], runs.deviation_mm[rows])
                 away = float(np.abs(mean.value - other_errors.curves[name].at(mean.position_mm)).max()) / MM_PER_UM
-                doubts.append(
+                asking.ask(
                     f"a sheet contains {name}, and the runs of {AXES[axis]} give it, too (their means differ by up to "
-                    f"{away:.3g} um); exclude one sheet with --ignore SHEET"
+                    f"{away:.3g} um)",
+                    "ignore",
+                    choices_of([sheet for sheet, _ in parts]),
+                    "exclude one sheet with --ignore SHEET",
                 )
     elif kinds == {"errors"}:
         data = _joined_errors(first, errors)
@@ -1212,7 +1306,7 @@ def merged_sheets(parts: Sequence[tuple[str, Imported]]) -> Imported:
         kind=kind,
         data=data,
         understood=understood,
-        doubts=tuple(doubts),
+        questions=tuple(asking.questions),
         notes=notes,
         other_errors=other_errors,
         reversal=reversal,

@@ -210,3 +210,14 @@ def test_the_stated_uncertainty_of_a_level_is_its_u(tmp_path):
     assert 1e6 * found.data.curves["EBX"].u == pytest.approx([5.0] * 3)
     with pytest.raises(InputError, match="uncertainty of a reading"):
         import_file(written(tmp_path, text.format("u: 3 um\n")))
+
+
+@pytest.mark.parametrize("word", ["längs", "laengs", "entlang"])
+def test_a_level_along_x_on_the_spindle_side_in_german(tmp_path, word):
+    """The end at +X sinks by 0.02 mm/m over 400 mm: X turns right-handed about +Y by 20 urad."""
+    path = tmp_path / "l.csv"
+    path.write_text(
+        f"X-Achse\nPosition [mm];Richtwaage {word} X [mm/m]\n0;0,00\n200;-0,01\n400;-0,02\n", encoding="utf-8"
+    )
+    item = import_file(path, ImportOptions(mounted="spindle"))
+    assert {name: curve.value[-1] for name, curve in item.data.curves.items()} == pytest.approx({"EBX": 20e-6})

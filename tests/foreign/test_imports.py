@@ -590,11 +590,14 @@ def test_where_the_other_axes_stood_is_asked_and_kept(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text(LINE_TABLE, encoding="utf-8")
     silent = import_file(path, ImportOptions(axis="X", sign="error"))
-    assert any("where Y and Z stood" in note and "--line Y=MM,Z=MM" in note for note in silent.notes)
+    assert any("where Y and Z stood" in note and "--line Y=MM,Z=MM" in note for note in silent.offers)
+    assert silent.doubts == ()
+    (asked,) = silent.questions
+    assert (asked.option, asked.key, asked.required, asked.picture) == ("line", "Y,Z", False, "line")
     half = import_file(path, ImportOptions(axis="X", sign="error", line="y = -250"))
-    assert any("where Z stood" in note for note in half.notes)
+    assert any("where Z stood" in note for note in half.offers)
     stated = import_file(path, ImportOptions(axis="X", sign="error", line="Y=-250, Z=-100.5"))
-    assert not any("stood" in note for note in stated.notes)
+    assert not any("stood" in note for note in (*stated.notes, *stated.offers))
     (text,) = stated.files().values()
     (tmp_path / "x.axis.csv").write_text(text, encoding="utf-8")
     assert read_axis_runs(tmp_path / "x.axis.csv").line_mm()[1].tolist() == [100.0, -250.0, -100.5]

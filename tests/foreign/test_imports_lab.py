@@ -522,7 +522,7 @@ def test_a_sheet_of_squareness_beside_sheets_of_axes(tmp_path, rows, expected_ur
 @pytest.mark.parametrize(
     ("rows", "doubt"),
     [
-        ([["XY", 25, "µrad"]], "the sign of 'XY' is not clear; write EC0Y instead"),
+        ([["XY", 25, "µrad"]], "the sign of 'XY' is not clear (EC0Y > 0"),
         ([["EC0Y", 25]], "no unit of 'EC0Y'"),
         ([["Rechtwinkligkeit"], ["Spindel", 25, "µm"]], "'Squareness' contains numbers that are not understood"),
         ([["a", "b"], ["c", 1, 2, 3], ["d", 4, 5, 6]], "'Squareness' contains numbers that are not understood"),

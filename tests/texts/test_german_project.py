@@ -215,14 +215,12 @@ def test_the_diagnosis_page_and_its_list_say_the_same_in_german(tmp_path, capsys
     assert "| | vorher (µm effektiv) | nachher |" in listed
 
 
-def test_a_question_is_its_message_without_what_answers_it():
+def test_a_question_and_how_it_is_answered_are_two_messages():
     german = texts_of("de")
-    assert german.question("the file does not state X, Y or Z") == "die Datei nennt weder X, Y noch Z"
-    # only there: a message is not translated in part
-    part = "contains such readings, which nothing here explains"
-    texts = Texts({f"{part}; give --option": "enthält solche Messwerte, die hier nichts erklärt; --option angeben"})
-    assert texts.text(f"{part}; give another option") == f"{part}; give another option"
-    assert texts.question(part) == "enthält solche Messwerte, die hier nichts erklärt"
+    assert german.lines("the file does not state X, Y or Z") == "die Datei nennt weder X, Y noch Z"
+    assert german.lines("the file does not state X, Y or Z; give --axis").startswith(
+        "die Datei nennt weder X, Y noch Z; "
+    )
 
 
 def test_effects_and_settings_of_all_controls_have_german_texts():

@@ -15,7 +15,7 @@ from compgen.accuracy.circularity import about_centre, circle_groups
 from compgen.data.circles import PLANES, Circles, arcs_of
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
-from compgen.data.names import AXES, COVERAGE, MM_PER_UM, error_named
+from compgen.data.names import AXES, COVERAGE, MM_PER_UM, describe_error, error_named
 from compgen.drawing.charts import (
     BOX,
     CYCLE,
@@ -52,19 +52,6 @@ class CurveSeries:
         if self.u is not None and np.isfinite(self.u).any():
             found["U"] = rounded(COVERAGE * self.u, 2)
         return found
-
-
-def describe_error(name: str) -> str:
-    """Return an error in words, e.g. ``"Straightness of X in Y"``."""
-    error = error_named(name)
-    axis = AXES[error.axis]
-    if error.kind == "linear":
-        return (
-            f"Straightness of {axis} in {AXES[error.direction]}" if error.is_straightness else f"Positioning of {axis}"
-        )
-    if error.kind == "squareness":
-        return {"EC0Y": "Squareness of Y to X", "EB0Z": "Squareness of Z to X", "EA0Z": "Squareness of Z to Y"}[name]
-    return f"Roll of {axis}" if error.direction == error.axis else f"Rotation of {axis} about {AXES[error.direction]}"
 
 
 def draw_proposed(entries: Sequence[Mapping[str, Any]]) -> list[Picture]:

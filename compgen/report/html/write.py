@@ -23,7 +23,7 @@ from compgen.accuracy.field import ErrorSource, Figure, error_source, volume_fig
 from compgen.data.error_table import ErrorTable
 from compgen.data.files import OutputFolder, json_text, json_values, read_bytes, read_text
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, error_named
+from compgen.data.names import AXES, COVERAGE, CURVE_NAMES, describe_error, error_named
 from compgen.drawing.charts import LABEL, Picture, page_assets
 from compgen.errors import CompgenError, number_text, one_line, um_text
 from compgen.identification.covariance import covariance_named_by
@@ -39,7 +39,6 @@ from compgen.report.html.folder import (
     table_curves,
 )
 from compgen.report.html.pictures import (
-    describe_error,
     draw_circles,
     draw_curve,
     draw_proposed,
