@@ -36,10 +36,12 @@ _NO_PRIOR = 1e3
 _STEPS, _SETTLED = 30, 1e-4
 #: Steps of the difference quotients: mm, rad.
 _STEP_MM, _STEP_RAD = 1e-3, 1e-6
+#: Tilts from which the derivatives by the linear axes are calculated again, rad.
+_FAR_RAD = 2e-3
 #: Groups of poses that are left out in turn.
 _FOLDS = 5
-#: Precision that keeps what is free in the equations apart from rounding, relative to the largest.
-_RIDGE = 1e-13
+#: Precision of what is free, mm^-2: it keeps the equations solvable and is far below what any reading says.
+_RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,11 @@ class Problem:
     @cached_property
     def _linear_design(self) -> tuple[FloatArray, ...]:
         """Derivatives (n, 3, r) of the tips by what is unknown of the linear axes."""
+        return self._design_with(RotaryErrors())
+
+    def _design_with(self, rotary: RotaryErrors) -> tuple[FloatArray, ...]:
         return tuple(
-            at.design(linear_columns(self.machine, part.joint_mm, part.angle_deg, part.tool_mm)[:, :3])
+            at.design(linear_columns(self.machine, part.joint_mm, part.angle_deg, part.tool_mm, rotary)[:, :3])
             for part, at in zip(self.parts, self._linear_at, strict=True)
         )
 
@@ -165,9 +170,15 @@ class Problem:
             step[j] = _STEP_MM if unit_of(name) == "um" else _STEP_RAD
             for found, high, low in zip(by_error, self.tips(x + step), self.tips(x - step), strict=True):
                 found[:, :, j] = (high - low) / (2.0 * step[j])
+        tilts = [value for name, value in zip(self.names, x, strict=False) if unit_of(name) != "um"]
+        linear = (
+            self._linear_design
+        )  # of a machine without errors: near enough unless its axes are far off, or nothing is assumed
+        if np.abs(tilts).max(initial=0.0) > _FAR_RAD:
+            linear = self._design_with(RotaryErrors({}, constants_of(self.names, x[:k], np.zeros(k))))
         columns = np.zeros((self.rows[-1].stop, len(self.sizes)))
         for part, tip, own, rows, turned, straight in zip(
-            self.parts, tips, self.own, self.rows, by_error, self._linear_design, strict=True
+            self.parts, tips, self.own, self.rows, by_error, linear, strict=True
         ):
             by_tip, columns[rows, own] = part.slopes(tip, x[own])
             columns[rows, :k] = np.einsum("mi,mij->mj", by_tip, turned[part.of_pose])
@@ -204,7 +215,7 @@ def solve(problem: Problem, u_mm: FloatArray, start: FloatArray | None = None) -
         jacobian = problem.columns(x) * size / u_mm[:, None]
         residual = problem.residual(x) / u_mm
         normal = jacobian.T @ jacobian + np.diag(precision)
-        normal[free, free] += _RIDGE * np.diag(normal).max()
+        normal[free, free] += _RIDGE
         step = np.linalg.solve(normal, -(jacobian.T @ residual) - precision * x / size)
         x = x + step * size
         if np.abs(jacobian @ step).max() < _SETTLED:
@@ -225,7 +236,7 @@ def information(problem: Problem, x: FloatArray, u_mm: FloatArray) -> FloatArray
     jacobian = problem.columns(x) * np.where(free, 1.0, problem.sizes) / u_mm[:, None]
     normal = jacobian.T @ jacobian
     rest = np.arange(k, len(free))
-    normal[rest, rest] += np.where(free[k:], _RIDGE * np.diag(normal).max(), 1.0)
+    normal[rest, rest] += np.where(free[k:], _RIDGE, 1.0)
     eliminated = np.linalg.solve(normal[k:, k:], normal[k:, :k])
     return np.asarray(normal[:k, :k] - normal[:k, k:] @ eliminated)
 
@@ -392,7 +403,7 @@ def left_out(problem: Problem, x: FloatArray, u_mm: FloatArray, zero: FloatArray
         inside = fold != k
         weighted = columns[inside] / u_mm[inside, None] ** 2
         normal = weighted.T @ columns[inside] + np.diag(prior)
-        normal[free, free] += _RIDGE * np.diag(normal).max()
+        normal[free, free] += _RIDGE
         step = np.linalg.solve(normal, -(weighted.T @ residual[inside]) - prior * x)
         after += float(np.sum((residual + columns @ step)[~inside] ** 2))
         own = np.linalg.lstsq(columns[inside, m:], -zero[inside], rcond=1e-12)[0]

@@ -102,21 +102,26 @@ _STEP_MM, _STEP_RAD = 1e-3, 1e-6
 
 
 def linear_columns(
-    machine: Machine, position_mm: FloatArray, angle_deg: Mapping[str, FloatArray], tool_mm: FloatArray | None = None
+    machine: Machine,
+    position_mm: FloatArray,
+    angle_deg: Mapping[str, FloatArray],
+    tool_mm: FloatArray | None = None,
+    rotary: RotaryErrors | None = None,
 ) -> FloatArray:
     """C with six rows: derivative of tip and orientation (n, 6) by the 21 errors of the linear axes, (n, 6, 21).
 
-    Central differences of the exact chain at zero errors, mm and rad: tip in the workpiece frame, which turns with the table.
+    Central differences of the exact chain at zero errors of the linear axes, mm and rad: tip in the workpiece frame, which turns
+    with the table. ``rotary`` are errors of the rotary axes; None: none.
     """
-    count = len(position_mm)
-    straight = pose_of_values(machine, np.zeros((count, 21)), RotaryErrors(), position_mm, angle_deg, tool_mm)[1]
+    count, rotary = len(position_mm), RotaryErrors() if rotary is None else rotary
+    straight = pose_of_values(machine, np.zeros((count, 21)), rotary, position_mm, angle_deg, tool_mm)[1]
     columns = np.zeros((count, 6, len(ERROR_NAMES)))
     for k, name in enumerate(ERROR_NAMES):
         step = _STEP_MM if name[1] in AXES else _STEP_RAD
         values, ends = np.zeros((count, 21)), []
         for sign in (1.0, -1.0):
             values[:, k] = sign * step
-            tip, turned = pose_of_values(machine, values, RotaryErrors(), position_mm, angle_deg, tool_mm)
+            tip, turned = pose_of_values(machine, values, rotary, position_mm, angle_deg, tool_mm)
             ends.append(np.hstack([tip, rotation_between(turned, straight)]))
         columns[:, :, k] = (ends[0] - ends[1]) / (2.0 * step)
     return columns
