@@ -119,7 +119,7 @@ def _squareness(machine: Machine, errors: ErrorTable) -> list[str]:
     """What the squareness errors are over the travel."""
     listed = [_of_squareness(machine, errors, name) for name in SQUARENESS_NAMES if name in errors.squareness]
     joined = ", ".join(listed)
-    return [f"squareness: {joined}"] if listed else ["squareness: not measured"]
+    return [f"squareness over the travel: {joined}"] if listed else ["squareness: not measured"]
 
 
 def _of_squareness(machine: Machine, errors: ErrorTable, name: str) -> str:
