@@ -95,6 +95,10 @@ counts_per_mm = { X = 1000.0, Y = 2000.0, Z = -1500.0 }
 build = "xy-only"
 [controllers.ecmc]
 version = "11.0.8"
+[controllers.centroid]
+sign = "correction"
+values = "mm"
+
 [controllers.weihong]
 sign = "error"
 [controllers.mach4]
