@@ -57,7 +57,7 @@ system:
 lint: .venv/ready-dev
 	$(BIN)/ruff check compgen tests examples docs benchmarks
 	$(BIN)/ruff format --check compgen tests examples docs benchmarks
-	$(BIN)/mypy --num-workers 2
+	$(BIN)/mypy
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "compgen needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 1; }

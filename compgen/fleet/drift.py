@@ -36,6 +36,7 @@ from compgen.fleet.decisions import excluded
 from compgen.fleet.records import MachineRecord, active_of
 from compgen.fleet.store import Store
 from compgen.identification.covariance import error_design
+from compgen.identification.posterior import symmetric_root
 
 # Trend of one figure over time: weighted regression plus a random walk, temperature and sudden steps.
 #
@@ -356,9 +357,7 @@ def forecast(
     for k, part in enumerate(trend.components):  # the number of exits drawn from each follows its share
         generator = np.random.default_rng([SEED, k])
         count = max(int(round(PATHS * part.share)), 1)
-        values, vectors = np.linalg.eigh(part.state_covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        state = part.state + generator.standard_normal((count, 2)) @ root.T
+        state = part.state + generator.standard_normal((count, 2)) @ symmetric_root(part.state_covariance)
         path = state[:, :1] - reference + state[:, 1:] * days
         if part.q > 0.0:
             steps = generator.standard_normal((count, len(days) - 1)) * np.sqrt(part.q * np.diff(days))

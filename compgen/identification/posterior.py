@@ -340,8 +340,9 @@ class FieldSpread:
         n, _, r = self.factor.shape
         found = (self.factor.reshape(3 * n, r) @ random.standard_normal((r, count))).T.reshape(count, n, 3)
         for item in self.between:
-            root = root_of(item.left)
-            values = (random.standard_normal((count, root.shape[1])) @ root.T)[:, item.level]
+            # of equal eigenvalues any directions are right, so that those of two computers differ; this root has none
+            root = symmetric_root(item.left)
+            values = (random.standard_normal((count, len(root))) @ root)[:, item.level]
             for output in np.flatnonzero(item.column.any(axis=0)):
                 found[:, :, output] += values * item.column[:, output]
         return np.asarray(found)
@@ -526,6 +527,12 @@ def root_of(covariance: FloatArray) -> FloatArray:
     values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
     used = values > 1e-10 * max(float(values[-1]), 1e-300)
     return np.asarray(directions[:, used] * np.sqrt(values[used]))
+
+
+def symmetric_root(covariance: FloatArray) -> FloatArray:
+    """The symmetric square root of a covariance that may be singular: unlike any other factor there is only one."""
+    values, directions = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray((directions * np.sqrt(np.maximum(values, 0.0))) @ directions.T)
 
 
 def posterior_of_values(
