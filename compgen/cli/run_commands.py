@@ -271,9 +271,11 @@ def run_command(
 
         read_certificate(certificate, complete=False)
     if heat := [name for name in controller if name in HEAT_OUTPUTS]:
-        message = f"{heat[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml "
-        f"--controller {heat[0]}"
-        raise InputError(message, field="--controller")
+        raise InputError(
+            f"{heat[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml --controller "
+            f"{heat[0]}",
+            field="--controller",
+        )
     turned = _rotary_run(machine, measurements, controller, out, options, allow_unverified)
     if turned is not None:
         turned.linear = replace(turned.linear, instrument=instrument, stated=stated, answers=answers, active=active)
