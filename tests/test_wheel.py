@@ -8,9 +8,11 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from compgen.resources import VERSION, data_folder
 
@@ -138,6 +140,23 @@ def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
     assert {"sphinx", "myst-parser", "furo"} <= set(docs) - set(dev)
     assert all(docs[name] == run[name] for name in docs.keys() & run.keys())
     assert run["numpy"][1] > 20  # the wheels of all platforms, not of one
+
+
+def test_a_pin_has_the_extras_that_other_packages_ask_for():
+    """With hashes pip refuses `coverage[toml]` where only `coverage` is pinned, as soon as there is a newer release."""
+    text = (ROOT / "requirements-dev.txt").read_text()
+    pinned = dict(re.findall(r"^([a-z0-9._-]+)(?:\[(.*)\])?==", text, re.MULTILINE))
+    asked = 0
+    for name in pinned:
+        try:
+            requirements = [Requirement(item) for item in metadata.requires(name) or ()]
+        except metadata.PackageNotFoundError:  # of another system
+            continue
+        for item in requirements:
+            if item.extras and (item.marker is None or item.marker.evaluate({"extra": ""})):
+                assert item.extras <= set(pinned[item.name].split(",")), f"{name} asks for {item}"
+                asked += 1
+    assert asked >= 1  # pytest-cov asks for coverage[toml]
 
 
 def test_make_installs_nothing_without_hashes():
