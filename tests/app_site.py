@@ -110,6 +110,11 @@ class Page:
         self._then(lambda: self.browser.ask(f"{find}.click()"))
         self.settle()
 
+    def send(self, selector):
+        """Send the form that a field is in, and wait for the next page and its result."""
+        self._then(lambda: self.browser.ask(f"document.querySelector({selector!r}).closest('form').requestSubmit()"))
+        self.settle()
+
     def settle(self):
         """Wait until nothing runs and the page shows the result."""
         until = time.monotonic() + PATIENCE_S

@@ -9,6 +9,7 @@ import click
 
 from compgen.cli.common import NUMBER, PATH, json_option, stopped_by_signals
 from compgen.cli.terminal import answer, complain
+from compgen.data.files import OutputFolder
 from compgen.errors import InputError, doubled, visible_line
 
 _NAME = re.compile(r"[A-Za-z][\w-]{0,40}")
@@ -69,10 +70,10 @@ def log_command(source: str, sensors: tuple[str, ...], out: Path, interval: floa
         raise InputError("must end with .temperatures.csv", file=out, field="--out")
     if out.exists():
         raise InputError("exists already; give another name, so that no day is lost", file=out)
-    if not out.absolute().parent.is_dir():
-        raise InputError("the folder does not exist", file=out.absolute().parent)
+    OutputFolder(out.absolute().parent)  # refused before the first reading if it cannot be written
     keys = _sensors(sensors)
     recorder = Recorder(source_named(source, keys), tuple(keys), out, interval, source)
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with stopped_by_signals() as stop:
         done = recorder.run(stop, hours * 3600.0, complain)
     data = {

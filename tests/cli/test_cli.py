@@ -531,7 +531,11 @@ def output_cases(small_machine_file, small_lengths_file, errors_file, points_fil
     program.write_text("G21 G90 G17 G54\nG0 X0 Y0 Z-100\nG1 X50 F100\nM2\n")
     drift = points_file.with_name("a.drift.csv")
     drift.write_text("time_s,temp_a_c,dx_um\n0,20,0\n60,21,1\n")
+    logger = points_file.with_name("logger.csv")
+    logger.write_text("time_s,T\n0,20.5\n")
+    once = ("--interval", "0.1", "--hours", "0.0001")
     return {
+        "log": (logger, "--sensor", "ambient=T", *once, "--out", out / "day.temperatures.csv"),
         "heat": (small_machine_file, drift, "--out", out),
         "correct": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
         "part": (small_machine_file, program, "--errors", errors_file, "--wcs", "G54=0,0,0", "--out", out),
@@ -586,6 +590,7 @@ WRITING = [
     "compare",
     "diagnose",
     "heat",
+    "log",
 ]
 
 

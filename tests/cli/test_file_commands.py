@@ -374,7 +374,15 @@ def test_the_written_file_passes_the_check_and_is_planned_and_simulated(call, tm
     assert [len(axis.nodes_mm) for axis in machine.axes] == [9, 5, 6]
     # what must be stated before the section can be read is left as a comment, with the reason
     text = Path("my-mill.toml").read_text()
-    assert set(CONTROLLERS) - set(machine.controllers) == {"ecmc", "fagor-8055", "mach4", "pmac", "ucnc", "weihong"}
+    assert set(CONTROLLERS) - set(machine.controllers) == {
+        "centroid",
+        "ecmc",
+        "fagor-8055",
+        "mach4",
+        "pmac",
+        "ucnc",
+        "weihong",
+    }
     assert "# open: [controllers.pmac] counts_per_mm is missing" in text and "\n# counts_per_mm = ... " in text
     assert "# open: [controllers.mitsubishi] mode is missing" in text and '\n# sign = "error" ' in text
     code, stdout, stderr = call("check", "my-mill.toml")
