@@ -32,6 +32,8 @@ MADE = {
     "dialects.word_pattern": _DIALECTS,
     "dialects.head": [(dialect.head(), "match") for dialect in DIALECTS.values()],
     "dialects.without_words": [(dialect.without_words(), "fullmatch") for dialect in DIALECTS.values()],
+    "dialects.length_of": [(re.compile(rf"{item.comments}|\s"), "sub") for item in DIALECTS.values() if item.bare],
+    "klartext._approach": [(re.compile(rf"(?<![A-Z]){name}\s*+[-+.\dQ]"), "search") for name in ("LEN", "CCA", "R")],
     "runs.__init__": _DIALECTS,
     "follower._runs": [(block_runs(name), "match") for name in DIALECTS],
     "follower.__init__": [(re.compile(comments), "sub") for comments in (*_COMMENTS.values(), _OTHER_COMMENTS)],

@@ -130,7 +130,16 @@ def _value_of(node: ast.expr) -> Value:
     raise ValueError("not arithmetic")
 
 
-_VARIABLE = re.compile(r"\$?\$?[A-Z]+_\w+\[\w+\]")
+def _without_comments(line: str) -> str:
+    """Return a line of structured text without its comments (* ... *), in one pass."""
+    kept, at = [], 0
+    while (begin := line.find("(*", at)) >= 0 and (end := line.find("*)", begin + 2)) >= 0:
+        kept.append(line[at:begin])
+        at = end + 2
+    return "".join([*kept, line[at:]])
+
+
+_VARIABLE = re.compile(r"(?<![\w$])\$?\$?[A-Z]++_\w++\[\w++\]")
 
 
 def _as_name(variable: str) -> str:
@@ -321,7 +330,7 @@ class SiemensHeat(HeatOutput):
                     f"{plain[:60]!r} is no synchronized action of this program, in order of numbers", number
                 )
             last = int(match[1])
-            for target, value in re.findall(r"([$\w]+\[\w+\])=(\S+)", match[3]):
+            for target, value in re.findall(r"(?<![$\w])([$\w]++\[\w++\])=(\S++)", match[3]):
                 if target.startswith("$AC_TIMER"):
                     continue
                 if written := re.fullmatch(r"\$\$SA_TEMP_COMP_ABS_VALUE\[(\w+)\]", target):
@@ -463,7 +472,7 @@ class TwincatHeat(HeatOutput):
         offsets: dict[str, tuple[str, float]] = {}
         first, ended = False, False
         for number, line in enumerate(source.text.splitlines(), start=1):
-            plain = re.sub(r"\(\*.*?\*\)", "", line).strip()
+            plain = _without_comments(line).strip()
             ended |= plain == "END_FUNCTION_BLOCK"
             if found := re.fullmatch(r"temp_(\w+) : LREAL;", plain):
                 sensors[found[1]] = f"temp_{found[1]}", 1.0

@@ -136,7 +136,10 @@ def rotary_kind(path: Path) -> str | None:
     """
     if path.suffix.lower() != ".csv":
         return None
-    kind = detect_format(path)
+    try:
+        kind = detect_format(path)
+    except InputError:  # no file of ours, e.g. in another encoding: the reader of such files says what it is
+        return None
     if kind == "sphere" and path.name.lower().endswith(".deviations.csv"):
         kind = "deviations"
     if kind in ("sphere", "bar"):

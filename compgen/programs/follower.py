@@ -1252,7 +1252,7 @@ class KlartextFollower(Follower):
         elif number in (1, 2, 17):
             if part in (None, "0"):
                 self.cycle, self.cycle_name, self.modally = {}, "G83" if number == 1 else "G84", False
-            elif part in ("1", "2") and (last := re.search(r"([-+]? ?[\d.]+)$", text.strip())):
+            elif part in ("1", "2") and (last := re.search(r"(?<![\d.])([-+]? ?[\d.]++)$", text.strip())):
                 self.cycle |= {f"P0{part}": float(last[1].replace(" ", ""))}
 
     def _rotate(self, text: str) -> None:

@@ -31,11 +31,11 @@ CALCULATED = 8
 _DEEPEST, _MOST_LINES, _MOST_HOLES, _MOST_JUMPS = 20, 2_000_000, 100_000, 100_000
 #: FN 9: IF +Q1 EQU +5 GOTO LBL 2, and FN 10 (NE), FN 11 (GT), FN 12 (LT).
 _JUMP = (
-    r"FN\s*(?:9|10|11|12)\s*:\s*IF\s*(?P<one>[^\s].*?)\s*\b(?P<how>EQU|NE|GT|LT)\b\s*(?P<other>.+?)\s*GOTO\s*LBL\s*"
+    r"FN\s*(?:9|10|11|12)\s*:\s*IF(?P<one>(?:(?!\bEQU|\bNE|\bGT|\bLT).)++)(?P<how>EQU|NE|GT|LT)\b(?P<other>(?:(?!GOTO).)++)GOTO\s*LBL\s*"
     r"(?P<label>\"[^\"]+\"|\d+)"
 )
 _NEEDED = re.compile(
-    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|\b(?:APPR|DEP)\s*+P|PATTERN|PLANE\s*+(?!\s*RESET)|TRANS\s*+ROT\w*+\s*+I?ROT"
+    rb"CALL|\b(?:LP|CT|CTP|RND|CHF)\b|\b(?:APPR|DEP)\s*+P|PATTERN|PLANE\s*+(?!\s*RESET)|TRANS\s*+ROT[A-Z]{0,5}+\s*+I?ROT"
     rb"|DEF\s*+(?:22[01]|10)\b|FN\s*+\d|(?<=[A-Z=+*/(\s-])Q[LR]?\d++(?!\s*+=)",
     re.IGNORECASE,
 )
@@ -747,7 +747,7 @@ class _Program:
         self, item: _Statement, jump: re.Match[str], k: int, labels: dict[str, int], every: list[_Statement]
     ) -> int:
         """Follow FN 9 to FN 12: where both sides are constant the control jumps, or it does not."""
-        both = [self._evaluated(jump[name]) for name in ("one", "other")]
+        both = [self._evaluated(jump[name].strip()) for name in ("one", "other")]
         if None in both:
             self._fail(
                 item, "a jump (FN 9 to FN 12) that depends on what is known when the program runs; post it without"
