@@ -18,7 +18,7 @@ from compgen.identification.any_measurement import MixedMeasurement, identify_me
 from compgen.identification.axis_tests import identify_circles
 from compgen.identification.options import IdentifyOptions
 from compgen.identification.positions import identify_artefact
-from compgen.identification.posterior import processes_of, root_of
+from compgen.identification.posterior import processes_of, symmetric_root
 from compgen.identification.result import state_names
 from compgen.identification.together import Source, identify_together
 from compgen.kinematics.exact_chain import tip_position
@@ -146,7 +146,7 @@ def drawn(machine, seed):
     rng, names, curves = np.random.default_rng(seed), state_names(machine), {}
     for name, process in processes_of(machine, machine.prior, names).items():
         at = np.linspace(*machine.axes[error_named(name).axis].range_mm, 61)
-        root = root_of(process.covariance(at, at))
+        root = symmetric_root(process.covariance(at, at))
         curves[name] = Curve(at, root @ rng.standard_normal(root.shape[1]), np.zeros(61))
     squareness = {name: (machine.prior.size(name) * rng.standard_normal(), 0.0) for name in SQUARENESS_NAMES}
     return ErrorTable(curves, squareness)

@@ -421,7 +421,7 @@ def test_a_machine_that_is_too_small_comes_last(tmp_path, make_errors):
 def test_the_page_holds_the_figures_and_escapes_names(tmp_path, make_errors):
     found, _ = predicted(tmp_path, make_errors(mill(), 1))
     page = part_page(found)
-    assert "<h1>part&lt;1&gt;.nc</h1>" in page
+    assert ">part&lt;1&gt;.nc</h1>" in page
     assert "part<1>" not in page
     data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
     assert len(data["at"]) == len(data["off"][0]) > 100
