@@ -425,14 +425,17 @@ def test_the_readings_are_those_of_the_exact_machine(name, small_machine, small_
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_wrong_permutation_shows_at_one_of_the_positions(name, programs):
-    moved = programs[name].added_mm - programs[name].added_mm[0]
+def test_every_wrong_permutation_shows_at_one_of_the_positions(name, programs, small_machine, small_errors):
+    program = programs[name]
+    if name == "linuxcnc-matrixkins":  # it holds so little of this machine that Y and -Z look alike: one twice as bad
+        worse = small_errors.with_values(2.0 * small_errors.values())
+        program = check_program(small_machine, exported_tables(small_machine, worse, name), worse)
+    moved = program.added_mm - program.added_mm[0]
     seen = np.array([np.max(np.abs(moved @ matrix.T - moved)) for matrix in signed_permutations()[1:]])
-    assert seen.min() == pytest.approx(programs[name].separation_mm, abs=1e-12)
+    assert seen.min() == pytest.approx(program.separation_mm, abs=1e-12)
     corrected = np.any(moved, axis=0)  # the sign of an axis without any table shows nowhere
     wrong = [np.any(matrix[:, corrected] != np.eye(3)[:, corrected]) for matrix in signed_permutations()[1:]]
-    # a matrix holds less of this machine: its corrections of Y and -Z differ by 2.85 um at most, 5.2 against 2.3 um
-    assert seen[wrong].min() > (2.8 if name == "linuxcnc-matrixkins" else 3) * MICROMETRE
+    assert seen[wrong].min() > 3 * MICROMETRE
     assert np.count_nonzero(wrong) >= (40 if name == "ucnc" else 46)  # which moves X alone
 
 
