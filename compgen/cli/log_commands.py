@@ -73,7 +73,6 @@ def log_command(source: str, sensors: tuple[str, ...], out: Path, interval: floa
     OutputFolder(out.absolute().parent)  # refused before the first reading if it cannot be written
     keys = _sensors(sensors)
     recorder = Recorder(source_named(source, keys), tuple(keys), out, interval, source)
-    out.absolute().parent.mkdir(parents=True, exist_ok=True)
     with stopped_by_signals() as stop:
         done = recorder.run(stop, hours * 3600.0, complain)
     data = {

@@ -69,6 +69,7 @@ class Recorder:
         if first is None:
             return done
         try:
+            self.file.absolute().parent.mkdir(parents=True, exist_ok=True)
             handle = os.open(self.file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND, 0o666)
         except FileExistsError:
             raise InputError("exists already; give another name, so that no day is lost", file=self.file) from None

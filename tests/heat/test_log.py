@@ -284,7 +284,7 @@ def test_pins_are_asked_by_halcmd(tmp_path, monkeypatch):
         (["log.csv", "--sensor", "a=1", "--sensor", "temp_a_c=2", "--out", "o.csv"], "twice"),
         (["log.csv", "--sensor", "a=1", "--out", "o.txt"], "temperatures.csv"),
         (["log.csv", "--sensor", "a=1", "--out", "o.csv", "--interval", "0"], "3600"),
-        (["log.csv", "--sensor", "a=1", "--out", "none/o.csv"], "does not exist"),
+        (["log.csv", "--sensor", "a=1", "--out", f"{__file__}/o.csv"], "is a file"),
         (["ftp://here", "--sensor", "a=1", "--out", "o.csv"], "no source"),
     ],
 )
@@ -293,6 +293,17 @@ def test_wrong_usage_writes_nothing(tmp_path, monkeypatch, capsys, words, said):
     assert run_command(cli, ["log", *words]) == 2
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_folder_of_the_file_is_made_with_the_first_reading(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["log", "log.csv", "--sensor", "a=T", "--interval", "0.1", "--hours", "0.0001"]
+    assert run_command(cli, [*words, "--out", "new/o.csv"]) == 1
+    assert "nothing was read" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "log.csv").write_text("T\n20.5\n")
+    assert run_command(cli, [*words, "--out", "new/o.csv"]) == 0
+    assert "20.5" in (tmp_path / "new" / "o.csv").read_text()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
