@@ -24,8 +24,9 @@ PIP_RELEASE := $(RELEASE)/python $(PIP_INSTALL)
 COMPILE = uv pip compile --quiet --no-strip-extras --universal --python-version 3.11 --generate-hashes --custom-compile-command "make pins"
 
 # the tests of a file go to one process, which then prepares once what they share; three processes for two processors, because
-# some tests wait (for LinuxCNC, a browser, other processes); in the order of tests/conftest.py
-SPREAD := -n 3 --dist loadfile --no-loadscope-reorder
+# some tests wait (for LinuxCNC, a browser, other processes); in the order of tests/conftest.py; a process that is lost is not
+# replaced: its successor would begin with the same test, again and again where that one does not end
+SPREAD := -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
