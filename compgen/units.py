@@ -18,7 +18,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from compgen.resources import LANGUAGES
 
@@ -233,25 +232,3 @@ def cell_unit(cell: str) -> str:
 def factor_of(name: str) -> float:
     """Return how many of the inch unit are one of the unit ``name``; 1 for what has none."""
     return _INCH[name].per if name in _INCH else 1.0
-
-
-def picture_data(item: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the data of one picture in inch: limits and series by the units of its axes, cells from um."""
-    units = item.get("units")
-    if not isinstance(units, list):
-        return dict(item)
-    x, y = (factor_of(name) for name in units)
-    made = {**item, "limits": [value * part for value, part in zip(item["limits"], (x, x, y, y), strict=True)]}
-
-    def scaled(values: Sequence[float | None], by: float) -> list[float | None]:
-        return [None if value is None else float(f"{value * by:.6g}") for value in values]
-
-    if "series" in item:
-        made["series"] = [
-            {**one, "x": scaled(one["x"], x), "y": scaled(one["y"], y)}
-            | ({"U": scaled(one["U"], y)} if "U" in one else {})
-            for one in item["series"]
-        ]
-    if isinstance(item.get("values"), list):
-        made["values"] = [scaled(row, factor_of("um")) for row in item["values"]]
-    return made
