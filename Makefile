@@ -6,6 +6,7 @@
 # make sbom   writes the bill of materials of the wheel again, from the pins and the version
 # make release builds wheel and source in dist/, checks both, and looks up known vulnerabilities of the pins
 # make bench  prints the ratios against named peers
+# make second      runs the tests of the chain with a second Python, where one is found
 # make coverage    runs the tests and prints their branch coverage
 # make docs        builds the documentation site in docs-out/; make docs-links follows its links to other sites
 PYTHON ?= python3
@@ -31,7 +32,7 @@ SPREAD := -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo extras test lint system bench coverage docs docs-links texts pins sbom release clean
+.PHONY: demo extras test lint second system bench coverage docs docs-links texts pins sbom release clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready $(TEXTS)
@@ -54,6 +55,9 @@ coverage: .venv/ready-dev system $(TEXTS)
 # programs of the system that some tests run against; those tests are skipped by name where they cannot be installed
 system:
 	@.ci/system-packages
+
+second: .venv/ready-dev
+	@.ci/second-python
 
 lint: .venv/ready-dev
 	$(BIN)/ruff check compgen tests examples docs benchmarks
@@ -139,4 +143,4 @@ release: .venv-release/ready sbom
 	.ci/audit $(RELEASE)/pip-audit requirements-extras.txt
 
 clean:
-	rm -rf .venv .venv-docs .venv-release demo-out docs-out dist .coverage
+	rm -rf .venv .venv-docs .venv-release .venv-second demo-out docs-out dist .coverage
