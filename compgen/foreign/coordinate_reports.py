@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -145,6 +145,11 @@ def _phrases(line: str) -> tuple[str, dict[str, str]]:
         axis = letters[-1].upper() if letters else axis
         cells.setdefault(name if letters or not axis else f"{name} {axis}", number[0])
     return feature, cells
+
+
+def names_setting(line: str) -> bool:
+    """Whether a line states a zero, a set-up or the unit of what follows."""
+    return any(pattern.search(line) for pattern in (_OFFSET, _SETUP_LINE, _UNITS_LINE))
 
 
 @dataclass(frozen=True)
@@ -719,7 +724,7 @@ def read_dmis(source: Text, options: ImportOptions) -> Report:
     """Read the features that a DMIS output file gives as nominal, F(label), and measured, FA(label)."""
     report = Report(source.path)
     nominal: dict[str, FloatArray] = {}
-    measured: list[tuple[str, FloatArray, int]] = []
+    measured: list[tuple[str, str, FloatArray, int]] = []
     mm: float | None = None
     text = re.sub(r"\$\s*\n\s*", "", source.text)  # a line that ends with $ goes on
     for line, content in enumerate(text.splitlines(), 1):
@@ -741,7 +746,7 @@ def read_dmis(source: Text, options: ImportOptions) -> Report:
         if found[1].upper() == "F":
             nominal[found[2]] = place
         else:
-            measured.append((found[2], place, line))
+            measured.append((found[2], found[3], place, line))
     given = options.given_unit("position", "value", among=MM_PER_LENGTH, what="length")
     mm = MM_PER_LENGTH[given] if given else mm
     if mm is None:
@@ -752,13 +757,14 @@ def read_dmis(source: Text, options: ImportOptions) -> Report:
             "give --unit position=mm or in",
             key="position",
         )
-    for name, place, line in measured:
+    for name, kind, place, line in measured:
         if name not in nominal:
             raise report.fail(f"FA({name}) was measured, and there is no nominal feature F({name})", line)
         if name in options.ignore:
             report.notes.append(f"feature {name!r} was excluded by --ignore")
             continue
-        report.features.append(Feature(name, nominal[name] * (mm or 1.0), place * (mm or 1.0), 1, line))
+        if _has_place(report, name, kind, nominal[name], place):
+            report.features.append(Feature(name, nominal[name] * (mm or 1.0), place * (mm or 1.0), 1, line))
     report.understood["unit"] = "mm" if mm == 1.0 else "in" if mm == 25.4 else f"{mm} mm"
     return report
 
@@ -783,13 +789,10 @@ def read_qif(path: Path, options: ImportOptions) -> Report:
     report = Report(path)
     nodes = {node.get("id"): node for node in root.iter() if node.get("id")}
     mm = _qif_unit(root, report, options)
-    for node in root.iter():
-        tag = _tag(node)
-        if not tag.endswith(("FeatureActual", "FeatureMeasurement")):
-            continue
+    for block, node in _qif_results(root):
         item = nodes.get(_child(node, "FeatureItemId"))
         nominal = None if item is None else nodes.get(_child(item, "FeatureNominalId"))
-        name = (_child(item, "FeatureName") if item is not None else "") or f"{tag} {node.get('id')}"
+        name = (_child(item, "FeatureName") if item is not None else "") or f"{_tag(node)} {node.get('id')}"
         if name in options.ignore:
             report.notes.append(f"feature {name!r} was excluded by --ignore")
             continue
@@ -803,8 +806,50 @@ def read_qif(path: Path, options: ImportOptions) -> Report:
         both = [np.array([float(word) for word in place.split()]) * mm for place in places if _is_place(place)]
         if len(both) != 2:
             raise report.fail(f"feature {name!r}: Location is not three numbers")
-        report.features.append(Feature(name, both[0], both[1], 1, 0))
+        if _has_place(report, name, re.sub("Feature(Actual|Measurement)$", "", _tag(node)), *both):
+            report.features.append(Feature(name, both[0], both[1], block, 0))
+    if not report.features and any(_tag(node).startswith("ExternalQIF") for node in root.iter()):
+        raise report.fail(
+            "refers to another QIF document for its features: export one document with nominal and measured features"
+        )
     return report
+
+
+def _qif_results(root: ElementTree.Element) -> Iterator[tuple[int, ElementTree.Element]]:
+    """Yield the measured features, with the number of the measurement that they belong to."""
+    count, of_node = 0, dict[int, int]()
+    for node in root.iter():
+        if _tag(node) == "MeasurementResults":
+            count += 1
+            of_node.update((id(part), count) for part in node.iter())
+        if _tag(node).endswith(("FeatureActual", "FeatureMeasurement")):
+            yield of_node.get(id(node), 1), node
+
+
+#: Features whose place is any point of theirs, so that nominal and measured places do not belong together; DMIS and QIF words.
+_ANYWHERE = re.compile("(?i)plane|line|cyl|cone|parallel|cpar|torus|surf|gcurve|gsurf|edgpt|extru|pattern")
+#: A point was probed along its normal if the rest of its deviation is below this share of it.
+_ALONG = 1e-3
+
+
+def _has_place(report: Report, name: str, kind: str, nominal: FloatArray, actual: FloatArray) -> bool:
+    """Whether all coordinates of a feature were measured: those of centres are, and of points unless probed along one axis.
+
+    A plane, a line or a cylinder has a place anywhere on it; of a point that was probed along an axis the other coordinates are
+    where the machine was sent, and would count as errors of zero.
+    """
+    if _ANYWHERE.search(kind):
+        report.notes.append(
+            f"feature {name!r} ({kind.lower()}) has no place of its own, only a point on it, and was skipped"
+        )
+        return False
+    away = np.sort(np.abs(actual - nominal))
+    if re.search("(?i)point", kind) and away[2] > 0 and away[1] <= _ALONG * away[2]:
+        report.notes.append(
+            f"point {name!r} was probed along one axis only and was skipped: its other coordinates are not measured"
+        )
+        return False
+    return True
 
 
 def _is_place(text: str) -> bool:

@@ -56,6 +56,7 @@ from compgen.foreign.laser_files import (
     read_renishaw,
     without_runs,
 )
+from compgen.foreign.measuring_logs import grid_of_log
 from compgen.foreign.one_axis import OneAxis, axis_in, check_error, cycles, errors_of, motion, remarks
 from compgen.foreign.questions import AXIS, Asking, Choice, Question, directions, errors_along, unit_choices
 from compgen.foreign.source import (
@@ -482,10 +483,10 @@ def _of_text(path: Path, options: ImportOptions) -> Imported:
     try:
         return _of_grid(grid_of_text(text), options, "table")
     except InputError:
-        phrases = grid_of_phrases(text)
-        if phrases is None:
+        found = grid_of_log(text, options.ignore) or grid_of_phrases(text)
+        if found is None:
             raise
-    return _of_grid(phrases, options, "table")
+    return _of_grid(found, options, "table")
 
 
 def _import_workbook(path: Path, options: ImportOptions) -> Imported:

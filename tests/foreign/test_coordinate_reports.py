@@ -273,6 +273,55 @@ def test_a_qif_document_whose_nominal_is_elsewhere_or_that_is_cut_is_refused(tmp
         import_file(path, PART)
 
 
+def test_several_measurements_in_a_qif_document_can_be_set_ups_of_their_own(tmp_path):
+    """Six samples of one part: each was clamped by itself."""
+    path = tmp_path / "results.qif"
+    text = qif([(n, g, a) for n, g, a in zip(NAMES, GRID, printed(), strict=True)])
+    begin, end = text.index("<MeasurementsResults>") + 21, text.index("</MeasurementsResults>")
+    one = f"<MeasurementResults>{text[begin:end]}</MeasurementResults>"
+    path.write_text(text[:begin] + one + one + text[end:])
+    assert "2 tables" in " ".join(import_file(path, PART).doubts)
+    each = import_file(path, ImportOptions(kind="part", origin="0,0,0", clamping="each"))
+    assert sorted(each.data.setup.tolist()) == [1] * len(GRID) + [2] * len(GRID)
+
+
+@pytest.mark.parametrize("form", ["qif", "dmis"])
+def test_planes_and_points_that_were_probed_along_an_axis_are_not_places(form, tmp_path):
+    """Their other coordinates are where the machine was sent: as errors of zero they would pull the result to nothing."""
+    beside = {"A": ("Plane", [9.0, 3.0, 0.0], [2.0, 1.0, 0.01]), "B": ("Point", [9.0, 3.0, 0.0], [9.0, 3.0, 0.02])}
+    path = tmp_path / "results.txt"
+    if form == "qif":
+        every = [(n, g, a) for n, g, a in zip(NAMES, GRID, printed(), strict=True)]
+        text = qif([*every, *((name, one, other) for name, (_, one, other) in beside.items())])
+        for k, (kind, _, _) in enumerate(beside.values(), len(every)):
+            text = re.sub(
+                rf'<Circle(Feature\w+) id="([135]){k:02d}">(.*?)</Circle',
+                rf'<{kind}\1 id="\g<2>{k:02d}">\3</{kind}',
+                text,
+            )
+    else:
+        text = PRINTS["dmis"]
+        for name, (kind, one, other) in beside.items():
+            for role, place in (("F", one), ("FA", other)):
+                text += f"{role}({name})=FEAT/{kind.upper()},CART,{place[0]},{place[1]},{place[2]},0,0,1\n"
+    path.write_text(text)
+    item = import_file(path, PART)
+    assert list(item.data.feature) == NAMES
+    assert "'A' (plane) has no place of its own" in " ".join(item.notes)
+    assert "'B' was probed along one axis" in " ".join(item.notes)
+
+
+def test_a_qif_document_whose_features_are_in_another_one_says_so(tmp_path):
+    path = tmp_path / "results.qif"
+    path.write_text(
+        '<QIFDocument xmlns="http://qifstandards.org/xsd/qif3"><FileUnits><PrimaryUnits><LinearUnit><SIUnitName>meter</SIUnitName>'
+        "<UnitName>mm</UnitName><UnitConversion><Factor>0.001</Factor></UnitConversion></LinearUnit></PrimaryUnits></FileUnits>"
+        "<ExternalQIFReferences/></QIFDocument>"
+    )
+    with pytest.raises(InputError, match="another QIF document"):
+        import_file(path, PART)
+
+
 def test_a_report_in_inches_is_converted_and_one_without_a_unit_is_judged(tmp_path):
     path = tmp_path / "inch.csv"
     path.write_text(
