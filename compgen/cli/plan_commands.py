@@ -172,7 +172,8 @@ def plan_command(
     measure next, of what a workshop has, where --errors are known (*.errors.csv of volcomp identify or run), or nothing is.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
-    suggested.stations.csv, with --target-um proposed.points.csv (mm). Lists the effects other than the geometric errors
+    suggested.stations.csv, with --target-um proposed.points.csv (mm); what to measure next with order.html, a sheet to print
+    and fill in for each measurement. Lists the effects other than the geometric errors
     that the plan cannot show (volcomp effects), and what to measure in addition. Without --u-length-um 0.1 um + 0.15
     um/m is assumed. Exit code 1 if an unknown is undetermined, or no trajectory reaches the target; with gauges only if no
     error at all is determined.
@@ -294,6 +295,7 @@ def _plan_gauges(
 def _plan_next(machine: Machine, errors: Path | None, out: Path, language: str, *, as_json: bool) -> int:
     """Say what to measure next, from the errors that are known, or from nothing but the prior."""
     from compgen.identification.posterior import not_measured
+    from compgen.planning.measurement_order import ORDER_NAME, order_page
     from compgen.planning.next_measurement import next_best, next_page, unmeasured
 
     if machine.prior.is_none:
@@ -318,8 +320,11 @@ def _plan_next(machine: Machine, errors: Path | None, out: Path, language: str, 
         **found.summary(),
     }
     folder = OutputFolder(out)
-    page = next_page(found, str(summary["assumed"]))
-    folder.add("plan.html", for_readers({"plan.html": page}, language)["plan.html"])
+    pages = {"plan.html": next_page(found, str(summary["assumed"]))}
+    if found.measurements:
+        pages[ORDER_NAME] = order_page(found, language)
+    for name, text in for_readers(pages, language).items():
+        folder.add(name, text)
     folder.add("plan.json", json.dumps(summary, indent=2) + "\n")
     folder.commit()
     answer(as_json, summary, next_table(found, str(summary["assumed"])))

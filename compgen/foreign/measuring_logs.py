@@ -18,7 +18,7 @@ from compgen.foreign.source import Text, shown
 
 _NOMINAL, _ACTUAL, _DEVIATION = "Nominal", "Actual", "Deviation"
 _WORDS = {
-    _NOMINAL: "set ?points?|sollwerte?|soll|nominal|nom|target",
+    _NOMINAL: "set\\W?points?|sollwerte?|soll|nominal|nom|target",
     _ACTUAL: "actual|act|istwerte?|ist|measured|meas|gemessen|messwerte?",
     _DEVIATION: "deviations?|dev|differences?|diff|abweichung(?:en)?|abw|differenz(?:en)?",
 }
@@ -120,11 +120,9 @@ def grid_of_log(source: Text, ignore: Sequence[str] = ()) -> CellGrid | None:
     first = blocks[0]
     for block in blocks:
         if block.axes != first.axes and names[id(block)] not in ignore:
-            have = (
-                f"has {' and '.join(block.axes)}, the first one, {shown(names[id(first)])}, {' and '.join(first.axes)}"
-            )
-            name = shown(names[id(block)])
-            raise source.fail(f"feature {name} {have}: leave it out with --ignore {name}, or complete it", block.line)
+            name, mine, others = shown(names[id(block)]), " and ".join(block.axes), " and ".join(first.axes)
+            text = f"feature {name} has a place in {mine}, and the first one in {others}: complete it, or give --ignore {name}"
+            raise source.fail(text, block.line)
     return _as_grid(reading, blocks, names)
 
 

@@ -712,6 +712,9 @@ def _seen(place_mm: FloatArray) -> FloatArray:
     return np.column_stack([x + 0.45 * y, z + 0.3 * y])
 
 
+_TO_PRINT = "<p>To print and fill in: order.html beside this page, a sheet for each measurement.</p>"
+
+
 def next_page(found: NextBest, assumed: str) -> str:
     """Return the text of ``plan.html``: what to measure next, and how each instrument stands. It loads nothing."""
     pictures = [
@@ -730,7 +733,7 @@ def next_page(found: NextBest, assumed: str) -> str:
     body = (
         f"<h1>What to measure next on {name}</h1><p>{escape(found.text or NOTHING_NEXT)}</p>"
         f'<p class="note">u of the tool tip over the volume now: {um_text(found.u_um)} µm rms (k = 1); {escape(assumed)}.</p>'
-        + (table + picture_grid(pictures) if pictures else "")
+        + (table + picture_grid(pictures) + _TO_PRINT if pictures else "")
     )
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
