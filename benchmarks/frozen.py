@@ -1,7 +1,7 @@
 """What the program does, written down: outputs of every command on the examples, to compare before and after a change.
 
     python benchmarks/frozen.py record DIR [--python PATH] [--only TEXT]   # runs the commands, writes what came out to DIR
-    python benchmarks/frozen.py compare DIR DIR                            # lists what differs; exit code 1 if anything does
+    python benchmarks/frozen.py compare DIR DIR [--only TEXT]              # lists what differs; exit code 1 if anything does
     python benchmarks/frozen.py kinds DIR DIR                              # the same by kind: largest numbers, each wording once
 
 A change of structure must leave every byte as it was: files of all controls on three machines, JSON of every command,
@@ -22,52 +22,13 @@ from concurrent.futures import ThreadPoolExecutor
 from difflib import SequenceMatcher
 from pathlib import Path
 
+from compgen.cli import cli
+from compgen.controls import CONTROLLERS
+
 ROOT = Path(__file__).resolve().parents[1]
 MACHINES = ("zha-gantry", "jia-xytz", "moving-table-mill")
-CONTROLS = [
-    "isg-csv",
-    "etalon-exchange",
-    "siemens-eec",
-    "siemens-cec",
-    "siemens-cec-eec",
-    "fanuc-pitch",
-    "fanuc-straightness",
-    "fanuc-3d",
-    "heidenhain-com",
-    "heidenhain-kinematics",
-    "twincat-lists",
-    "pmac",
-    "mitsubishi",
-    "linuxcnc-comp",
-    "linuxcnc-volumetric",
-    "neutral",
-]
-COMMANDS = [
-    "accuracy",
-    "compare",
-    "controllers",
-    "crash-test",
-    "diagnose",
-    "diff",
-    "effects",
-    "export",
-    "fit",
-    "identify",
-    "import",
-    "instruments",
-    "machines",
-    "merge",
-    "options",
-    "plan",
-    "predict",
-    "read",
-    "recal",
-    "report",
-    "run",
-    "serve",
-    "simulate",
-    "verify",
-]
+CONTROLS = sorted(CONTROLLERS)
+COMMANDS = sorted(cli.commands)
 RECAL = [
     "add",
     "run",
@@ -321,17 +282,26 @@ def record(out: Path, python: str, only: str) -> None:
     """All chains, two at a time."""
     chosen = {name: lines for name, lines in commands().items() if only in name}
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda item: chain(*item, out, python), chosen.items()))
+        recorded = {name: pool.submit(chain, name, lines, out, python) for name, lines in chosen.items()}
+    failed = {name: future.exception() for name, future in recorded.items() if future.exception() is not None}
+    if failed:
+        sys.exit("\n".join(f"not recorded: {name}: {error!r}" for name, error in failed.items()))
 
 
-def compare(old: Path, new: Path) -> int:
-    """Print what differs between two recordings; the number of files that do."""
+def compare(old: Path, new: Path, only: str) -> int:
+    """Print what differs between two recordings; the number of files that do, and of chains that one of them lacks.
+
+    With ``only`` these chains alone are compared, as they are recorded.
+    """
+    chosen = [name.replace(" ", "-") for name in commands() if only in name]
+    lacking = [f"{top}: {name}" for top in (old, new) for name in chosen if not (top / name / "log.txt").exists()]
+    for text in lacking:
+        print(f"not recorded, so not compared: {text}")
     names = sorted({p.relative_to(top).as_posix() for top in (old, new) for p in top.rglob("*") if p.is_file()})
-    recorded = {p.name for p in new.iterdir()}
-    differing = 0
+    differing = len(lacking)
     for name in names:
         a, b = old / name, new / name
-        if name.endswith("processor-time.json") or name.split("/")[0] not in recorded:
+        if name.endswith("processor-time.json") or name.split("/")[0] not in chosen:
             continue
         if not a.exists() or not b.exists() or a.read_bytes() != b.read_bytes():
             differing += 1
@@ -405,7 +375,8 @@ def main() -> int:
     if given.action == "record":
         record(given.folders[0].resolve(), given.python, given.only)
         return 0
-    return int((kinds if given.action == "kinds" else compare)(*given.folders) > 0)
+    old, new = given.folders
+    return int((kinds(old, new) if given.action == "kinds" else compare(old, new, given.only)) > 0)
 
 
 if __name__ == "__main__":
