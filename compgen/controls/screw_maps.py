@@ -4,241 +4,38 @@ from __future__ import annotations
 
 import math
 import re
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from compgen.controls.shared.base import (
-    Controller,
+    Settings,
     SourceFile,
     Term,
-    Usage,
-    by_travel,
-    coverage_violations,
-    nodes_by_axis,
     parameter_row,
-    travel_of,
 )
-from compgen.controls.shared.grids import equidistant_grid, loss_setting, uneven_nodes_mm
-from compgen.controls.shared.scanner import check_complete, check_size, content_lines, fixed_point, floating
-from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controls.shared.grids import equidistant_grid, loss_setting, rounded
+from compgen.controls.shared.scanner import check_complete, content_lines, fixed_point, floating
+from compgen.controls.shared.tables import AxisTableController, AxisTables, Table1D
+from compgen.controls.shared.terms import one_dimensional_name
 from compgen.data import toml_files
-from compgen.data.csv_files import FloatArray, fixed, whole_number
-from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
+from compgen.data.csv_files import FloatArray, whole_number
+from compgen.data.error_table import ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import Section, accepts, axis_setting, choice, setting, whole
-from compgen.errors import InputError
 
-_MOST_CHARACTERS = 5_000_000
-#: Decimals of a position, mm.
-POSITION_DIGITS = 6
-#: Longest table of a control without a limit in its documents.
-MOST_POINTS = 1000
 #: How often the correction at the corrected position is looked up again: a slope of 1e-3 leaves 1e-3 of it each time.
 _STEPS = 12
 
-Settings = TypeVar("Settings")
 
-
-@dataclass(frozen=True)
-class ScrewMap:
-    """Table of one axis with the numbers of its file: positions (n,) mm, values in both directions (n,)."""
-
-    position_mm: FloatArray
-    positive: FloatArray
-    negative: FloatArray
-
-    def with_values(self, positive: FloatArray, negative: FloatArray, digits: int) -> ScrewMap:
-        """Return the table with other values, rounded as written."""
-        return ScrewMap(self.position_mm, *(rounded(column, digits) for column in (positive, negative)))
-
-
-@dataclass(frozen=True)
-class ScrewMaps:
-    """Tables by axis 0..2."""
-
-    maps: Mapping[int, ScrewMap]
-
-
-class ScrewMapControl(Controller[Settings, ScrewMaps]):
-    """What these controls have in common: one polyline over each axis, perhaps one for each direction.
-
-    All are zero at the reference point: a constant would only move the axis when the table is switched on.
-    """
+class ScrewControl(AxisTableController[Settings]):
+    """One polyline over each axis, zero at the reference point: a constant would only move the axis when it is switched on."""
 
     anchored = True
-    #: True if the positions must be evenly spaced; how many there may be and must be; decimals of a value.
-    even, most, least, digits = False, MOST_POINTS, 2, 6
-    #: The number that this control needs where 1 mm must be added to the command.
-    sign = 1.0
-    #: Name of the table in messages; how many points of the file one node makes.
-    table_name, points_per_node = "table", 1
-
-    @property
-    def most_points(self) -> int:
-        """Return the largest number of points of one axis."""
-        return self.points_per_node * int(getattr(self.settings, "most_points", self.most))
-
-    @abstractmethod
-    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
-        """Return position (mm) and the values in both directions of each row, by axis."""
-
-    def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return X(x), Y(y), Z(z)."""
-        nodes = [self.nodes_mm(errors, axis) for axis in range(3)]
-        pairs = [(axis, axis) for axis in range(3)]
-        return one_dimensional_terms(self.machine, errors, nodes, pairs, anchored=self.anchored)
-
-    def nodes_mm(self, errors: ErrorTable, axis: int) -> FloatArray:
-        """Return the positions of a table: where the curves need them, evenly spaced where the control wants it."""
-        loss_mm, most = getattr(self.settings, "loss_mm", 0.0), self.most_points // self.points_per_node
-        if self.even:
-            grid = equidistant_grid(self.machine, errors, axis, most=most, loss_mm=loss_mm, anchor=self.anchored)
-            return grid.nodes_mm
-        nodes = rounded(uneven_nodes_mm(self.machine, errors, axis, loss_mm=loss_mm, most=most), POSITION_DIGITS)
-        if len(nodes) < self.least:
-            nodes = np.union1d(nodes, rounded(np.linspace(nodes[0], nodes[-1], self.least), POSITION_DIGITS))
-        return nodes
-
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
-        """Return the values, rounded as written, the same in both directions."""
-        maps = {}
-        for axis, term in enumerate(basis):
-            column = self.sign * np.asarray(values[one_dimensional_name(axis, axis)])
-            maps[axis] = ScrewMap(term.nodes_mm, column, column).with_values(column, column, self.digits)
-        return ScrewMaps(maps)
-
-    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return the reversal of each axis along itself, if the control has a table for each direction."""
-        own = {key: part for key, part in reversal.curves.items() if key[0] == key[1]}
-        return replace(reversal, curves=own if self.bidirectional else {})
-
-    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
-        """Return the tables with half of the reversal less after positive travel and half more after negative travel."""
-        found = dict(tables.maps)
-        for (axis, _), curve in reversal.curves.items():
-            if np.max(np.abs(curve.value)) >= WORTH_MM:
-                half = 0.5 * self.sign * curve.at(found[axis].position_mm)
-                found[axis] = found[axis].with_values(
-                    found[axis].positive - half, found[axis].negative + half, self.digits
-                )
-        return ScrewMaps(found)
-
-    def context(self, tables: ScrewMaps) -> dict[str, Any]:
-        """Return the rows by axis, and the sign with a worked number."""
-        shown = [
-            {
-                "letter": AXES[axis],
-                "rows": list(
-                    zip(*(column.tolist() for column in (t.position_mm, t.positive, t.negative)), strict=True)
-                ),
-            }
-            for axis, t in sorted(tables.maps.items())
-        ]
-        return {
-            "sign_statement": self._sign_statement(tables),
-            "parameters": self.parameters(tables),
-            "warnings": [],
-            "tables": shown,
-            "records": sum(len(table.position_mm) for table in tables.maps.values()),
-            "digits": self.digits,
-            "settings": self.settings,
-        }
-
-    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
-        """Return what must be set on the control besides the tables."""
-        return []
-
-    def parse(self, files: Sequence[SourceFile]) -> ScrewMaps:
-        """Read the tables strictly; positions must rise."""
-        maps: dict[int, ScrewMap] = {}
-        for source in files:
-            check_size(source, _MOST_CHARACTERS)
-            for axis, rows in self.read_file(source).items():
-                if axis in maps:
-                    raise source.fail(f"is a second {self.table_name} of {AXES[axis]}", 1)
-                columns = np.array(rows, dtype=np.float64).reshape(-1, 3).T
-                if np.any(np.diff(columns[0]) <= 0.0):
-                    k = int(np.argmax(np.diff(columns[0]) <= 0.0))
-                    message = (
-                        f"the position {columns[0, k + 1]:g} of {AXES[axis]} is not above {columns[0, k]:g} before it"
-                    )
-                    raise source.fail(message, 1)
-                if len(rows) < self.least:
-                    message = f"the {self.table_name} of {AXES[axis]} has {len(rows)} points; at least {self.least} are needed"
-                    raise source.fail(message, 1)
-                maps[axis] = ScrewMap(*columns)
-        if not maps:
-            raise files[0].fail("contains no table", 1) if files else InputError("no file was given")
-        return ScrewMaps(maps)
-
-    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
-        """Return what the polylines add, end values outside, by the direction of the last travel if it matters."""
-        added = np.zeros((len(points), 3))
-        for axis, table in tables.maps.items():
-            position = points.position_mm[:, axis]
-            columns = (np.interp(position, table.position_mm, part) for part in (table.positive, table.negative))
-            positive, negative = columns if self.bidirectional else (next(columns),) * 2
-            added[:, axis] = by_travel(travel_of(points, axis), positive, negative) / self.sign
-        return added
-
-    def violations(self, tables: ScrewMaps) -> list[str]:
-        """Return axes without a table, travel that a table does not cover, too many points, uneven spacing."""
-        found = [f"there is no {self.table_name} for {AXES[axis]}" for axis in range(3) if axis not in tables.maps]
-        for axis, table in sorted(tables.maps.items()):
-            position, what = table.position_mm, f"the {self.table_name}"
-            found += coverage_violations(self.machine, axis, position[0], position[-1], what)
-            if len(position) > self.most_points:
-                found.append(
-                    f"{what} of {AXES[axis]} has {len(position)} points; at most {self.most_points} are possible"
-                )
-            steps = np.diff(position)
-            if self.even and np.ptp(steps) > 2.0 * 10.0**-POSITION_DIGITS:
-                found.append(
-                    f"the positions of {AXES[axis]} are not evenly spaced: {steps.min():g} ... {steps.max():g} mm"
-                )
-        return found
-
-    def table_nodes_mm(self, tables: ScrewMaps) -> tuple[FloatArray, ...]:
-        """Return the positions of each axis."""
-        return nodes_by_axis((axis, table.position_mm) for axis, table in tables.maps.items())
-
-    def usage(self, tables: ScrewMaps) -> list[Usage]:
-        """Return the points of each axis against the limit."""
-        return [
-            Usage(f"points of {AXES[axis]}", len(table.position_mm), self.most_points, "points")
-            for axis, table in sorted(tables.maps.items())
-        ]
-
-    def resolution_mm(self) -> float:
-        """Half of the last decimal of a value."""
-        return 0.5 * 10.0**-self.digits
-
-    def sign_words(self) -> str:
-        """Return what a value is, in words."""
-        return ""
-
-    def _sign_statement(self, tables: ScrewMaps) -> str:
-        axis, table = max(tables.maps.items(), key=lambda item: float(np.max(np.abs(item[1].positive))))
-        k = int(np.argmax(np.abs(table.positive)))
-        position = np.tile(0.5 * (self.machine.lower_mm + self.machine.upper_mm), (1, 1))
-        position[0, axis] = np.clip(table.position_mm[k], *self.machine.axes[axis].range_mm)
-        added = float(self.emulate(tables, Points(position, approach=np.ones_like(position)))[0, axis])
-        return (
-            f"{self.sign_words()} Example: at {AXES[axis]} {table.position_mm[k]:.6f} mm the file has "
-            f"{fixed(float(table.positive[k]), self.digits)}; for the command {AXES[axis]} {position[0, axis]:.4f} mm in "
-            f"positive travel the axis goes to {fixed(float(position[0, axis]) + added, 5)} mm."
-        )
-
-
-def rounded(values: FloatArray, digits: int) -> FloatArray:
-    """Return numbers as read back from a text with so many decimals."""
-    return np.array([float(fixed(value, digits)) for value in np.asarray(values).tolist()])
 
 
 def axis_named(source: SourceFile, line: int, word: str) -> int:
@@ -257,7 +54,7 @@ def sign_setting(values: str) -> Any:
     )
 
 
-class StatedSign(ScrewMapControl[Settings]):
+class StatedSign(ScrewControl[Settings]):
     """A control whose sign the machine file must state, with a table for each direction of travel."""
 
     bidirectional = True
@@ -282,7 +79,7 @@ class StatedSign(ScrewMapControl[Settings]):
         super().__init__(machine, settings)
         self.sign = -1.0 if getattr(self.settings, "sign") == "error" else 1.0  # noqa: B009
 
-    def reservations(self, tables: ScrewMaps) -> list[str]:
+    def reservations(self, tables: AxisTables) -> list[str]:
         """Say that the sign comes from the machine file."""
         return [
             f'the sign of the values is the one that the machine file states ("{getattr(self.settings, "sign")}"); '  # noqa: B009
@@ -441,39 +238,22 @@ class Centroid(StatedSign[CentroidSettings]):
             return super().resolution_mm()
         return 0.5 * max(self.mm_per_value(axis) for axis in range(3))
 
-    def as_written(self, axis: int, values_mm: FloatArray) -> FloatArray:
-        """Return values in mm as they come back from the file: whole counts, or with its decimals."""
+    def as_written(self, axis: int, nodes_mm: FloatArray, positive_mm: FloatArray, negative_mm: FloatArray) -> Table1D:
+        """Return the table as it comes back from the file: whole counts, or with its decimals."""
+        table, size = super().as_written(axis, nodes_mm, positive_mm, negative_mm), self.mm_per_value(axis)
         if self.settings.values == "mm":
-            return rounded(values_mm, self.digits)
-        return np.round(values_mm / self.mm_per_value(axis)) * self.mm_per_value(axis)
+            return table
+        return self.table_of(axis, nodes_mm, *(np.round(column / size) * size for column in table.columns))
 
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
-        """Return the values as written, the same in both directions."""
-        maps = super().build(basis, values).maps
-        return ScrewMaps({axis: self._written(axis, table) for axis, table in maps.items()})
-
-    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
-        """Return the tables with the reversal, as written."""
-        maps = super().with_reversal(tables, reversal).maps
-        return ScrewMaps({axis: self._written(axis, table) for axis, table in maps.items()})
-
-    def _written(self, axis: int, table: ScrewMap) -> ScrewMap:
-        return replace(
-            table, positive=self.as_written(axis, table.positive), negative=self.as_written(axis, table.negative)
-        )
-
-    def context(self, tables: ScrewMaps) -> dict[str, Any]:
+    def context(self, tables: AxisTables) -> dict[str, Any]:
         """Return the rows in the order of the file: from the end that is nearer to machine zero, where the axis is homed."""
         digits = self.digits if self.settings.values == "mm" else 0
         shown = []
-        for axis, table in sorted(tables.maps.items()):
-            columns = (
-                table.position_mm,
-                *(part / self.mm_per_value(axis) for part in (table.positive, table.negative)),
-            )
+        for axis, table in sorted(tables.tables.items()):
+            columns = (table.nodes, *(part / self.mm_per_value(axis) for part in table.columns))
             rows = list(zip(*(column.tolist() for column in columns), strict=True))
-            outward = abs(table.position_mm[0]) <= abs(table.position_mm[-1])
-            interval = (table.position_mm[-1] - table.position_mm[0]) / (len(rows) - 1)
+            outward = abs(table.nodes[0]) <= abs(table.nodes[-1])
+            interval = (table.nodes[-1] - table.nodes[0]) / (len(rows) - 1)
             shown.append({"letter": AXES[axis], "interval": interval, "rows": rows if outward else rows[::-1]})
         return {**super().context(tables), "tables": {part["letter"]: part for part in shown}, "digits": digits}
 
@@ -521,14 +301,16 @@ class Centroid(StatedSign[CentroidSettings]):
             )
         line, word = keys["INTERVAL"]
         interval = float(fixed_point(source, line, word, "INTERVAL"))
-        if len(positions) > 1 and np.any(np.abs(np.abs(np.diff(positions)) - interval) > 4.0 * 10.0**-POSITION_DIGITS):
+        if len(positions) > 1 and np.any(
+            np.abs(np.abs(np.diff(positions)) - interval) > 4.0 * 10.0**-self.position_digits
+        ):
             raise source.fail(f"INTERVAL {interval:g} is not the distance between the positions", line)
 
-    def reservations(self, tables: ScrewMaps) -> list[str]:
+    def reservations(self, tables: AxisTables) -> list[str]:
         """Say also where the table does not begin at machine zero, as the only file seen does."""
         found = super().reservations(tables)
-        for axis, table in sorted(tables.maps.items()):
-            if not np.isclose(np.abs(table.position_mm[[0, -1]]).min(), 0.0, atol=10.0**-POSITION_DIGITS):
+        for axis, table in sorted(tables.tables.items()):
+            if not np.isclose(np.abs(table.nodes[[0, -1]]).min(), 0.0, atol=10.0**-self.position_digits):
                 found.append(
                     f"the table of {AXES[axis]} does not begin at machine zero, where the axis is homed, as the only public file "
                     "does: check that the control takes its positions"
@@ -565,15 +347,15 @@ class Mach4(SheetControl[Mach4Settings]):
         super().__init__(machine, settings)
         self.bidirectional = self.settings.both_directions
 
-    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+    def parameters(self, tables: AxisTables) -> list[dict[str, str]]:
         """Return start, length and number of points of each axis."""
         return [
             parameter_row(
                 f"{AXES[axis]}: start, length, points",
-                f"{table.position_mm[0]:.4f}, {table.position_mm[-1] - table.position_mm[0]:.4f}, {len(table.position_mm)}",
+                f"{table.nodes[0]:.4f}, {table.nodes[-1] - table.nodes[0]:.4f}, {len(table.nodes)}",
                 "mm; the points are evenly spaced and include both ends",
             )
-            for axis, table in sorted(tables.maps.items())
+            for axis, table in sorted(tables.tables.items())
         ]
 
 
@@ -593,32 +375,30 @@ class Fagor8055(SheetControl[FagorSettings]):
     settings_class = FagorSettings
     table_name = "leadscrew table"
 
-    def with_reversal(self, tables: ScrewMaps, reversal: ReversalCurves) -> ScrewMaps:
+    def with_reversal(self, tables: AxisTables, reversal: ReversalCurves) -> AxisTables:
         """Return the tables with the reversal; a negative column of zeros alone would mean: as in positive travel."""
         found = {}
-        for axis, table in super().with_reversal(tables, reversal).maps.items():
+        for axis, table in super().with_reversal(tables, reversal).tables.items():
             if np.any(table.positive) and not np.any(table.negative):
-                negative = table.negative.copy()
+                negative = table.columns[1].copy()
                 negative[0] = 10.0**-self.digits
                 table = replace(table, negative=negative)
             found[axis] = table
-        return ScrewMaps(found)
+        return AxisTables(found)
 
-    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
-        """Return what the tables add; a negative column of zeros means that the positive one holds for both directions."""
-        maps = {
-            axis: table if np.any(table.negative) else replace(table, negative=table.positive)
-            for axis, table in tables.maps.items()
-        }
-        return super().emulate(ScrewMaps(maps), points)
+    def curves(self, tables: AxisTables) -> Sequence[Table1D]:
+        """Return the tables; a negative column of zeros means that the positive one holds for both directions."""
+        return [
+            table if np.any(table.columns[1]) else replace(table, negative=None) for table in super().curves(tables)
+        ]
 
-    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+    def parameters(self, tables: AxisTables) -> list[dict[str, str]]:
         """Return the axis parameters that switch a table on."""
         return [
             row
-            for axis, table in sorted(tables.maps.items())
+            for axis, table in sorted(tables.tables.items())
             for row in (
-                parameter_row(f"{AXES[axis]}: NPOINTS (P16)", str(len(table.position_mm)), "points of the table"),
+                parameter_row(f"{AXES[axis]}: NPOINTS (P16)", str(len(table.nodes)), "points of the table"),
                 parameter_row(f"{AXES[axis]}: LSCRWCOM (P15)", "ON", "switches the table on"),
             )
         ]
@@ -642,7 +422,7 @@ class EcmcLookupSettings:
     loss_mm: float = loss_setting()
 
 
-class EcmcLookup(ScrewMapControl[EcmcLookupSettings]):
+class EcmcLookup(ScrewControl[EcmcLookupSettings]):
     """``ecmc``: lookup tables of the encoders, one file per axis."""
 
     name = "ecmc"
@@ -694,14 +474,14 @@ class EcmcLookup(ScrewMapControl[EcmcLookupSettings]):
             rows.append((position, value, value))
         return {AXES.index(named[-1].upper()): rows}
 
-    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+    def emulate(self, tables: AxisTables, points: Points) -> FloatArray:
         """Return encoder minus command where the corrected encoder shows the command."""
         added = np.zeros((len(points), 3))
         for _ in range(_STEPS):
             added = super().emulate(tables, Points(points.position_mm + added))
         return added
 
-    def parameters(self, tables: ScrewMaps) -> list[dict[str, str]]:
+    def parameters(self, tables: AxisTables) -> list[dict[str, str]]:
         """Return the commands that load the tables."""
         return [
             parameter_row("ecmc", self.settings.version, "release for which the sign was chosen"),
@@ -736,26 +516,26 @@ class AerotechSettings:
         return -1.0 if self.reversed_axes[axis] else 1.0
 
 
-class Aerotech(ScrewMapControl[AerotechSettings]):
+class Aerotech(ScrewControl[AerotechSettings]):
     """``aerotech``: one-dimensional axis calibration of A3200 and Automation1."""
 
     name = "aerotech"
     settings_class = AerotechSettings
     even, table_name = True, "calibration table"
 
-    def context(self, tables: ScrewMaps) -> dict[str, Any]:
+    def context(self, tables: AxisTables) -> dict[str, Any]:
         """Return the tables as in the file: in the direction of the encoder, six values a line."""
         shown = []
-        for axis, table in sorted(tables.maps.items()):
+        for axis, table in sorted(tables.tables.items()):
             way = self.settings.way(axis)
-            step = (table.position_mm[-1] - table.position_mm[0]) / (len(table.position_mm) - 1)
+            step = (table.nodes[-1] - table.nodes[0]) / (len(table.nodes) - 1)
             values = [way * value for value in table.positive.tolist()]
             shown.append(
                 {
                     "letter": AXES[axis],
                     "number": self.settings.axis_numbers[axis],
                     "sample_mm": way * step,
-                    "offset_mm": -way * float(table.position_mm[0]),
+                    "offset_mm": -way * float(table.nodes[0]),
                     "lines": [values[k : k + 6] for k in range(0, len(values), 6)],
                 }
             )
@@ -830,7 +610,7 @@ class SmoothiewareSettings:
     loss_mm: float = loss_setting()
 
 
-class Smoothieware(ScrewMapControl[SmoothiewareSettings]):
+class Smoothieware(ScrewControl[SmoothiewareSettings]):
     """``smoothieware``: pitch_compensation.dat of Carvera and Smoothieware, multipliers of the position."""
 
     name = "smoothieware"
@@ -853,26 +633,26 @@ class Smoothieware(ScrewMapControl[SmoothiewareSettings]):
         apart[-1] = True
         return np.asarray(nodes[apart])
 
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> ScrewMaps:
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> AxisTables:
         """Return the multipliers: constant between two nodes, changing linearly over a bend at each node between.
 
         The integral of the multipliers then passes through every node but for the rounding of its bend.
         """
-        maps = {}
+        found = {}
         for axis, term in enumerate(basis):
             nodes, added = term.nodes_mm, np.asarray(values[one_dimensional_name(axis, axis)])
             slopes = 1.0 + np.diff(added) / np.diff(nodes)
             bends = [position for node in nodes[1:-1] for position in (node - self.BEND_MM, node + self.BEND_MM)]
             positions = np.array([nodes[0], *bends, nodes[-1]])
             column = rounded(np.repeat(slopes, 2), self.digits)
-            maps[axis] = ScrewMap(rounded(positions, POSITION_DIGITS), column, column)
-        return ScrewMaps(maps)
+            found[axis] = Table1D(axis, axis, rounded(positions, self.position_digits), column)
+        return AxisTables(found)
 
-    def emulate(self, tables: ScrewMaps, points: Points) -> FloatArray:
+    def emulate(self, tables: AxisTables, points: Points) -> FloatArray:
         """Return the integral of the multipliers minus the position: ``integrate`` of PitchCompensation.cpp, in float32."""
         added = np.zeros((len(points), 3))
-        for axis, table in tables.maps.items():
-            position = table.position_mm.astype(np.float32)
+        for axis, table in tables.tables.items():
+            position = table.nodes.astype(np.float32)
             multiplier = table.positive.astype(np.float32)
             dx = np.diff(position).astype(np.float64)
             mean = (multiplier[1:] + multiplier[:-1]).astype(np.float64) / 2.0
@@ -888,10 +668,10 @@ class Smoothieware(ScrewMapControl[SmoothiewareSettings]):
             added[:, axis] = total[:-1] - total[-1] - where[:-1]
         return added
 
-    def violations(self, tables: ScrewMaps) -> list[str]:
+    def violations(self, tables: AxisTables) -> list[str]:
         """Return also multipliers that the control skips."""
         found = super().violations(tables)
-        for axis, table in sorted(tables.maps.items()):
+        for axis, table in sorted(tables.tables.items()):
             if np.any(np.abs(table.positive - 1.0) > 0.5):
                 found.append(f"{AXES[axis]} has a multiplier outside 0.5 ... 1.5, which the control skips")
         return found

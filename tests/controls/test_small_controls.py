@@ -269,8 +269,8 @@ def test_ecmc_looks_up_what_its_own_reader_does():
     _, tables = read("ecmc", machine, GOLDEN / "ecmc" / "x.lut")
     position = [-200, -100.5, -30.15, 0, 10, 40, 200, 300]
     expected = [0.012, 0.012, 0.00045, -0.0045, -0.002625, 0.003, 0.01707847800237812, 0.0215]
-    table = tables.maps[0]
-    assert np.allclose(np.interp(position, table.position_mm, table.positive), expected, rtol=0, atol=1e-15)
+    table = tables.tables[0]
+    assert np.allclose(np.interp(position, table.nodes, table.positive), expected, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize(("version", "sign"), [("9.6.8", 1.0), ("10.0.0", -1.0), ("11.0.8", -1.0)])
@@ -280,8 +280,8 @@ def test_ecmc_stands_where_the_corrected_encoder_shows_the_command(version, sign
     control, tables = read("ecmc", machine, GOLDEN / "ecmc" / "x.lut")
     commands = np.array([[x, 0.0, 0.0] for x in (-120.0, -60.0, 1.0, 35.0, 249.0)])
     encoder = moved_to(control, tables, commands)[:, 0]
-    table = tables.maps[0]
-    shown = encoder + sign * np.interp(encoder, table.position_mm, table.positive)
+    table = tables.tables[0]
+    shown = encoder + sign * np.interp(encoder, table.nodes, table.positive)
     assert np.allclose(shown, commands[:, 0], rtol=0, atol=1e-9)
 
 
@@ -337,8 +337,8 @@ def test_the_stated_sign_turns_the_values_and_a_reversal_leaves_nothing(name, si
     position = np.random.default_rng(3).uniform(machine.lower_mm, machine.upper_mm, (50, 3))
     forth, back = (moved_to(control, tables, position, direction)[:, 0] for direction in (1.0, -1.0))
     assert np.allclose(forth - back, -0.012, rtol=0, atol=1.1e-4)
-    mean = 0.5 * (tables.maps[0].positive + tables.maps[0].negative)
-    wanted = errors.curves["EXX"].at(tables.maps[0].position_mm) * (1.0 if sign == "error" else -1.0)
+    mean = 0.5 * (tables.tables[0].positive + tables.tables[0].negative)
+    wanted = errors.curves["EXX"].at(tables.tables[0].nodes) * (1.0 if sign == "error" else -1.0)
     assert np.corrcoef(mean, wanted)[0, 1] > 0.7
 
 
@@ -384,8 +384,8 @@ def test_a_negative_column_of_zeros_means_both_directions_on_a_fagor():
     half = ReversalCurves({(0, 0): Curve(np.zeros(1), np.array([0.02]), np.full(1, np.nan))})
     basis = control.basis(flat)
     tables = control.with_reversal(control.build(basis, {term.name: term.start - 0.01 for term in basis}), half)
-    assert np.all(tables.maps[0].positive == 0.02)  # 0.02 forth and none back must not read as 0.02 in both
-    assert tables.maps[0].negative.tolist() == [0.0001, 0.0]
+    assert np.all(tables.tables[0].positive == 0.02)  # 0.02 forth and none back must not read as 0.02 in both
+    assert tables.tables[0].negative.tolist() == [0.0001, 0.0]
 
 
 # --- Aerotech and KMotion --------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import numpy as np
 
 from compgen.controls.shared.base import SourceFile
 from compgen.data import toml_files
-from compgen.data.csv_files import FloatArray
+from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
@@ -37,6 +37,12 @@ def kept_by_numbers(calculation: Callable[..., Result]) -> Callable[..., Result]
         return copy(result_of(pickle.dumps(arguments)))
 
     return wrapper
+
+
+def rounded(values: FloatArray | float, digits: int) -> FloatArray:
+    """Return numbers as read back from a text with so many decimals, in the shape of ``values``."""
+    flat = [float(fixed(value, digits)) for value in np.asarray(values).ravel().tolist()]
+    return np.array(flat).reshape(np.shape(values))
 
 
 # Fewest nodes of a polyline that stays within tolerance of the curves: a shortest path over candidate nodes.

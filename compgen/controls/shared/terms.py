@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -174,3 +174,22 @@ def continued(term: Term, range_mm: tuple[float, float]) -> Term:
             ratio = (nodes[out] - nodes[inner]) / (nodes[inner] - nodes[third])
             start[out] = start[inner] + ratio * (start[inner] - start[third])
     return replace(term, start=start)
+
+
+def field_on_grid(
+    terms: Iterable[Term], values: Mapping[str, FloatArray], lines_mm: Mapping[int, FloatArray], tool_mm: FloatArray
+) -> FloatArray:
+    """Return what terms with these values add at the vertices of a grid, mm.
+
+    ``lines_mm`` has the positions along each axis 0..2, in the order of the dimensions of the result, (n0, n1[, n2], 3); an
+    axis without a line is at zero. ``tool_mm`` is the tool offset, shape (3,).
+    """
+    mesh = np.meshgrid(*lines_mm.values(), indexing="ij")
+    position_mm = np.zeros((mesh[0].size, 3))
+    for axis, along_mm in zip(lines_mm, mesh, strict=True):
+        position_mm[:, axis] = along_mm.ravel()
+    field = np.zeros_like(position_mm)
+    for term in terms:
+        along = term.curve(np.asarray(values[term.name]), position_mm)
+        field += term.carrier_field(position_mm, tool_mm) * along[:, None]
+    return field.reshape(*mesh[0].shape, 3)
