@@ -5,28 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
-from compgen.controls.shared.base import (
-    Controller,
-    SourceFile,
-    Term,
-    Usage,
-    by_travel,
-    coverage_violations,
-    nodes_by_axis,
-    travel_of,
-)
-from compgen.controls.shared.grids import loss_setting, uneven_nodes_mm
+from compgen.controls.shared.base import SourceFile, coverage_violations, parameter_row
+from compgen.controls.shared.grids import loss_setting, rounded
 from compgen.controls.shared.scanner import number_pattern
-from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
+from compgen.controls.shared.tables import AxisTableController, AxisTables, Table1D, largest_of
 from compgen.data import toml_files
-from compgen.data.csv_files import FloatArray, fixed
-from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
-from compgen.data.lengths import Points
+from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import Curve
 from compgen.data.machine import MM_PER_UNIT, Machine
 from compgen.data.names import AXES, LARGEST, MM_PER_UM
 from compgen.data.toml_files import (
@@ -124,48 +114,35 @@ _COLUMNS = ("the nominal position", "the forward value", "the reverse value")
 
 
 @dataclass(frozen=True)
-class CompTable:
-    """One COMP_FILE with the numbers of its text, in machine units of ``mm_per_unit``, in which the control rounds too.
+class CompTable(Table1D):
+    """One COMP_FILE with the numbers of its text, in machine units, in which the control rounds too.
 
-    ``nominal`` (n,) is strictly increasing; ``forward`` and ``reverse`` (n,) are trims, which are added.
+    ``nodes`` are the nominal positions; the values are the trims while the joint moves up and down, which are added.
     """
 
-    nominal: FloatArray
-    forward: FloatArray
-    reverse: FloatArray
-    mm_per_unit: float = 1.0
-
-    @property
-    def nominal_mm(self) -> FloatArray:
-        """Positions of the rows, mm."""
-        return self.nominal * self.mm_per_unit
-
-    @property
-    def forward_mm(self) -> FloatArray:
-        """Trims while the joint moves up, mm."""
-        return self.forward * self.mm_per_unit
-
-    @property
-    def reverse_mm(self) -> FloatArray:
-        """Trims while the joint moves down, mm."""
-        return self.reverse * self.mm_per_unit
-
-    def at(self, position_mm: FloatArray, direction: int) -> FloatArray:
-        """Return the correction at joint positions (m,) in direction +1 or -1, bit for bit as in the control."""
-        trims = (self.forward if direction > 0 else self.reverse).astype(np.float32)
+    def interpolated(self, along: FloatArray, values: FloatArray) -> FloatArray:
+        """Return the trim at joint positions (m,), bit for bit as in the control."""
+        trims = values.astype(np.float32)
         # slopes after each row: float32 of the float32 differences; zero after the last
         differences = (trims[1:] - trims[:-1]).astype(np.float64)
-        slopes = np.append((differences / np.diff(self.nominal)).astype(np.float32), np.float32(0.0))
-        position = np.asarray(position_mm, dtype=np.float64) / self.mm_per_unit
-        row = np.searchsorted(self.nominal, position, side="right") - 1
+        slopes = np.append((differences / np.diff(self.nodes)).astype(np.float32), np.float32(0.0))
+        row = np.searchsorted(self.nodes, along, side="right") - 1
         inside = np.clip(row, 0, len(trims) - 1)
-        found = trims[inside].astype(np.float64) + slopes[inside].astype(np.float64) * (position - self.nominal[inside])
-        return np.where(row < 0, np.float64(trims[0]), found) * self.mm_per_unit
+        found = trims[inside].astype(np.float64) + slopes[inside].astype(np.float64) * (along - self.nodes[inside])
+        return np.where(row < 0, np.float64(trims[0]), found)
 
-    @property
-    def step_mm(self) -> FloatArray:
-        """Size of the step between forward and reverse at each row, shape (n,), mm."""
-        return np.abs(self.forward_mm - self.reverse_mm)
+
+def comp_table(
+    axis: int, nominal: FloatArray, forward: FloatArray, reverse: FloatArray, mm_per_unit: float = 1.0
+) -> CompTable:
+    """Return the table of a joint with numbers in machine units of ``mm_per_unit``."""
+    return CompTable(axis, axis, nominal, forward, reverse, mm_per_unit, mm_per_unit)
+
+
+def steps_mm(table: Table1D) -> FloatArray:
+    """Size of the step between forward and reverse at each row, shape (n,), mm."""
+    forward, reverse = (table.value_mm * column for column in table.columns)
+    return np.abs(forward - reverse)
 
 
 def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: float) -> str:
@@ -183,7 +160,7 @@ def standstill_outcome(step_mm: float, acceleration_mm_s2: float, period_s: floa
     return "never" if abs(step_mm) <= RAMPED * unit_mm else "ramped"
 
 
-def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> CompTable:
+def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0, axis: int = 0) -> CompTable:
     """Read a COMP_FILE strictly.
 
     Parameters
@@ -191,6 +168,7 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
     source : the text; CRLF, exponents and additional columns are accepted, as by the control.
     file_type : 0: nominal, actual forward, actual reverse (trim = nominal minus actual); 1: the trims themselves.
     mm_per_unit : machine unit used in the file; the file itself does not state it.
+    axis : the axis 0..2 of the joint.
 
     Raises
     ------
@@ -224,8 +202,8 @@ def parse_comp(source: SourceFile, file_type: int, mm_per_unit: float = 1.0) -> 
         message += f": the trims would be up to {largest:g} machine units. Set comp_file_type in the machine file"
         raise source.fail(message, 1)
     if file_type == 0:
-        return CompTable(nominal, nominal - forward, nominal - reverse, mm_per_unit)
-    return CompTable(nominal, forward, reverse, mm_per_unit)
+        forward, reverse = nominal - forward, nominal - reverse
+    return comp_table(axis, nominal, forward, reverse, mm_per_unit)
 
 
 def _row(source: SourceFile, line: int, text: str, above: list[tuple[float, ...]]) -> tuple[float, ...]:
@@ -254,11 +232,11 @@ _SECONDS_PER_US = 1e-6
 _NO_STEP_MM = 1e-9
 
 
-def sign_statement(file_type: int, unit: str, tables: Mapping[int, CompTable]) -> str:
+def sign_statement(file_type: int, unit: str, tables: Mapping[int, Table1D]) -> str:
     """Return the sign in words, with a number from the file."""
-    axis, table = max(tables.items(), key=lambda item: float(np.max(np.abs(item[1].forward))))
-    row = int(np.argmax(np.abs(table.forward)))
-    position, trim = float(table.nominal[row]), float(table.forward[row])
+    table = largest_of(tables.values())
+    axis, row = table.axis, table.largest
+    position, trim = float(table.nodes[row]), float(table.positive[row])
     places = 6 if unit == "mm" else 8
     written = f"the trim {trim:+.{places}f}" if file_type == 1 else f"the actual position {position - trim:.{places}f}"
     return (
@@ -268,47 +246,48 @@ def sign_statement(file_type: int, unit: str, tables: Mapping[int, CompTable]) -
 
 
 def parameters(
-    file_type: int, unit: str, servo_period_us: float, tables: Mapping[int, CompTable], files: Sequence[str]
+    file_type: int, unit: str, servo_period_us: float, tables: Mapping[int, Table1D], files: Sequence[str]
 ) -> list[dict[str, str]]:
     """Return the INI lines of each joint, and the accelerations at which a reversal step may be lost, in machine units."""
     rows = [
-        {
-            "name": "[TRAJ] LINEAR_UNITS",
-            "value": unit,
-            "meaning": "unit of all numbers in the files; LinuxCNC reads them in its own unit, without a check",
-        }
+        parameter_row(
+            "[TRAJ] LINEAR_UNITS",
+            unit,
+            "unit of all numbers in the files; LinuxCNC reads them in its own unit, without a check",
+        )
     ]
     for axis, table in sorted(tables.items()):
         section = f"[JOINT_{axis}]"
-        rows.append({"name": f"{section} COMP_FILE", "value": files[axis], "meaning": f"the file of {AXES[axis]}"})
+        rows.append(parameter_row(f"{section} COMP_FILE", files[axis], f"the file of {AXES[axis]}"))
         columns = "forward trim, reverse trim" if file_type == 1 else "actual forward, actual reverse"
-        rows.append({"name": f"{section} COMP_FILE_TYPE", "value": str(file_type), "meaning": f"nominal, {columns}"})
+        rows.append(parameter_row(f"{section} COMP_FILE_TYPE", str(file_type), f"nominal, {columns}"))
         rows.append(
-            {
-                "name": f"{section} BACKLASH",
-                "value": "0",
-                "meaning": "ignored for a joint with a COMP_FILE; a previous value must go into the file",
-            }
+            parameter_row(
+                f"{section} BACKLASH",
+                "0",
+                "ignored for a joint with a COMP_FILE; a previous value must go into the file",
+            )
         )
-        steps = table.step_mm[table.step_mm > _NO_STEP_MM]
+        steps = steps_mm(table)
+        steps = steps[steps > _NO_STEP_MM]
         if len(steps):
             # range of accelerations for which some steps are in the dead zone
             square = (servo_period_us * _SECONDS_PER_US) ** 2
-            low = float(steps.min()) / (RAMPED * square) / table.mm_per_unit
-            high = float(steps.max()) / (AT_ONCE * square) / table.mm_per_unit
+            low = float(steps.min()) / (RAMPED * square) / table.value_mm
+            high = float(steps.max()) / (AT_ONCE * square) / table.value_mm
             rows.append(
-                {
-                    "name": f"{section} MAX_ACCELERATION",
-                    "value": f"not {low:.0f} ... {high:.0f} {unit}/s2",
-                    "meaning": f"for SERVO_PERIOD {servo_period_us:g} us: in this range, the reversal step of {AXES[axis]} "
+                parameter_row(
+                    f"{section} MAX_ACCELERATION",
+                    f"not {low:.0f} ... {high:.0f} {unit}/s2",
+                    f"for SERVO_PERIOD {servo_period_us:g} us: in this range, the reversal step of {AXES[axis]} "
                     "may not be applied from standstill",
-                }
+                )
             )
     return rows
 
 
 def dead_zone_warnings(
-    servo_period_us: float, accelerations_mm_s2: Sequence[float] | None, tables: Mapping[int, CompTable]
+    servo_period_us: float, accelerations_mm_s2: Sequence[float] | None, tables: Mapping[int, Table1D]
 ) -> list[str]:
     """Return a warning for each joint whose reversal steps the control may not apply at the stated acceleration."""
     if accelerations_mm_s2 is None:
@@ -317,7 +296,9 @@ def dead_zone_warnings(
     period_s = servo_period_us * _SECONDS_PER_US
     for axis, table in sorted(tables.items()):
         acceleration = accelerations_mm_s2[axis]
-        lost = [step for step in table.step_mm.tolist() if standstill_outcome(step, acceleration, period_s) == "never"]
+        lost = [
+            step for step in steps_mm(table).tolist() if standstill_outcome(step, acceleration, period_s) == "never"
+        ]
         if lost:
             unit_um = acceleration * period_s**2 / MM_PER_UM
             found.append(
@@ -383,71 +364,40 @@ class CompSettings:
         return MM_PER_UNIT[self.machine_units]
 
 
-@dataclass(frozen=True)
-class CompTables:
-    """Tables by axis 0..2; an axis without one is not corrected."""
-
-    tables: Mapping[int, CompTable]
-
-
-class LinuxcncComp(Controller[CompSettings, CompTables]):
+class LinuxcncComp(AxisTableController[CompSettings]):
     """``linuxcnc-comp``: positioning of each joint, with its reversal."""
 
     name = "linuxcnc-comp"
     settings_class = CompSettings
     bidirectional = True
+    most, table_name, point_name = MOST_ROWS, "COMP_FILE", "rows"
 
     @classmethod
     def check_settings(cls, settings: CompSettings, section: toml_files.Section, machine: Machine) -> CompSettings:
         """Take the unit of the machine, unless the section states it."""
         return with_units(settings, section, machine)
 
-    def basis(self, errors: ErrorTable) -> list[Term]:
-        """Return X(x), Y(y), Z(z) with rows where the curves need them."""
-        nodes = [
-            _written_mm(
-                uneven_nodes_mm(self.machine, errors, axis, loss_mm=self.settings.loss_mm, most=MOST_ROWS),
-                self.settings,
-            )
-            for axis in range(3)
-        ]
-        return one_dimensional_terms(self.machine, errors, nodes, [(axis, axis) for axis in range(3)])
+    def positions_as_written(self, position_mm: FloatArray) -> FloatArray:
+        """Return positions as in the file, in mm: those equal in the file are equal here to the last bit."""
+        return rounded(position_mm / self.settings.mm_per_unit, POSITION_DIGITS) * self.settings.mm_per_unit
 
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> CompTables:
-        """Return the trims, rounded as written; the same for both directions."""
-        found = {}
-        for axis in range(3):
-            term = next(item for item in basis if item.name == one_dimensional_name(axis, axis))
-            trims = values[term.name]
-            found[axis] = self._as_written(term.nodes_mm, trims, trims)
-        return CompTables(found)
+    def as_written(self, axis: int, nodes_mm: FloatArray, positive_mm: FloatArray, negative_mm: FloatArray) -> Table1D:
+        """Return the table of these positions and trims as read back from its text."""
+        unit = self.settings.mm_per_unit
+        table = comp_table(axis, nodes_mm / unit, positive_mm / unit, negative_mm / unit, unit)
+        nominal, forward, reverse = (rounded(column, VALUE_DIGITS) for column in np.array(self._rows(table)).T)
+        if self.settings.comp_file_type == 0:
+            forward, reverse = nominal - forward, nominal - reverse
+        return comp_table(axis, nominal, forward, reverse, unit)
 
-    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return the reversal of each axis along itself; a COMP_FILE cannot contain a transverse displacement."""
-        return replace(reversal, curves={key: part for key, part in reversal.curves.items() if key[0] == key[1]})
+    def reversal_nodes_mm(self, table: Table1D, curve: Curve) -> FloatArray:
+        """Return the rows of a table and those that its reversal needs, as far as the control takes so many."""
+        low, high = self.machine.axes[table.axis].range_mm
+        inside = curve.position_mm[(curve.position_mm >= low) & (curve.position_mm <= high)]
+        nodes_mm = np.union1d(table.nodes_mm, self.positions_as_written(inside))
+        return table.nodes_mm if len(nodes_mm) > MOST_ROWS else nodes_mm
 
-    def with_reversal(self, tables: CompTables, reversal: ReversalCurves) -> CompTables:
-        """Return the tables with -B/2 in the forward and +B/2 in the reverse column (B: reversal value)."""
-        found = dict(tables.tables)
-        for (axis, _), curve in reversal.curves.items():
-            if np.max(np.abs(curve.value)) < WORTH_MM:
-                continue
-            table = found[axis]
-            low, high = self.machine.axes[axis].range_mm
-            inside = curve.position_mm[(curve.position_mm >= low) & (curve.position_mm <= high)]
-            nodes = np.union1d(table.nominal_mm, _written_mm(inside, self.settings))
-            nodes = table.nominal_mm if len(nodes) > MOST_ROWS else nodes
-            half = 0.5 * curve.at(nodes)
-            forward = np.interp(nodes, table.nominal_mm, table.forward_mm) - half
-            reverse = np.interp(nodes, table.nominal_mm, table.reverse_mm) + half
-            found[axis] = self._as_written(nodes, forward, reverse)
-        return CompTables(found)
-
-    def backlash_parameters(self, reversal: ReversalCurves) -> list[dict[str, str]]:
-        """Return none: a joint with a COMP_FILE ignores BACKLASH, and the rest is transverse to the axis."""
-        return []
-
-    def context(self, tables: CompTables) -> dict[str, Any]:
+    def context(self, tables: AxisTables) -> dict[str, Any]:
         """Return rows by axis letter, INI lines, and what to know about small reversal steps."""
         settings = self.settings
         return {
@@ -464,22 +414,22 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
             ],
         }
 
-    def parse(self, files: Sequence[SourceFile]) -> CompTables:
+    def parse(self, files: Sequence[SourceFile]) -> AxisTables:
         """Read one file per joint; its name identifies the joint: ``joint0`` or the letter, as in ``joint0-x.comp``."""
-        found: dict[int, CompTable] = {}
+        found: dict[int, Table1D] = {}
         for source in files:
             axis = _axis_of(source)
             if axis in found:
                 raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
-            found[axis] = parse_comp(source, self.settings.comp_file_type, self.settings.mm_per_unit)
+            found[axis] = parse_comp(source, self.settings.comp_file_type, self.settings.mm_per_unit, axis)
         if not found:
             raise InputError(f"no COMP_FILE was given; expected {', '.join(FILES)}")
-        return CompTables(found)
+        return AxisTables(found)
 
-    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[CompTables, list[str]]:
+    def parse_foreign(self, files: Sequence[SourceFile]) -> tuple[AxisTables, list[str]]:
         """Read COMP_FILEs under any name: ``comp_files`` assigns them, else a letter at the end of the name."""
         settings = self.settings
-        found: dict[int, CompTable] = {}
+        found: dict[int, Table1D] = {}
         remarks = []
         for source in files:
             last = _LAST_LETTER.search(source.path.stem)
@@ -498,28 +448,15 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
                     raise source.fail(message) from None
             if axis in found:
                 raise source.fail(f"is a second file for {AXES[axis]}; give one per joint")
-            found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit)
+            found[axis] = parse_comp(source, settings.comp_file_type, settings.mm_per_unit, axis)
             remarks.append(f"{source.path.name} was read as the file of {AXES[axis]}, type {settings.comp_file_type}")
-        return CompTables(found), remarks
+        return AxisTables(found), remarks
 
-    def emulate(self, tables: CompTables, points: Points) -> FloatArray:
-        """Return the trims at the commanded positions in the direction of the last travel; the mean if unknown.
-
-        This is the settled correction; for small steps from standstill in the control's filter see
-        :func:`compgen.controls.linuxcnc_comp.standstill_outcome`.
-        """
-        added = np.zeros((len(points), 3))
-        for axis, table in tables.tables.items():
-            position = points.position_mm[:, axis]
-            forward, reverse = table.at(position, 1), table.at(position, -1)
-            added[:, axis] = by_travel(travel_of(points, axis), forward, reverse)
-        return added
-
-    def violations(self, tables: CompTables) -> list[str]:
+    def violations(self, tables: AxisTables) -> list[str]:
         """Return joints without a table, and travel that a table does not cover, e.g. with a file in another unit."""
         found = [f"there is no COMP_FILE for {AXES[axis]}" for axis in range(3) if axis not in tables.tables]
         for axis, table in sorted(tables.tables.items()):
-            first, last = table.nominal_mm[0], table.nominal_mm[-1]
+            first, last = table.nodes_mm[[0, -1]]
             left_out = coverage_violations(self.machine, axis, first, last, f"the COMP_FILE of {AXES[axis]}")
             other = "inch" if self.settings.machine_units == "mm" else "mm"
             share = MM_PER_UNIT[other] / self.settings.mm_per_unit
@@ -534,41 +471,12 @@ class LinuxcncComp(Controller[CompSettings, CompTables]):
         """Half of the last decimal, plus float32 rounding."""
         return _RESOLUTION_MM
 
-    def table_nodes_mm(self, tables: CompTables) -> tuple[FloatArray, ...]:
-        """Return the nominal positions of each joint."""
-        return nodes_by_axis((axis, table.nominal_mm) for axis, table in tables.tables.items())
-
-    def usage(self, tables: CompTables) -> list[Usage]:
-        """Return the rows of each joint against the 256 that LinuxCNC accepts."""
-        return [
-            Usage(f"rows of {AXES[axis]}", len(table.nominal_mm), MOST_ROWS, "rows")
-            for axis, table in sorted(tables.tables.items())
-        ]
-
-    def _as_written(self, nominal_mm: FloatArray, forward_mm: FloatArray, reverse_mm: FloatArray) -> CompTable:
-        """Return the table of these positions and trims as read back from its text."""
-        unit = self.settings.mm_per_unit
-        table = CompTable(nominal_mm / unit, forward_mm / unit, reverse_mm / unit, unit)
-        nominal, forward, reverse = (_written(column) for column in np.array(self._rows(table)).T)
-        if self.settings.comp_file_type == 0:
-            forward, reverse = nominal - forward, nominal - reverse
-        return CompTable(nominal, forward, reverse, unit)
-
-    def _rows(self, table: CompTable) -> list[list[float]]:
+    def _rows(self, table: Table1D) -> list[list[float]]:
         """Rows of the file, in machine units: nominal, then trims (type 1) or actual positions (type 0)."""
-        forward, reverse = table.forward, table.reverse
+        columns = table.columns
         if self.settings.comp_file_type == 0:
-            forward, reverse = table.nominal - forward, table.nominal - reverse
-        return [list(row) for row in zip(table.nominal.tolist(), forward.tolist(), reverse.tolist(), strict=True)]
-
-
-def _written(values: FloatArray, digits: int = POSITION_DIGITS) -> FloatArray:
-    return np.array([float(fixed(value, digits)) for value in values.tolist()])
-
-
-def _written_mm(position_mm: FloatArray, settings: CompSettings) -> FloatArray:
-    """Positions as in the file, in mm: those equal in the file are equal here to the last bit."""
-    return _written(position_mm / settings.mm_per_unit) * settings.mm_per_unit
+            columns = (table.nodes - columns[0], table.nodes - columns[1])
+        return [list(row) for row in zip(*(column.tolist() for column in (table.nodes, *columns)), strict=True)]
 
 
 def _axis_of(source: SourceFile) -> int:

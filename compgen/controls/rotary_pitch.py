@@ -246,7 +246,7 @@ class LinuxcncRotary(PitchFormat):
             if letter not in self.machine.rotary or letter in found:
                 raise InputError("the name does not say which axis it belongs to; expected rotary-c.comp", file=path)
             rows = parse_comp(SourceFile(path, text), 1)
-            found[letter] = self.turned(letter, AngleTable(rows.nominal, rows.forward, rows.reverse))
+            found[letter] = self.turned(letter, AngleTable(rows.nodes, *rows.columns))
         return found
 
     def instructions(self, letters: Iterable[str]) -> list[str]:

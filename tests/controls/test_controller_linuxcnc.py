@@ -13,7 +13,7 @@ from steps import grows_with_its_file
 
 import compgen
 from compgen.controls import SourceFile, controller_named
-from compgen.controls.linuxcnc_comp import CompTable, parse_comp, standstill_outcome
+from compgen.controls.linuxcnc_comp import comp_table, parse_comp, standstill_outcome
 from compgen.controls.linuxcnc_volumetric import VolCurve, VolTable, VolTerm, parse_volcomp
 from compgen.data import toml_files
 from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
@@ -137,7 +137,7 @@ def test_the_emulator_rounds_as_the_control_does():
     generator = np.random.default_rng(1)
     nominal = np.cumsum(generator.uniform(0.5, 30.0, 256)) - 700.0
     forward = generator.normal(size=256) * 0.05
-    table = CompTable(nominal, forward, -forward)
+    table = comp_table(0, nominal, forward, -forward)
     positions = np.concatenate([generator.uniform(-900, 4500, 500), nominal])
     for direction, trims in ((1, forward), (-1, -forward)):
         expected = [rule_of_the_control(nominal, trims, position) for position in positions]
@@ -155,7 +155,7 @@ def test_the_exported_files_add_minus_the_error(file_type):
     )
     last = texts["joint0-x.comp"].splitlines()[-1].split()
     assert last == ["500.000000000", *(["-0.010000000"] * 2 if file_type else ["500.010000000"] * 2)]
-    assert np.array_equal(parsed(COMP, machine, texts).tables[0].forward_mm, tables.tables[0].forward_mm)
+    assert np.array_equal(parsed(COMP, machine, texts).tables[0].positive, tables.tables[0].positive)
 
 
 @pytest.mark.parametrize("file_type", [0, 1])
@@ -169,7 +169,7 @@ def test_files_for_an_inch_machine_hold_inches(file_type):
     points = Points(np.array([[500.0, 0, 0], [100.0, 0, 0]]))
     assert added(COMP, machine, texts, points)[:, 0] == pytest.approx([-0.0127, -0.00635], abs=COMP_QUANTUM_MM)
     read = parsed(COMP, machine, texts)
-    assert np.array_equal(read.tables[0].forward, tables.tables[0].forward)
+    assert np.array_equal(read.tables[0].positive, tables.tables[0].positive)
     control = controller_named(COMP)
     assert control(machine).violations(read) == []
     metric = machine_with(comp={"comp_file_type": file_type})
@@ -299,7 +299,7 @@ def test_256_rows_are_accepted_and_the_name_says_the_joint():
     ):
         tables = parsed(COMP, machine_with(), {name: text}).tables
         assert list(tables) == [axis]
-        assert len(tables[axis].nominal_mm) == 256
+        assert len(tables[axis].nodes) == 256
     for names in (("table.comp",), ("x.comp", "joint0-x.comp")):
         with pytest.raises(InputError, match="joint"):
             parsed(COMP, machine_with(), dict.fromkeys(names, text))
