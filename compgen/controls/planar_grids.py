@@ -5,79 +5,48 @@ from __future__ import annotations
 import re
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from compgen.controls.screw_maps import AerotechSettings
-from compgen.controls.shared.base import (
-    Controller,
-    SourceFile,
-    Term,
-    Usage,
-    coverage_violations,
-    nodes_by_axis,
-    parameter_row,
-)
-from compgen.controls.shared.grids import equidistant_grid, loss_setting
+from compgen.controls.shared.base import Settings, SourceFile, Term, Usage, parameter_row
+from compgen.controls.shared.grids import equidistant_grid, loss_setting, rounded
 from compgen.controls.shared.scanner import check_complete, check_size, content_lines, fixed_point, floating
-from compgen.controls.shared.terms import one_dimensional_terms, product_terms
+from compgen.controls.shared.tables import TableController, TableGrid
+from compgen.controls.shared.terms import field_on_grid, one_dimensional_terms, product_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
-from compgen.data.lengths import Points
 from compgen.data.machine import MM_PER_UNIT
 from compgen.data.names import AXES
 from compgen.data.toml_files import choice, setting, whole
 from compgen.errors import InputError
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import full_grid
 
 _MOST_CHARACTERS = 20_000_000
 #: KMotion takes so many rows and columns.
 KMOTION_MOST = 4000
 
-Settings = TypeVar("Settings")
+
+def planar(start_mm: FloatArray, step_mm: FloatArray, added_mm: FloatArray, *, extends: bool = False) -> TableGrid:
+    """Return corrections (columns, rows, 3) over X and Y; ``start_mm`` and ``step_mm`` are (2,), for X and Y."""
+    return TableGrid((0, 1), (0, 1, 2), start_mm, step_mm, added_mm, extends=extends)
 
 
-@dataclass(frozen=True)
-class PlanarGrid:
-    """Corrections over X and Y, in mm.
-
-    ``added_mm`` (columns, rows, 3) is what is added at ``start_mm`` + (column, row) ``step_mm``; both (2,), for X and Y.
-    """
-
-    start_mm: FloatArray
-    step_mm: FloatArray
-    added_mm: FloatArray
-
-    def nodes_mm(self, axis: int) -> FloatArray:
-        """Return the positions of the columns (axis 0) or rows (axis 1)."""
-        return np.asarray(self.start_mm[axis] + self.step_mm[axis] * np.arange(self.added_mm.shape[axis]))
-
-    def at(self, position_mm: FloatArray, *, extrapolate: bool) -> FloatArray:
-        """Return what is added at positions (n, 3): bilinear; outside the nearest cell goes on, or its edge is kept."""
-        ratio = (position_mm[:, :2] - self.start_mm) / self.step_mm
-        most = np.array(self.added_mm.shape[:2]) - 1
-        cell = np.clip(np.floor(ratio), 0, most - 1)
-        share = ratio - cell if extrapolate else np.clip(ratio - cell, 0.0, 1.0)
-        column, row = cell.astype(np.intp).T
-        along, across = share[:, :1], share[:, 1:]
-        bottom = self.added_mm[column, row] * (1.0 - along) + self.added_mm[column + 1, row] * along
-        top = self.added_mm[column, row + 1] * (1.0 - along) + self.added_mm[column + 1, row + 1] * along
-        return np.asarray(bottom * (1.0 - across) + top * across)
-
-
-class PlanarControl(Controller[Settings, PlanarGrid]):
+class PlanarControl(TableController[Settings, TableGrid]):
     """What the two have in common: a correction that depends on X and Y, whatever Z is."""
 
     #: Axes that are corrected; decimals of a number of the file in mm.
     outputs: Sequence[int] = (0, 1)
     digits = 6
-    extrapolates = False
+
+    def grids(self, tables: TableGrid) -> Sequence[TableGrid]:
+        """Return the one grid."""
+        return [tables]
 
     @abstractmethod
-    def read_grid(self, source: SourceFile) -> PlanarGrid:
+    def read_grid(self, source: SourceFile) -> TableGrid:
         """Read the file."""
 
     def basis(self, errors: ErrorTable) -> list[Term]:
@@ -102,23 +71,19 @@ class PlanarControl(Controller[Settings, PlanarGrid]):
         ]
         return one_dimensional_terms(self.machine, errors, nodes, pairs, lever_origin_mm=middle) + products
 
-    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> PlanarGrid:
+    def build(self, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> TableGrid:
         """Return the sum of the terms at each place, rounded as written."""
         nodes = [next(term.nodes_mm for term in basis if term.axis == axis) for axis in range(2)]
-        position = full_grid([*nodes, np.array([0.5 * sum(self.machine.axes[2].range_mm)])]).reshape(-1, 3)
-        tool = tool_of(self.machine, None)
-        added = np.zeros_like(position)
-        for term in basis:
-            added += term.carrier_field(position, tool) * term.curve(values[term.name], position)[:, None]
+        lines_mm = {0: nodes[0], 1: nodes[1], 2: np.array([0.5 * sum(self.machine.axes[2].range_mm)])}
+        added = field_on_grid(basis, values, lines_mm, tool_of(self.machine, None))[:, :, 0]
         start, step = np.array([[part[0] for part in nodes], [part[1] - part[0] for part in nodes]])
-        grid = PlanarGrid(start, step, added.reshape(len(nodes[0]), len(nodes[1]), 3))
-        return self.as_written(grid)
+        return self.as_written(planar(start, step, added))
 
-    def as_written(self, grid: PlanarGrid) -> PlanarGrid:
+    def as_written(self, grid: TableGrid) -> TableGrid:
         """Return the grid as read back from its text."""
-        return PlanarGrid(*(_rounded(part, self.digits) for part in (grid.start_mm, grid.step_mm, grid.added_mm)))
+        return planar(*(rounded(part, self.digits) for part in (grid.start, grid.step, grid.values)))
 
-    def parse(self, files: Sequence[SourceFile]) -> PlanarGrid:
+    def parse(self, files: Sequence[SourceFile]) -> TableGrid:
         """Read the one file."""
         if len(files) != 1:
             message = f"{len(files)} files were given; expected one with the grid"
@@ -126,28 +91,19 @@ class PlanarControl(Controller[Settings, PlanarGrid]):
         check_size(files[0], _MOST_CHARACTERS)
         return self.read_grid(files[0])
 
-    def emulate(self, tables: PlanarGrid, points: Points) -> FloatArray:
-        """Return the bilinear value at the commanded X and Y."""
-        return tables.at(points.position_mm, extrapolate=self.extrapolates)
-
-    def violations(self, tables: PlanarGrid) -> list[str]:
+    def violations(self, tables: TableGrid) -> list[str]:
         """Return travel that the grid does not cover, and too many rows or columns."""
         found, most = [], getattr(self.settings, "most_points", 0)
-        for axis in range(2):
-            nodes = tables.nodes_mm(axis)
-            found += coverage_violations(self.machine, axis, nodes[0], nodes[-1], "the grid")
+        for axis, nodes in tables.spans:
+            found += self.not_covered(axis, nodes, "the grid")
             if len(nodes) > most:
                 found.append(f"the grid has {len(nodes)} positions of {AXES[axis]}; at most {most} are possible")
         return found
 
-    def table_nodes_mm(self, tables: PlanarGrid) -> tuple[FloatArray, ...]:
-        """Return the columns and rows."""
-        return nodes_by_axis((axis, tables.nodes_mm(axis)) for axis in range(2))
-
-    def usage(self, tables: PlanarGrid) -> list[Usage]:
+    def usage(self, tables: TableGrid) -> list[Usage]:
         """Return columns and rows against the limit."""
         most = getattr(self.settings, "most_points", 0)
-        return [Usage(f"positions of {AXES[axis]}", tables.added_mm.shape[axis], most, "points") for axis in range(2)]
+        return [Usage(f"positions of {AXES[axis]}", tables.values.shape[axis], most, "points") for axis in range(2)]
 
     def resolution_mm(self) -> float:
         """Half of the last decimal: a bilinear value is a mean of four."""
@@ -161,20 +117,15 @@ class PlanarControl(Controller[Settings, PlanarGrid]):
             f"for the mean of the travel, Z {height:g} mm, only"
         ]
 
-    def example(self, grid: PlanarGrid) -> str:
+    def example(self, grid: TableGrid) -> str:
         """Return the place of the largest correction, and where the axes go for it."""
-        column, row, axis = np.unravel_index(int(np.argmax(np.abs(grid.added_mm))), grid.added_mm.shape)
+        column, row, axis = np.unravel_index(int(np.argmax(np.abs(grid.values))), grid.values.shape)
         place = np.array([grid.nodes_mm(0)[column], grid.nodes_mm(1)[row]])
-        added = grid.added_mm[column, row]
+        added = grid.values[column, row]
         return (
             f"Example: at X {place[0]:.4f} Y {place[1]:.4f} mm the control adds {fixed(float(added[axis]), 6)} mm to "
             f"{AXES[int(axis)]}; column {column}, row {row}."
         )
-
-
-def _rounded(values: FloatArray, digits: int) -> FloatArray:
-    flat = [float(fixed(value, digits)) for value in np.asarray(values).ravel().tolist()]
-    return np.array(flat).reshape(np.shape(values))
 
 
 @dataclass(frozen=True)
@@ -196,33 +147,32 @@ class Kmotion(PlanarControl[KmotionSettings]):
     name = "kmotion"
     settings_class = KmotionSettings
     outputs, digits = (0, 1, 2), 7
-    extrapolates = True
 
-    def as_written(self, grid: PlanarGrid) -> PlanarGrid:
+    def as_written(self, grid: TableGrid) -> TableGrid:
         """Return the grid as read back: the file has the corrected places in its unit."""
         unit, quantum = MM_PER_UNIT[self.settings.units], 10.0**-self.digits
         # the first place is rounded down and the spacing up, so that the travel stays within the grid
-        count = np.array(grid.added_mm.shape[:2]) - 1
-        last = grid.start_mm + count * grid.step_mm
-        start = _rounded(np.floor(np.round(grid.start_mm / unit / quantum, 3)) * quantum, self.digits)
-        step = _rounded(np.ceil(np.round((last / unit - start) / count / quantum, 3)) * quantum, self.digits)
-        places = self._places(PlanarGrid(start * unit, step * unit, grid.added_mm)) / unit
-        return self._from_places(start, step, _rounded(places, self.digits))
+        count = np.array(grid.values.shape[:2]) - 1
+        last = grid.start + count * grid.step
+        start = rounded(np.floor(np.round(grid.start / unit / quantum, 3)) * quantum, self.digits)
+        step = rounded(np.ceil(np.round((last / unit - start) / count / quantum, 3)) * quantum, self.digits)
+        places = self._places(planar(start * unit, step * unit, grid.values)) / unit
+        return self._from_places(start, step, rounded(places, self.digits))
 
-    def _places(self, grid: PlanarGrid) -> FloatArray:
+    def _places(self, grid: TableGrid) -> FloatArray:
         """Corrected X and Y, and the offset of Z, at each place, (columns, rows, 3), mm."""
-        places = grid.added_mm.copy()
+        places = grid.values.copy()
         places[..., 0] += grid.nodes_mm(0)[:, None]
         places[..., 1] += grid.nodes_mm(1)[None, :]
         return places
 
-    def _from_places(self, start: FloatArray, step: FloatArray, places: FloatArray) -> PlanarGrid:
+    def _from_places(self, start: FloatArray, step: FloatArray, places: FloatArray) -> TableGrid:
         """Return the grid from numbers in the unit of the file."""
         unit = MM_PER_UNIT[self.settings.units]
-        grid = PlanarGrid(start * unit, step * unit, np.zeros_like(places))
-        return PlanarGrid(grid.start_mm, grid.step_mm, places * unit - self._places(grid))
+        nothing = planar(start * unit, step * unit, np.zeros_like(places), extends=True)
+        return replace(nothing, values=places * unit - self._places(nothing))
 
-    def context(self, tables: PlanarGrid) -> dict[str, Any]:
+    def context(self, tables: TableGrid) -> dict[str, Any]:
         """Return rows, columns, spacing, origin and the corrected places, in the unit of the file."""
         unit = MM_PER_UNIT[self.settings.units]
         places = self._places(tables) / unit
@@ -242,15 +192,15 @@ class Kmotion(PlanarControl[KmotionSettings]):
             ],
             "columns": columns,
             "rows": rows,
-            "start": (tables.start_mm / unit).tolist(),
-            "step": (tables.step_mm / unit).tolist(),
+            "start": (tables.start / unit).tolist(),
+            "step": np.asarray(tables.step / unit).tolist(),
             "places": [
                 [row, column, *places[column, row].tolist()] for row in range(rows) for column in range(columns)
             ],
             "units": self.settings.units,
         }
 
-    def read_grid(self, source: SourceFile) -> PlanarGrid:
+    def read_grid(self, source: SourceFile) -> TableGrid:
         """Read the numbers separated by commas; each place of the grid must be given once."""
         lines = content_lines(source, "#")
         words = [(line, word.strip()) for line, text in lines for word in text.strip(", ").split(",")]
@@ -303,11 +253,11 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
         """Return +1 for X and Y, or -1 where the encoder counts against the axis, shape (2,)."""
         return np.array([self.settings.way(axis) for axis in range(2)])
 
-    def context(self, tables: PlanarGrid) -> dict[str, Any]:
+    def context(self, tables: TableGrid) -> dict[str, Any]:
         """Return the header and, for each row of Y, the pairs of each column, in the direction of the encoders."""
         ways, numbers = self.ways, self.settings.axis_numbers
-        sample, offset = ways * tables.step_mm, -ways * tables.start_mm
-        pairs = ways * tables.added_mm[..., :2]
+        sample, offset = ways * tables.step, -ways * tables.start
+        pairs = ways * tables.values[..., :2]
         return {
             "sign_statement": (
                 "A pair is the correction of X and Y, minus the measured error, in mm; the control ADDS it (inferred, see "
@@ -321,14 +271,14 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
             ],
             "warnings": [],
             "numbers": numbers,
-            "columns": tables.added_mm.shape[0],
-            "records": tables.added_mm[..., 0].size,
+            "columns": tables.values.shape[0],
+            "records": tables.values[..., 0].size,
             "sample": sample.tolist(),
             "offset": offset.tolist(),
             "lines": [[part for pair in line for part in pair] for line in pairs.transpose(1, 0, 2).tolist()],
         }
 
-    def read_grid(self, source: SourceFile) -> PlanarGrid:
+    def read_grid(self, source: SourceFile) -> TableGrid:
         """Read ``:START2D`` with its seven numbers and keys, the rows, and ``:END``."""
         keys: dict[str, float] = {}
         header: list[float] = []
@@ -377,4 +327,4 @@ class Aerotech2d(PlanarControl[Aerotech2dSettings]):
             raise source.fail("the signs of the sample distances do not fit reversed_axes of the machine file", begun)
         start = -self.ways * np.array([keys["OFFSETCOL"], keys["OFFSETROW"]])
         pairs = np.array(values).reshape(-1, columns, 2).transpose(1, 0, 2) * self.ways * keys.get("unit", 1.0)
-        return PlanarGrid(start, step, np.concatenate([pairs, np.zeros((*pairs.shape[:2], 1))], axis=2))
+        return planar(start, step, np.concatenate([pairs, np.zeros((*pairs.shape[:2], 1))], axis=2))
