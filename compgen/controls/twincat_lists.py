@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
+from compgen.controls.shared.base import SourceFile, Term, Usage, travel_of
 from compgen.controls.shared.grids import equidistant_grid, loss_setting, uneven_nodes_mm
 from compgen.controls.shared.scanner import Findings, check_complete, content_lines, fixed_point
-from compgen.controls.shared.terms import continued, one_dimensional_terms, product_terms
+from compgen.controls.shared.tables import Table1D, TableController, TableGrid
+from compgen.controls.shared.terms import continued, field_on_grid, one_dimensional_terms, product_terms
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
 from compgen.data.lengths import Points
@@ -46,73 +47,46 @@ MM_PER_UNIT = 1e-4
 
 
 @dataclass(frozen=True)
-class LeadscrewTable:
-    """``kw.ssfk``: values over the position of the same axis, ``neg`` for negative travel (None: one table for both).
+class LeadscrewTable(Table1D):
+    """``kw.ssfk``: values over the position of the same axis; ``interval`` is their spacing, or 0 if the file lists each."""
 
-    ``setpoints`` (n,) ascend; ``interval`` is their spacing, or 0 if the file lists each of them. All in 0.1 um.
-    """
-
-    setpoints: FloatArray
-    pos: FloatArray
-    neg: FloatArray | None = None
     interval: float = 0.0
 
-    def at(self, along: FloatArray, direction: FloatArray) -> FloatArray:
-        """Value at positions (n,) reached in directions (n,) (+1, -1; 0: unknown, mean), end values outside."""
-        pos = np.interp(along, self.setpoints, self.pos)
-        if self.neg is None:
-            return pos
-        neg = np.interp(along, self.setpoints, self.neg)
-        return np.asarray(0.5 * (pos + neg) + 0.5 * np.sign(direction) * (pos - neg))
+
+def leadscrew(
+    axis: int, setpoints: FloatArray, pos: FloatArray, neg: FloatArray | None = None, interval: float = 0.0
+) -> LeadscrewTable:
+    """Return the leadscrew table of an axis, in 0.1 um."""
+    return LeadscrewTable(axis, axis, setpoints, pos, neg, MM_PER_UNIT, MM_PER_UNIT, interval=interval)
 
 
 @dataclass(frozen=True)
-class CrossTable:
-    """``kw.crosscomp`` of a slave axis: values over the command position of axis ``master`` (0..2), in 0.1 um."""
+class CrossTable(Table1D):
+    """``kw.crosscomp`` of a slave axis: values over the command position of another, the master, which the file names."""
 
-    master: int
-    setpoints: FloatArray
-    values: FloatArray
+    axis: int
 
-    def at(self, along: FloatArray) -> FloatArray:
-        """Value at positions (n,), end values outside."""
-        return np.interp(along, self.setpoints, self.values)
+
+def cross_table(slave: int, master: int, setpoints: FloatArray, values: FloatArray) -> CrossTable:
+    """Return the cross table of a slave axis, in 0.1 um."""
+    return CrossTable(master, slave, setpoints, values, None, MM_PER_UNIT, MM_PER_UNIT)
 
 
 @dataclass(frozen=True)
-class PlaneTable:
-    """``kw.crosscomp2`` of a slave axis: values [j, i] with i along ``masters[0]`` and j along ``masters[1]``, 0.1 um.
+class PlaneTable(TableGrid):
+    """``kw.crosscomp2`` of a slave axis over two masters, which the file names; one spacing along both."""
 
-    ``starts`` are the positions of i = 0 and j = 0; ``interval`` is the spacing along both axes.
+    axes: tuple[int, ...]
+
+
+def plane_table(
+    slave: int, masters: tuple[int, int], starts: tuple[float, float], interval: float, values: FloatArray
+) -> PlaneTable:
+    """Return the plane of a slave axis, in 0.1 um.
+
+    ``values`` [j, i] with i along ``masters[0]`` and j along ``masters[1]``, ``starts`` the positions of i = 0 and j = 0.
     """
-
-    masters: tuple[int, int]
-    starts: tuple[float, float]
-    interval: float
-    values: FloatArray
-
-    def nodes(self, place: int) -> FloatArray:
-        """Positions of the columns (``place`` 0: first master) or rows (1: second master), 0.1 um."""
-        return np.asarray(
-            self.starts[place] + self.interval * np.arange(self.values.shape[1 - place]), dtype=np.float64
-        )
-
-    def at(self, first: FloatArray, second: FloatArray) -> FloatArray:
-        """Value at positions (n,) of both masters: bilinear between four corners, boundary values outside."""
-        (i, u), (j, v) = (
-            _cell(along, start, self.interval, count)
-            for along, start, count in zip((first, second), self.starts, self.values.shape[::-1], strict=True)
-        )
-        i_next, j_next = np.minimum(i + 1, self.values.shape[1] - 1), np.minimum(j + 1, self.values.shape[0] - 1)
-        low = (1.0 - u) * self.values[j, i] + u * self.values[j, i_next]
-        high = (1.0 - u) * self.values[j_next, i] + u * self.values[j_next, i_next]
-        return np.asarray((1.0 - v) * low + v * high)
-
-
-def _cell(along: FloatArray, start: float, interval: float, count: int) -> tuple[np.ndarray, FloatArray]:
-    ratio = np.clip((along - start) / interval, 0.0, count - 1)
-    cell = np.minimum(ratio.astype(np.intp), max(count - 2, 0))
-    return cell, ratio - cell
+    return PlaneTable(masters, (slave,), np.array(starts), interval, values.T[..., None], MM_PER_UNIT, MM_PER_UNIT)
 
 
 @dataclass(frozen=True)
@@ -128,11 +102,11 @@ class AxisList:
         """All positions and values of the tables, shape (n,)."""
         parts: list[FloatArray | None] = [np.zeros(1)]
         if self.screw is not None:
-            parts += [self.screw.setpoints, self.screw.pos, self.screw.neg]
+            parts += [self.screw.nodes, self.screw.positive, self.screw.negative]
         if self.cross is not None:
-            parts += [self.cross.setpoints, self.cross.values]
+            parts += [self.cross.nodes, self.cross.positive]
         if self.plane is not None:
-            parts += [np.array([*self.plane.starts, self.plane.interval]), self.plane.values]
+            parts += [self.plane.start, np.array(self.plane.step), self.plane.values]
         return np.concatenate([np.ravel(part) for part in parts if part is not None])
 
 
@@ -154,8 +128,8 @@ class PointLimits:
 
 def point_counts(item: AxisList) -> dict[str, int]:
     """Return the number of points of each table in a list, by structure (``ssfk``, ``crosscomp``, ``crosscomp2``)."""
-    counts = {} if item.screw is None else {"ssfk": len(item.screw.setpoints)}
-    counts |= {} if item.cross is None else {"crosscomp": len(item.cross.setpoints)}
+    counts = {} if item.screw is None else {"ssfk": len(item.screw.nodes)}
+    counts |= {} if item.cross is None else {"crosscomp": len(item.cross.nodes)}
     return counts | ({} if item.plane is None else {"crosscomp2": item.plane.values.size})
 
 
@@ -171,29 +145,12 @@ def spans_mm(item: AxisList, axis: int) -> list[tuple[str, int, FloatArray]]:
     """Return (structure, input axis, positions in mm) for every table in the list of ``axis``."""
     found: list[tuple[str, int, FloatArray]] = []
     if item.screw is not None:
-        found.append(("kw.ssfk", axis, item.screw.setpoints * MM_PER_UNIT))
+        found.append(("kw.ssfk", axis, item.screw.nodes_mm))
     if item.cross is not None:
-        found.append(("kw.crosscomp", item.cross.master, item.cross.setpoints * MM_PER_UNIT))
+        found.append(("kw.crosscomp", item.cross.axis, item.cross.nodes_mm))
     if item.plane is not None:
-        found += [
-            ("kw.crosscomp2", master, item.plane.nodes(place) * MM_PER_UNIT)
-            for place, master in enumerate(item.plane.masters)
-        ]
+        found += [("kw.crosscomp2", master, nodes_mm) for master, nodes_mm in item.plane.spans]
     return found
-
-
-def stored_sums(item: AxisList, axis: int, position_mm: FloatArray, approach: FloatArray) -> tuple[FloatArray, ...]:
-    """Return the value of ``ssfk`` and the sum of cross and plane tables at positions (n, 3), each (n,), mm."""
-    along = np.asarray(position_mm) / MM_PER_UNIT
-    screw, cross = np.zeros(len(along)), np.zeros(len(along))
-    if item.screw is not None:
-        screw = item.screw.at(along[:, axis], approach[:, axis])
-    if item.cross is not None:
-        cross = cross + item.cross.at(along[:, item.cross.master])
-    if item.plane is not None:
-        first, second = item.plane.masters
-        cross = cross + item.plane.at(along[:, first], along[:, second])
-    return screw * MM_PER_UNIT, cross * MM_PER_UNIT
 
 
 def units_outwards(machine: Machine, axis: int, positions_mm: FloatArray) -> FloatArray:
@@ -455,7 +412,7 @@ def _screw(body: _Body, axis: int) -> LeadscrewTable:
     if two_sided or (name, "neg") in body.tables:
         neg = body.column(name, "neg", (count,))
     other = _values(body, name, axis, neg) if two_sided else None
-    return LeadscrewTable(setpoints, _values(body, name, axis, pos), other, interval)
+    return leadscrew(axis, setpoints, _values(body, name, axis, pos), other, interval)
 
 
 def _cross(body: _Body, axis: int) -> CrossTable:
@@ -463,7 +420,7 @@ def _cross(body: _Body, axis: int) -> CrossTable:
     count = body.whole(name, "last_index", 0, _MOST_POINTS - 1) + 1
     setpoints = _ascending(body, name, body.column(name, "setpoint", (count,)))
     values = _values(body, name, axis, body.column(name, "correction", (count,)))
-    return CrossTable(body.axis(name, "master_ax_nr"), setpoints, values)
+    return cross_table(axis, body.axis(name, "master_ax_nr"), setpoints, values)
 
 
 def _plane(body: _Body, axis: int) -> PlaneTable:
@@ -479,7 +436,7 @@ def _plane(body: _Body, axis: int) -> PlaneTable:
         raise body.fail(name, "master2_ax_nr", "is also the first master; a plane needs two different axes")
     starts = (body.number(name, "start_position_master1"), body.number(name, "start_position_master2"))
     values = _values(body, name, axis, body.column(name, "correction", (second, first)))
-    return PlaneTable(masters, starts, interval, values)
+    return plane_table(axis, masters, starts, interval, values)
 
 
 # Settings ``[controllers.twincat-lists]`` of a machine file.
@@ -598,7 +555,7 @@ def _units(nodes_mm: FloatArray) -> FloatArray:
 _LARGEST_SGN32 = 2.0**31 - 1
 
 
-class TwincatLists(Controller[TwincatSettings, TwincatTables]):
+class TwincatLists(TableController[TwincatSettings, TwincatTables]):
     """TwinCAT CNC axis lists: one file per axis."""
 
     name = "twincat-lists"
@@ -615,27 +572,23 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         # cross and plane tables of zeros are left out
         return TwincatTables({slave: self._list_of(slave, basis, values) for slave in range(3)})
 
-    def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
-        """Return the reversals that go into tables: only those of an axis along itself."""
-        return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
-
     def with_reversal(self, tables: TwincatTables, reversal: ReversalCurves) -> TwincatTables:
         """Return the tables with a bilateral leadscrew table for the reversal of each axis along itself."""
         lists = dict(tables.lists)
         for (axis, _), curve in sorted(reversal.curves.items()):
             screw = lists[axis].screw
             if screw is not None and np.max(np.abs(curve.value)) >= WORTH_MM:
-                nodes = screw.setpoints
+                nodes = screw.nodes
                 if len(curve.position_mm) > 1:
                     between = np.interp(curve.position_mm, nodes * MM_PER_UNIT, curve.at(nodes * MM_PER_UNIT))
                     if np.max(np.abs(between - curve.value)) > WORTH_MM:
                         inside = np.clip(np.rint(curve.position_mm / MM_PER_UNIT), nodes[0], nodes[-1])
                         nodes = np.unique(np.concatenate([nodes, inside]))
                 # reversal B: after positive travel -B/2 is added to the command, after negative travel +B/2
-                base = np.round(np.interp(nodes, screw.setpoints, screw.pos), self.settings.digits)
+                base = np.round(np.interp(nodes, screw.nodes, screw.positive), self.settings.digits)
                 half = self._rounded(0.5 * self.settings.screw_factor * curve.at(nodes * MM_PER_UNIT))
-                interval = screw.interval if len(nodes) == len(screw.setpoints) else 0.0
-                lists[axis] = replace(lists[axis], screw=LeadscrewTable(nodes, base - half, base + half, interval))
+                interval = screw.interval if len(nodes) == len(screw.nodes) else 0.0
+                lists[axis] = replace(lists[axis], screw=leadscrew(axis, nodes, base - half, base + half, interval))
         return TwincatTables(lists)
 
     def context(self, tables: TwincatTables) -> dict[str, Any]:
@@ -686,29 +639,37 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             lists[axis], seen[axis] = item, source
         return TwincatTables(lists)
 
+    def curves(self, tables: TwincatTables) -> list[Table1D]:
+        """Return the leadscrew and cross tables with the signs of the settings."""
+        screw_mm, cross_mm = self.settings.screw_factor * MM_PER_UNIT, self.settings.cross_factor * MM_PER_UNIT
+        screws = [replace(item.screw, value_mm=screw_mm) for item in tables.lists.values() if item.screw is not None]
+        return screws + [
+            replace(item.cross, value_mm=cross_mm) for item in tables.lists.values() if item.cross is not None
+        ]
+
+    def grids(self, tables: TwincatTables) -> list[TableGrid]:
+        """Return the planes with the sign of the settings."""
+        value_mm = self.settings.cross_factor * MM_PER_UNIT
+        return [replace(item.plane, value_mm=value_mm) for item in tables.lists.values() if item.plane is not None]
+
     def emulate(self, tables: TwincatTables, points: Points) -> FloatArray:
         """Return the sum of all tables of each axis with the signs of the settings.
 
         A bilateral leadscrew table needs the last direction of travel; if that is unknown, the mean of both directions
         is used and a CompgenWarning is issued.
         """
-        unknown = np.zeros_like(points.position_mm)
-        approach = unknown if points.approach is None else points.approach
-        result = np.zeros((len(points), 3))
-        for axis, item in tables.lists.items():
-            if item.screw is not None and item.screw.neg is not None and np.any(approach[:, axis] == 0):
+        for table in self.curves(tables):
+            if table.negative is not None and np.any(travel_of(points, table.axis) == 0):
                 message = (
-                    f"kw.ssfk of {AXES[axis]} has values for both directions of travel, but some points do not state the "
-                    "direction of approach: the mean of both is used there. Give approach_x, approach_y, approach_z"
+                    f"kw.ssfk of {AXES[table.axis]} has values for both directions of travel, but some points do not state "
+                    "the direction of approach: the mean of both is used there. Give approach_x, approach_y, approach_z"
                 )
                 warnings.warn(message, CompgenWarning, stacklevel=2)
-            screw, cross = stored_sums(item, axis, points.position_mm, approach)
-            result[:, axis] = self.settings.screw_factor * screw + self.settings.cross_factor * cross
-        return result + 0.0
+        return super().emulate(tables, points)
 
     def by_direction(self, tables: TwincatTables) -> bool:
         """Return whether a leadscrew table has values for both directions of travel."""
-        return any(item.screw is not None and item.screw.neg is not None for item in tables.lists.values())
+        return any(table.negative is not None for table in self.curves(tables))
 
     def violations(self, tables: TwincatTables) -> list[str]:
         """Return tables with too many points, numbers that do not fit, travel not covered, missing lists."""
@@ -727,7 +688,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             found += [
                 message
                 for what, over, nodes in spans_mm(item, axis)
-                for message in coverage_violations(self.machine, over, nodes[0], nodes[-1], f"{what} of {AXES[axis]}")
+                for message in self.not_covered(over, nodes, f"{what} of {AXES[axis]}")
             ]
             numbers = item.numbers
             if not settings.real64 and np.any(numbers != np.round(numbers)):
@@ -745,12 +706,6 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             for axis, item in sorted(tables.lists.items())
             for use in list_usage(AXES[axis], item, self.settings.most)
         ]
-
-    def table_nodes_mm(self, tables: TwincatTables) -> tuple[FloatArray, ...]:
-        """Return the nodes of all tables by input axis."""
-        return nodes_by_axis(
-            (over, nodes) for axis, item in tables.lists.items() for _, over, nodes in spans_mm(item, axis)
-        )
 
     def resolution_mm(self) -> float:
         """Half of the last digit of each of the three tables that act on one axis."""
@@ -830,7 +785,8 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
 
     def _list_of(self, slave: int, basis: Sequence[Term], values: Mapping[str, FloatArray]) -> AxisList:
         screw_term, cross_term, *plane_terms = (term for term in basis if term.carrier[0].output == slave)
-        cross = CrossTable(
+        cross = cross_table(
+            slave,
             int(cross_term.axis or 0),
             _units(cross_term.nodes_mm),
             self._rounded(self.settings.cross_factor * values[cross_term.name]),
@@ -840,27 +796,24 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             # first and second master as in the machine file, else in the order X, Y, Z
             stated = self.settings.planes[slave]
             axes = {axis for term in plane_terms for axis in (term.axis, term.carrier[0].lever) if axis is not None}
-            masters = stated if isinstance(stated, tuple) else sorted(axes if len(axes) == 2 else {*axes, cross.master})
+            masters = stated if isinstance(stated, tuple) else sorted(axes if len(axes) == 2 else {*axes, cross.axis})
             one, other = masters
             step = float(np.diff(_units(plane_terms[0].nodes_mm))[0])
             lines = [self._even_units(axis, step) for axis in (one, other)]
-            second, first = np.meshgrid(lines[1] * MM_PER_UNIT, lines[0] * MM_PER_UNIT, indexing="ij")
-            position_mm = np.zeros((first.size, 3))
-            position_mm[:, one], position_mm[:, other] = first.ravel(), second.ravel()
-            total = np.zeros(first.size)  # bilinear between nodes, like each of the terms
-            for term in plane_terms:
-                carrier = term.carrier_field(position_mm, np.zeros(3))[:, term.carrier[0].output]
-                total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
-            numbers = self._rounded(self.settings.cross_factor * total.reshape(first.shape))
-            plane = PlaneTable((one, other), (float(lines[0][0]), float(lines[1][0])), step, numbers)
+            lines_mm = {axis: line * MM_PER_UNIT for axis, line in zip((one, other), lines, strict=True)}
+            # bilinear between nodes, like each of the terms
+            total = field_on_grid(plane_terms, values, lines_mm, np.zeros(3))[..., slave].T
+            numbers = self._rounded(self.settings.cross_factor * total)
+            plane = plane_table(slave, (one, other), (float(lines[0][0]), float(lines[1][0])), step, numbers)
         nodes = _units(screw_term.nodes_mm)
         return AxisList(
-            LeadscrewTable(
+            leadscrew(
+                slave,
                 nodes,
                 self._rounded(self.settings.screw_factor * values[screw_term.name]),
                 interval=0.0 if self.settings.own_setpoints else float(nodes[1] - nodes[0]),
             ),
-            cross if np.any(cross.values) else None,
+            cross if np.any(cross.positive) else None,
             plane if plane is not None and np.any(plane.values) else None,
         )
 
@@ -892,7 +845,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
             for name, table in (("ssfk", item.screw), ("crosscomp", item.cross), ("crosscomp2", item.plane)):
                 active = 1 if table is not None else 0
                 rows.append((f"lr_param.{name} ({AXES[axis]})", active, where))
-            if item.screw is not None and item.screw.neg is not None:
+            if item.screw is not None and item.screw.negative is not None:
                 meaning = "bilateral table: it contains the backlash, so backlash compensation of this axis must be off"
                 rows.append((f"backlash compensation ({AXES[axis]})", "off", meaning))
                 meaning = "cycles over which the change at a reversal is spread"
@@ -915,7 +868,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         slaves = [
             AXES[axis]
             for axis, item in sorted(tables.lists.items())
-            if item.plane is not None and axis in item.plane.masters
+            if item.plane is not None and axis in item.plane.axes
         ]
         if slaves:
             found.append(
@@ -924,7 +877,7 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         idle = [
             AXES[axis]
             for axis, item in tables.lists.items()
-            if not (item.cross or item.plane or (item.screw and (np.any(item.screw.pos) or np.any(item.screw.neg))))
+            if not (item.cross or item.plane or (item.screw and (any(map(np.any, item.screw.columns)))))
         ]
         if idle:
             found.append(f"The tables of {', '.join(idle)} are zero everywhere.")
@@ -945,23 +898,23 @@ class TwincatLists(Controller[TwincatSettings, TwincatTables]):
         if (screw := item.screw) is not None:
             context["screw"] = {
                 "interval": screw.interval,
-                "start": screw.setpoints[0],
-                "setpoints": [] if screw.interval else screw.setpoints.tolist(),
-                "pos": screw.pos.tolist(),
-                "neg": [] if screw.neg is None else screw.neg.tolist(),
+                "start": screw.nodes[0],
+                "setpoints": [] if screw.interval else screw.nodes.tolist(),
+                "pos": screw.positive.tolist(),
+                "neg": [] if screw.negative is None else screw.negative.tolist(),
             }
             entries += 6 + sum(len(context["screw"][column]) for column in ("setpoints", "pos", "neg"))
         if (cross := item.cross) is not None:
-            rows = list(zip(cross.setpoints.tolist(), cross.values.tolist(), strict=True))
-            context["cross"] = {"master": numbers[cross.master], "letter": AXES[cross.master], "rows": rows}
+            rows = list(zip(cross.nodes.tolist(), cross.positive.tolist(), strict=True))
+            context["cross"] = {"master": numbers[cross.axis], "letter": AXES[cross.axis], "rows": rows}
             entries += 4 + 2 * len(rows)
         if (plane := item.plane) is not None:
             context["plane"] = {
-                "masters": [numbers[master] for master in plane.masters],
-                "letters": [AXES[master] for master in plane.masters],
-                "starts": list(plane.starts),
-                "interval": plane.interval,
-                "values": plane.values.tolist(),
+                "masters": [numbers[master] for master in plane.axes],
+                "letters": [AXES[master] for master in plane.axes],
+                "starts": plane.start.tolist(),
+                "interval": plane.step,
+                "values": plane.values[..., 0].T.tolist(),
             }
             entries += 9 + plane.values.size
         return {**context, "entries": entries}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import compgen
 from compgen.controls import CONTROLLERS, SourceFile
-from compgen.controls.twincat_lists import PlaneTable, units_outwards
+from compgen.controls.twincat_lists import plane_table, units_outwards
 from compgen.data import toml_files
 from compgen.data.error_table import ReversalCurves
 from compgen.data.machine import Axis, Chain, Machine
@@ -110,7 +110,7 @@ def test_too_long_a_pitch_is_stored_as_a_positive_error_in_tenths_of_a_micrometr
     machine = machine_with(tool=(0.0, 0.0, 0.0))
     exported, tables = made(machine, errors_of(EXX=(1e-5, 10.0)))
     screw = tables.lists[0].screw
-    at_500 = np.interp(5_000_000, screw.setpoints, screw.pos)
+    at_500 = np.interp(5_000_000, screw.nodes, screw.positive)
     assert at_500 == pytest.approx(49, abs=0.5)  # 10 um/m over 490 mm: 4.9 um too far
     assert added(tables, [500, 0, 0], machine)[0, 0] == pytest.approx(-0.0049, abs=TENTH_UM)
     assert "kw.ssfk.unit                          1\n" in exported.files["achskw1.lis"]
@@ -120,11 +120,11 @@ def test_a_straightness_goes_to_the_list_of_the_slave_with_the_sign_of_a_correct
     machine = machine_with(tool=(0.0, 0.0, 0.0))
     _, tables = made(machine, errors_of(EZX=(1e-5, 10.0)))
     cross = tables.lists[2].cross
-    assert cross.master == 0
-    assert np.interp(5_000_000, cross.setpoints, cross.values) == pytest.approx(-49, abs=0.5)
+    assert cross.axis == 0
+    assert np.interp(5_000_000, cross.nodes, cross.positive) == pytest.approx(-49, abs=0.5)
     turned, tables = made(machine_with(tool=(0.0, 0.0, 0.0), cross_sign="error"), errors_of(EZX=(1e-5, 10.0)))
     cross = tables.lists[2].cross
-    assert np.interp(5_000_000, cross.setpoints, cross.values) == pytest.approx(+49, abs=0.5)
+    assert np.interp(5_000_000, cross.nodes, cross.positive) == pytest.approx(+49, abs=0.5)
     assert 'cross_sign = "error"' in turned.files["achskw3.lis"]
 
 
@@ -133,12 +133,12 @@ def test_an_angle_goes_to_the_plane_that_holds_it():
     machine = machine_with("WFYXZT", tool=(0.0, 0.0, 0.0))
     _, tables = made(machine, errors_of(EBX=(2e-7, 10.0)))
     plane = tables.lists[0].plane
-    assert plane.masters == (0, 2)
+    assert plane.axes == (0, 2)
     result = added(tables, [500, 0, -400], machine)[0]
     assert result == pytest.approx([-(-400 * 2e-7 * 490), 0, 0], abs=3 * TENTH_UM)
     _, turned = made(machine_with("WFYXZT", tool=(0.0, 0.0, 0.0), planes={"X": "ZX"}), errors_of(EBX=(2e-7, 10.0)))
-    assert turned.lists[0].plane.masters == (2, 0)
-    assert np.array_equal(turned.lists[0].plane.values, plane.values.T)
+    assert turned.lists[0].plane.axes == (2, 0)
+    assert np.array_equal(turned.lists[0].plane.values, plane.values.transpose(1, 0, 2))
 
 
 # --- round trip ------------------------------------------------------------------------------------------------------
@@ -200,7 +200,7 @@ def test_a_reversal_that_bends_between_the_nodes_is_held_where_it_was_measured()
 def test_a_table_over_a_travel_in_whole_units_ends_where_the_travel_ends():
     _, tables = made(machine_with(tool=(0.0, 0.0, 0.0)), errors_of(EXX=(1e-5, 10.0)))
     ends = np.array(TRAVELS[0]) * 10_000
-    assert tables.lists[0].screw.setpoints[[0, -1]] == pytest.approx(ends, abs=0)
+    assert tables.lists[0].screw.nodes[[0, -1]] == pytest.approx(ends, abs=0)
 
 
 # --- limits ----------------------------------------------------------------------------------------------------------
@@ -349,15 +349,16 @@ def test_an_equidistant_table_covers_the_travel_with_no_node_to_spare(low_mm, hi
     axes = (Axis((low_mm, high_mm), np.linspace(low_mm, high_mm, 5)), *PLAIN.axes[1:])
     machine = replace(PLAIN, axes=axes, reference_point_mm=(10.0, 20.0, -30.0))
     screw = made(machine, compgen.ErrorTable({}, {"EC0Y": (0.0, np.nan)}))[1].lists[0].screw
-    intervals = len(screw.setpoints) - 1
-    assert np.diff(screw.setpoints).tolist() == [screw.interval] * intervals
-    assert screw.setpoints[0] == first
-    assert last <= screw.setpoints[-1] <= last + intervals
+    intervals = len(screw.nodes) - 1
+    assert np.diff(screw.nodes).tolist() == [screw.interval] * intervals
+    assert screw.nodes[0] == first
+    assert last <= screw.nodes[-1] <= last + intervals
 
 
 def test_a_plane_of_one_row_or_one_column_holds_its_value_along_the_other_master():
-    row = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0, 8.0]]))
-    column = PlaneTable((0, 1), (0.0, 0.0), 10.0, np.array([[4.0], [8.0]]))
-    along, across = np.array([0.0, 5.0, 10.0]), np.array([-3.0, 0.0, 99.0])
-    assert row.at(along, across) == pytest.approx([4.0, 6.0, 8.0])
-    assert column.at(across, along) == pytest.approx([4.0, 6.0, 8.0])
+    row = plane_table(2, (0, 1), (0.0, 0.0), 10.0, np.array([[4.0, 8.0]]))
+    column = plane_table(2, (0, 1), (0.0, 0.0), 10.0, np.array([[4.0], [8.0]]))
+    along, across = np.array([0.0, 5.0, 10.0]) * TENTH_UM, np.array([-3.0, 0.0, 99.0]) * TENTH_UM
+    nothing = np.zeros(3)
+    assert row.at(np.column_stack([along, across, nothing]))[:, 0] == pytest.approx([4.0, 6.0, 8.0])
+    assert column.at(np.column_stack([across, along, nothing]))[:, 0] == pytest.approx([4.0, 6.0, 8.0])
