@@ -20,16 +20,7 @@ from compgen.controls.heidenhain_text import (
     read_table,
     template_layout,
 )
-from compgen.controls.shared.base import (
-    Controller,
-    SourceFile,
-    Term,
-    Usage,
-    by_travel,
-    coverage_violations,
-    nodes_by_axis,
-    travel_of,
-)
+from compgen.controls.shared.base import SourceFile, Term, Usage, parameter_row
 from compgen.controls.shared.grids import (
     EquidistantGrid,
     curve_nodes_mm,
@@ -38,11 +29,11 @@ from compgen.controls.shared.grids import (
     nearly_best,
     worth_mm,
 )
+from compgen.controls.shared.tables import Table1D, TableController, along_itself
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
-from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.toml_files import (
@@ -287,23 +278,17 @@ class ComTable:
     @property
     def nodes_mm(self) -> FloatArray:
         """Positions, shape (n,), mm."""
-        return np.array([float(position) for position in self.positions])
+        return _floats(self.positions)
 
-    def at(self, output: int, position_mm: FloatArray) -> FloatArray:
-        """Interpolated entries of a column, end values held outside, shape of ``position_mm``."""
-        return np.interp(position_mm, self.nodes_mm, [float(value) for value in self.columns[output]])
-
-    def backlash_at(self, position_mm: FloatArray) -> FloatArray | None:
-        """Interpolated entries of the column BACKLASH, None if they are all zero."""
-        if self.backlash is None or not any(self.backlash):
-            return None
-        return np.interp(position_mm, self.nodes_mm, [float(value) for value in self.backlash])
+    def column(self, axis: int, values: Sequence[Decimal], output: int, value_mm: float) -> Table1D:
+        """Entries over the input axis ``axis`` that move ``output``: linear between nodes, end values held outside."""
+        return Table1D(axis, output, self.nodes_mm, _floats(values), value_mm=value_mm)
 
     @property
     def steepest(self) -> float:
         """Largest change of an entry per travel, mm/mm."""
         steps = np.diff(self.nodes_mm)
-        slopes = [np.abs(np.diff([float(value) for value in values])) / steps for values in self.columns.values()]
+        slopes = [np.abs(np.diff(_floats(values))) / steps for values in self.columns.values()]
         return float(max((slope.max(initial=0.0) for slope in slopes), default=0.0))
 
 
@@ -358,7 +343,7 @@ def _exponent(step: Decimal) -> int | None:
 def _largest(tables: ComTables) -> tuple[int, int, int]:
     """Input axis, corrected axis and row of the largest entry."""
     sizes = {
-        (axis, output): np.abs([float(value) for value in values])
+        (axis, output): np.abs(_floats(values))
         for axis, table in tables.tables.items()
         for output, values in table.columns.items()
     }
@@ -373,7 +358,7 @@ def _largest(tables: ComTables) -> tuple[int, int, int]:
 # ``templates/heidenhain-com/format.toml``.
 
 
-class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
+class HeidenhainCom(TableController[HeidenhainSettings, ComTables]):
     """Tables of each axis over each axis: positioning, straightness, squareness; no products, no fixed lever arm."""
 
     name = "heidenhain-com"
@@ -483,19 +468,20 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             )
         return ComTables({axis: self._com_table(axis, coms[name][1]) for axis, name in sorted(active.items())})
 
-    def emulate(self, tables: ComTables, points: Points) -> FloatArray:
-        """Return minus (``sign = "correction"``: plus) the sum of the entries, linear between nodes, held outside."""
-        total = np.zeros((len(points), 3))
+    def curves(self, tables: ComTables) -> list[Table1D]:
+        """Return every column, with the sign of the settings, and what the column BACKLASH adds after negative travel."""
+        found, sign = [], float(self.settings.sign)
         for axis, table in tables.tables.items():
-            along = points.position_mm[:, axis]
-            for output in table.columns:
-                total[:, output] += table.at(output, along)
-            backlash = table.backlash_at(along)
-            if backlash is not None:
-                positive = table.at(axis, along) if axis in table.columns else np.zeros(len(points))
-                step = backlash - positive if self.settings.backlash == "absolute" else backlash
-                total[:, axis] += by_travel(travel_of(points, axis), np.zeros(len(points)), step)
-        return self.settings.sign * total
+            found += [table.column(axis, values, output, sign) for output, values in table.columns.items()]
+            if table.backlash is None or not any(table.backlash):
+                continue
+            step = table.column(axis, table.backlash, axis, sign)
+            nothing = np.zeros(len(table.positions))
+            entries = step.positive
+            if self.settings.backlash == "absolute" and axis in table.columns:
+                entries = entries - _floats(table.columns[axis])
+            found.append(replace(step, positive=nothing, negative=entries))
+        return found
 
     def violations(self, tables: ComTables) -> list[str]:
         """Return broken limits: entries, tables, spacing of the older controls, travel not covered."""
@@ -514,9 +500,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 found.append(
                     f"{what} has the spacing {shown} mm; expected one power of two times 0.0001 mm (6.5536 mm: n = 16)"
                 )
-            found += coverage_violations(
-                self.machine, axis, float(table.positions[0]), float(table.positions[-1]), what
-            )
+            found += self.not_covered(axis, table.nodes_mm, what)
         if settings.max_total_points is not None and tables.total_points > settings.max_total_points:
             found.append(
                 f"all tables have {tables.total_points} entries; the limit is {settings.max_total_points} (module "
@@ -528,16 +512,9 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
             )
         return found
 
-    def table_nodes_mm(self, tables: ComTables) -> tuple[FloatArray, ...]:
-        """Return the positions of each table."""
-        return nodes_by_axis((axis, table.nodes_mm) for axis, table in tables.tables.items())
-
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Return what goes into the column BACKLASH: reversals along the axis itself, unless it stays empty."""
-        if self.settings.backlash == "empty":
-            return ReversalCurves({})
-        along_itself = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
-        return ReversalCurves(along_itself, reversal.metadata)
+        return ReversalCurves({}) if self.settings.backlash == "empty" else along_itself(reversal)
 
     def with_reversal(self, tables: ComTables, reversal: ReversalCurves) -> ComTables:
         """Put half of each reversal into the column of the axis and the other direction into the column BACKLASH.
@@ -552,7 +529,7 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 continue
             table = found[axis]
             half = -0.5 * settings.sign * curve.at(table.nodes_mm)
-            entries = np.array([float(value) for value in table.columns[axis]])
+            entries = _floats(table.columns[axis])
             positive = _rounded(entries + half, settings.decimals)
             negative = _rounded(entries - half, settings.decimals)
             if settings.backlash == "difference":
@@ -568,13 +545,13 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
         settings = self.settings
         name = "MP710 (iTNC 530: MP750)" if settings.older else "MP_backLash"
         return [
-            {
-                "name": f"{name} of {settings.axis_names[axis]}",
-                "value": f"{abs(reversal.mean_mm(axis)):.4f} mm in size",
-                "meaning": "position reached in positive travel minus that in negative travel: "
+            parameter_row(
+                f"{name} of {settings.axis_names[axis]}",
+                f"{abs(reversal.mean_mm(axis)):.4f} mm in size",
+                "position reached in positive travel minus that in negative travel: "
                 f"{reversal.mean_mm(axis):+.4f} mm; which sign corrects it is not documented: test it with "
                 "a dial gauge. If a value was active while the machine was measured, add this one to it",
-            }
+            )
             for axis in range(3)
             if abs(reversal.mean_mm(axis)) >= WORTH_MM
         ]
@@ -778,44 +755,40 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
     def _parameters(self, tables: ComTables) -> list[dict[str, str]]:
         if not self.settings.older:
             return [
-                {
-                    "name": "CfgAxes/axisList",
-                    "value": ", ".join(self.settings.axis_names),
-                    "meaning": "keys of X, Y, Z; the columns of .COM and .CMA have these names",
-                },
-                {
-                    "name": "MP_refPosition",
-                    "value": "unchanged",
-                    "meaning": "AXISPOS counts from the machine datum, as must the positions in the machine file",
-                },
-                {
-                    "name": "column ACTIVE of CONFIG.CMA",
-                    "value": "* in line 0",
-                    "meaning": "exactly one line is active",
-                },
-                {
-                    "name": "linear axis error compensation",
-                    "value": "off",
-                    "meaning": "for X, Y, Z: an axis has either linear or non-linear compensation",
-                },
+                parameter_row(
+                    "CfgAxes/axisList",
+                    ", ".join(self.settings.axis_names),
+                    "keys of X, Y, Z; the columns of .COM and .CMA have these names",
+                ),
+                parameter_row(
+                    "MP_refPosition",
+                    "unchanged",
+                    "AXISPOS counts from the machine datum, as must the positions in the machine file",
+                ),
+                parameter_row("column ACTIVE of CONFIG.CMA", "* in line 0", "exactly one line is active"),
+                parameter_row(
+                    "linear axis error compensation",
+                    "off",
+                    "for X, Y, Z: an axis has either linear or non-linear compensation",
+                ),
             ]
         rows = [
-            {
-                "name": f"MP730 bit {axis}",
-                "value": "1",
-                "meaning": f"{AXES[axis]}: non-linear axis error compensation; switches the linear one (MP720) off",
-            }
+            parameter_row(
+                f"MP730 bit {axis}",
+                "1",
+                f"{AXES[axis]}: non-linear axis error compensation; switches the linear one (MP720) off",
+            )
             for axis in range(3)
         ]
         for axis, table in sorted(tables.tables.items()):
             step = table.positions[1] - table.positions[0]
             rows.append(
-                {
-                    "name": f"datum, spacing of AXIS_{AXES[axis]}.COM",
-                    "value": f"{table.positions[0]:f} mm, {step:f} mm",
-                    "meaning": f"spacing 2^{_exponent(step)} x 0.0001 mm; both count from the machine datum. Check "
+                parameter_row(
+                    f"datum, spacing of AXIS_{AXES[axis]}.COM",
+                    f"{table.positions[0]:f} mm, {step:f} mm",
+                    f"spacing 2^{_exponent(step)} x 0.0001 mm; both count from the machine datum. Check "
                     "that the head of the table on the control shows them",
-                }
+                )
             )
         return rows
 
@@ -847,6 +820,10 @@ class HeidenhainCom(Controller[HeidenhainSettings, ComTables]):
                 "column AXISPOS. Save an empty table on the control and export with --template-from."
             )
         return found
+
+
+def _floats(values: Sequence[Decimal]) -> FloatArray:
+    return np.array([float(value) for value in values])
 
 
 def _rounded(values_mm: FloatArray, decimals: int) -> tuple[Decimal, ...]:
