@@ -26,20 +26,17 @@ from compgen.controls.fanuc_records import (
     type_word,
 )
 from compgen.controls.shared.base import (
-    Controller,
     Monomial,
     SourceFile,
     Term,
     Usage,
-    coverage_violations,
-    nodes_by_axis,
 )
 from compgen.controls.shared.grids import curve_nodes_mm, kept_by_numbers
+from compgen.controls.shared.tables import Table1D, TableController
 from compgen.controls.shared.terms import ACROSS, one_dimensional_name, one_dimensional_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable, hat_matrix
-from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import setting, whole
@@ -219,8 +216,6 @@ MOVING, COMPENSATED, POINTS, AMOUNTS = 5711, 5721, 5731, 5761
 UNKNOWN_MOVING = range(5714, 5721)
 #: Reference, first, last number and interval of the compensation points.
 GRID_PARAMETERS = (3620, 3621, 3622, 3624)
-#: Positions closer than this are the same, mm.
-SAME_MM = 1e-6
 
 
 def entry_numbers(entry: int) -> tuple[int, ...]:
@@ -248,12 +243,6 @@ class StraightTable:
     def along_mm(self) -> FloatArray:
         """Positions of the four knots from the reference point, mm."""
         return np.array([self.grid.along_mm(number) for number in self.numbers])
-
-    def counts(self, along_mm: FloatArray) -> FloatArray:
-        """Amount in counts at positions (n,) from the reference point: linear between the knots, zero outside."""
-        knots = self.along_mm
-        inside = (along_mm >= knots[0] - SAME_MM) & (along_mm <= knots[-1] + SAME_MM)
-        return np.where(inside, np.interp(along_mm, knots, self.amounts), 0.0)
 
 
 @dataclass(frozen=True)
@@ -348,7 +337,7 @@ def _gain_of_inner_knots(
 # What the control is assumed to do, and how little of it is certain: see ``templates/fanuc-straightness/format.toml``.
 
 
-class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
+class FanucStraightness(TableController[StraightnessSettings, StraightTables]):
     """Up to three tables such as Y(x), each moving axis once; zero at the reference point except for rounding."""
 
     name = "fanuc-straightness"
@@ -465,13 +454,21 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             remarks.append(found.skipped_remark("straightness"))
         return StraightTables(entries, tuple(remarks))
 
-    def emulate(self, tables: StraightTables, points: Points) -> FloatArray:
-        """Return sign * count * polyline at each point, zero outside the knots."""
-        added = np.zeros((len(points), 3))
-        for entry in tables.entries:
-            along = points.position_mm[:, entry.moving] - self.machine.reference_point_mm[entry.moving]
-            added[:, entry.compensated] += self.settings.sign * self.settings.count_mm * entry.counts(along)
-        return added
+    def curves(self, tables: StraightTables) -> list[Table1D]:
+        """Return the polylines in counts, zero outside their knots."""
+        return [self._polyline(entry) for entry in tables.entries]
+
+    def _polyline(self, entry: StraightTable) -> Table1D:
+        value_mm = self.settings.sign * self.settings.count_mm
+        return Table1D(
+            entry.moving,
+            entry.compensated,
+            entry.along_mm,
+            np.array(entry.amounts, dtype=np.float64),
+            value_mm=value_mm,
+            origin_mm=self.machine.reference_point_mm[entry.moving],
+            zero_outside=True,
+        )
 
     def violations(self, tables: StraightTables) -> list[str]:
         """Return amounts beyond their range, and travel not covered by the knots."""
@@ -481,8 +478,7 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
             most = max(map(abs, entry.amounts))
             if most > settings.amount_limit:
                 messages.append(f"{entry.name}: an amount is {most} counts; the limit is {settings.amount_limit}")
-            knots = self.machine.reference_point_mm[entry.moving] + entry.along_mm
-            short = coverage_violations(self.machine, entry.moving, knots[0], knots[-1], f"the polyline {entry.name}")
+            short = self.not_covered(entry.moving, self._polyline(entry).nodes_mm, f"the polyline {entry.name}")
             messages += [
                 f"{text}; {AXES[entry.moving]} needs a compensation point at or beyond each end" for text in short
             ]
@@ -493,12 +489,6 @@ class FanucStraightness(Controller[StraightnessSettings, StraightTables]):
                     f"{entry.grid.interval_mm:f} mm, which differ from those of the machine file or of the sample"
                 )
         return messages
-
-    def table_nodes_mm(self, tables: StraightTables) -> tuple[FloatArray, ...]:
-        """Return the knots over each moving axis."""
-        return nodes_by_axis(
-            (entry.moving, self.machine.reference_point_mm[entry.moving] + entry.along_mm) for entry in tables.entries
-        )
 
     def usage(self, tables: StraightTables) -> list[Usage]:
         """Return the largest amount of each entry against its range, and the entries in use."""
