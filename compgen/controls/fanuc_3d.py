@@ -36,7 +36,7 @@ from compgen.controls.shared.base import (
 )
 from compgen.controls.shared.grids import STEP_QUANTUM, EquidistantGrid, equidistant_grid, loss_setting, trilinear
 from compgen.controls.shared.scanner import check_size
-from compgen.controls.shared.terms import one_dimensional_terms, product_terms
+from compgen.controls.shared.terms import field_on_grid, one_dimensional_terms, product_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import ErrorTable
@@ -46,7 +46,6 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import axis_setting, file_setting, multiple_of, setting, whole, word_for
 from compgen.errors import InputError, one_line
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.many_points import full_grid
 
 # Records of three-dimensional compensation data as in a file punched from the user's control.
 #
@@ -348,14 +347,9 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
         vertex: half a count. No other whole numbers stay within half a count at every vertex.
         """
         nodes = [next(term.nodes_mm for term in basis if term.axis == axis) for axis in range(3)]
-        position = full_grid(nodes).reshape(-1, 3)
-        tool = tool_of(self.machine, None)
-        field = np.zeros_like(position)
-        for term in basis:
-            field += term.carrier_field(position, tool) * term.curve(values[term.name], position)[:, None]
+        field = field_on_grid(basis, values, dict(enumerate(nodes)), tool_of(self.machine, None))
         count_mm = np.array([self.settings.count_mm(axis) for axis in range(3)])
         counts = np.floor(self.settings.sign * field / count_mm + 0.5).astype(np.int64)
-        shape = (len(nodes[0]), len(nodes[1]), len(nodes[2]), 3)
         grids = []
         for axis, nodes_mm in enumerate(nodes):  # in exact decimals; the reference point is one of the vertices
             length = Decimal(repr(round(float(nodes_mm[-1] - nodes_mm[0]), 9)))
@@ -363,7 +357,7 @@ class Fanuc3d(Controller[VolumeSettings, VolumeTable]):
             reference = self.machine.reference_point_mm[axis]
             below = int(np.argmin(np.abs(nodes_mm - reference)))
             grids.append(EquidistantGrid(Decimal(repr(reference)) - below * step, step, len(nodes_mm)))
-        return VolumeTable(tuple(grids), counts.reshape(shape), self.settings.magnification)
+        return VolumeTable(tuple(grids), counts, self.settings.magnification)
 
     def context(self, tables: VolumeTable) -> dict[str, Any]:
         """Return the vertices, the plan point number -> values, what to set, and the sign statement."""

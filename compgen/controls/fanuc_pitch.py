@@ -42,6 +42,7 @@ from compgen.controls.shared.grids import (
     worth_mm,
 )
 from compgen.controls.shared.integers import IntegerCurve, best_integers, lowest_free, travel_weights
+from compgen.controls.shared.tables import along_itself
 from compgen.controls.shared.terms import one_dimensional_name, one_dimensional_terms
 from compgen.data.csv_files import FloatArray, fixed
 from compgen.data.error_table import WORTH_MM, ErrorTable, ReversalCurves
@@ -301,8 +302,7 @@ class FanucPitch(Controller[PitchSettings, PitchTables]):
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Return the reversal of each axis along itself if ``bidirectional`` is set, else none."""
-        along = {key: curve for key, curve in reversal.curves.items() if key[0] == key[1]}
-        return ReversalCurves(along if self.settings.bidirectional else {})
+        return along_itself(reversal) if self.settings.bidirectional else ReversalCurves({})
 
     def with_reversal(self, tables: PitchTables, reversal: ReversalCurves) -> PitchTables:
         """Return the tables of both directions, each with the best whole numbers for its curve."""

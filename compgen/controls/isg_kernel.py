@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import Cell, ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.grids import Cell, ParameterGrid, grid_order, loss_setting, rounded, uneven_nodes_mm
 from compgen.controls.shared.scanner import MOST_LINES, check_complete, content_lines, floating, uses_exponent
 from compgen.controls.shared.terms import error_terms
 from compgen.data.csv_files import FloatArray, fixed, whole_number
@@ -369,11 +369,10 @@ MOST_FILES = 10
 LIST_ENTRIES = 9
 
 
-def rounded(name: str, values: FloatArray) -> FloatArray:
+def rounded_error(name: str, values: FloatArray) -> FloatArray:
     """Return values of an error (ISO name) rounded as written to the file."""
     digits = LENGTH_DIGITS if error_named(name).kind == "linear" else ANGLE_DIGITS
-    flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
-    return np.array(flat).reshape(np.shape(values))
+    return rounded(values, digits)
 
 
 class VolumetricController(Controller[IsgSettings, IsgTables]):
@@ -412,8 +411,8 @@ class VolumetricController(Controller[IsgSettings, IsgTables]):
         """Round the errors as written to the file, and add the list file."""
         fields = {}
         for term in sorted(basis, key=lambda term: ERROR_NAMES.index(term.name)):
-            numbers = rounded(term.name, np.asarray(values[term.name], dtype=np.float64))
-            nodes = np.array([float(fixed(node, POSITION_DIGITS)) for node in term.nodes_mm.tolist()])
+            numbers = rounded_error(term.name, np.asarray(values[term.name], dtype=np.float64))
+            nodes = rounded(term.nodes_mm, POSITION_DIGITS)
             one = ((term.axis,), (nodes,), numbers) if term.axis is not None else ((), (), numbers[0])
             fields[term.name] = ParameterGrid(*one)
         tool = [float(fixed(value, POSITION_DIGITS)) for value in self.machine.tool_offset_mm]

@@ -22,7 +22,7 @@ from compgen.controls.linuxcnc_comp import (
     with_units,
 )
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import equidistant_grid, loss_setting, trilinear
+from compgen.controls.shared.grids import equidistant_grid, loss_setting, rounded, trilinear
 from compgen.controls.shared.terms import error_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray, fixed
@@ -414,11 +414,6 @@ def in_file_units(table: VolTable) -> VolTable:
     return table.scaled(1.0 / MM_PER_UNIT[table.unit])
 
 
-def _rounded(values: FloatArray, digits: int) -> FloatArray:
-    flat = [float(fixed(value, digits)) for value in np.ravel(values).tolist()]
-    return np.array(flat).reshape(np.shape(values))
-
-
 def as_written(table: VolTable) -> VolTable:
     """Return the table as read back from its text, in mm."""
     inside, places = in_file_units(table), position_digits(table)
@@ -427,7 +422,7 @@ def as_written(table: VolTable) -> VolTable:
             curve,
             first_mm=float(fixed(curve.first_mm, places)),
             step_mm=float(fixed(curve.step_mm, places)),
-            values=_rounded(curve.values, digits_of(table, curve)),
+            values=rounded(curve.values, digits_of(table, curve)),
         )
         for curve in inside.curves
     )
@@ -435,7 +430,7 @@ def as_written(table: VolTable) -> VolTable:
     if grid is not None:
         x, y, z = (float(fixed(value, places)) for value in grid.first_mm)
         hx, hy, hz = (float(fixed(value, places)) for value in grid.step_mm)
-        grid = VolGrid((x, y, z), (hx, hy, hz), _rounded(grid.vertices_mm, length_digits(table)))
+        grid = VolGrid((x, y, z), (hx, hy, hz), rounded(grid.vertices_mm, length_digits(table)))
     return replace(inside, curves=curves, grid=grid).scaled(MM_PER_UNIT[table.unit])
 
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, coverage_violations, nodes_by_axis
-from compgen.controls.shared.grids import ParameterGrid, grid_order, loss_setting, uneven_nodes_mm
+from compgen.controls.shared.grids import ParameterGrid, grid_order, loss_setting, rounded, uneven_nodes_mm
 from compgen.controls.shared.terms import error_terms
-from compgen.data.csv_files import FloatArray, csv_table, fixed
+from compgen.data.csv_files import FloatArray, csv_table
 from compgen.data.error_table import ERROR_COLUMNS, Curve, ErrorTable, errors_of_table
 from compgen.data.lengths import Points
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
@@ -76,12 +76,12 @@ def curves_from(basis: Sequence[Term], values: Mapping[str, FloatArray]) -> Erro
     terms = {term.name: term for term in basis}
     for name in (name for name in ERROR_NAMES if name in terms):
         unit = error_named(name).si_per_unit
-        rounded = np.array([float(fixed(v / unit, CURVE_DIGITS)) * unit for v in np.asarray(values[name]).tolist()])
+        value = rounded(np.asarray(values[name]) / unit, CURVE_DIGITS) * unit
         if name in SQUARENESS_NAMES:
-            squareness[name] = (float(rounded[0]), math.nan)
+            squareness[name] = (float(value[0]), math.nan)
         else:
-            nodes = np.array([float(fixed(node, POSITION_DIGITS)) for node in terms[name].nodes_mm.tolist()])
-            curves[name] = Curve(nodes, rounded, np.full(len(nodes), np.nan))
+            nodes = rounded(terms[name].nodes_mm, POSITION_DIGITS)
+            curves[name] = Curve(nodes, value, np.full(len(nodes), np.nan))
     return ErrorTable(curves, squareness)
 
 
@@ -274,8 +274,7 @@ class Neutral(Controller[NeutralSettings, NeutralTables]):
         x, y, z = (self._nodes_mm(curves, axis) for axis in range(3))
         position_mm = full_grid((x, y, z))
         added = self._curve_correction(curves, position_mm.reshape(-1, 3), None) / MM_PER_UM
-        flat = np.array([float(fixed(value, FIELD_DIGITS)) for value in added.ravel().tolist()])
-        return NeutralTables(FieldGrid((x, y, z), flat.reshape(position_mm.shape)), curves)
+        return NeutralTables(FieldGrid((x, y, z), rounded(added, FIELD_DIGITS).reshape(position_mm.shape)), curves)
 
     def context(self, tables: NeutralTables) -> dict[str, Any]:
         """Return field and curves in the units of the files, and the sign conventions with worked examples."""

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from compgen.controls.shared.base import Controller, SourceFile, Term, Usage, nodes_by_axis, travel_of
 from compgen.controls.shared.grids import equidistant_grid, loss_setting
 from compgen.controls.shared.scanner import content_lines
-from compgen.controls.shared.terms import continued, one_dimensional_terms, product_terms
+from compgen.controls.shared.tables import along_itself
+from compgen.controls.shared.terms import continued, field_on_grid, one_dimensional_terms, product_terms
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves
@@ -603,7 +604,7 @@ class Pmac(Controller[PmacSettings, PmacTables]):
 
     def reversal_in_tables(self, reversal: ReversalCurves) -> ReversalCurves:
         """Only the reversal of an axis along itself goes into tables."""
-        return ReversalCurves({key: curve for key, curve in reversal.curves.items() if key[0] == key[1]})
+        return along_itself(reversal)
 
     def with_reversal(self, tables: PmacTables, reversal: ReversalCurves) -> PmacTables:
         """Return the tables with Ixx86 and, if the reversal varies, a backlash table and half of it in the pitch table.
@@ -873,15 +874,10 @@ class Pmac(Controller[PmacSettings, PmacTables]):
             nodes = next((term.nodes_mm for term in terms if term.axis == axis), None)
             wide_mm = 0.5 * self.machine.axes[axis].length_mm
             rings.append(self._ring_of(axis, wide_mm) if nodes is None else self._ring_from(axis, nodes))
-        along = [ring.positions_mm(settings) for ring in rings]
-        second, first = np.meshgrid(along[1], along[0], indexing="ij")
-        position_mm = np.zeros((first.size, 3))
-        position_mm[:, pair[0]], position_mm[:, pair[1]] = first.ravel(), second.ravel()
-        total = np.zeros(first.size)
-        for term in terms:
-            carrier = term.carrier_field(position_mm, np.zeros(3))[:, output]
-            total += carrier * term.curve(np.asarray(values[term.name]), position_mm)
-        inner = self._sixteenths(output, total).reshape(first.shape)
+        lines_mm = {
+            axis: ring.positions_mm(settings) for axis, ring in zip(reversed(pair), reversed(rings), strict=True)
+        }
+        inner = self._sixteenths(output, field_on_grid(terms, values, lines_mm, np.zeros(3))[..., output])
         inner[0, 0] = 0
         row, column = (settings.motors[axis] for axis in pair)
         return CompTable2D(
