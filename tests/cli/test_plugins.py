@@ -11,6 +11,7 @@ import pytest
 
 import compgen
 from compgen.controls import CONTROLLERS, controller_named
+from compgen.data.lengths import Points
 from compgen.plugins import KINDS
 from compgen.registry import Kind, load_entry_points, restored
 from compgen.simulation import EFFECTS, INSTRUMENTS
@@ -92,6 +93,30 @@ def test_the_round_trip_of_the_tutorial_gives_the_same_bytes(tutorial, example):
     made = compgen.export(machine, errors, "shop-csv")
     common = export_context(machine, errors, "shop-csv", Provenance())
     assert rerender(machine, "shop-csv", made.files, common) == dict(made.files)
+
+
+def test_the_short_control_of_the_tutorial_is_the_same_one(tutorial, example):
+    """The base class gives the bytes, the correction and the refusals of the class that is written out."""
+    machine, errors, made, read = example.machine, example.fitted.errors, {}, {}
+    places = np.random.default_rng(3).uniform(machine.lower_mm - 50.0, machine.upper_mm + 50.0, (80, 3))
+    for name in ("csv", "short"):
+        compgen.load_plugins([f"shop/shop_{name}.py"], installed=False)
+        made[name] = compgen.export(machine, errors, "shop-csv")
+        Path("SHOP.CSV").write_bytes(made["csv"].files["SHOP.CSV"].encode())
+        tables = compgen.read_tables(machine, "SHOP.CSV", "shop-csv")
+        read[name] = tables.correction(machine, Points(places))
+        Path("SHORT.CSV").write_text("\n".join(HEADED))
+        far = tables.controller.violations(compgen.read_tables(machine, "SHORT.CSV", "shop-csv").tables)
+        assert any("covers -10 ... 0 mm of X; the travel is -800 ... 0 mm" in text for text in far)
+        assert any("51 " in text and "50" in text for text in far)
+        del CONTROLLERS["shop-csv"]
+    assert dict(made["csv"].files) == dict(made["short"].files)
+    assert np.max(np.abs(read["csv"] - read["short"])) < 1e-15
+    assert "which the control ADDS" in made["short"].preflight
+
+
+#: A file of 51 rows, one too many, that covers 10 mm of X.
+HEADED = ["axis,position_mm,correction_um", *(f"X,{0.2 * k - 10.0:.3f},{k:.1f}" for k in range(51)), "END", ""]
 
 
 @pytest.mark.parametrize(
