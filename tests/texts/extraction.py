@@ -28,7 +28,7 @@ MODULES = (
     "accuracy/*.py", "app/*.py", "cli/common.py", "cli/accuracy_commands.py", "cli/diagnose_commands.py",
     "cli/file_commands.py",
     "cli/identify_commands.py", "cli/listing_commands.py", "cli/plan_commands.py", "cli/program_commands.py",
-    "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "data/*.py",
+    "cli/run_commands.py", "cli/table_commands.py", "controls/*.py", "controls/shared/base.py", "controls/shared/tables.py", "data/*.py",
     "diagnose/*.py", "drawing/*.py",
     "language.py", "new_machine.py", "registry.py",
     "effects/*.py", "fitting/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identification/*.py",
