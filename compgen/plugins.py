@@ -55,8 +55,12 @@ def _method_problems(code: type) -> list[str]:
     problems = []
     abstract: frozenset[str] = getattr(code, "__abstractmethods__", frozenset())
     missing = [item for item in vars(Controller) if item in abstract]
-    if missing:
+    further = sorted(abstract - set(missing))  # what a base class between asks for, such as read_file
+    if missing or further:
         texts = [f"{item}({', '.join(_arguments(item))})" for item in missing]
+        texts += [
+            f"{item}({', '.join(list(inspect.signature(getattr(code, item)).parameters)[1:])})" for item in further
+        ]
         problems.append(f"{code.__name__} has no {', '.join(texts)}")
     for item in vars(Controller):
         method = getattr(code, item, None)

@@ -13,7 +13,7 @@ import numpy as np
 from compgen.controls.shared.base import SourceFile, coverage_violations, parameter_row
 from compgen.controls.shared.grids import loss_setting, rounded
 from compgen.controls.shared.scanner import number_pattern
-from compgen.controls.shared.tables import AxisTableController, AxisTables, Table1D, largest_of
+from compgen.controls.shared.tables import AxisTables, PerAxisController, Table1D, largest_of
 from compgen.data import toml_files
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve
@@ -364,7 +364,7 @@ class CompSettings:
         return MM_PER_UNIT[self.machine_units]
 
 
-class LinuxcncComp(AxisTableController[CompSettings]):
+class LinuxcncComp(PerAxisController[CompSettings]):
     """``linuxcnc-comp``: positioning of each joint, with its reversal."""
 
     name = "linuxcnc-comp"

@@ -115,6 +115,13 @@ def test_the_short_control_of_the_tutorial_is_the_same_one(tutorial, example):
     assert "which the control ADDS" in made["short"].preflight
 
 
+def test_a_table_per_axis_without_its_reader_is_refused(tutorial):
+    path = Path("shop/shop_short.py")
+    path.write_text(without(path.read_text(), "read_file"))
+    with pytest.raises(compgen.InputError, match=r"ShopShort has no read_file\(source\)"):
+        compgen.load_plugins([path], installed=False)
+
+
 #: A file of 51 rows, one too many, that covers 10 mm of X.
 HEADED = ["axis,position_mm,correction_um", *(f"X,{0.2 * k - 10.0:.3f},{k:.1f}" for k in range(51)), "END", ""]
 

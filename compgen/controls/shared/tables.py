@@ -10,6 +10,7 @@ wrote a file is not asked: the interpolation is arithmetic that both sides may u
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -218,27 +219,23 @@ class AxisTables:
     tables: Mapping[int, Table1D]
 
 
-class AxisTableController(TableController[Settings, AxisTables]):
+class PerAxisController(TableController[Settings, AxisTables]):
     """A control with one table per axis, over its own position, perhaps with a column for each direction of travel.
 
-    A control states the class variables below and reads its file (:meth:`read_file`); the rest follows.
+    A control states the class variables below and reads its files (``parse``); the rest follows.
     """
 
     #: True if the positions must be evenly spaced; most and least points of an axis; decimals of a position and a value.
     even, most, least, position_digits, digits = False, 1000, 2, 6, 6
     #: +1 if the control adds the values to the command, -1 if it subtracts them; unit of a value, mm.
     sign, unit_mm = 1.0, 1.0
-    #: A table and one of its rows in messages; how many points of the file one node makes; longest text of a file.
-    table_name, point_name, points_per_node, most_characters = "table", "points", 1, 5_000_000
+    #: A table and one of its rows in messages; how many points of the file one node makes.
+    table_name, point_name, points_per_node = "table", "points", 1
 
     @property
     def most_points(self) -> int:
         """Return the largest number of points of one axis."""
         return self.points_per_node * int(getattr(self.settings, "most_points", self.most))
-
-    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
-        """Return position (mm) and the values in both directions of each row, by axis; not asked where ``parse`` is."""
-        raise NotImplementedError(f"{self.name} has neither read_file nor a parse of its own")
 
     def curves(self, tables: AxisTables) -> Sequence[Table1D]:
         """Return the tables in the order of the axes."""
@@ -327,29 +324,6 @@ class AxisTableController(TableController[Settings, AxisTables]):
         """Return what must be set on the control besides the tables."""
         return []
 
-    def parse(self, files: Sequence[SourceFile]) -> AxisTables:
-        """Read the tables strictly; positions must rise."""
-        found: dict[int, Table1D] = {}
-        for source in files:
-            check_size(source, self.most_characters)
-            for axis, rows in self.read_file(source).items():
-                if axis in found:
-                    raise source.fail(f"is a second {self.table_name} of {AXES[axis]}", 1)
-                columns = np.array(rows, dtype=np.float64).reshape(-1, 3).T
-                if np.any(np.diff(columns[0]) <= 0.0):
-                    k = int(np.argmax(np.diff(columns[0]) <= 0.0))
-                    message = (
-                        f"the position {columns[0, k + 1]:g} of {AXES[axis]} is not above {columns[0, k]:g} before it"
-                    )
-                    raise source.fail(message, 1)
-                if len(rows) < self.least:
-                    message = f"the {self.table_name} of {AXES[axis]} has {len(rows)} points; at least {self.least} are needed"
-                    raise source.fail(message, 1)
-                found[axis] = self.table_of(axis, *columns)
-        if not found:
-            raise files[0].fail("contains no table", 1) if files else InputError("no file was given")
-        return AxisTables(found)
-
     def violations(self, tables: AxisTables) -> list[str]:
         """Return axes without a table, travel that a table does not cover, too many points, uneven spacing."""
         what = f"the {self.table_name}"
@@ -394,3 +368,37 @@ class AxisTableController(TableController[Settings, AxisTables]):
             f"{fixed(float(table.positive[k]), self.digits)}; for the command {AXES[axis]} {position[0, axis]:.4f} mm in "
             f"positive travel the axis goes to {fixed(float(position[0, axis]) + added, 5)} mm."
         )
+
+
+class AxisTableController(PerAxisController[Settings]):
+    """The same for a control whose file has rows of position and value: :meth:`read_file` is all that it needs."""
+
+    #: Longest text of a file.
+    most_characters = 5_000_000
+
+    @abstractmethod
+    def read_file(self, source: SourceFile) -> dict[int, list[tuple[float, float, float]]]:
+        """Return position (mm) and the values in both directions of each row, by axis."""
+
+    def parse(self, files: Sequence[SourceFile]) -> AxisTables:
+        """Read the tables strictly; positions must rise."""
+        found: dict[int, Table1D] = {}
+        for source in files:
+            check_size(source, self.most_characters)
+            for axis, rows in self.read_file(source).items():
+                if axis in found:
+                    raise source.fail(f"is a second {self.table_name} of {AXES[axis]}", 1)
+                columns = np.array(rows, dtype=np.float64).reshape(-1, 3).T
+                if np.any(np.diff(columns[0]) <= 0.0):
+                    k = int(np.argmax(np.diff(columns[0]) <= 0.0))
+                    message = (
+                        f"the position {columns[0, k + 1]:g} of {AXES[axis]} is not above {columns[0, k]:g} before it"
+                    )
+                    raise source.fail(message, 1)
+                if len(rows) < self.least:
+                    message = f"the {self.table_name} of {AXES[axis]} has {len(rows)} points; at least {self.least} are needed"
+                    raise source.fail(message, 1)
+                found[axis] = self.table_of(axis, *columns)
+        if not found:
+            raise files[0].fail("contains no table", 1) if files else InputError("no file was given")
+        return AxisTables(found)
