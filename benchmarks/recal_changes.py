@@ -160,6 +160,8 @@ ROWS = {
     "twice that": Repeats(0.6, 2.0),
     "0.3 K + 1 urad, read to 0.05 K": Repeats(0.3, 1.0, 0.05),
     "the same, coefficient 20 % wrong, hall +- 3 K": Repeats(0.3, 1.0, 0.05, 0.2, 3.0),
+    "0.3 K + 1 urad, hall +- 2 K that nobody reads": Repeats(0.3, 1.0, season_k=2.0),
+    "0.3 K + 1 urad, hall +- 2 K, read to 0.05 K": Repeats(0.3, 1.0, 0.05, 0.0, 2.0),
 }
 SQUARENESS, SCALE = {"EC0Y": 5e-6}, {"EXX": 5e-6}
 

@@ -44,6 +44,7 @@ from compgen.resources import LANGUAGES
 
 if TYPE_CHECKING:
     from compgen.fitting import FitOptions, FitResult
+    from compgen.identification.heat_of_readings import HeatSource
     from compgen.identification.monte_carlo import SelfCheck
     from compgen.identification.stated import Shown
     from compgen.planning.next_measurement import NextBest
@@ -379,6 +380,31 @@ def identify_bare(
     return replace(result, corrections={**result.corrections, "active_tables": report})
 
 
+def identify_warm(
+    machine: Machine,
+    measurement: Measurement | ErrorTable,
+    heat: HeatSource | None,
+    numbers: StatedNumbers,
+    options: IdentifyOptions | None = None,
+    active: ActiveTables | None = None,
+) -> Identification:
+    """Identify as :func:`identify_beside` at the reference state of heat, if temperatures of the readings are known.
+
+    ``corrections["heat"]`` of the result says what was taken out, a CompgenWarning too.
+    """
+
+    def identified(readings: Measurement | ErrorTable) -> Identification:
+        return identify_beside(machine, readings, numbers, options, active)
+
+    if heat is None:
+        return identified(measurement)
+    from compgen.identification.heat_of_readings import at_reference_heat, identified_at_reference
+
+    found = at_reference_heat(machine, measurement, heat)
+    warnings.warn(found.says(), CompgenWarning, stacklevel=2)
+    return identified_at_reference(found, identified)
+
+
 def identify_beside(
     machine: Machine,
     measurement: Measurement | ErrorTable,
@@ -543,6 +569,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     language: str = LANGUAGES[0],
     progress: Progress = lambda _: None,
     beyond: Callable[[Identification], Identification] | None = None,
+    heat: HeatSource | None = None,
 ) -> RunResult:
     """Run the whole chain and write everything to ``folder``, after the last step that may find bad input.
 
@@ -566,6 +593,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     language : of the preflight list and the page of the check program, ``"en"`` or ``"de"``.
     progress : called with the name of each step when it begins.
     beyond : adds to the identified errors what was measured with the rotary axes of the machine.
+    heat : temperatures of the readings, and the model that tells what they have moved.
 
     Raises
     ------
@@ -607,10 +635,11 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     numbers = stated or StatedNumbers()
     numbers.reversal()  # wrong numbers are found before the work begins
     measurement = open_measurement(measurements, instrument, stated=numbers.errors(machine), answers=answers)
-    provenance = provenance_of(machine.file, *measurements, instrument)
+    warm = () if heat is None else heat.inputs
+    provenance = provenance_of(machine.file, *measurements, instrument, *warm)
     progress(f"identifying: {describe(measurement)}")
     with failure_reported(folder):
-        identification = identify_beside(machine, measurement, numbers, identify_options, active)
+        identification = identify_warm(machine, measurement, heat, numbers, identify_options, active)
         identification = identification if beyond is None else beyond(identification)
     progress("fitting smooth curves")
     known = None if not identification.has_covariance else covariance.joint_covariance(identification)

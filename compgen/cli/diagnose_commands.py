@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -19,7 +20,13 @@ from compgen.cli.common import (
     print_json,
 )
 from compgen.cli.identify_commands import diagnose_rotary, of_rotary_axes
-from compgen.cli.shared_options import instrument_option, machine_argument, mapper, measurements_argument
+from compgen.cli.shared_options import (
+    heat_of_readings_options,
+    instrument_option,
+    machine_argument,
+    mapper,
+    measurements_argument,
+)
 from compgen.cli.terminal import progress, say
 from compgen.controls.isg_kernel import read_error_file
 from compgen.data.files import OutputFolder, json_text
@@ -27,11 +34,14 @@ from compgen.data.machine import Machine
 from compgen.diagnose import AxisDiagnosis, CircleDiagnosis, DiagnoseOptions, Diagnosis, diagnose
 from compgen.diagnose.any_diagnosis import SixDofDiagnosis, diagnose_sixdof, sixdof_text
 from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
-from compgen.diagnose.observed import read_diagnosed
+from compgen.diagnose.observed import Measurement, read_diagnosed
 from compgen.diagnose.page import diagnosis_files, next_steps, summary, told
-from compgen.errors import CompgenError, InputError
+from compgen.errors import CompgenError, CompgenWarning, InputError
 from compgen.instruments.sixdof_instrument import read_instrument, read_sixdof
 from compgen.kinematics.kernel_switch import one_thread
+
+if TYPE_CHECKING:
+    from compgen.identification.heat_of_readings import HeatSource
 
 # ``volcomp diagnose --each``: every measurement separately, in this process, in several, or on a cluster.
 
@@ -46,6 +56,7 @@ class DiagnoseRequest:
     machine: Machine
     options: DiagnoseOptions
     instrument: Path | None
+    heat: HeatSource | None = None
 
     def __call__(self, path: Path) -> DiagnosedMeasurement:
         """Diagnose one measurement; a file that cannot be used is part of the result."""
@@ -71,13 +82,25 @@ def diagnosed(
 ) -> tuple[Diagnosis | AxisDiagnosis | CircleDiagnosis | FeatureDiagnosis | SixDofDiagnosis, dict[str, str | bytes]]:
     """Diagnose files as one measurement; return the diagnosis and its files by name."""
     if request.instrument is None:
-        found = diagnose(request.machine, read_diagnosed(measurements), request.options, show=show)
+        read = read_diagnosed(measurements)
+        if request.heat is not None:
+            read = _at_reference(request.machine, read, request.heat)
+        found = diagnose(request.machine, read, request.options, show=show)
         show("drawing")
         return found, dict(diagnosis_files(found))
     if request.options.against is not None or request.options.effects or request.options.add:
         raise InputError("--against, --effects and --add cannot be used with six-DOF readings")
     readings = diagnose_sixdof(request.machine, read_sixdof(measurements), read_instrument(request.instrument))
     return readings, {"diagnosis.json": json_text(readings.to_dict()), "diagnosis.md": sixdof_text(readings)}
+
+
+def _at_reference(machine: Machine, measurement: Measurement, heat: HeatSource) -> Measurement:
+    """Return the readings without the growth that a model of heat tells; what remains of heat is to be found."""
+    from compgen.identification.heat_of_readings import at_reference_heat
+
+    found = at_reference_heat(machine, measurement, heat)
+    warnings.warn(found.says(), CompgenWarning, stacklevel=2)
+    return cast("Measurement", found.measurement)
 
 
 def diagnose_each(
@@ -125,6 +148,7 @@ def _names(text: str) -> tuple[str, ...]:
 @out_option
 @options_of(DiagnoseOptions, "options", read={"effects": _names, "against": read_error_file})
 @instrument_option
+@heat_of_readings_options
 @click.option(
     "--each", is_flag=True, help="Diagnose each measurement separately, into a folder of --out with its name."
 )
@@ -137,6 +161,7 @@ def diagnose_command(
     out: Path,
     options: DiagnoseOptions,
     instrument: Path | None,
+    heat: HeatSource | None,
     each: bool,
     workers: int,
     cluster: str | None,
@@ -165,7 +190,7 @@ def diagnose_command(
     OutputFolder(out)
     if any(of_rotary_axes(path) for path in measurements):
         return diagnose_rotary(machine, measurements, out, as_json)
-    request = DiagnoseRequest(machine, options, instrument)
+    request = DiagnoseRequest(machine, options, instrument, heat)
     if each:
         return diagnose_each(request, measurements, out, (workers, cluster), language, as_json=as_json)
     if workers > 1 or cluster is not None:

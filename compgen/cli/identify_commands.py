@@ -14,6 +14,7 @@ from compgen.cli.common import fleet_options, json_option, out_option, print_jso
 from compgen.cli.shared_options import (
     active_options,
     answer_options,
+    heat_of_readings_options,
     identify_options,
     instrument_option,
     machine_argument,
@@ -41,6 +42,7 @@ from compgen.pipeline import (
     failure_reported,
     identification_files,
     identify_beside,
+    identify_warm,
     next_measurements,
     proposed_keys,
     provenance_of,
@@ -48,6 +50,7 @@ from compgen.pipeline import (
 from compgen.report.terminal import advice_text, identification_table, what_matters
 
 if TYPE_CHECKING:
+    from compgen.identification.heat_of_readings import HeatSource
     from compgen.identification.with_rotary import RotaryResult
     from compgen.tables.active import ActiveTables
 
@@ -75,6 +78,7 @@ from compgen.report.terminal import fit_table
 @out_option
 @identify_options
 @active_options("--controller")
+@heat_of_readings_options
 @click.option(
     "--self-check",
     "replicates",
@@ -93,6 +97,7 @@ def identify_command(
     out: Path,
     options: IdentifyOptions,
     active: ActiveTables | None,
+    heat: HeatSource | None,
     replicates: int | None,
     workers: int,
     cluster: str | None,
@@ -133,7 +138,7 @@ def identify_command(
         measurement = open_measurement(measurements, instrument, stated=stated.errors(machine), answers=answers)
         show(f"identifying: {describe(measurement)}")
         with failure_reported(out):
-            result = identify_beside(machine, measurement, stated, options, active)
+            result = identify_warm(machine, measurement, heat, stated, options, active)
         checked = None
         if replicates is not None:
             if active is not None or not isinstance(measurement, Lengths):
@@ -150,7 +155,8 @@ def identify_command(
                     mapper=spread,
                 )
     proposed = next_measurements(result)
-    sources = provenance_of(machine.source, *measurements, instrument)
+    warm = () if heat is None else heat.inputs
+    sources = provenance_of(machine.source, *measurements, instrument, *warm)
     files = identification_files(result, sources, checked, proposed, heads_of(measurements))
     output = OutputFolder(out)
     add_identification(output, {**files, **evidence_files(machine, measurement, result)})

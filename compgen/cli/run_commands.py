@@ -19,6 +19,7 @@ from compgen.cli.shared_options import (
     emphasis_options,
     explain_option,
     fitting_options,
+    heat_of_readings_options,
     identify_options,
     instrument_option,
     limits_option,
@@ -46,6 +47,7 @@ from compgen.tables.judge import SafetyLimits
 
 if TYPE_CHECKING:
     from compgen.cli.identify_commands import RotaryRun
+    from compgen.identification.heat_of_readings import HeatSource
     from compgen.report.html.folder import KnownTables
     from compgen.report.html.write import Further
     from compgen.tables.active import ActiveTables
@@ -183,7 +185,7 @@ class _Run(GroupedCommand):
         "Needed": ("controller", "out"),
         "Numbers known without a file": ("stated__",),
         "What files of other programs leave open (volcomp import shows it)": ("answers__", "instrument"),
-        "Identification": ("options__", "prior"),
+        "Identification": ("options__", "prior", "heat_model", "temperatures", "u_clock_s"),
         "Smoothing and bounds of the tables": ("fitting__", "zone", "tools", "limits__"),
         "Tables on the control": ("active", "template_from", "style_from", "templates", "allow_unverified", "sample"),
         "Verdict and output": ("allow_misfit", "explain", "no_report", "certificate", "language", "units", "as_json"),
@@ -206,6 +208,7 @@ class _Run(GroupedCommand):
 @templates_option
 @unverified_option
 @active_options()
+@heat_of_readings_options
 @limits_option
 @click.option(
     "--allow-misfit",
@@ -236,6 +239,7 @@ def run_command(
     templates: Path | None,
     allow_unverified: bool,
     active: ActiveTables | None,
+    heat: HeatSource | None,
     limits: SafetyLimits,
     allow_misfit: bool,
     explain: bool,
@@ -270,10 +274,10 @@ def run_command(
         from compgen.report.dcc.laboratory import read_certificate
 
         read_certificate(certificate, complete=False)
-    if heat := [name for name in controller if name in HEAT_OUTPUTS]:
+    if outputs := [name for name in controller if name in HEAT_OUTPUTS]:
         raise InputError(
-            f"{heat[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml --controller "
-            f"{heat[0]}",
+            f"{outputs[0]} takes a model of heat: volcomp heat, then volcomp export MACHINE NAME.heat.toml --controller "
+            f"{outputs[0]}",
             field="--controller",
         )
     turned = _rotary_run(machine, measurements, controller, out, options, allow_unverified)
@@ -302,6 +306,7 @@ def run_command(
             templates=templates,
             allow_unverified=allow_unverified,
             active=active,
+            heat=heat,
             limits=limits,
             allow_misfit=allow_misfit,
             language=language,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from compgen import effects
-from compgen.cli.common import PATH, Command, options_of
+from compgen.cli.common import NUMBER, PATH, Command, options_of
 from compgen.controls import CONTROLLERS, HEAT_OUTPUTS, ROTARY_PITCH, ROTARY_TARGETS, controller_named
 from compgen.data.error_table import ErrorTable
 from compgen.data.machine import (
@@ -35,6 +36,7 @@ from compgen.identification.options import StatedNumbers
 from compgen.resources import data_folder
 
 if TYPE_CHECKING:
+    from compgen.identification.heat_of_readings import HeatSource
     from compgen.kinematics.parallel import Map
     from compgen.tables.active import ActiveTables
 
@@ -314,6 +316,54 @@ def active_options(*names: str) -> Callable[[Command], Command]:
         return named(option)  # type: ignore[return-value]
 
     return decorate
+
+
+def heat_of_readings_options(command: Command) -> Command:
+    """Add the temperatures of the readings and the model of heat; the command receives ``heat``. Below machine_argument."""
+
+    @functools.wraps(command)
+    def wrapper(
+        *args: Any,
+        machine: Machine,
+        heat_model: Path | None,
+        temperatures: Path | None,
+        u_clock_s: float | None,
+        **options: Any,
+    ) -> Any:
+        return command(
+            *args, machine=machine, heat=_heat_source(machine, heat_model, temperatures, u_clock_s), **options
+        )
+
+    text = "Standard uncertainty of the moment at which readings were taken on the clock of the temperatures, s (default: 60)."
+    decorated: Any = click.option("--u-clock-s", type=NUMBER, help=text)(wrapper)
+    text = (
+        "Temperatures while the readings were taken (*.temperatures.csv), joined by time: the growth that the model of heat "
+        "tells is taken out of the readings, and its uncertainty enters u."
+    )
+    decorated = path_option("--temperatures", text)(decorated)
+    text = (
+        "Model of heat of `volcomp heat` (default with --temperatures: NAME.heat.toml beside the machine file); without "
+        "--temperatures the columns temp_..._c of the measurement count."
+    )
+    return click.option("--heat", "heat_model", metavar="FILE", type=PATH, help=text)(decorated)  # type: ignore[no-any-return]
+
+
+def _heat_source(
+    machine: Machine, model: Path | None, temperatures: Path | None, u_clock_s: float | None
+) -> HeatSource | None:
+    if model is None and temperatures is None:
+        if u_clock_s is not None:
+            raise InputError("--u-clock-s is of --temperatures; add them, or leave it out")
+        return None
+    if u_clock_s is not None and not 0.0 <= u_clock_s < math.inf:
+        raise InputError("must be zero or more", field="--u-clock-s")
+    from compgen.heat.joining import U_CLOCK_S
+    from compgen.identification.heat_of_readings import heat_source
+
+    if model is None and machine.source is not None:
+        beside = Path(machine.source).with_name(f"{machine.name}.heat.toml")
+        model = beside if beside.exists() else None
+    return heat_source(machine, model, temperatures, U_CLOCK_S if u_clock_s is None else u_clock_s)
 
 
 def _names(target: Any) -> list[str]:

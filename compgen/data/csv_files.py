@@ -104,6 +104,15 @@ def comment_of(line: str) -> tuple[str, str] | None:
     return (key.strip(), value.strip()) if line.startswith("#") and equals and value.strip() else None
 
 
+def comments_of(path: str | Path) -> dict[str, str]:
+    """Return the comments ``# key = value`` of a text file; none of a file of another kind, or that cannot be read."""
+    try:
+        with open(path, encoding="utf-8-sig", errors="replace") as lines:
+            return dict(found for line in lines if (found := comment_of(line.strip())))
+    except OSError:
+        return {}
+
+
 def parse_any(source: Path, content: str) -> CsvFile:
     """Read any file of the dialect, line by line."""
     metadata: dict[str, str] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from typing import Any
 
@@ -15,6 +15,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.repeatability import EXPANSION_SHARE, USUAL_UM_PER_M_K
 from compgen.errors import InputError
 from compgen.fleet.decisions import excluded
 from compgen.fleet.records import AFTER, WITHOUT_PRIOR, IdentificationRecord, MachineRecord, TableRecord, comparable
@@ -570,7 +571,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
 # other two scales, or squarenesses, tell of the repeatability is r = (4 + SS' / s0'^2) / (4 + N'), which counts as F = 4 + N',
 # at most 10, degrees of freedom: one of the three may repeat worse than the others. A scale
 # that is corrected for its temperature T may have a wrong expansion coefficient: y = level + c (T - 20 degC), c normal with the
-# uncertainty of the coefficient, which is one more observation. The other shapes of the errors are compared as a field: the
+# uncertainty of the coefficient, which is one more observation. Where no temperature is read, the hall moves all scales together
+# by the same temperature: that common change is compared with what a season does (season_k), and each scale with the others, from
+# which the hall cancels as far as their coefficients are known. The other shapes of the errors are compared as a field: the
 # sum of squares against that of the uncertainties, which the calibrations before scale (F-test).
 
 
@@ -585,6 +588,8 @@ WINDOW, LONG_WINDOW = 3, 10
 #: At most so many of the last calibrations are compared.
 MOST_COMPARED = 60
 REFERENCE_C = 20.0
+#: Name of the direction in which the temperature of the hall moves all scales together.
+ALL_SCALES = "all scales"
 
 
 @dataclass(frozen=True)
@@ -599,6 +604,10 @@ class Direction:
     weight: FloatArray
     shape: FloatArray
     axis: int | None
+    #: Standard deviation of it that the unread temperature of the hall causes, mm/mm.
+    by_hall: float = 0.0
+    #: How much less sure it is than one scale, since the others are subtracted; below 1 for their mean.
+    spread: float = 1.0
 
 
 def change_since(
@@ -618,9 +627,10 @@ def change_since(
     motion = small_motion(position_mm)
     design = error_design(machine, data.field_covariance(len(history) - 1), position_mm).reshape(position_mm.size, -1)
     directions = _six_directions(data)
-    tested = _tested(data, history, level, directions, corrected=corrected)
+    judged = _with_hall(data, history, directions, corrected=corrected)
+    tested = _tested(data, history, level, judged, corrected=corrected)
     own = np.flatnonzero(level == level[-1])
-    count = max(len(_windows(len(own))) * len(directions), 1)
+    count = max(len(_windows(len(own))) * len(judged), 1)
     p_value, said = min(((p * count / FOR_DIRECTIONS, text) for p, text, _ in tested), default=(1.0, ""))
     p_rest = _p_of_other_shapes(data, level, directions, motion, design) / (1.0 - FOR_DIRECTIONS)
     if p_rest < min(p_value, 1.0):
@@ -628,7 +638,7 @@ def change_since(
     first = history[own[0]]
     found = compared_fields(machine, _known(history[-1]), _known(first), position_mm)
     sizes = sizes_of(found.size / MM_PER_UM)
-    own_shapes = motion.taken_out(design @ np.array([item.shape for item in directions]).reshape(-1, design.shape[1]).T)
+    own_shapes = motion.taken_out(design @ np.array([item.shape for item in judged]).reshape(-1, design.shape[1]).T)
     repeats = sum(2.0 * s2 * float(shape @ shape) for (_, _, s2), shape in zip(tested, own_shapes.T, strict=True))
     return Change(
         rms_um=sizes.rms,
@@ -666,6 +676,39 @@ def _six_directions(data: Aligned) -> list[Direction]:
     return found
 
 
+def _with_hall(
+    data: Aligned, history: Sequence[Calibration], directions: Sequence[Direction], *, corrected: bool
+) -> list[Direction]:
+    """Return directions, scales of which no temperature is read against the other ones, and what they have in common."""
+    hall_k = data.machine.repeatability.hall_k
+    unread = [
+        k
+        for k, item in enumerate(directions)
+        if item.axis is not None and _warm(data, history, item.axis, corrected=corrected) is None
+    ]
+    if not unread or hall_k == 0.0:
+        return list(directions)
+    axes = [data.machine.axes[axis] for k in unread if (axis := directions[k].axis) is not None]
+    per_k = 1e-6 * np.array([axis.expansion_um_per_m_k or USUAL_UM_PER_M_K for axis in axes])
+    u_per_k = np.array([axis.u_expansion or EXPANSION_SHARE * own for axis, own in zip(axes, per_k, strict=True)])
+    if len(unread) == 1:
+        (only,) = unread
+        return [replace(item, by_hall=hall_k * per_k[0]) if k == only else item for k, item in enumerate(directions)]
+    weights = np.array([directions[k].weight for k in unread])
+    found, mean = list(directions), float(per_k.mean())
+    for row, k in enumerate(unread):
+        rest = np.arange(len(unread)) != row
+        kelvin = per_k[rest] @ weights[rest] / float(per_k[rest] @ per_k[rest])  # that the others tell
+        spread = float(np.sqrt(1.0 + per_k[row] ** 2 / (per_k[rest] @ per_k[rest])))
+        by_hall = hall_k * float(np.hypot(u_per_k[row], u_per_k[rest].mean() / np.sqrt(rest.sum())))
+        weight = weights[row] - per_k[row] * kelvin
+        found[k] = replace(directions[k], weight=weight, by_hall=by_hall, spread=spread)
+    together = mean * per_k @ weights / float(per_k @ per_k)
+    shape = np.sum([own / mean * directions[k].shape for own, k in zip(per_k, unread, strict=True)], axis=0)
+    axis, least = directions[unread[0]].axis, 1.0 / float(np.sqrt(len(unread)))
+    return [*found, Direction(ALL_SCALES, "um/m", together, shape, axis, hall_k * mean, least)]
+
+
 def _tested(
     data: Aligned,
     history: Sequence[Calibration],
@@ -683,13 +726,19 @@ def _tested(
         steps = [_step(item, level, before, own[-window:]) for item in series]
         over = "" if window == 1 else f" over the last {window} measurements"
         for k, (direction, step) in enumerate(zip(directions, steps, strict=True)):
-            kind = direction.axis is None
-            others = [steps[j] for j, item in enumerate(directions) if j != k and (item.axis is None) == kind]
+            others = [steps[j] for j, item in enumerate(directions) if j != k and _kind(item) == _kind(direction)]
             p_value, variance = _t_test(step, series[k].s0, others)
             if p_value <= best[k][0]:
                 said = f"{direction.name} {1e6 * step.size:+.1f} {direction.unit}{over}"
                 best[k] = p_value, said, variance
     return best
+
+
+def _kind(direction: Direction) -> str:
+    """Directions of one kind repeat equally well; what all scales have in common is of its own."""
+    if direction.name == ALL_SCALES:
+        return ALL_SCALES
+    return "squareness" if direction.axis is None else "scale"
 
 
 @dataclass(frozen=True)
@@ -724,13 +773,19 @@ def _series(data: Aligned, history: Sequence[Calibration], direction: Direction,
     value, machine = data.value @ direction.weight, data.machine
     u = np.array([np.linalg.norm(direction.weight @ factor) for factor in data.factor])
     warm, u_expansion = None, 0.0
-    if direction.axis is not None and corrected and machine.axes[direction.axis].u_expansion > 0.0:
+    if direction.axis is not None:
         u_expansion = machine.axes[direction.axis].u_expansion
-        warm = _temperatures_of(history, direction.axis)
+        warm = _warm(data, history, direction.axis, corrected=corrected)
     known = machine.repeatability
     repeats = 1e-6 * known.squareness_urad if direction.axis is None else known.scale(temperatures=warm is not None)
-    s0 = float(np.sqrt(repeats**2 + np.mean(u**2)))
+    s0 = float(np.sqrt((direction.spread * repeats) ** 2 + direction.by_hall**2 + np.mean(u**2)))
     return Series(value, s0) if warm is None else Series(value, s0, warm - REFERENCE_C, s0 / u_expansion)
+
+
+def _warm(data: Aligned, history: Sequence[Calibration], axis: int, *, corrected: bool) -> FloatArray | None:
+    """Temperatures for which a scale was corrected, (n,); None if it was not."""
+    known = corrected and data.machine.axes[axis].u_expansion > 0.0
+    return _temperatures_of(history, axis) if known else None
 
 
 def _temperatures_of(history: Sequence[Calibration], axis: int) -> FloatArray | None:

@@ -8,6 +8,7 @@ import io
 import os
 import re
 import stat
+import warnings
 import zipfile
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from compgen.data.csv_files import MOST_COLUMNS
 from compgen.data.files import sha256_of
-from compgen.errors import InputError, visible
+from compgen.errors import CompgenWarning, InputError, visible
 from compgen.fleet.job import MachineJob, OtherInbox
 from compgen.fleet.records import MachineRecord, NewMeasurement
 
@@ -192,7 +193,7 @@ def receive(store: Store, machine: MachineRecord, job: MachineJob) -> None:
     """Store the measurements that are in the inbox; what cannot be read is reported by the next pass over the machine."""
     for group in scan(job, store.now()).groups:
         with contextlib.suppress(InputError):
-            store.add_measurement(machine, measurement_of(*read_files(job, group)))
+            store.add_measurement(machine, measurement_of(*read_files(job, group), job.temperatures))
 
 
 def read_backup(job: MachineJob, paths: Iterable[Path]) -> dict[str, tuple[bytes, datetime]]:
@@ -329,8 +330,10 @@ def _opened_folder(folder: Path, *, real: bool) -> Iterator[int | None]:
         os.close(handle)
 
 
-def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime) -> NewMeasurement:
-    """Return a measurement from the contents of its files."""
+def measurement_of(
+    name: str, contents: Mapping[str, bytes], file_time: datetime, log: Path | None = None
+) -> NewMeasurement:
+    """Return a measurement from the contents of its files; ``log`` has temperatures of its scales, if its files have none."""
     comments: dict[str, str] = {}
     for content in contents.values():  # the first file wins
         comments = {**comments_in(content), **comments}
@@ -338,6 +341,8 @@ def measurement_of(name: str, contents: Mapping[str, bytes], file_time: datetime
     temperatures: dict[str, dict[str, float]] = {}
     for content in contents.values():
         temperatures |= _temperatures(content)
+    if log is not None:
+        temperatures = {**_logged(log, contents), **temperatures}
     return NewMeasurement(
         sha256=digest_of(contents),
         name=name,
@@ -482,6 +487,41 @@ def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
             if values:
                 found[name] = {"low": min(values), "mean": sum(values) / len(values), "high": max(values)}
     return found
+
+
+#: Columns of the scales, whose temperatures may be those of a log.
+_OF_SCALES = ("temp_x_c", "temp_y_c", "temp_z_c")
+
+
+def _logged(log: Path, contents: Mapping[str, bytes]) -> dict[str, dict[str, float]]:
+    """Return lowest, mean and highest temperature of each scale in a log while the files were measured; none where it has none.
+
+    What is wrong with the log is said when the measurement is processed.
+    """
+    import numpy as np  # imported here: few machines have a log
+
+    from compgen.data.csv_files import comment_of
+    from compgen.heat.joining import columns_at, moments_of, on_clock, read_stretches, stretch_of
+
+    try:
+        moments = []
+        for content in contents.values():
+            lines = content.decode("utf-8-sig", "replace").splitlines()
+            comments = dict(found for line in lines if (found := comment_of(line.strip())))
+            moments.append(moments_of(np.linspace(0.0, duration_s(content), 50), comments, None))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CompgenWarning)
+            part, _ = stretch_of(read_stretches(log), moments, log)
+    except InputError:
+        return {}
+    means: dict[str, dict[str, float]] = {}
+    for column in _OF_SCALES:
+        values = part.celsius.get(column[len("temp_") : -len("_c")])
+        if values is not None:
+            at_s = [on_clock(part, item.at_s, epoch=item.epoch) for item in moments]
+            read = np.concatenate([columns_at(part, values, at) for at in at_s])
+            means[column] = {"low": float(read.min()), "mean": float(read.mean()), "high": float(read.max())}
+    return means
 
 
 def _number(cell: str, most: float = 1e6) -> float | None:

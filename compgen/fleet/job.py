@@ -331,6 +331,19 @@ class MachineJob:
         "back.",
     )
     instrument: Path | None = setting(_path, None, metavar="FILE", meaning="Instrument TOML of six-DOF readings.")
+    heat: Path | None = setting(
+        _path,
+        None,
+        metavar="FILE",
+        meaning="Model of heat of `volcomp heat`: what temperatures have moved is taken out of the readings.",
+    )
+    temperatures: Path | None = setting(
+        _path,
+        None,
+        metavar="FILE",
+        meaning="Temperatures while one measures: a *.temperatures.csv of `volcomp log`, or a folder of them; sensors x, y, z "
+        "are those of the scales.",
+    )
     templates: Path | None = setting(_path, None, meaning="Folder of your own templates, as for `volcomp run`.")
     allow_unverified: bool = setting(
         toml_files.flag, False, meaning="Export formats that no public document fully describes."
@@ -399,6 +412,10 @@ class MachineJob:
             rules["max_minutes"] = self.max_minutes
         if self.language != LANGUAGES[0]:
             rules["language"] = self.language
+        if self.heat is not None:
+            rules["heat"] = sha256_of(read_bytes(self.heat))
+        if self.temperatures is not None:  # which grow from day to day: their contents are no setting
+            rules["temperatures"] = str(self.temperatures)
         if self.repeatability:
             rules["repeatability"] = dict(self.repeatability)
         found = sha256_of(json.dumps([digests, own, rules], sort_keys=True).encode())
@@ -538,6 +555,8 @@ def _machine(name: str, keys: Section, folder: Path) -> MachineJob:
         out=placed(job.out),
         schedule=_schedule(job, keys),
         instrument=None if job.instrument is None else placed(job.instrument),
+        heat=None if job.heat is None else placed(job.heat),
+        temperatures=None if job.temperatures is None else placed(job.temperatures),
         templates=None if job.templates is None else placed(job.templates),
     )
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -68,6 +68,9 @@ from compgen.tables import ReadTables, program_version, verify
 from compgen.tables.active import ActiveTables, difference
 from compgen.tables.judge import SafetyLimits
 from compgen.tables.verification import MISFIT_CODES
+
+if TYPE_CHECKING:
+    from compgen.identification.heat_of_readings import HeatSource
 
 #: A measurement dated further in the future than this has a wrong time.
 FUTURE = timedelta(days=1)
@@ -432,6 +435,7 @@ def process(
             allow_unverified=job.allow_unverified,
             active=None if on.tables is None else ActiveTables(on.tables),
             instrument=job.instrument,
+            heat=_heat_of(job, machine),
             limits=SafetyLimits(job.policy.max_step_um),
             language=job.language,
             allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
@@ -450,6 +454,15 @@ def process(
     )
     now_active = active_of(past.tables)
     return Processed(kept, None if now_active is None else now_active.id)
+
+
+def _heat_of(job: MachineJob, machine: Machine) -> HeatSource | None:
+    """The model of heat and the temperatures that a job names; None if it names none."""
+    if job.heat is None and job.temperatures is None:
+        return None
+    from compgen.identification.heat_of_readings import heat_source
+
+    return heat_source(machine, job.heat, job.temperatures)
 
 
 def confirmation(store: Store, job: MachineJob, record: MachineRecord, measurement: MeasurementRecord) -> str:

@@ -239,7 +239,7 @@ class _Pass:
         for problem in problems:
             self._problem("inbox", *problem)
         for item in received:
-            self.store.add_measurement(self.machine, inbox.measurement_of(*item))
+            self.store.add_measurement(self.machine, inbox.measurement_of(*item, self.job.temperatures))
         for measurement, name in self._new_evidence():
             self.store.add_evidence(self.machine, measurement, self.backups[name], "inbox")
         settings = self.job.settings_sha256()  # a missing machine file ends the pass here; files taken so far are kept
@@ -474,12 +474,19 @@ class Parcel:
 
     @classmethod
     def of(cls, job: MachineJob) -> Parcel:
-        """Pack the machine file, the instrument file, the user's templates, and the inboxes of the other machines."""
+        """Pack the files that the settings name, and the inboxes of the other machines."""
         source, folder = load_machine(job.machine).source, job.templates
         assert source is not None
         files = {"machine": {source.name: read_bytes(source)}}
         if job.instrument is not None:
             files["instrument"] = {job.instrument.name: read_bytes(job.instrument)}
+        if job.heat is not None:
+            files["heat"] = {job.heat.name: read_bytes(job.heat)}
+        if job.temperatures is not None:
+            logs_of = (
+                sorted(job.temperatures.glob("*.temperatures.csv")) if job.temperatures.is_dir() else [job.temperatures]
+            )
+            files["temperatures"] = {path.name: read_bytes(path) for path in logs_of}
         if folder is not None:
             paths = [path for path in sorted(folder.rglob("*")) if path.is_file()]
             files["templates"] = {path.relative_to(folder).as_posix(): read_bytes(path) for path in paths}
@@ -494,7 +501,7 @@ class Parcel:
         places: dict[str, Any] = {}
         for kind, contents in self.files.items():
             paths = write_files(folder / kind, contents)
-            places[kind] = folder / kind if kind == "templates" else paths[0]
+            places[kind] = folder / kind if kind in ("templates", "temperatures") else paths[0]
         return replace(self.job, **{**places, "machine": str(places["machine"])})
 
 

@@ -14,6 +14,7 @@ from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray, format_csv, read_csv
 from compgen.data.files import sha256_of_file
@@ -111,12 +112,17 @@ def write_temperatures(temperatures: Temperatures, metadata: Mapping[str, object
     return format_csv(columns, metadata, {"time_s": 3, **dict.fromkeys(list(columns)[1:], 4)})
 
 
+def temperatures_of(table: CsvTable) -> Temperatures:
+    """Return the temperatures of a table, up to its first long gap; it warns of what was bridged."""
+    return _temperatures(table)[0]
+
+
 def _temperatures(table: CsvTable) -> tuple[Temperatures, int]:
     """Return the temperatures, and the number of rows before a gap that cannot be bridged."""
     sensors = {name[len("temp_") : -len("_c")]: name for name in table.columns if name.startswith("temp_")}
     if not sensors:
         raise InputError("has no temperatures; expected columns such as temp_spindle_c (degC)", file=table.path)
-    time_s, since = _times(table)
+    time_s, since = times_of(table)
     count, notes = _before_gap(table, time_s)
     readings, broken = {}, []
     for sensor, column in sensors.items():
@@ -137,7 +143,7 @@ def _temperatures(table: CsvTable) -> tuple[Temperatures, int]:
     return Temperatures(time_s[:count], readings, since, tuple(notes), tuple(broken)), count
 
 
-def _times(table: CsvTable) -> tuple[FloatArray, float | None]:
+def times_of(table: CsvTable) -> tuple[FloatArray, float | None]:
     """Return the times, s, and the moment from which they count; they rise from row to row."""
     both = [name for name in ("time_s", "time") if name in table.columns]
     if len(both) != 1:
@@ -185,11 +191,16 @@ def _clock_offset_s(table: CsvTable) -> float:
     return offset
 
 
-def _before_gap(table: CsvTable, time_s: FloatArray) -> tuple[int, list[str]]:
-    """Return the rows before the first gap that is too long, with what to say of it."""
+def gaps_of(time_s: FloatArray) -> NDArray[np.intp]:
+    """Return the rows behind which there is a gap that is too long to be bridged."""
     steps = np.diff(time_s)
     usual = float(np.median(steps)) if steps.size else 0.0
-    long = np.flatnonzero(steps > max(LONGEST_GAP_S, 3 * usual))
+    return np.flatnonzero(steps > max(LONGEST_GAP_S, 3 * usual))
+
+
+def _before_gap(table: CsvTable, time_s: FloatArray) -> tuple[int, list[str]]:
+    """Return the rows before the first gap that is too long, with what to say of it."""
+    steps, long = np.diff(time_s), gaps_of(time_s)
     if not long.size:
         return len(time_s), []
     count = int(long[0]) + 1

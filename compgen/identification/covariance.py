@@ -305,7 +305,11 @@ def with_systematic(
         rows = [matrix @ response[columns] for _, _, columns, matrix in error_values(result.layout)]
         worst = worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
         contributions.append(Contribution(name, given[name], response, worst))
-    systematic = Systematic(tuple(contributions), result.worst_u)
+    return _including(result, Systematic(tuple(contributions), result.worst_u))
+
+
+def _including(result: Identification, systematic: Systematic) -> Identification:
+    """Return the identification with these contributions in its standard uncertainties."""
     joint = joint_covariance(replace(result, systematic=systematic))
     errors = _with_u(result.errors, joint.errors_factor)
     u = np.sqrt(np.einsum("ij,ij->i", joint.factor, joint.factor))[len(joint.error) :]
@@ -325,6 +329,46 @@ def with_systematic(
         worst_u=worst_uncertainty(errors),
         systematic=systematic,
     )
+
+
+def with_response(result: Identification, others: Sequence[Identification], name: str, share: float) -> Identification:
+    """Return the identification with the contribution ``name`` added to all standard uncertainties.
+
+    Parameters
+    ----------
+    others : the same readings, each with one cause larger by ``share`` of its standard uncertainty.
+    """
+    if not others:
+        return result
+    if result.values_factor is not None or result.adjustment is None:
+        columns = np.array([item.errors.values() - result.errors.values() for item in others]).T / share
+        factor = columns if result.values_factor is None else np.hstack([result.values_factor, columns])
+        errors = _with_u(result.errors, factor)
+        found = replace(result, errors=errors, values_factor=factor, worst_u=worst_uncertainty(errors))
+    else:
+        columns = np.array([_unknowns(item) - _unknowns(result) for item in others]).T / share
+        rows = [matrix @ columns[own] for _, _, own, matrix in error_values(result.layout)]
+        worst = worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
+        known = () if result.systematic is None else result.systematic.contributions
+        before = result.worst_u if result.systematic is None else result.systematic.random_worst
+        found = _including(result, Systematic((*known, Contribution(name, 1.0, columns, worst)), before))
+    if result.posterior_source is None:
+        return found
+
+    def later() -> Posterior:
+        own = result.posterior
+        assert own is not None
+        moved = [item.posterior.state - own.state for item in others if item.posterior is not None]
+        return replace(own, factor=np.hstack([own.factor, np.array(moved).T / share]))
+
+    return replace(found, posterior_source=later)
+
+
+def _unknowns(result: Identification) -> FloatArray:
+    """All unknowns of an adjustment: errors, stations, dead lengths."""
+    assert result.adjustment is not None
+    state = result.adjustment.state
+    return np.concatenate([state.errors, state.stations_mm.ravel(), state.dead_length_mm])
 
 
 def _with_u(errors: ErrorTable, factor: FloatArray) -> ErrorTable:

@@ -1,6 +1,7 @@
 """Whether a machine has changed, given how well it repeats: worked numbers, and how often the decision is right."""
 
 import sys
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -99,7 +100,11 @@ def test_windows_grow_with_the_history():
 
 @pytest.mark.parametrize(
     ("row", "expansion"),
-    [("0.3 K + 1 urad", None), ("the same, coefficient 20 % wrong, hall +- 3 K", 11.5)],
+    [
+        ("0.3 K + 1 urad", None),
+        ("the same, coefficient 20 % wrong, hall +- 3 K", 11.5),
+        ("0.3 K + 1 urad, hall +- 2 K that nobody reads", None),
+    ],
 )
 def test_an_unchanged_machine_is_rarely_proposed(bench, row, expansion):
     """At most 2 % of the measurements; the benchmark counts 300 machines."""
@@ -126,6 +131,26 @@ def test_what_changed_is_named_with_its_size(bench):
     known.append(made.calibration())
     found = change.change_since(machine, known, [0] * 7, 0.98, corrected=False)
     assert found.significant and found.largest.startswith("scale of Y +4") and found.largest.endswith("um/m")
+
+
+def test_one_scale_is_told_from_a_hall_that_nobody_reads(bench):
+    """The hall is 2 K warmer: 23 um/m in all scales, which is no change; 20 um/m in X alone is one, and is named."""
+    machine, rng = bench.machine_of(), np.random.default_rng(8)
+    made = bench.Simulated(machine, bench.Repeats(), rng)
+    known = [made.calibration() for _ in range(6)]
+    made.step = dict.fromkeys(("EXX", "EYY", "EZZ"), 23e-6)
+    warm = change.change_since(machine, [*known, made.calibration()], [0] * 7, 0.98, corrected=False)
+    assert not warm.significant
+    still = machine_with(machine, Repeatability(season_k=0.0))
+    assert change.change_since(still, [*known, made.calibration()], [0] * 7, 0.98, corrected=False).significant
+    made.step["EXX"] += 30e-6
+    found = change.change_since(machine, [*known, made.calibration()], [0] * 7, 0.98, corrected=False)
+    assert found.significant
+    assert found.largest.startswith("scale of X +")
+
+
+def machine_with(machine, repeatability):
+    return replace(machine, repeatability=repeatability)
 
 
 # --- through the commands --------------------------------------------------------------------------------------------
