@@ -14,6 +14,7 @@ from compgen.data.files import json_text
 from compgen.data.names import MM_PER_UM
 from compgen.diagnose.axis_diagnosis import AxisDiagnosis, AxisFindings
 from compgen.diagnose.circle_diagnosis import CircleDiagnosis
+from compgen.diagnose.control_settings import settings_of
 from compgen.diagnose.diagnosis import Diagnosis
 from compgen.diagnose.feature_diagnosis import FeatureDiagnosis
 from compgen.diagnose.search import gains, remainder_of
@@ -311,6 +312,7 @@ def _effects(data: dict[str, Any]) -> str:
             text += f"<br>{escape(item['text'])}"
         if item.get("what_to_do"):
             text += f"<br><i>What to do:</i> {escape(item['what_to_do'])}"
+        text += "".join(f"<br><span class=note>{escape(line)}</span>" for line in settings_of(item))
         lines.append(text)
     for item in data["unknown"]:
         depends = ", ".join(item["covariates"]) or "nothing that was logged"
@@ -568,4 +570,4 @@ def _effect_lines(item: Mapping[str, Any], *, markdown: bool, several: bool) -> 
     lines += [f"  * {reason}" for reason in item.get("reasons", [])]
     if item.get("what_to_do"):
         lines.append(f"  * what to do: {item['what_to_do']}")
-    return lines
+    return [*lines, *(f"  * {line}" for line in settings_of(item))]
