@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from compgen.data.csv_files import FloatArray
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError
 from compgen.programs.path import (
@@ -274,6 +275,22 @@ def _corners(moves: Moves, arcs: list[tuple[int, tuple[complex, complex, complex
         part.line, kind, start, end, centre, plane, sweep, zero, tool, end, part.corrected, none, np.zeros(count)
     )
     return found, rows
+
+
+def peaks(corners: Moves) -> FloatArray:
+    """Return how far a control goes at outer corners that it does not round, (n, 2, 3), mm: straight on along both sides.
+
+    ``corners`` are the arcs about the corners. Up to a right angle both points are where the paths meet; beyond, they are the
+    radius away from the arc, as FANUC goes.
+    """
+    ends = np.stack([corners.start_mm, corners.end_mm], axis=1)
+    arm = ends - corners.centre_mm[:, None]
+    way = (
+        np.stack([-arm[..., 1], arm[..., 0], np.zeros(arm.shape[:2])], axis=-1)
+        * np.sign(corners.sweep_rad)[:, None, None]
+    )
+    far = np.tan(np.minimum(0.5 * np.abs(corners.sweep_rad), 0.25 * np.pi))
+    return np.asarray(ends + way * (far[:, None] * np.array([1.0, -1.0]))[..., None])
 
 
 def unknown_radius(model: ExactModel, moves: Moves, tolerance_mm: float) -> InputError | None:

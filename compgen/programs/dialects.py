@@ -60,6 +60,7 @@ _FANUC = {
     **{"G74": "cycle 84", "G84": "cycle 84", "G76": "cycle 86", "G88": "cycle 86"},
     # Haas: offsets G110 to G129 and G154 P1 to P99
     **{f"G{k}": "work offset" for k in (*range(110, 130), 154)},
+    "G39": "arc about the corner",
     # smoothing and look-ahead (G5, G5.1, G8; Haas G103, G187), supervision of travel and spindle, error of the workpiece off
     **{"G5": "setting P0 P10000", "G54.2": "setting P0", "G54.4": "setting P0"},
     **dict.fromkeys(("G5.1", "G8", "G103", "G187", "G22", "G23", "G25", "G26"), "setting"),
@@ -86,7 +87,11 @@ _SIEMENS = {
     **dict.fromkeys(("DYNNORM", "DYNPOS", "DYNROUGH", "DYNSEMIFIN", "DYNFINISH", "DYNPREC"), "nothing"),
     **dict.fromkeys(("G25", "G26"), "setting"),
     **dict.fromkeys(("ORIAXES", "ORIVECT", "ORIMKS", "ORIWKS", "ORIEULER", "ORIRPY", "OSOF", "OSC", "OST"), "nothing"),
-    **dict.fromkeys(("NORM", "TRAFOOF", "DIAMOF", "CDOF", "KONT", "KONTC", "KONTT", "G450", "G451"), "nothing"),
+    **dict.fromkeys(("TRAFOOF", "DIAMOF", "CDOF", "CDOF2", "CDON", "CUT2D", "CUTCONOF"), "nothing"),
+    # radius compensation: how the tool comes to a contour, and goes about an outer corner; settings of G147 and G148
+    **dict.fromkeys(("NORM", "KONT", "KONTC", "KONTT", "G460", "G461", "G462"), "way"),
+    **dict.fromkeys(("G450", "G451", "DISC"), "corner"),
+    **dict.fromkeys(("G140", "G141", "G142", "G143", "G340", "G341"), "nothing"),
 }
 for _code in ("G20", "G21"):
     del _SIEMENS[_code]
@@ -127,6 +132,7 @@ _SPLINE = "splines are not followed; post lines and arcs"
 _PATTERN = "patterns of holes are not followed; post X and Y of each hole"
 _TURNING = "belongs to turning; correct programs for milling"
 _TABLES = "writes offsets that the correction does not follow; set them at the control"
+_UNITS_OF_MACH = "is inch or mm on Mach3 and Mach4, a turning cycle on LinuxCNC; post G20 or G21"
 #: Why a code is refused, and what to do; the same in all dialects unless a dialect gives the code a meaning.
 REFUSED = {
     **dict.fromkeys(("G41", "G42"), f"the control has no cutter radius compensation; {_CAM}"),
@@ -147,6 +153,8 @@ REFUSED = {
     **dict.fromkeys(("G70", "G71", "G72"), _PATTERN),
     **dict.fromkeys(("G27", "G31", "G35", "G36", "G37", "G136", *(f"G38.{k}" for k in range(2, 8))), _PROBED),
     **dict.fromkeys(("G33", "G33.1", "G34", "G76"), "threads by a moving spindle are not followed; post a tapping cycle"),
+    "G38": f"a vector of radius compensation that is kept is not followed; {_CAM}",
+    **dict.fromkeys(("G45", "G46", "G48"), f"moves that are longer by a tool offset are not followed; {_CAM}"),
     "G87": "back boring moves aside within the hole and is not followed; post its moves",
     "G92.3": "restores an offset of another program, which is not known; post G92",
     "M99": "a program that repeats itself is not followed; end it with M30",
@@ -171,6 +179,7 @@ _HEIDENHAIN_REFUSED = {
     **dict.fromkeys(("M92", "M104"), "positions from a point of the maker, and older datums, are not known; use M91"),
     **dict.fromkeys(("M112", "M113", "M114", "M115", "M128", "M130", "M138", "M144"), _ROTARY),
     **dict.fromkeys(("M142", "M143"), "deletes settings that the program does not show; post the program without it"),
+    "M118": "X, Y and Z of M118 are ways of the handwheel, and read like a move; post the program without it",
     "M140": "how far the tool goes back is not known; post the move",
 }  # fmt: skip
 _SIEMENS_REFUSED = {
@@ -187,6 +196,11 @@ _SIEMENS_REFUSED = {
     **dict.fromkeys(("IF", "ELSE", "ENDIF", "GOTO", "GOTOF", "GOTOB", "GOTOC", "FOR", "WHILE", "LOOP", "REPEAT", "CASE", "DEF"),
                     "variables, conditions and loops are not followed; post the program with numbers"),
     **dict.fromkeys(("CALL", "PCALL", "EXTERN", "EXTCALL", "PROC", "EXECTAB", "SAVE"), _MACRO),
+    **dict.fromkeys(("G147", "G148", "G247", "G248", "G347", "G348", "DISR", "DISCL"),
+                    "soft approaches and retractions of the control are not followed; post their lines and arcs"),
+    "CUTCONON": f"radius compensation that is suppressed within a contour is not followed; {_CAM}",
+    "CUT2DF": f"radius compensation in the plane of a turned frame is not followed; {_CAM}",
+    "OFFN": "an allowance on the contour (OFFN) is not known to the correction; post the contour with it",
     **dict.fromkeys(("HOLES1", "HOLES2", "CYCLE801", "CYCLE802"), _PATTERN),
     **dict.fromkeys(("LONGHOLE", "SLOT1", "SLOT2", "POCKET1", "POCKET2", "POCKET3", "POCKET4"), _MILLED),
     **dict.fromkeys((f"CYCLE{k}" for k in (*range(60, 65), *range(70, 80), 90, 899)), _MILLED),
@@ -194,7 +208,8 @@ _SIEMENS_REFUSED = {
 }  # fmt: skip
 _M_CODES = (*range(10), 10, 11, 13, 14, 19, 29, 30, *range(40, 46), 48, 49, 60)
 #: The M codes that act when the block ends, so that they follow the last piece of a divided block.
-AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "G9"}
+#: M97 and M98 of HEIDENHAIN are about the corner at the end of their block.
+AT_THE_END = {"M0", "M1", "M2", "M5", "M9", "M30", "M60", "M97", "M98", "G9"}
 #: Text in the first comment of a corrected program.
 MARK = "CORRECTED BY VOLCOMP"
 
@@ -394,8 +409,8 @@ DIALECTS = {
             decimals=(4, 5),
             refused={**REFUSED, **_HEIDENHAIN_REFUSED},
             words=rf"(?P<address>D[LR](?=\s*+[+-])|P\d\d(?=\s|[+-])|[A-Z])\s*+(?P<value>{VALUE}|\"[^\"]*\")",
-            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 91, 94, 101, 102, 103, 107, 108, 116, 117, 118,
-                                                120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
+            m_codes=frozenset(f"M{k}" for k in (*_M_CODES, 15, 16, 89, 90, 91, 94, 97, 98, 101, 102, 103, 107, 108, 109, 110,
+                                                111, 116, 117, 120, 124, 126, 127, 129, 136, 137, 141, 145, 148, 149)),
             end=frozenset(("M2", "M30", "%")),
             work_offset="PRESET",
             starts_in_its_units=False,
@@ -426,6 +441,7 @@ DIALECTS = {
             _PARENTHESES + r"|;[^\n]*",
             "({})",
             decimals=(5, 6),
+            refused={**REFUSED, **dict.fromkeys(("G70", "G71"), _UNITS_OF_MACH)},
             longest_block=252,  # rs274 stops at 253: "Command too long"
             m_codes=frozenset(f"M{k}" for k in (*_M_CODES, *range(50, 54), *range(61, 69))),
             end=frozenset(("M2", "M30", "%")),

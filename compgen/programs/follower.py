@@ -1048,6 +1048,12 @@ class _Line:
     slash: bool
 
 
+#: Words that belong to an M code: ways of the handwheel, look-ahead, shortest element, latest tool change.
+_OF_M_CODES = re.compile(
+    rf"(M\s*(?:118(?=\s*[A-Z])|120(?=\s*LA)|124(?=\s*T)|101(?=\s*BT)))(?:\s*(?:[XYZABC]|LA|BT|T)\s*{_NUMBER})+"
+)
+
+
 def _sentences_of(text: str, numbers: Sequence[int]) -> list[_Line]:
     found: list[_Line] = []
     goes_on = remark = False
@@ -1061,6 +1067,7 @@ def _sentences_of(text: str, numbers: Sequence[int]) -> list[_Line]:
             head = re.match(r"(?:/\s*\d+\s+|\d+(?=[\s/*;]|$)\s*)?(?:/\d?\s*)?", said)
             bare = said[head.end() :] if head else said
             bare = bare.replace("CYCLE", "CYCL", 1) if bare.startswith("CYCLE ") else bare
+            bare = _OF_M_CODES.sub(r"\1", bare)
             found.append(_Line(number, bare, bool(head and "/" in head[0])))
             remark = not bare and ";" in line
         goes_on = line.endswith("~")

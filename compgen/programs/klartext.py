@@ -64,6 +64,7 @@ _PATTERN = re.compile(r"(POS|ROW|PAT|FRAME|CIRC|PITCHCIRC)\d+\s*\(([^()]*)\)", r
 #: Words of a move, and what follows them.
 _MOVE_WORD = re.compile(
     rf"\s*+(?:(?P<machine>M\s*140)\s*+(?:MB\s*+(?:MAX|{VALUE}))?"
+    rf"|(?P<beside>M\s*118(?:\s*+[XYZABC]\s*+{VALUE})*+|M\s*120\s*+LA\s*+{VALUE}|M\s*124\s*+T\s*+{VALUE}|M\s*101\s*+BT\s*+{VALUE})"
     rf"|(?P<inc>I)?(?P<axis>[XYZABCUVW])\s*+(?P<value>{VALUE})|(?P<polar>I?P[AR])\s*+(?P<angle>{VALUE})"
     rf"|(?P<turn>DR\s*[+-])|(?P<side>R[LR](?![A-Z])|R0(?![.\d]))|R\s*+(?P<radius>{VALUE})|(?P<max>F\s*+MAX)|F\s*+AUTO"
     rf"|F[ZU]?\s*+(?:{VALUE}|[+-]?Q[LR]?\d+)|M\s*+(?P<m>\d+)|(?P<bare>R[+-](?=\s|$))"

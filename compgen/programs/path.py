@@ -540,6 +540,11 @@ class Corrector:
         # after a reversal the slack is taken up at once: the first piece is as short as allowed
         share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
         breaks[first[takes_up] + 1] = True
+        cut = _cut_by_corners(moves)[rows][own]
+        # a piece that an inner corner takes away has no path beside it, and the tool does not come there
+        apart = np.stack([share, 1.0 - share], axis=1) * length[own, None]
+        divisible = (cut == 0.0) | (apart > cut + self._shortest(moves.part(rows))[own, None])
+        may_break = divisible.all(axis=1)
         owner = rows[own]
         wanted = points_of(moves, share, owner)
         target = self._commands(moves, owner, wanted, ended.take(owner, axis=0))
@@ -556,7 +561,7 @@ class Corrector:
             across = target - chord
             # the corner of a contour may be farther along its lines than what is right within them
             across -= np.einsum("ij,ij->i", across, along)[:, None] * along
-            off = np.where(breaks, 0.0, sizes(across))
+            off = np.where(breaks | ~may_break, 0.0, sizes(across))
             new = (off > _DIVIDED * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
             if not new.any():
                 break
@@ -694,6 +699,26 @@ def _joints(phase: IntArray) -> tuple[IntArray, IntArray]:
     every = np.flatnonzero((phase == ENTRY) | (phase == CONTOUR))
     follows = phase[every[1:]] == CONTOUR
     return every[:-1][follows], every[1:][follows]
+
+
+def _cut_by_corners(moves: Moves) -> FloatArray:
+    """How much of each move of a contour inner corners take away at its begin and at its end, (n, 2), mm; 0 for others.
+
+    Between straight moves it is the radius times the tangent of half the turn; beside an arc about that.
+    """
+    found = np.zeros((len(moves), 2))
+    first, then = _joints(moves.phase)
+    both = (moves.phase[first] == CONTOUR) & np.isfinite(moves.aside_mm[then])
+    first, then = first[both], then[both]
+    if not len(first):
+        return found
+    before, after = moves.part(first), moves.part(then)
+    one, other = _leftwards(before, before.end_mm), _leftwards(after, after.start_mm)
+    turn = np.arctan2(one[:, 0] * other[:, 1] - one[:, 1] * other[:, 0], (one * other).sum(axis=1))
+    aside = after.aside_mm
+    cut = np.where(turn * aside > 0.0, np.abs(aside) * np.tan(0.5 * np.minimum(np.abs(turn), 3.0)), 0.0)
+    found[first, 1], found[then, 0] = cut, cut
+    return found
 
 
 def _along(moves: Moves) -> FloatArray:

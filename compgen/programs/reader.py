@@ -23,9 +23,9 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import MM_PER_UNIT, Machine, Vector3
 from compgen.errors import InputError, visible_line
 from compgen.programs import klartext, sinumerik
-from compgen.programs.compensation import centre_path
+from compgen.programs.compensation import centre_path, peaks
 from compgen.programs.cycles import DrillingCycle, defines_hole
-from compgen.programs.dialects import MARK, REFUSED, Dialect, codes_that_stay, written_offset
+from compgen.programs.dialects import MARK, REFUSED, VALUE, Dialect, codes_that_stay, written_offset
 from compgen.programs.path import (
     CCW,
     CONTOUR,
@@ -73,6 +73,24 @@ _PECK_CLEARANCE_MM = 0.254
 SAME_PLACE_MM = 1e-7
 #: Where X and Y are with radius compensation: not at all, before the move to the contour, on it, before the move away from it.
 _OUTSIDE, _ENTERING, _ON, _LEAVING = range(4)
+#: Codes with which the control goes to a contour in a straight line, and about outer corners on an arc.
+_AS_JUDGED = {"way": ("NORM", "G460"), "corner": ("G450",)}
+_TO_THE_CONTOUR = (
+    "the control comes to the contour and leaves it about its first and last point, where a straight line is judged"
+)
+_TO_THE_CORNER = (
+    "outer corners lead beyond the arc that is judged, at most to where the paths beside both moves meet; "
+    "the tool is in the air there"
+)
+_TO_THE_END = (
+    "at an inner corner the tool goes to the end of the move, beyond where the paths beside both moves meet; "
+    "that is not judged"
+)
+_GOES_AROUND = {
+    **dict.fromkeys(("KONT", "KONTC", "KONTT", "G461", "G462"), _TO_THE_CONTOUR),
+    **dict.fromkeys(("G451", "DISC", "M97"), _TO_THE_CORNER),
+    "M98": _TO_THE_END,
+}
 #: A rest of a hole below which no further peck is made: the rounding of sums, mm.
 PECK_REST_MM = 1e-9
 
@@ -262,6 +280,9 @@ class Reader:
         self.written_out: WrittenOut | None = None
         #: A program of Klartext with the programs that it calls behind it.
         self.linked: Linked | None = None
+        #: How the control comes to contours and goes about outer corners, and the lines of what is another way than is judged.
+        self._around: dict[str, str] = {}
+        self._around_lines: dict[str, dict[int, None]] = {}
         self._integers: tuple[Pointed, str] | None = None
         self._rows: list[tuple[float, ...]] = []
 
@@ -397,6 +418,7 @@ class Reader:
         if self._integers and self._integers[0].used:
             self.assumed[self._integers[1]] = None
         self._say_probed()
+        self._say_around()
         if self.unknown:
             first = min(map(self.in_file, next(iter(self.unknown.values()))))
             raise InputError(self._said_unknown(), file=self.source, line=first)
@@ -957,7 +979,8 @@ class Reader:
                 return name.end()
             if code in dialect.codes and not name[2]:
                 words.append((code, "", at, at))
-                return name.end(1)
+                assigned = re.compile(rf"\s*+=\s*+{VALUE}").match(body, name.end(1)) if code == "DISC" else None
+                return assigned.end() if assigned else name.end(1)
             if code in dialect.refused:
                 self._fail(f"{code}: {dialect.refused[code]}")
         if rest[0] == ",":
@@ -1124,6 +1147,9 @@ class Reader:
     def _m_code(self, code: str) -> None:
         if code in self.dialect.end:
             self.ended = True
+        elif code in ("M97", "M98") and code in self.dialect.m_codes:
+            if self._turned[1] if self._turned else self.side:
+                self._around_lines.setdefault(code, {})[self._line] = None
         elif code not in self.dialect.m_codes and code not in self.setup.keep_unknown:
             if code in self.dialect.refused:
                 self._fail(f"{code}: {self.dialect.refused[code]}")
@@ -1147,6 +1173,15 @@ class Reader:
             self.plane = int(argument)
         elif what == "compensation":
             self._turned = code, int(argument)
+        elif meaning in ("way", "corner"):
+            self._around[meaning] = code
+            if self.side:
+                self._note_around(meaning)
+        elif meaning == "arc about the corner":
+            if values.keys() - {"N"}:
+                self._fail(
+                    f"{code} with other words gives the corner another direction; post {code} in a block of its own"
+                )
         elif meaning == "departure":
             self._turned = code, 0
             actions.append(meaning)
@@ -1231,6 +1266,18 @@ class Reader:
             actions.append(f"home {code}")
         elif meaning != "nothing":
             actions.append(meaning)
+
+    def _note_around(self, what: str) -> None:
+        """Keep where the control goes to a contour, or about its corners, in another way than the path that is judged."""
+        code = self._around.get(what, _AS_JUDGED[what][0])
+        if code not in _AS_JUDGED[what]:
+            self._around_lines.setdefault(code, {})[self._line] = None
+
+    def _say_around(self) -> None:
+        """Say how the control goes beside a contour where that is not the path that is judged."""
+        for code, found in self._around_lines.items():
+            lines = ", ".join(map(str, self._lines_said(found)))
+            self.assumed[f"{code} in line {lines}: {_GOES_AROUND[code]}"] = None
 
     def _note_probe(self, code: str) -> None:
         """Keep where the program probes: its block stays as it is, and where the tool is after it is not known."""
@@ -1401,6 +1448,8 @@ class Reader:
             )
         else:
             self.contour, self.side_code = _ENTERING, code
+            self._note_around("way")
+            self._note_around("corner")
             self.radius_mm = self._radius(code, values)
         self.side = side
 
@@ -1927,9 +1976,22 @@ class Reader:
             self._move(kind, [x, y, height], at=[x, y, at], corrected=(sides[0], sides[1], 1))
         return "hole"
 
+    def _note_peaks(self, corners: Moves) -> None:
+        """Say where an outer corner leads beyond the travel, if the control does not go about it on an arc."""
+        places = peaks(corners)
+        beyond = np.fmax(self.machine.lower_mm - places, places - self.machine.upper_mm).max(axis=1)
+        row, k = np.unravel_index(np.argmax(beyond), beyond.shape)
+        if beyond[row, k] > self.travel_slack_mm:
+            self.assumed[
+                f"line {self.in_file(int(corners.line[row]))}: a control that does not round the outer corner there goes "
+                f"{beyond[row, k]:.3f} mm beyond the travel of {'XYZ'[k]}"
+            ] = None
+
     def _check(self, moves: Moves) -> None:
         """Refuse positions outside the travel, at ends of moves and along arcs: usually the work offset is wrong."""
         path = centre_path(moves)
+        if len(path.corners) and (self.dialect.name == "fanuc" or self._around_lines):
+            self._note_peaks(path.corners)
         moves = Moves.joined([path.moves, path.corners]) if len(path.corners) else path.moves
         least, most = reach_of(moves)
         found = np.vstack([self.reached_mm, least, most])

@@ -179,7 +179,7 @@ def _blanked(comment: re.Match[bytes]) -> bytes:
 
 def _moves_nothing(code: str, dialect: Dialect, keep_unknown: Collection[str], with_move: bool) -> bool:
     """Whether an M code stays where it is and changes nothing that positions depend on."""
-    known = dialect.m_codes - dialect.end - {"M6", "M89", "M91", "M99"}
+    known = dialect.m_codes - dialect.end - {"M6", "M89", "M91", "M97", "M98", "M99"}
     return code in known and code not in keep_unknown and not (with_move and code in AT_THE_END)
 
 
