@@ -572,7 +572,7 @@ def _say_program(item: WatchedProgram, as_json: bool) -> None:
     elif item.before:
         say(f"{name}: accepted before, unchanged -> {item.file}")
     elif item.result is None:
-        say(f"{name}: deleted; its corrected program stays in its folder")
+        say(f"{name}: deleted; what was made of it stays in its folder")
     else:
         before, after = (figures.as_dict()["normal_max_um"] for figures in (item.result.before, item.result.after))
         say(f"{name}: accepted, {before:.2f} um from the path before, {after:.2f} um after -> {item.file}")
