@@ -14,7 +14,7 @@ import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from gettext import GNUTranslations
 from html import escape, unescape
 from typing import TYPE_CHECKING, Any
@@ -195,9 +195,7 @@ class Texts:
             for pattern in _patterns(message):
                 if match := pattern.fullmatch(english):
                     texts = match.groupdict()
-                    if any(
-                        colon and self._word(name) for name, colon, _ in (t.partition(": ") for t in texts.values())
-                    ):
+                    if any(self._is_verdict(name) for text in texts.values() for name in text.split(": ")[:-1]):
                         continue  # a verdict and its sentence are translated one after the other
                     if letters < least and any(_LETTERS.search(text) for text in texts.values()):
                         continue
@@ -211,9 +209,25 @@ class Texts:
                     return _PLACE.sub(lambda place, values=values: values[place[1]], self.messages[message])  # type: ignore[misc]
         return None
 
+    def _is_verdict(self, english: str) -> bool:
+        return self._word(english) is not None
+
+    @cached_property
+    def _headings(self) -> dict[str, str]:
+        """What stands before the colon of messages that are one value behind a heading, ``next measurement: {text}``."""
+        both = ((english.rpartition(": {"), text.rpartition(": {")) for english, text in self.messages.items())
+        return {
+            one[0]: other[0]
+            for one, other in both
+            if one[1] and other[1] and "{" not in one[0] and re.fullmatch(r"\w+\}", one[2]) and "\x04" not in one[0]
+        }
+
     def _of_verdict(self, english: str, least: int) -> str | None:
         """Translate a verdict of several words, e.g. "accepted with reservations", and what follows its colon."""
         verdict, _, rest = english.partition(": ")
+        if rest and " " not in verdict and self._word(verdict) is None:  # the control before it
+            found = self._of_verdict(rest, least)
+            return None if found is None else f"{verdict}: {found}"
         if not rest or " " not in verdict or self._word(verdict) is None:
             return None
         found = self._complete(rest, least)
@@ -222,9 +236,9 @@ class Texts:
     def _by_parts(self, english: str, least: int) -> str | None:
         """Translate a name and what follows its colon, several sentences, or parts between semicolons or commas."""
         name, _, rest = english.partition(": ")
-        known = self._whole(rest, least)
+        known = self._of_verdict(rest, least) or self._whole(rest, least)
         if known is not None and not _PROSE.search(name):
-            return f"{self._word(name) or name}: {known}"
+            return f"{self._word(name) or self._headings.get(name, name)}: {known}"
         for end in (_SENTENCES, _REMARK, _CLAUSES, _AFTER_COLON, _COMMAS):
             pieces = end.split(english)
             found: list[str | None] = []
@@ -241,7 +255,7 @@ class Texts:
 
     def _ended(self, english: str, least: int) -> str | None:
         """Return the translation of a whole message, also where its end is followed by what separates it from others."""
-        found = self._word(english) or self._whole(english, least)
+        found = self._word(english) or self._of_verdict(english, least) or self._whole(english, least)
         if found is None and english[-1:] in (".", ";", ":", ","):
             shorter = self._word(english[:-1]) or self._whole(english[:-1], least)
             return None if shorter is None else shorter + english[-1]

@@ -85,7 +85,7 @@ from compgen.language import texts_of
 from compgen.new_machine import chains_of, in_words
 from compgen.programs.dialects import DIALECTS
 from compgen.report.html.pictures import thousands
-from compgen.report.html.write import markdown
+from compgen.report.html.write import markdown, micro
 from compgen.report.pdf import pdf_of
 from compgen.resources import LANGUAGES, cache_folder, data_folder
 from compgen.units import UNITS, typed_mm
@@ -1197,6 +1197,7 @@ def make_app(workbench: Workbench) -> Flask:
         readable=_readable,
         thousands=thousands,
         um=_um,
+        micro=micro if workbench.language == LANGUAGES[0] else str,
         described=describe_error,
     )
     app.jinja_env.globals.update(

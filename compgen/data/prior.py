@@ -157,9 +157,9 @@ class PriorSettings:
         text = f"class {self.stated_class}, {CLASS_WORDS.get(self.stated_class, 'nothing is assumed')}"
         if self.class_name is None:
             text += ", as the machine file states none"
-        larger = [
-            f"{what} {x:.3g} times" for what, x in zip(("curves", "squareness"), self.factor, strict=True) if x > 1
-        ]
+        curves, squareness = self.factor
+        larger = [f"curves {curves:.3g} times"] if curves > 1 else []
+        larger += [f"squareness {squareness:.3g} times"] if squareness > 1 else []
         return text + (f"; raised: {', '.join(larger)}" if larger else "")
 
     def _of_class(self, key: str) -> float:

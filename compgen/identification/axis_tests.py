@@ -143,6 +143,8 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
             "to_mm": float(runs.position_mm[rows].max()),
             "taken_off_um": offsets[POSITIONING[axis]] / MM_PER_UM,
         }
+        if reversal is not None and (axis, axis) in reversal.curves:  # actual position from plus minus from minus
+            summaries[AXES[axis]]["reversal_um"] = float(reversal.curves[axis, axis].value.mean()) / MM_PER_UM
     known = all(np.isfinite(curve.u).all() for curve in errors.curves.values())
     missing = "runs along single axes do not show it"
     return replace(

@@ -141,6 +141,11 @@ def _backlash(identify: Mapping[str, Any]) -> list[str]:
     for item in circles.get("unknowns") or () if isinstance(circles, Mapping) else ():
         if isinstance(item, Mapping) and item.get("what") == "reversal" and str(item.get("of")) in AXES:
             found[str(item["of"])] = float(item["value"])
+    runs = identify.get("axis-runs")
+    of_runs = runs.get("axes") if isinstance(runs, Mapping) else None
+    for axis, item in of_runs.items() if isinstance(of_runs, Mapping) else ():
+        if axis in AXES and isinstance(item, Mapping) and isinstance(item.get("reversal_um"), int | float):
+            found[axis] = float(item["reversal_um"])
     reversal = identify.get("reversal")
     by_axis = reversal.get("axes") if isinstance(reversal, Mapping) else None
     for axis, item in by_axis.items() if isinstance(by_axis, Mapping) else ():

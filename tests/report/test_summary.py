@@ -48,6 +48,22 @@ def test_squareness_over_the_travel_the_largest_error_and_what_is_not_measured()
     assert re.findall(r'data-unit="um">([\d.]+)<', picture.svg) == [f"{rms:.1f}", "15.6", "4.81", "2.30"]
 
 
+def test_the_backlash_of_axis_runs_is_that_of_their_directions(tmp_path, call):
+    """X stops 6 um further in the positive approach at every target: +6.00 um, with the sign of ISO 230-2."""
+    path = tmp_path / "x.axis.csv"
+    rows = [
+        f"X,{place},{way},{run},{0.01 * place + 3.0 * way + 0.25 * (run - 2):.3f}"
+        for run in (1, 2, 3)
+        for way in (1, -1)
+        for place in range(-800, 1, 100)
+    ]
+    path.write_text("\n".join(["axis,position_mm,direction,run,deviation_um", *rows]) + "\n")
+    call("identify", "zha-gantry", path, "--out", tmp_path / "o")
+    facts = json.loads((tmp_path / "o" / "identify.json").read_text())
+    assert facts["axis-runs"]["axes"]["X"]["reversal_um"] == pytest.approx(6.0, abs=1e-6)
+    assert summary_of(MACHINE, ERRORS, facts).lines[2] == "backlash: X +6.00 um"
+
+
 def test_a_result_without_errors_or_with_damaged_facts_has_no_summary_or_a_shorter_one():
     assert summary_of(None, ERRORS, {}) is None
     assert summary_of(MACHINE, ErrorTable(), {}) is None
@@ -78,5 +94,6 @@ def test_the_report_of_a_folder_begins_with_what_matters(small_machine_file, sma
     page, data = (out / "report.html").read_text(), json.loads((out / "report.json").read_text())
     lines = data["summary"]["lines"]
     assert page.index("What matters") < page.index("<h2>Figures") and 'id="figure-summary"' in page
-    assert all(line[1:] in page for line in lines)
+    assert all(line[1:].replace(" um", " µm").replace(" urad", " µrad") in page for line in lines)
+    assert any(" um" in line for line in lines)  # as the terminal prints them
     assert lines[0] in printed and lines[-1] in printed

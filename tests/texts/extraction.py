@@ -69,7 +69,7 @@ NOT_SHOWN_IN = re.compile(
 WORDS = (
     "repeats", "neighbouring readings", "curves",
     "table", "head",
-    "accepted with reservations", "accepted, partial", "better only after a new set-up", "not accepted", "volume max",
+    "accepted with reservations", "accepted, partial", "partial", "better only after a new set-up", "not accepted", "volume max",
     "volume rms", "Air pressure", "Air temperature", "Relative humidity of the air", "Temperature of the machine", "um",
     "urad", "Accepted", "Customer", "Feed", "Instrument", "Laboratory", "Machine", "Operator", "Sections", "Squareness",
     "Temperature", "The", "Volume", "no table", "full volumetric", "+ straightness", "+ squareness",

@@ -209,6 +209,38 @@ def test_a_sentence_is_never_a_mixture():
     assert texts.text("siemens-cec: the table A is not used") == "siemens-cec: die Tabelle A ist unbenutzt"
 
 
+@pytest.mark.parametrize(
+    ("english", "said"),
+    [
+        (
+            "isg-csv: accepted with reservations: the error over the volume goes from 41 um rms (18 to 81 um) to 3 um, "
+            "at most 4 um",
+            "isg-csv: angenommen mit Vorbehalten: die Abweichung über das Volumen geht von 41 µm rms (18 bis 81 µm) auf 3 µm, "
+            "höchstens 4 µm",
+        ),
+        (
+            "isg-csv: partial: positioning only, 1 of 17 errors measured; accepted with reservations: the error over the volume "
+            "goes from 41 um rms (18 to 81 um) to 3 um, at most 4 um",
+            "isg-csv: teilweise: nur Positionierung, 1 von 17 Abweichungen gemessen; angenommen mit Vorbehalten: die Abweichung "
+            "über das Volumen geht von 41 µm rms (18 bis 81 µm) auf 3 µm, höchstens 4 µm",
+        ),
+        (
+            "next measurement: Assumed, not measured: squareness of Y to X (EC0Y) up to 80 urad (k = 2). It makes 50 % of the "
+            "remaining uncertainty.",
+            "nächste Messung: Angenommen, nicht gemessen: Rechtwinkligkeit von Y zu X (EC0Y) bis 80 µrad (k = 2). Das macht 50 % "
+            "der verbleibenden Unsicherheit aus.",
+        ),
+        (
+            "what was not measured may cost, rms over the volume: EC0Y 35.1 um, EYY 15.1 um and 12 others",
+            "was nicht gemessen wurde, kann kosten (effektiv über das Volumen): EC0Y 35.1 µm, EYY 15.1 µm und 12 weitere",
+        ),
+    ],
+)
+def test_verdicts_and_headings_before_a_colon_are_translated_with_their_sentence(english, said, german):
+    """A verdict behind the name of a control was taken apart: "angenommen mit reservations", "nur partial: Positionierung"."""
+    assert german.lines(english) == said
+
+
 def test_lines_of_a_file_are_not_texts(german):
     assert german.filled("not known") == "nicht bekannt"
     assert german.filled("not known\n1.0 not known") == "not known\n1.0 not known"

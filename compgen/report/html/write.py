@@ -645,6 +645,15 @@ def css_string(text: str) -> Markup:
     return Markup("".join(char if char.isalnum() or char == " " else f"\\{ord(char):x} " for char in text[:120]))
 
 
+def micro(text: str) -> str:
+    """Return a text of the terminal with the units of numbers as pages write them.
+
+    >>> micro("EC0Y +2904 urad, 35.1 um over X; um.csv")
+    'EC0Y +2904 µrad, 35.1 µm over X; um.csv'
+    """
+    return re.sub(r"(?<=\d )u(?=(?:m|rad)\b)", "µ", text)
+
+
 def page_environment(kind: str, language: str = LANGUAGES[0]) -> Environment:
     """Return the templates of pages in a language: every text is escaped; compiled templates are kept for each ``kind``."""
     environment = Environment(
@@ -664,6 +673,7 @@ def page_environment(kind: str, language: str = LANGUAGES[0]) -> Environment:
         "unit": lambda name: LABEL.get(name, name),
         "thousands": thousands,
         "word": str,
+        "micro": micro if language == LANGUAGES[0] else str,  # other languages write the sign themselves
     }
     if language != LANGUAGES[0]:
         from compgen.language import texts_of
