@@ -540,11 +540,12 @@ class Corrector:
         # after a reversal the slack is taken up at once: the first piece is as short as allowed
         share[first[takes_up] + 1] = np.minimum(share[first[takes_up] + 1], self.shortest_mm / length[takes_up])
         breaks[first[takes_up] + 1] = True
-        cut = _cut_by_corners(moves)[rows][own]
-        # a piece that an inner corner takes away has no path beside it, and the tool does not come there
-        apart = np.stack([share, 1.0 - share], axis=1) * length[own, None]
-        divisible = (cut == 0.0) | (apart > cut + self._shortest(moves.part(rows))[own, None])
-        may_break = divisible.all(axis=1)
+        may_break: NDArray[np.bool_] | bool = True
+        if moves.phase.any():
+            cut = _cut_by_corners(moves)[rows][own]
+            # a piece that an inner corner takes away has no path beside it, and the tool does not come there
+            apart = np.stack([share, 1.0 - share], axis=1) * length[own, None]
+            may_break = ((cut == 0.0) | (apart > cut + self._shortest(moves.part(rows))[own, None])).all(axis=1)
         owner = rows[own]
         wanted = points_of(moves, share, owner)
         target = self._commands(moves, owner, wanted, ended.take(owner, axis=0))
@@ -561,7 +562,7 @@ class Corrector:
             across = target - chord
             # the corner of a contour may be farther along its lines than what is right within them
             across -= np.einsum("ij,ij->i", across, along)[:, None] * along
-            off = np.where(breaks | ~may_break, 0.0, sizes(across))
+            off = np.where(may_break & ~breaks, sizes(across), 0.0)
             new = (off > _DIVIDED * self.tolerance_mm) & (off == np.maximum.reduceat(off, at)[part])
             if not new.any():
                 break
