@@ -2,6 +2,7 @@
 # make test   sets up, checks style and types, runs the tests
 # make extras installs what recal, serve, --cluster, dcc.xml and the compiled kernels need in addition
 # make texts  writes the catalogues of texts again (CONTRIBUTING.md), and lists what has no translation
+# make options writes the tables of options in docs/commands.md again
 # make pins   writes the pinned dependencies again (CONTRIBUTING.md)
 # make sbom   writes the bill of materials of the wheel again, from the pins and the version
 # make release builds wheel and source in dist/, checks both, and looks up known vulnerabilities of the pins
@@ -32,7 +33,7 @@ SPREAD := -n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart=0
 # the tests start some hundred processes: each would compile all modules again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo extras test lint second system bench coverage docs docs-links texts pins sbom release clean
+.PHONY: demo extras test lint second system bench coverage docs docs-links texts options pins sbom release clean
 .DELETE_ON_ERROR:
 
 demo: .venv/ready $(TEXTS)
@@ -115,9 +116,12 @@ bench: .venv/ready-dev
 texts: .venv/ready-dev
 	$(BIN)/python tests/texts/extraction.py
 
+options: .venv/ready-extras
+	$(BIN)/python docs/option_tables.py
+
 # pins stay as they are unless UPGRADE names a package: make pins UPGRADE="--upgrade-package numpy"
 pins:
-	$(COMPILE) $(UPGRADE) pyproject.toml requirements.in -o requirements.txt
+	$(COMPILE) $(UPGRADE) --extra plot pyproject.toml requirements.in -o requirements.txt
 	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt pyproject.toml -o requirements-extras.txt
 	$(COMPILE) $(UPGRADE) --all-extras -c requirements.txt -c requirements-extras.txt pyproject.toml requirements-dev.in -o requirements-dev.txt
 	$(COMPILE) $(UPGRADE) -c requirements.txt -c requirements-extras.txt requirements-docs.in -o requirements-docs.txt

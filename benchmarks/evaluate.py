@@ -21,7 +21,7 @@ from compgen import load_machine, read_errors
 from compgen.data.names import ERROR_INDEX, error_named
 from compgen.kinematics.exact_chain import exact_error, tip_position
 from compgen.kinematics.first_order import coefficients, factor
-from compgen.kinematics.kernel_switch import PLAIN, VARIABLE, load_kernels
+from compgen.kinematics.kernel_switch import COMPILED, PLAIN, VARIABLE, has_numba
 from compgen.kinematics.many_points import volumetric_error, volumetric_error_on_grid
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -152,7 +152,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7, help="alternating runs, at least 5 (default 7)")
     parser.add_argument("--large", action="store_true", help="also 1e8 points (6 GB of memory)")
     options = parser.parse_args()
-    compiled = load_kernels()
+    compiled = has_numba()
+    if compiled:
+        os.environ[VARIABLE] = COMPILED
     print(timing.machine_line())
     if not compiled:
         print("numba is not installed: rows of the compiled kernels are missing (pip install compgen[fast])")

@@ -28,9 +28,9 @@ from compgen.identification import identify, identify_measurement, joint_covaria
 from compgen.identification.adjust.grid_problem import grid_problem
 from compgen.identification.adjust.starts import start_moments, station_start_from_moments
 from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters
-from compgen.kinematics import load_kernels, modelled_errors
+from compgen.kinematics import modelled_errors
 from compgen.kinematics.exact_chain import exact_columns, tip_position
-from compgen.kinematics.kernel_switch import PLAIN, VARIABLE
+from compgen.kinematics.kernel_switch import COMPILED, PLAIN, VARIABLE, has_numba
 
 STATIONS_MM = np.array(  # Zha & Zhang 2024, Table 6
     [
@@ -271,7 +271,9 @@ def main() -> None:
     if arguments.archive:
         archive()
         return
-    print("identify with the compiled loops of COMPGEN_KERNELS=compiled:", load_kernels())
+    if has_numba():
+        os.environ[VARIABLE] = COMPILED
+    print("identify with the compiled loops of COMPGEN_KERNELS=compiled:", has_numba())
     compare(11, 11, arguments.runs, ("trf", "lm"), clock)
     if not arguments.quick:
         compare(21, 21, arguments.runs, ("trf",), clock)

@@ -83,8 +83,8 @@ def _arguments(method: str) -> list[str]:
 
 #: What plug-ins may add: word, name of the dict in a file, group of entry points, registry, check.
 KINDS = (
-    Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control, broken=CONTROLLERS.broken),
-    Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect, broken=EFFECTS.broken),
+    Kind("control", "CONTROLLERS", "compgen.controllers", CONTROLLERS, check_control),
+    Kind("effect", "EFFECTS", "compgen.effects", EFFECTS, check_effect),
     Kind("effect family", "FAMILIES", "compgen.effect_families", FAMILIES, check_family),
     Kind("instrument", "INSTRUMENTS", "compgen.instruments", INSTRUMENTS, check_instrument),
 )
@@ -142,5 +142,5 @@ def _load_once(paths: tuple[str, ...]) -> None:
 
 def with_plugins(function: Callable[[Any], Any]) -> WithPlugins:
     """Wrap the function with the plug-ins that were loaded from paths."""
-    origins = {origin for kind in KINDS for origin in kind.origins.values() if origin.startswith(PATH_ORIGIN)}
+    origins = {origin for kind in KINDS for origin in kind.registry.origins.values() if origin.startswith(PATH_ORIGIN)}
     return WithPlugins(function, tuple(sorted(origin.removeprefix(PATH_ORIGIN) for origin in origins)))

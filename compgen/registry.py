@@ -16,17 +16,18 @@ import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from compgen.errors import CompgenWarning, InputError, one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+Item = TypeVar("Item")
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 #: What the code of a plug-in may raise while it is imported; ``sys.exit`` in it must not end the program.
 _FAULTS = (Exception, SystemExit)
@@ -34,12 +35,40 @@ _FAULTS = (Exception, SystemExit)
 PATH_ORIGIN = "plug-in "
 
 
-class Registry(dict[str, Any]):
-    """The items of the program and its plug-ins by name; ``broken`` says why an installed entry point is unavailable."""
+class Registry(MutableMapping[str, Item]):
+    """The items of the program and its plug-ins by name.
 
-    def __init__(self) -> None:
-        super().__init__()
+    Attributes
+    ----------
+    origins : the source of each item of a plug-in, by name.
+    broken : why an entry point of an installed distribution is unavailable, by name.
+    """
+
+    def __init__(self, built_in: Mapping[str, Item] | None = None) -> None:
+        self._items: dict[str, Item] = dict(built_in or {})
+        self.origins: dict[str, str] = {}
         self.broken: dict[str, str] = {}
+
+    def __getitem__(self, name: str) -> Item:
+        return self._items[name]
+
+    def __setitem__(self, name: str, item: Item) -> None:
+        self._items[name] = item
+
+    def __delitem__(self, name: str) -> None:
+        del self._items[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._items
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._items)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {', '.join(self)}>"
 
 
 def why_missing(broken: Mapping[str, str], name: str) -> str:
@@ -56,19 +85,15 @@ class Kind:
     word : its name in messages, e.g. ``"control"``.
     attribute : name of the dict in a plug-in's file, e.g. ``"CONTROLLERS"``.
     group : group of entry points, e.g. ``"compgen.controllers"``.
-    registry : the registry for it, by name.
+    registry : the registry for it.
     check : takes name and item, returns the item to register and all its problems, in words.
-    origins : the source of each item of a plug-in, by name.
-    broken : why an entry point of an installed distribution is unavailable, by name.
     """
 
     word: str
     attribute: str
     group: str
-    registry: MutableMapping[str, Any]
+    registry: Registry[Any]
     check: Callable[[str, Any], tuple[Any, list[str]]]
-    origins: dict[str, str] = field(default_factory=dict)
-    broken: dict[str, str] = field(default_factory=dict)
 
     def register(self, name: str, thing: Any, origin: str) -> None:
         """Add an item of the plug-in ``origin``; InputError with all its problems."""
@@ -78,7 +103,7 @@ class Kind:
             problems = [text, *problems]
         elif name in self.registry:
             problems = [
-                f"the name is already used by {self.origins.get(name, 'a built-in one')}; choose another",
+                f"the name is already used by {self.registry.origins.get(name, 'a built-in one')}; choose another",
                 *problems,
             ]
         if problems:
@@ -90,7 +115,7 @@ class Kind:
             what = f"{origin}: the {self.word} {name!r} cannot be registered: {'; '.join(problems)}"
             raise InputError(what, file=file, line=line)
         self.registry[name] = thing
-        self.origins[name] = origin
+        self.registry.origins[name] = origin
 
 
 def call_problem(function: Any, arguments: Sequence[str], what: str) -> list[str]:
@@ -115,7 +140,7 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
     if file.suffix != ".py":
         raise InputError("is not a Python file; a plug-in is a .py file or a folder with an __init__.py", file=file)
     origin = f"{PATH_ORIGIN}{source}"
-    if any(origin in kind.origins.values() for kind in kinds):
+    if any(origin in kind.registry.origins.values() for kind in kinds):
         return
     name = f"compgen_plugin_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
     module = _import(name, file, source.is_dir(), origin)
@@ -175,7 +200,7 @@ def load_entry_points(kinds: Sequence[Kind]) -> None:
     installed = entry_points()
     for kind in kinds:
         for entry in installed.select(group=kind.group):
-            if kind.origins.get(entry.name) != _origin(entry):
+            if kind.registry.origins.get(entry.name) != _origin(entry):
                 origin = _origin(entry)
                 try:
                     try:
@@ -185,7 +210,7 @@ def load_entry_points(kinds: Sequence[Kind]) -> None:
                     kind.register(entry.name, thing, origin)
                 except InputError as error:
                     if entry.name not in kind.registry:
-                        kind.broken[entry.name] = str(error)
+                        kind.registry.broken[entry.name] = str(error)
                     warnings.warn(f"left out: {error}", CompgenWarning, stacklevel=4)
 
 
@@ -197,7 +222,7 @@ def _origin(entry: EntryPoint) -> str:
 @contextmanager
 def restored(kinds: Sequence[Kind], *, only_after_errors: bool = False) -> Iterator[None]:
     """Remove what the block added to the registries, always or only after an error."""
-    before = [(item, set(item)) for kind in kinds for item in (kind.registry, kind.origins)]
+    before = [(item, set(item)) for kind in kinds for item in (kind.registry, kind.registry.origins)]
     failed = True
     try:
         yield

@@ -18,12 +18,17 @@ from compgen.tables import residuals
 HERE = Path(__file__).parent
 
 
+def points_mm(machine: compgen.Machine) -> np.ndarray:
+    """The random points, shape (2000, 3), mm."""
+    return np.random.default_rng(2000).uniform(machine.lower_mm, machine.upper_mm, (2000, 3))
+
+
 def residual_mm(machine: compgen.Machine, truth: compgen.ErrorTable, folder: Path) -> np.ndarray:
     """Error of the true machine at 2000 random points with the tables of one folder active, shape (2000, 3), mm."""
     manifest = json.loads((folder / "manifest.json").read_text())
     paths = [folder / (manifest["file_prefix"] + item["name"]) for item in manifest["files"]]
     tables = compgen.read_tables(machine, paths, manifest["controller"])
-    position_mm = np.random.default_rng(2000).uniform(machine.lower_mm, machine.upper_mm, (2000, 3))
+    position_mm = points_mm(machine)
     correction_mm = tables.correction(machine, compgen.Points(position_mm))
     return compgen.exact_error(machine, truth, position_mm + correction_mm) + correction_mm
 

@@ -1,6 +1,7 @@
 """What results show in a session and a notebook: short lines, escaped tables, pictures of the right figures."""
 
 import html.parser
+import sys
 
 import matplotlib
 import numpy as np
@@ -176,6 +177,12 @@ def test_a_picture_of_its_own_is_made_without_a_figure_and_nothing_is_no_picture
     plt.close(figure)
     with pytest.raises(ValueError, match="nothing to draw: no errors"):
         compgen.ErrorTable().plot()
+
+
+def test_a_picture_without_matplotlib_says_which_extra_it_needs(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(compgen.InputError, match=r"pictures need matplotlib; install compgen\[plot\]"):
+        compgen.ErrorTable({"EXX": compgen.Curve(np.arange(3.0), np.zeros(3), np.zeros(3))}).plot()
 
 
 def test_texts_are_escaped():

@@ -7,6 +7,7 @@ import warnings
 from collections import Counter
 from pathlib import Path
 
+import click
 import pytest
 from markdown_it import MarkdownIt
 
@@ -95,6 +96,35 @@ def test_the_first_page_links_to_every_page_that_it_lists():
     assert sorted(set(links_of(DOCS / "index.md"))) == sorted(
         [f"{name}.md" for name in contents()] + ["figures/example.png"]
     )
+
+
+def test_the_tables_of_options_are_those_of_the_commands(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    tables = importlib.import_module("option_tables")
+    page = tables.PAGE.read_text("utf-8")
+    assert tables.written(page) == page, "python docs/option_tables.py writes them again"
+    commands = [command.loaded for command in cli.commands.values()]
+    options = [item for command in commands if not isinstance(command, click.Group) for item in command.params]
+    names = {word for item in options if not getattr(item, "hidden", False) for word in item.opts if word[:2] == "--"}
+    assert len(names) > 150
+    assert {name for name in names if not re.search(rf"(?<![\w-]){name}(?![\w-])", page)} == set()
+    assert page.count(tables.BEGIN) == page.count(tables.END) > 20
+
+
+def test_the_first_picture_has_the_figures_of_the_text():
+    """Both are of the example's run: the picture notes its own figures (docs/figures.py)."""
+    picture = (DOCS / "figures" / "example.png").read_bytes()
+    noted = re.search(rb"Description\0rms, um: ([^\x00]*?)(?=.{4}\x00\x00|$)", picture, re.DOTALL)[1].decode("latin-1")
+    figures = dict(item.rsplit(" ", 1) for item in noted.split("; "))
+    for page in (ROOT / "README.md", DOCS / "index.md"):
+        before, after = re.search(
+            r"the true machine from (\d+) µm to ([\d.]+) µm rms", page.read_text("utf-8")
+        ).groups()
+        assert abs(float(figures["before"]) - float(before)) <= 5.0  # said to three digits
+        assert {figures[name] for name in ("isg-csv", "etalon-exchange", "siemens-cec")} == {after}
+    shown = (DOCS / "getting-started.md").read_text("utf-8")
+    for name, rms in re.findall(r"^  ([a-z-]+) +max +[\d.]+ um +rms +([\d.]+) um$", shown, re.MULTILINE):
+        assert float(figures[name]) == pytest.approx(float(rms), abs=0.5 if float(rms) > 10 else 0.0)
 
 
 def test_the_readme_fits_one_screen_with_one_picture_and_two_commands():

@@ -27,7 +27,7 @@ import time
 import tomllib
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePath
 from typing import IO, Any
@@ -265,7 +265,7 @@ class Project:
                 raise StaleError("the project was changed in another window; reload this page, then do it again")
             number = int(step.folder.partition("-")[0]) if step.folder else self._next(state)
             now = datetime.now(UTC).isoformat(timespec="seconds")
-            step = Step(**{**asdict(step), "number": number, "time": now})
+            step = replace(step, number=number, time=now)
             state = ProjectState(state.revision + 1, tuple(sorted((*state.steps, step), key=lambda item: item.number)))
             self._write(state)
             return state
@@ -588,8 +588,8 @@ class Runner:
                 job.problems.append("\n".join(errors) or f"volcomp {words[0]} ended with exit code {code}")
                 return
         told = [match[1] for line in messages if (match := TOLD.match(line))]
-        found = {"exit_code": worst, "seconds": round(time.monotonic() - began, 2), "warnings": told}
-        step = Step(**{**asdict(task.step), **found})
+        seconds = round(time.monotonic() - began, 2)
+        step = replace(task.step, exit_code=worst, seconds=seconds, warnings=tuple(told))
         self.project.add(step if task.finish is None else task.finish(step, output))
 
     def _command(self, job: Progress, words: Sequence[str]) -> tuple[str, list[str], int]:

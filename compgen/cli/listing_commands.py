@@ -72,7 +72,7 @@ def controllers_command(name: str | None, as_json: bool) -> int:
         )
         return 0
     if name is not None:
-        shown, origin = control_card(name), CONTROLS.origins.get(name)
+        shown, origin = control_card(name), CONTROLS.registry.origins.get(name)
         answer(as_json, {**shown.summary(), "plugin": origin}, card_text(shown, origin))
         return 0
     cards = [load_format(known) for known in sorted(CONTROLLERS)]
@@ -81,7 +81,7 @@ def controllers_command(name: str | None, as_json: bool) -> int:
         return 0
     table = Table("name", "control", "what it can express", "format", box=box.SIMPLE)
     for card in cards:
-        origin = CONTROLS.origins.get(card.name)
+        origin = CONTROLS.registry.origins.get(card.name)
         table.add_row(card.name, card.title, card.expresses, f"{card.evidence}{', plug-in' if origin else ''}")
     for key, about in ABOUT.items():
         table.add_row(key, about["title"], about["expresses"], about["evidence"])
@@ -96,7 +96,7 @@ def _listed(card: Format) -> dict[str, object]:
         "evidence": card.evidence,
         "unverified": list(card.unverified),
         "limits": list(card.limits),
-        "plugin": CONTROLS.origins.get(card.name),
+        "plugin": CONTROLS.registry.origins.get(card.name),
     }
 
 
@@ -144,7 +144,7 @@ def effects_command(name: str | None, as_json: bool) -> int:
 def _effect_origins() -> dict[str, str]:
     """Return the plug-in of each effect that comes from one."""
     found: dict[str, str] = {}
-    for family, origin in EFFECT_FAMILIES.origins.items():
+    for family, origin in EFFECT_FAMILIES.registry.origins.items():
         found |= {effect.card.name: origin for effect in FAMILIES[family].members((ANY_STATION,))}
     return found
 
@@ -169,7 +169,7 @@ def instruments_command(as_json: bool) -> int:
 def _readers(kind: Kind) -> dict[str, dict[str, str | None]]:
     """Return the first line of the docstring of every reader of a registry, and its plug-in."""
     return {
-        name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.origins.get(name)}
+        name: {"title": (inspect.getdoc(reader) or "").partition("\n")[0], "plugin": kind.registry.origins.get(name)}
         for name, reader in sorted(kind.registry.items())
     }
 

@@ -2,56 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from compgen.data.files import read_text
 from compgen.errors import InputError, nearest
+from compgen.registry import Registry
 from compgen.resources import data_folder, on_first_use
 
 if TYPE_CHECKING:
     from compgen.controls.shared.base import AnyController, Controller, Monomial, SourceFile, Term
 
 
-class Controls(MutableMapping[str, "type[AnyController]"]):
+class Controls(Registry["type[AnyController]"]):
     """The class of every control by name; the module of a built-in control is imported when its class is requested."""
 
     def __init__(self, built_in: Mapping[str, str]) -> None:
-        self._classes: dict[str, str | type[AnyController]] = dict(built_in)
-        #: Name of each entry point of an installed distribution that is not available -> the reason.
-        self.broken: dict[str, str] = {}
+        super().__init__()
+        self._items: dict[str, Any] = dict(built_in)  # a class, or where it is until it is requested
 
     def __getitem__(self, name: str) -> type[AnyController]:
-        found = self._classes[name]
+        found = self._items[name]
         if isinstance(found, str):
             module, _, kind = found.partition(".")
-            found = self._classes[name] = getattr(import_module(f"compgen.controls.{module}"), kind)
-        return found
-
-    def __setitem__(self, name: str, control: type[AnyController]) -> None:
-        self._classes[name] = control
-
-    def __delitem__(self, name: str) -> None:
-        del self._classes[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._classes
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._classes)
-
-    def __len__(self) -> int:
-        return len(self._classes)
+            found = self._items[name] = getattr(import_module(f"compgen.controls.{module}"), kind)
+        control: type[AnyController] = found
+        return control
 
     def templates(self, name: str) -> Path | None:
         """Return the template folder of a plug-in's control; None for a built-in control, which is not imported."""
-        control = self._classes.get(name)
+        control = self._items.get(name)
         return None if control is None or isinstance(control, str) else control.templates
-
-    def __repr__(self) -> str:
-        return f"<Controls: {', '.join(self)}>"
 
 
 #: The class of every control by its name on the command line; ``CONTROLLERS["pmac"](machine)`` binds it to a machine.

@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from compgen.data.arguments import path_of
-from compgen.errors import InputError, Message
+from compgen.errors import CompgenError, InputError, Message
 
 TEMPORARY = ".tmp"
 #: Put in front of the name of a table or program that was not accepted.
@@ -318,6 +318,23 @@ def working_folder(name: str = "", parent: Path | None = None) -> Iterator[Path]
     remove_abandoned_folders(parent)
     with _own_folder(Path(tempfile.mkdtemp(prefix=f"{FOLDERS}{name}", dir=parent))) as folder:
         yield folder
+
+
+def named_below(text: str, *folders: Path) -> str:
+    """Return a text with the files below ``folders`` named from there: a temporary folder means nothing to a reader."""
+    for place in (place for folder in folders for place in (folder.resolve(), folder)):
+        text = text.replace(f"{place}{os.sep}", "")
+    return text
+
+
+@contextlib.contextmanager
+def naming_below(*folders: Path) -> Iterator[None]:
+    """Let the errors of a block name the files below ``folders`` as :func:`named_below` does."""
+    try:
+        yield
+    except CompgenError as error:
+        error.args = (named_below(str(error), *folders), *error.args[1:])
+        raise
 
 
 @contextlib.contextmanager

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.errors import InputError, Message
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -170,7 +172,10 @@ def drawn(panels: Sequence[Panel], title: str, figure: Figure | None = None) -> 
     across = min(PANELS_ACROSS, len(panels))
     down = -(-len(panels) // across)
     if figure is None:
-        import matplotlib.pyplot as plt  # imported here: slow to load, and only pictures need it
+        try:
+            import matplotlib.pyplot as plt  # imported here: slow to load, and only pictures need it
+        except ImportError as error:
+            raise InputError(Message("no-matplotlib", "pictures need matplotlib; install compgen[plot]")) from error
 
         figure = plt.figure(figsize=(across * PANEL_SIZE_INCH[0], down * PANEL_SIZE_INCH[1]), layout="constrained")
     for place, panel in enumerate(panels, start=1):

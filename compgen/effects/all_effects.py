@@ -63,6 +63,7 @@ from compgen.effects.structure import (
     Squareness,
     ToolOffsetError,
 )
+from compgen.registry import Registry
 
 # Effects that show in the noise of the readings, not in their mean: found by tests of the residuals, no columns.
 
@@ -180,7 +181,7 @@ _BUILT_IN: tuple[Family, ...] = (
 )
 
 #: Every family by name; plug-ins add to it.
-FAMILIES: dict[str, Family] = {family.name: family for family in _BUILT_IN}
+FAMILIES: Registry[Family] = Registry({family.name: family for family in _BUILT_IN})
 
 
 def catalogue(stations: Sequence[str] = ()) -> dict[str, Effect]:

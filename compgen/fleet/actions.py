@@ -20,7 +20,7 @@ from compgen.fleet.claims import keep_result
 from compgen.fleet.decisions import check_person
 from compgen.fleet.evidence import Held, held_by
 from compgen.fleet.job import Job, MachineJob
-from compgen.fleet.process import process, without_folder
+from compgen.fleet.process import process
 from compgen.fleet.publish import begin_folder, check_folder, note_empty_folder, notify, publish, set_aside
 from compgen.fleet.records import (
     ADOPTED,
@@ -320,7 +320,7 @@ def _again(
             with claims.renewal(store, claim):
                 found = process(store, job, machine, measurement, request.active_table)
         except CompgenError as error:
-            told = f"{request.actor} ({request.reason}): {without_folder(str(error))}"
+            told = f"{request.actor} ({request.reason}): {error}"
             store.add_event(REPROCESS_FAILED, measurement.name, told, machine)
             raise
         result = replace(

@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -64,31 +63,28 @@ class Claim:
 
 
 class _InHand:
-    """What this process works on in one store, by owner and measurement: its threads share one owner.
+    """What a process works on, by store, owner and measurement: its threads share one owner.
 
-    A claim of this process that is not listed here was left behind, and the process may take it again.
+    A claim of the process that is not listed here was left behind, and the process may take it again. Both methods are one
+    operation on a dict, so that a process which is started as a copy of this one never finds a lock that nobody releases.
     """
 
     def __init__(self) -> None:
-        self._keys: set[tuple[str, int]] = set()
-        self._lock = threading.Lock()
+        self._threads: dict[tuple[str, str, int], object] = {}
 
-    def begin(self, owner: str, measurement_id: int) -> bool:
+    def begin(self, store: Store, owner: str, measurement_id: int) -> bool:
         """Note that the work begins; False if another thread is at it."""
-        with self._lock:
-            is_new = (owner, measurement_id) not in self._keys
-            self._keys.add((owner, measurement_id))
-            return is_new
+        work = object()
+        return self._threads.setdefault((store.url, owner, measurement_id), work) is work
 
-    def end(self, owner: str, measurement_id: int) -> None:
-        with self._lock:
-            self._keys.discard((owner, measurement_id))
+    def end(self, store: Store, owner: str, measurement_id: int) -> None:
+        """Note that the work has ended."""
+        self._threads.pop((store.url, owner, measurement_id), None)
 
 
-@cache
-def _in_hand(_store_url: str, _process: int) -> _InHand:
-    """Return the only object for a store and this process; see :func:`compgen.fleet.database.engine_of`."""
-    return _InHand()
+#: As the owner, which has the number and the start of the process in its name, it belongs to the process, not to a store
+#: that happens to be open: several threads open the same store.
+_HERE = _InHand()
 
 
 def owner_name() -> str:
@@ -117,8 +113,7 @@ def take(
             return None
         return _add(connection, measurement.id, 1 if last is None else last.sequence + 1, "take", owner, now, lease_s)
 
-    in_hand = _in_hand(store.url, os.getpid())
-    if not in_hand.begin(owner, measurement.id):
+    if not _HERE.begin(store, owner, measurement.id):
         return None
     claim = None
     try:
@@ -127,7 +122,7 @@ def take(
         pass
     finally:
         if claim is None:
-            in_hand.end(owner, measurement.id)
+            _HERE.end(store, owner, measurement.id)
     return claim
 
 
@@ -229,7 +224,7 @@ def give_back(store: Store, claim: Claim) -> None:
 
 def forget(store: Store, claim: Claim) -> None:
     """Note that this process no longer works on a measurement, whatever the store says."""
-    _in_hand(store.url, os.getpid()).end(claim.owner, claim.measurement_id)
+    _HERE.end(store, claim.owner, claim.measurement_id)
 
 
 def left_by(store: Store, machine: MachineRecord, pid: int) -> list[MeasurementRecord]:

@@ -736,11 +736,11 @@ class Drift:
 def drift_of_store(store: Store, machine: MachineRecord, settings: DriftSettings) -> Drift:
     """Return the drift of a machine in the store; the calibration behind its active tables is the reference."""
     (history, ids, model), tables, left_out, other = store.together(
-        lambda: (
-            calibrations_of(store, machine),
-            store.tables(machine, figures=False),
-            excluded(store, machine),
-            with_other_prior(store, machine),
+        lambda moment: (
+            calibrations_of(moment, machine),
+            moment.tables(machine, figures=False),
+            excluded(moment, machine),
+            with_other_prior(moment, machine),
         )
     )
     history, ids, fewer = with_all_errors(history, ids)

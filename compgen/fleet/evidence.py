@@ -21,7 +21,7 @@ import numpy as np
 
 from compgen.data.comparison import small_motion
 from compgen.data.csv_files import FloatArray
-from compgen.data.files import FOLDERS, sha256_of, working_folder
+from compgen.data.files import naming_below, sha256_of, working_folder
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, SQUARENESS_NAMES, error_named
@@ -102,17 +102,13 @@ def held_by(
                 return _held_by_hash(store, machine, control, known, hashes)
             return _compared(store, machine, known, _read(machine, control, files))
         except InputError as error:
-            problems.append(f"{control}: {re.sub(rf'{_FOLDER}', '', str(error))}")
+            problems.append(f"{control}: {error}")
     raise InputError("; ".join(problems))
-
-
-#: The temporary folder in which a backup is read; its name means nothing to a reader.
-_FOLDER = rf"\S*{FOLDERS}backup-[^/\\]+[/\\]"
 
 
 def _read(machine: Machine, control: str, files: Mapping[str, bytes]) -> ReadTables | None:
     """Parse a backup as the file of a control; None if it has no table at all."""
-    with working_folder("backup-") as folder:
+    with working_folder("backup-") as folder, naming_below(folder):
         paths = []
         for name, content in files.items():
             path = Path(folder) / backup_part(name)

@@ -297,7 +297,7 @@ class MachineJob:
     file. ``tolerances`` are for the drift, mm or rad, by error or "volume". ``others`` are the machines with the same
     inbox, or whose inbox also contains one of this machine's files (:func:`compgen.fleet.inbox.with_twins`). If the
     files that the settings name are copies (:class:`compgen.fleet.runner.Parcel`), ``settings`` is the hash of the
-    settings, and ``original`` the machine file.
+    settings, ``original`` the machine file, and ``copies`` has the folder that they are in.
     """
 
     name: str
@@ -388,6 +388,7 @@ class MachineJob:
     others: tuple[OtherInbox, ...] = field(default=(), compare=False, repr=False)
     settings: str = field(default="", compare=False, repr=False)
     original: Path | None = field(default=None, compare=False, repr=False)
+    copies: tuple[Path, ...] = field(default=(), compare=False, repr=False)
 
     def settings_sha256(self, known: Container[str] = ()) -> str:
         """Return the SHA-256 of all that a result depends on, except the measurement; InputError for a wrong machine.

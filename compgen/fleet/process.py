@@ -6,7 +6,6 @@ are the rules of the policy: each adds reasons to hold the tables back, with the
 
 from __future__ import annotations
 
-import re
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from compgen.data.error_table import ErrorTable
-from compgen.data.files import FOLDERS, read_bytes, working_folder
+from compgen.data.files import FOLDERS, named_below, naming_below, read_bytes, working_folder
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, load_machine
 from compgen.data.names import AXES, MM_PER_UM
@@ -369,7 +368,6 @@ NOT_OF_A_CONTROL = (
 )
 #: Prefix of temporary folders; their names mean nothing to a reader.
 FOLDER = "compgen-recal-"
-_TEMPORARY = re.compile(rf"\S*{FOLDER}[^/\\]+[/\\](?:measurement|settings)[/\\]")
 
 
 @dataclass(frozen=True)
@@ -425,25 +423,27 @@ def process(
     with working_folder(FOLDER.removeprefix(FOLDERS)) as folder, warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("ignore")
         warnings.simplefilter("always", CompgenWarning)
-        outcome = run(
-            machine,
-            write_files(Path(folder) / "measurement", contents),
-            job.controllers,
-            Path(folder) / "out",
-            identify_options=IdentifyOptions(**job.identify),
-            templates=job.templates,
-            allow_unverified=job.allow_unverified,
-            active=None if on.tables is None else ActiveTables(on.tables),
-            instrument=job.instrument,
-            heat=_heat_of(job, machine),
-            limits=SafetyLimits(job.policy.max_step_um),
-            language=job.language,
-            allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
-        )
+        copies = (folder / "measurement", *job.copies)
+        with naming_below(*copies):
+            outcome = run(
+                machine,
+                write_files(copies[0], contents),
+                job.controllers,
+                folder / "out",
+                identify_options=IdentifyOptions(**job.identify),
+                templates=job.templates,
+                allow_unverified=job.allow_unverified,
+                active=None if on.tables is None else ActiveTables(on.tables),
+                instrument=job.instrument,
+                heat=_heat_of(job, machine),
+                limits=SafetyLimits(job.policy.max_step_um),
+                language=job.language,
+                allow_misfit=True,  # a misfit that makes `run` refuse the tables holds them back here: judge_misfit
+            )
         judgement = _judged(case, outcome, contents)
         told = [str(item.message) for item in caught if issubclass(item.category, CompgenWarning)]
-        judgement.figures["warnings"] = [without_folder(text) for text in told]
-        result = _result(Path(folder) / "out", machine, outcome, judgement)
+        judgement.figures["warnings"] = [named_below(text, *copies) for text in told]
+        result = _result(folder / "out", machine, outcome, judgement)
     kept = NewResult(
         **result,
         active_table_id=None if on.version is None else on.version.id,
@@ -503,13 +503,10 @@ def again_of(store: Store, record: MachineRecord, measurement: MeasurementRecord
 
 def _past_of(store: Store, record: MachineRecord) -> Past:
     return store.together(
-        lambda: Past(store.decisions(record), store.tables(record), store.measurements(record), store.events(record))
+        lambda moment: Past(
+            moment.decisions(record), moment.tables(record), moment.measurements(record), moment.events(record)
+        )
     )
-
-
-def without_folder(message: str) -> str:
-    """Return the message with the files of a measurement named as in the inbox."""
-    return _TEMPORARY.sub("", message)
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes]) -> list[Path]:

@@ -485,7 +485,7 @@ def notify(store: Store, machine: MachineRecord, command: Sequence[str]) -> list
 def untold(store: Store, machine: MachineRecord) -> list[tuple[str, dict[str, Any]]]:
     """Return the pending notifications, oldest first, each with a permanent name."""
     every, decisions, attempts = store.together(
-        lambda: (store.tables(machine, figures=False), store.decisions(machine), store.attempts(machine))
+        lambda moment: (moment.tables(machine, figures=False), moment.decisions(machine), moment.attempts(machine))
     )
     tables = {table.id: table for table in every}
     found: list[tuple[str, dict[str, Any]]] = []

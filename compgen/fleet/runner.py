@@ -17,14 +17,14 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-from compgen.data.files import FOLDERS, read_bytes, remove_abandoned_folders, sha256_of, working_folder
+from compgen.data.files import FOLDERS, naming_below, read_bytes, remove_abandoned_folders, sha256_of, working_folder
 from compgen.data.machine import load_machine
 from compgen.errors import CompgenError, InputError, visible
 from compgen.fleet import claims, inbox, logs
 from compgen.fleet.claims import Claim, ClaimLostError, keep_failure, keep_result
 from compgen.fleet.database import StoreError, plain, sqlite_path
 from compgen.fleet.job import Job, MachineJob
-from compgen.fleet.process import FOLDER, again_of, confirmation, process, without_folder, write_files
+from compgen.fleet.process import FOLDER, again_of, confirmation, process, write_files
 from compgen.fleet.publish import begin_folder, check_folder, is_published, notify, publish, untold
 from compgen.fleet.records import (
     HELD_BACK,
@@ -240,12 +240,12 @@ class _Pass:
             self._problem("inbox", *problem)
         for item in received:
             self.store.add_measurement(self.machine, inbox.measurement_of(*item, self.job.temperatures))
-        for measurement, name in self._new_evidence():
+        for measurement, name in self._new_evidence(self.store):
             self.store.add_evidence(self.machine, measurement, self.backups[name], "inbox")
         settings = self.job.settings_sha256()  # a missing machine file ends the pass here; files taken so far are kept
         if self.elsewhere is None:
             self.process_all(settings)
-        elif self._waiting(settings):
+        elif self._waiting(self.store, settings):
             done = self.elsewhere(replace(self.job, settings=settings))
             self.messages += done.messages
             self.processed += done.processed
@@ -255,11 +255,11 @@ class _Pass:
         failures = notify(self.store, self.machine, self.job.notify)
         self.messages += failures
         self.again = self.again or bool(failures)
-        return self._outcome(active, settings)
+        return self._outcome(self.store, active, settings)
 
-    def _unchanged(self) -> MachineOutcome | None:
+    def _unchanged(self, store: Store) -> MachineOutcome | None:
         """Return the outcome if there is nothing to do: all taken, processed, published and notified. Else None."""
-        store, machine = self.store, self.machine
+        machine = self.machine
         newest = store.newest_entry(machine)
         if self.present - {item.sha256 for item in store.measurements(machine)} or (newest and newest > store.now()):
             return None
@@ -269,23 +269,23 @@ class _Pass:
             return None
         told = not self.job.notify or not untold(store, machine)
         if (
-            self._new_evidence()
-            or self._waiting(settings)
+            self._new_evidence(store)
+            or self._waiting(store, settings)
             or not told
             or not is_published(store, machine, self.job.out)
         ):
             return None
-        return self._outcome(active_of(store.tables(machine, figures=False)), settings)
+        return self._outcome(store, active_of(store.tables(machine, figures=False)), settings)
 
-    def _new_evidence(self) -> list[tuple[MeasurementRecord, str]]:
+    def _new_evidence(self, store: Store) -> list[tuple[MeasurementRecord, str]]:
         """Backups in the inbox that are not yet evidence of the measurements whose names they have.
 
         A measurement that is in the inbox now comes first, else the last one of that name. The same file is not evidence
         twice: beside a new measurement it is a forgotten one, unless it was written again.
         """
-        found, known = [], self.store.evidence(self.machine) if self.backups else []
+        found, known = [], store.evidence(self.machine) if self.backups else []
         for name, files in self.backups.items():
-            same = [item for item in self.store.measurements(self.machine) if name in inbox.names_of(item.name)]
+            same = [item for item in store.measurements(self.machine) if name in inbox.names_of(item.name)]
             here = [item for item in same if item.sha256 in self.present] or sorted(same, key=lambda item: item.id)[-1:]
             listed = {(file, sha256_of(content), time.isoformat()) for file, (content, time) in files.items()}
             for measurement in here:
@@ -310,23 +310,23 @@ class _Pass:
         if self.store.add_event(kind, subject, message, self.machine):
             logs.warning(kind, machine=self.job.name, subject=subject, message=message)
 
-    def _waiting(self, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
+    def _waiting(self, store: Store, settings: str, seen: Container[int] = ()) -> list[MeasurementRecord]:
         """Return measurements without a result, in order of measurement; failed ones only if the settings changed.
 
         A measurement also waits if a backup of the control has come since it was judged.
         """
-        attempts = self.store.attempts(self.machine)
+        attempts = store.attempts(self.machine)
         failed = {item.measurement_id: item.at for item in attempts if self._is_failure(item, settings)}
-        measured = {*self.store.measured(self.machine).values()}
+        measured = {*store.measured(self.machine).values()}
         judged = {(item.measurement_id, item.message) for item in attempts if item.outcome == "done"}
-        shown = {item.measurement_id: item for item in self.store.evidence(self.machine)}  # the last of each
+        shown = {item.measurement_id: item for item in store.evidence(self.machine)}  # the last of each
         fresh = {
             key
             for key, item in shown.items()
             if (key, item.key) not in judged and not (key in failed and failed[key] >= item.at)
         }
         done = ({*failed} | measured) - fresh
-        return [item for item in self.store.measurements(self.machine) if item.id not in done and item.id not in seen]
+        return [item for item in store.measurements(self.machine) if item.id not in done and item.id not in seen]
 
     @staticmethod
     def _is_failure(attempt: AttemptRecord, settings: str) -> bool:
@@ -335,7 +335,7 @@ class _Pass:
     def process_all(self, settings: str) -> None:
         """Process waiting measurements; if another runner has one, the later ones are left to it as well."""
         seen: set[int] = set()
-        waiting = self._waiting(settings)
+        waiting = self._waiting(self.store, settings)
         while waiting:
             measurement = waiting[0]
             if self.stop():
@@ -350,12 +350,13 @@ class _Pass:
                 self.messages.append(f"{measurement.name}: {error}; the next run tries again")
                 self.again = True
                 break
-            waiting = waiting[1:] or self._waiting(settings, seen)
+            waiting = waiting[1:] or self._waiting(self.store, settings, seen)
 
     def _keep(self, measurement: MeasurementRecord, settings: str, claim: Claim) -> None:
         started = time.monotonic()
         try:
-            with claims.renewal(self.store, claim), limited(60.0 * self.job.max_minutes):
+            minutes, copies = self.job.max_minutes, self.job.copies
+            with claims.renewal(self.store, claim), limited(60.0 * minutes), naming_below(*copies):
                 confirmed = confirmation(self.store, self.job, self.machine, measurement)
                 done = None if confirmed else process(self.store, self.job, self.machine, measurement)
         except ClaimLostError:
@@ -366,7 +367,7 @@ class _Pass:
                     claims.give_back(self.store, claim)
                     self._problem("passing", measurement.name, f"{measurement.name}: {error}; it will be tried again")
                     return
-                message = without_folder(str(error))
+                message = str(error)
             else:
                 self.internal, message = True, f"internal error: {type(error).__name__}: {error}"
             keep_failure(self.store, self.machine, claim, message, settings, time.monotonic() - started)
@@ -381,12 +382,12 @@ class _Pass:
         fields = {"version": table.version, "state": table.state, "reasons": list(table.reasons)}
         logs.info("measurement processed", machine=self.job.name, measurement=measurement.name, **fields)
 
-    def _outcome(self, active: TableRecord | None, settings: str) -> MachineOutcome:
+    def _outcome(self, store: Store, active: TableRecord | None, settings: str) -> MachineOutcome:
         """Judge by the contents of the store: the same inbox gives the same outcome however often it is run."""
-        tables = self.store.tables(self.machine, figures=False)
+        tables = store.tables(self.machine, figures=False)
         # a failure is reported as long as its file is in the inbox: whoever removed or repaired the file knows of it
-        names = {item.id: item.name for item in self.store.measurements(self.machine) if item.sha256 in self.present}
-        for attempt in self.store.attempts(self.machine):
+        names = {item.id: item.name for item in store.measurements(self.machine) if item.sha256 in self.present}
+        for attempt in store.attempts(self.machine):
             name = names.get(attempt.measurement_id)
             if name is not None and attempt.outcome == "failed" and attempt.settings_sha256 == settings:
                 self.failed, text = True, attempt.message
@@ -502,7 +503,7 @@ class Parcel:
         for kind, contents in self.files.items():
             paths = write_files(folder / kind, contents)
             places[kind] = folder / kind if kind in ("templates", "temperatures") else paths[0]
-        return replace(self.job, **{**places, "machine": str(places["machine"])})
+        return replace(self.job, copies=(folder,), **{**places, "machine": str(places["machine"])})
 
 
 @dataclass(frozen=True, repr=False)

@@ -16,8 +16,8 @@ import time
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
-from contextvars import ContextVar
 from copy import copy
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import lru_cache, wraps
 from pathlib import Path
@@ -51,8 +51,6 @@ from compgen.identification.covariance import Covariance, parse_covariance
 Result = TypeVar("Result")
 Arguments = ParamSpec("Arguments")
 Clock = Callable[[], datetime]
-#: The store whose reads currently share one connection, that connection, and what was read through it.
-_together: ContextVar[tuple[Store, sa.Connection, dict[Any, Any]] | None] = ContextVar("compgen_store", default=None)
 
 # Queries that every pass over a machine makes, each built once: building one takes longer than running it. Their
 # parameters are named after the arguments of ``Store._rows``.
@@ -106,7 +104,7 @@ def at_one_moment(
 
     @wraps(function)
     def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
-        return store.together(lambda: function(store, *args, **options))
+        return store.together(lambda moment: function(moment, *args, **options))
 
     return wrapper
 
@@ -118,17 +116,24 @@ def read_once(
 
     @wraps(function)
     def wrapper(store: Store, /, *args: Arguments.args, **options: Arguments.kwargs) -> Result:
-        def action() -> Result:
-            current = _together.get()
-            assert current is not None
-            key, known = (function, args, *sorted(options.items())), current[2]
+        def action(moment: Store) -> Result:
+            assert moment._moment is not None
+            key, known = (function, args, *sorted(options.items())), moment._moment.known
             if key not in known:
-                known[key] = function(store, *args, **options)
+                known[key] = function(moment, *args, **options)
             return copy(cast(Result, known[key]))
 
         return store.together(action)
 
     return wrapper
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """The connection through which a store is read as it was at one moment, and what was read through it."""
+
+    connection: sa.Connection
+    known: dict[Any, Any] = field(default_factory=dict)
 
 
 class Store:
@@ -140,6 +145,7 @@ class Store:
 
     def __init__(self, engine: sa.Engine, url: str, clock: Clock | None = None, number: int = 0) -> None:
         self.engine, self.url, self._clock = engine, url, clock
+        self._moment: _Moment | None = None
         self._file = _StoreFile(Path(str(engine.url.database)), number) if engine.dialect.name == "sqlite" else None
 
     def close(self) -> None:
@@ -165,11 +171,8 @@ class Store:
             with self.engine.connect().execution_options(reading=True) as connection:
                 return action(connection)
 
-        current = _together.get()
         try:
-            if current is not None and current[0] is self:
-                return action(current[1])
-            return retried(once, self.url)
+            return retried(once, self.url) if self._moment is None else action(self._moment.connection)
         except (CompgenError, UnicodeDecodeError):
             raise
         except ValueError as error:  # invalid time or JSON
@@ -182,20 +185,17 @@ class Store:
             return connection.execution_options(isolation_level="REPEATABLE READ")
         return connection
 
-    def together(self, action: Callable[[], Result]) -> Result:
-        """Run ``action``, which reads several times, on one snapshot of the store: its reads are consistent."""
-        current = _together.get()
-        if current is not None and current[0] is self:
-            return action()
+    def together(self, action: Callable[[Store], Result]) -> Result:
+        """Run ``action`` with this store as it is at one moment: everything that it reads from that one is consistent."""
+        if self._moment is not None:
+            return action(self)
 
         def once() -> Result:
             self._check_file()
             with self.snapshot() as connection:
-                token = _together.set((self, connection, {}))
-                try:
-                    return action()
-                finally:
-                    _together.reset(token)
+                moment = copy(self)
+                moment._moment = _Moment(connection)
+                return action(moment)
 
         return retried(once, self.url)
 

@@ -3,7 +3,6 @@
 from compgen.kinematics.exact_chain import exact_columns, exact_error, predict
 from compgen.kinematics.first_order import c_matrix, coefficients, modelled_errors, observable_errors
 from compgen.kinematics.gauge import align, gauge_directions
-from compgen.kinematics.kernel_switch import load_kernels
 from compgen.kinematics.many_points import volumetric_error, volumetric_error_on_grid
 
 __all__ = [
@@ -13,7 +12,6 @@ __all__ = [
     "exact_columns",
     "exact_error",
     "gauge_directions",
-    "load_kernels",
     "modelled_errors",
     "observable_errors",
     "predict",

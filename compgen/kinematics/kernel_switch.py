@@ -75,18 +75,6 @@ def has_numba() -> bool:
     return True
 
 
-def load_kernels() -> bool:
-    """Use the compiled kernels for every size from now on, as with ``COMPGEN_KERNELS=compiled`` in the environment.
-
-    This applies to this process and those that it starts. Return False and change nothing if numba (``compgen[fast]``)
-    is not installed or ``COMPGEN_KERNELS`` is plain.
-    """
-    if kernel_choice() == PLAIN or not has_numba():
-        return False
-    os.environ[VARIABLE] = COMPILED
-    return True
-
-
 @contextmanager
 def _settings() -> Iterator[None]:
     """Vectorise within a row, and keep the code in :func:`cache_folder` unless the environment names another folder.

@@ -480,7 +480,7 @@ STATION_EFFECTS = {"station_drift": station_drift, "length_step": length_step, "
 
 SimulatedEffect = Displacement | LengthEffect | RunEffect
 #: Reader of a section ``[[effects]]`` of a scenario by its ``name``; plug-ins add to it.
-EFFECTS = Registry()
+EFFECTS: Registry[Callable[[toml_files.Section], SimulatedEffect]] = Registry()
 
 
 def effects_schema() -> dict[str, Any]:

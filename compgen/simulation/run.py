@@ -37,7 +37,7 @@ from compgen.drawing.display import Displayed, Overview
 from compgen.errors import InputError
 from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
-from compgen.registry import call_problem
+from compgen.registry import Registry, call_problem
 from compgen.simulation.bars import RotaryBallbar, read_rotary_ballbar
 from compgen.simulation.effects import (
     Displacement,
@@ -146,16 +146,18 @@ class Instrument(Protocol):
 OwnPath = AxisLaser | DiagonalLaser | Ballbar | TouchProbe | SphereProbe | RotaryBallbar
 AnyInstrument = Instrument | SimulatedSixDof | OwnPath
 #: Reader of the ``[instrument]`` section by its ``type``; plug-ins add to it.
-INSTRUMENTS: dict[str, Callable[[toml_files.Section], AnyInstrument]] = {
-    "laser-tracer": read_laser_tracer,
-    "sixdof": read_sixdof_measurement,
-    "axis-laser": read_axis_laser,
-    "diagonal-laser": read_diagonal_laser,
-    "ballbar": read_ballbar,
-    "touch-probe": read_touch_probe,
-    "sphere-probe": read_sphere_probe,
-    "rotary-ballbar": read_rotary_ballbar,
-}
+INSTRUMENTS: Registry[Callable[[toml_files.Section], AnyInstrument]] = Registry(
+    {
+        "laser-tracer": read_laser_tracer,
+        "sixdof": read_sixdof_measurement,
+        "axis-laser": read_axis_laser,
+        "diagonal-laser": read_diagonal_laser,
+        "ballbar": read_ballbar,
+        "touch-probe": read_touch_probe,
+        "sphere-probe": read_sphere_probe,
+        "rotary-ballbar": read_rotary_ballbar,
+    }
+)
 
 
 @toml_files.accepts({"type": "string", "pattern": r"^[A-Za-z0-9][A-Za-z0-9._-]{0,80}$"})

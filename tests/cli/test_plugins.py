@@ -13,7 +13,7 @@ import compgen
 from compgen.controls import CONTROLLERS, controller_named
 from compgen.data.lengths import Points
 from compgen.plugins import KINDS
-from compgen.registry import Kind, load_entry_points, restored
+from compgen.registry import Kind, Registry, load_entry_points, restored
 from compgen.simulation import EFFECTS, INSTRUMENTS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -498,11 +498,11 @@ def test_an_installed_plug_in_does_not_take_a_built_in_name(install):
 
 def test_a_further_registry_takes_one_line(tmp_path):
     """What a later stage adds: a dict and a check."""
-    shelf = {}
+    shelf = Registry()
     kind = Kind("tool", "TOOLS", "compgen.tools", shelf, lambda name, thing: (thing, []))
     (tmp_path / "p.py").write_text("TOOLS = {'hammer': 1}\n")
     from compgen.registry import load_file
 
     load_file(tmp_path / "p.py", (*KINDS, kind))
-    assert shelf == {"hammer": 1}
-    assert kind.origins == {"hammer": f"plug-in {tmp_path / 'p.py'}"}
+    assert dict(shelf) == {"hammer": 1}
+    assert shelf.origins == {"hammer": f"plug-in {tmp_path / 'p.py'}"}

@@ -20,7 +20,6 @@ from compgen.kinematics import exact_chain as exact_points
 from compgen.kinematics import exact_error, kernel_switch, volumetric_error
 from compgen.kinematics import many_points as evaluate
 from compgen.kinematics.exact_chain import tip_position
-from compgen.kinematics.kernel_switch import load_kernels
 from compgen.kinematics.many_points import NodeIndex, volumetric_error_on_grid
 from compgen.resources import cache_folder
 
@@ -118,8 +117,7 @@ def interpreted(monkeypatch):
 @pytest.fixture
 def compiled(monkeypatch):
     pytest.importorskip("numba")
-    monkeypatch.setenv("COMPGEN_KERNELS", "auto")
-    assert load_kernels()
+    monkeypatch.setenv("COMPGEN_KERNELS", "compiled")
 
 
 @pytest.fixture(params=["numpy_only", "interpreted"])
@@ -372,18 +370,16 @@ def test_small_jobs_do_not_wait_for_numba():
 @pytest.mark.skipif(not NUMBA, reason="numba is not installed")
 def test_kernels_work_where_no_cache_can_be_written(tmp_path):
     (tmp_path / "file").write_text("a file where a folder is due")
-    code = SMALL_JOB + (
-        "from compgen.kinematics import load_kernels\nassert load_kernels()\n"
-        "print(compgen.volumetric_error(machine, table, np.array([[0.0, -1000.0, 0.0]]))[0, 0])"
-    )
-    run = python(code, XDG_CACHE_HOME=str(tmp_path / "file"), LOCALAPPDATA=str(tmp_path / "file"), NUMBA_CACHE_DIR="")
+    code = SMALL_JOB + ("print(compgen.volumetric_error(machine, table, np.array([[0.0, -1000.0, 0.0]]))[0, 0])")
+    folders = {"XDG_CACHE_HOME": str(tmp_path / "file"), "LOCALAPPDATA": str(tmp_path / "file"), "NUMBA_CACHE_DIR": ""}
+    run = python(code, **folders, COMPGEN_KERNELS="compiled")
     assert (run.returncode, run.stdout.strip()) == (0, "1.0"), run.stderr
 
 
 def test_without_numba_there_are_no_kernels(monkeypatch):
     monkeypatch.delitem(sys.modules, COMPILED, raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
-    assert not load_kernels()
+    monkeypatch.setenv("COMPGEN_KERNELS", "auto")
     points = points_of(5)
     due = by_cross_products(machine_of(), errors_of(), points, None)
     monkeypatch.setattr(evaluate, "_POINTS_FOR_KERNELS", 1)

@@ -11,7 +11,6 @@ import pytest
 import compgen
 from compgen.errors import InputError
 from compgen.kinematics import kernel_switch as kernels
-from compgen.kinematics import load_kernels
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -99,26 +98,14 @@ def test_the_switch_decides_for_every_size(monkeypatch):
     pytest.importorskip("numba")
     monkeypatch.setenv(kernels.VARIABLE, "compiled")
     assert kernels.use_compiled(0, 5)
-    assert load_kernels()
     monkeypatch.setenv(kernels.VARIABLE, "plain")
     assert not kernels.use_compiled(10, 5)
-    assert not load_kernels()
-    assert os.environ[kernels.VARIABLE] == "plain"
-
-
-def test_load_kernels_is_the_switch(monkeypatch):
-    pytest.importorskip("numba")
-    monkeypatch.setenv(kernels.VARIABLE, "auto")
-    assert load_kernels()
-    assert os.environ[kernels.VARIABLE] == "compiled"
 
 
 def test_another_value_is_refused(monkeypatch):
     monkeypatch.setenv(kernels.VARIABLE, "fast")
     with pytest.raises(InputError, match=r"COMPGEN_KERNELS is 'fast'; set it to auto, compiled or plain"):
         compgen.volumetric_error(SMALL, ERRORS, HERE)
-    with pytest.raises(InputError, match="COMPGEN_KERNELS"):
-        load_kernels()
 
 
 def test_compiled_kernels_that_are_not_installed_are_not_replaced_in_silence(monkeypatch):
