@@ -17,7 +17,15 @@ from compgen import effects, tables
 from compgen.controls import controller_named
 from compgen.data.arguments import names_of, of_kind, path_of, paths_of
 from compgen.data.csv_files import FloatArray, format_csv
-from compgen.data.error_table import WORTH_MM, Curve, ErrorTable, ReversalCurves, format_errors, format_reversal
+from compgen.data.error_table import (
+    SIGNIFICANT,
+    WORTH_MM,
+    Curve,
+    ErrorTable,
+    ReversalCurves,
+    format_errors,
+    format_reversal,
+)
 from compgen.data.files import OutputFolder, Provenance, sha256_of_file, working_folder
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
@@ -26,7 +34,7 @@ from compgen.drawing.display import Bars, Drawable, Overview, Panel
 from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import FileHead, heads_of
-from compgen.foreign.source import open_measurement
+from compgen.foreign.opening import open_measurement
 from compgen.identification import Identification, IdentifyOptions, covariance
 from compgen.identification.any_measurement import (
     Measurement,
@@ -38,7 +46,6 @@ from compgen.identification.any_measurement import (
     known_alone,
 )
 from compgen.identification.options import StatedNumbers
-from compgen.identification.reversal_errors import SIGNIFICANT
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES
 

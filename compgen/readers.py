@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from compgen.data.lengths import Lengths, Points, read_lengths, read_points
     from compgen.data.rotary import SphereCentres, read_spheres
     from compgen.foreign.answers import ImportOptions
-    from compgen.foreign.source import open_errors, open_measurement
+    from compgen.foreign.opening import open_errors, open_measurement
     from compgen.heat.sessions import DriftSession, Temperatures, read_drift, read_temperatures
     from compgen.identification.options import StatedNumbers, read_stations
     from compgen.instruments.sixdof_instrument import SixDof, SixDofInstrument, read_instrument, read_sixdof

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin,
 
 import click
 
-from compgen.data.files import json_text
+from compgen.cli.output import VERBOSE, print_json
 from compgen.data.names import AXES
 from compgen.errors import CompgenError, CompgenWarning, InputError, Message, message_of, messages_of
 from compgen.resources import LANGUAGES
@@ -55,11 +55,6 @@ PATH = click.Path(path_type=Path)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout, nothing else.")
 out_option = click.option("--out", required=True, metavar="DIR", type=PATH, help="Folder for the results.")
-
-
-def print_json(data: Any) -> None:
-    """Print one JSON object to stdout."""
-    click.echo(json_text(data), nl=False)
 
 
 def _complain(text: str, style: str) -> None:
@@ -156,10 +151,6 @@ plugin_option: Callable[[Any], Any] = click.option(
     help="Plug-in to load: a .py file or a package folder with controls, effects, instruments "
     "(may be given several times).",
 )
-
-
-#: Key in the context of a command that is to say what it does.
-VERBOSE = "compgen.verbose"
 
 
 def _set_output(context: click.Context, parameter: click.Parameter, value: bool) -> None:

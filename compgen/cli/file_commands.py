@@ -15,7 +15,8 @@ import click
 import numpy as np
 
 from compgen import effects
-from compgen.cli.common import json_option, print_json, shown_units
+from compgen.cli.common import json_option, shown_units
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import check_settings
 from compgen.cli.terminal import answer, complain, say
 from compgen.controls import CONTROLLERS, controller_named, program_instead

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from compgen.cli.common import fleet_options, json_option, out_option, print_json
+from compgen.cli.common import fleet_options, json_option, out_option
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import (
     active_options,
     answer_options,
@@ -32,7 +33,7 @@ from compgen.data.machine import Machine
 from compgen.errors import CompgenWarning, InputError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import heads_of
-from compgen.foreign.source import open_measurement
+from compgen.foreign.opening import open_measurement
 from compgen.identification import Identification, IdentifyOptions
 from compgen.identification.any_measurement import describe, evidence_files
 from compgen.identification.covariance import covariance_file_of
@@ -63,7 +64,7 @@ from compgen.cli.shared_options import (
 )
 from compgen.cli.terminal import answer
 from compgen.fitting import FitOptions, fit
-from compgen.foreign.source import open_errors
+from compgen.foreign.opening import open_errors
 from compgen.pipeline import fit_files, write_all
 from compgen.report.terminal import fit_table
 

@@ -15,7 +15,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from compgen.cli.common import PATH, json_option, option_name, options_of, print_json
+from compgen.cli.common import PATH, json_option, option_name, options_of
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import open_machine
 from compgen.cli.terminal import answer, say, stdout
 from compgen.controls import CONTROLLERS

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import click
 
-from compgen.cli.common import PATH, GroupedCommand, json_option, language_option, out_option, page_shown, print_json
+from compgen.cli.common import PATH, GroupedCommand, json_option, language_option, out_option, page_shown
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import (
     active_options,
     answer_options,

@@ -10,7 +10,8 @@ from typing import Any
 
 import click
 
-from compgen.cli.common import NUMBER, PATH, for_readers, json_option, language_option, out_option, print_json
+from compgen.cli.common import NUMBER, PATH, for_readers, json_option, language_option, out_option
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import (
     active_options,
     controller_option,

@@ -16,7 +16,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from compgen.cli.common import VERBOSE, print_json
+from compgen.cli.output import VERBOSE, print_json
 from compgen.errors import visible
 from compgen.resources import LANGUAGES
 from compgen.units import UNITS, Inch, units_of_cells

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import CsvTable, FloatArray
+from compgen.data.error_table import SIGNIFICANT, WORTH_MM, Curve
 from compgen.data.names import AXES, BODY_DIAGONALS
 from compgen.data.records import AXIS, DIRECTION, POSITION, RUN, RUN_DEVIATION, Field, Schema, fail_at
 from compgen.drawing.display import Tabular
@@ -18,6 +19,9 @@ from compgen.errors import InputError, repeated
 # Positioning runs along single axes (ISO 230-2): ``*.axis.csv``.
 
 
+#: Targets closer than this are the same target, mm.
+SAME_TARGET_MM = 1e-4
+POSITIONING = ("EXX", "EYY", "EZZ")
 #: Positions of the other axes, where a line was measured: columns, or comments of the file.
 LINE_COLUMNS = ("line_x_mm", "line_y_mm", "line_z_mm")
 
@@ -79,6 +83,52 @@ _AXIS_RUNS = Schema(
         Field("covariates", ("time_s", "order", "dwell_s", "feed_mm_min", *LINE_COLUMNS), presence="covariates"),
     )
 )
+
+
+def two_way_mean(
+    position_mm: FloatArray, direction: np.ndarray, value: FloatArray
+) -> tuple[Curve, Curve | None, FloatArray]:
+    """Return mean over both directions, reversal, and residuals of the readings along one axis.
+
+    Parameters
+    ----------
+    position_mm, direction, value : targets, directions (+1, -1, or 0 where unknown) and readings, (n,), mm or rad.
+
+    Returns
+    -------
+    mean : at each target the mean of the means of both directions (ISO 230-2), or the mean of the only direction.
+    reversal : positive minus negative approach where both were measured; None if nowhere.
+    residual : reading minus mean of its target and direction, (n,).
+
+    Standard uncertainties come from the scatter within targets and directions, pooled over the axis, because a few
+    runs tell little about a single target; nan where nothing was repeated.
+    """
+    keys = np.round(position_mm / SAME_TARGET_MM).astype(np.int64)
+    _, first, target = np.unique(keys, return_index=True, return_inverse=True)
+    cell = 2 * target.ravel() + (np.asarray(direction) < 0)
+    count = np.bincount(cell, minlength=2 * len(first)).astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        mean = np.bincount(cell, value, minlength=2 * len(first)) / count
+    residual = value - mean[cell]
+    freedom = len(value) - int(np.count_nonzero(count))
+    variance = float(residual @ residual) / freedom if freedom else np.nan
+    both = mean.reshape(-1, 2)
+    with np.errstate(divide="ignore"):
+        square = np.where(np.isfinite(both), variance / count.reshape(-1, 2), 0.0)
+    ways = np.isfinite(both).sum(axis=1)
+    centre = Curve(position_mm[first], np.nansum(both, axis=1) / ways, np.sqrt(square.sum(axis=1)) / ways)
+    pairs = np.flatnonzero(ways == 2)
+    if not pairs.size:
+        return centre, None, residual
+    reversal = Curve(centre.position_mm[pairs], both[pairs, 0] - both[pairs, 1], np.sqrt(square[pairs].sum(axis=1)))
+    return centre, reversal, residual
+
+
+def worth_a_table(reversal: Curve) -> bool:
+    """Whether a reversal is large enough, and exceeds its uncertainty somewhere."""
+    size = np.abs(reversal.value)
+    beyond = np.isnan(reversal.u) | (size > SIGNIFICANT * reversal.u)
+    return bool(size.max() >= WORTH_MM and beyond.any())
 
 
 def read_axis_runs(files: str | Path | Sequence[str | Path]) -> AxisRuns:

@@ -494,6 +494,10 @@ def format_errors(errors: ErrorTable, metadata: Mapping[str, object] | None = No
 LARGEST_UM = 1000.0
 #: A smaller reversal is not worth a table, mm.
 WORTH_MM = 0.1 * MM_PER_UM
+#: A reversal below this many standard uncertainties is not removed from the readings.
+SIGNIFICANT = 5.0
+#: No machine tool has more; a larger number has another unit.
+LARGEST_MM, LARGEST_RAD = 2.0, 0.1
 _PAIRS_OF_AXES = frozenset((axis, component) for axis in range(3) for component in range(3))
 
 

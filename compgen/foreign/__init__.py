@@ -9,7 +9,8 @@ if TYPE_CHECKING:
     from compgen.foreign.converted import describe_native, given_errors
     from compgen.foreign.detect import form_of, import_file
     from compgen.foreign.findings import Imported
-    from compgen.foreign.source import native_format, open_errors, open_measurement
+    from compgen.foreign.opening import open_errors, open_measurement
+    from compgen.foreign.source import native_format
 
 __all__ = [
     "ImportOptions",

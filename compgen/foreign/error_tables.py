@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from compgen.data.error_table import Curve, ErrorTable
+from compgen.data.error_table import LARGEST_RAD, Curve, ErrorTable
 from compgen.data.names import CURVE_NAMES, ERROR_INDEX, ERROR_NAMES, RAD_PER_URAD, SQUARENESS_NAMES, error_named
 from compgen.errors import InputError, nearest
 from compgen.foreign.answers import ImportOptions
@@ -27,7 +27,6 @@ from compgen.foreign.column_names import (
 from compgen.foreign.findings import USUAL_URAD, Imported, TableFindings, usual_deviation_mm
 from compgen.foreign.questions import Asking, Choice, signs
 from compgen.foreign.source import parse_number, shown
-from compgen.identification.options import LARGEST_RAD
 
 
 def wide_errors(findings: TableFindings, columns: Mapping[str, NamedColumn]) -> ErrorTable:

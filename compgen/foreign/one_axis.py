@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from compgen.data.axis_runs import SAME_TARGET_MM, two_way_mean, worth_a_table
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, ReversalCurves, marked_apart
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.errors import InputError, nearest
-from compgen.identification.axis_tests import SAME_TARGET_MM, two_way_mean, worth_a_table
 
 IntArray = NDArray[np.int64]
 #: A reading is reported if it is this far from the median, mm or rad, and this many times further than nine in ten
@@ -177,7 +177,7 @@ def check_error(error: str, axis: str | None, *, angular: bool) -> str:
 def errors_of(runs: OneAxis, error: str, metadata: Mapping[str, str]) -> tuple[ErrorTable, ReversalCurves | None]:
     """Return the bidirectional mean over the targets as one error, and the reversal of the axis.
 
-    See :func:`compgen.identification.axis_tests.two_way_mean`. The reversal is None for angles, for one direction, and below
+    See :func:`compgen.data.axis_runs.two_way_mean`. The reversal is None for angles, for one direction, and below
     0.1 um.
     """
     centre, reversal, _ = two_way_mean(runs.position_mm, runs.direction, runs.value)

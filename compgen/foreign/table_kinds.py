@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from compgen.data.axis_runs import AxisRuns, check_single, join_axis_runs
+from compgen.data.axis_runs import POSITIONING, SAME_TARGET_MM, AxisRuns, check_single, join_axis_runs, two_way_mean
 from compgen.data.circles import LARGEST_RADIUS_MM, PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
@@ -78,7 +78,6 @@ from compgen.foreign.questions import (
     unit_choices,
 )
 from compgen.foreign.source import parse_number, shown
-from compgen.identification.axis_tests import POSITIONING, SAME_TARGET_MM, two_way_mean
 
 # Tables of readings along axes: a row for each reading, or a row for each target and a column for each run.
 #

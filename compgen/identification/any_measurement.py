@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format, may_be_large
 from compgen.errors import CompgenWarning, InputError, UndeterminedError, um_text
 from compgen.identification.adjust.propagation import SystematicInputs
+from compgen.identification.kinds import Measurement, MixedMeasurement, OneKind
 from compgen.identification.options import IdentifyOptions
 from compgen.identification.result import Identification, at_nodes, determines_all
 from compgen.identification.tracer_lengths import identify
@@ -29,26 +30,7 @@ if TYPE_CHECKING:
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.circles import Circles
     from compgen.data.deviations import Artefact, Deviations
-    from compgen.data.length_archive import LengthArchive
     from compgen.identification.posterior import Posterior
-    from compgen.identification.six_dof import SixDofMeasurement
-
-
-OneKind: TypeAlias = "Lengths | LengthArchive | Deviations | AxisRuns | Circles | Artefact | SixDofMeasurement"
-
-
-@dataclass(frozen=True)
-class MixedMeasurement:
-    """Several measurements of the same machine, each of one kind, and errors that are known otherwise; with their names."""
-
-    parts: tuple[tuple[str, OneKind | ErrorTable], ...]
-
-    def first(self) -> OneKind | None:
-        """Return the first measurement among the parts."""
-        return next((part for _, part in self.parts if not isinstance(part, ErrorTable)), None)
-
-
-Measurement: TypeAlias = "OneKind | MixedMeasurement"
 
 
 def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None = None) -> Measurement:

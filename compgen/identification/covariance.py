@@ -8,13 +8,12 @@ itself is never formed.
 from __future__ import annotations
 
 import io
-import json
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.gauge import common_gauge_part
 
 if TYPE_CHECKING:
-    from compgen.identification.posterior import Posterior
+    from compgen.identification.posterior import Posterior, StoredPosterior
 
 FILE_NAME = "identified.covariance.npz"
 FORMAT = "compgen covariance 1"
@@ -225,68 +224,6 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
     part, values = common_gauge_part(machine, errors), errors.values()
     values, factor = values - part @ values, factor - part @ factor
     return posterior_of_values(machine, known.error, known.position_mm, values, factor, taken_off=part)
-
-
-@dataclass(frozen=True)
-class StoredPosterior:
-    """A posterior without its machine, as a covariance file keeps it.
-
-    ``levels_mm`` are the levels of the state on X, Y and Z; ``names`` the errors, ``sizes`` (errors, 4) of each the size
-    and the scale of its prior, its rough part, and the size of a measured slope; ``mean`` (p,) and ``factor`` (p, r) of the
-    state; ``spans_mm`` (3, 2) where the readings were; ``prior`` the section of the machine file, with what was raised.
-    """
-
-    levels_mm: tuple[FloatArray, FloatArray, FloatArray]
-    names: tuple[str, ...]
-    sizes: FloatArray
-    mean: FloatArray
-    factor: FloatArray
-    spans_mm: FloatArray
-    prior: dict[str, Any]
-    follows_table: bool = True
-
-    def of(self, machine: Machine) -> Posterior:
-        """Return the posterior of the errors of this machine."""
-        from compgen.identification.posterior import restored
-
-        return restored(machine, self)
-
-    def members(self) -> dict[str, NDArray[np.generic]]:
-        """Return the members of the file."""
-        levels = {f"posterior_levels_{letter}_mm": at for letter, at in zip("xyz", self.levels_mm, strict=True)}
-        return {
-            **levels,
-            "posterior_names": np.array(self.names),
-            "posterior_sizes": self.sizes,
-            "posterior_mean": self.mean,
-            "posterior_factor": self.factor,
-            "posterior_spans_mm": self.spans_mm,
-            "posterior_prior": np.array(json.dumps(self.prior)),
-            "posterior_follows_table": np.array(self.follows_table),
-        }
-
-    @classmethod
-    def from_members(cls, members: dict[str, NDArray[np.generic]]) -> StoredPosterior | None:
-        """Return what a file contains; None if it has no posterior; ValueError for parts that do not match."""
-        if "posterior_names" not in members:
-            return None
-        try:
-            numbers = {
-                key: np.asarray(members[f"posterior_{key}"], dtype=np.float64)
-                for key in ("sizes", "mean", "factor", "spans_mm", *(f"levels_{letter}_mm" for letter in "xyz"))
-            }
-            names = tuple(str(name) for name in members["posterior_names"].ravel())
-            prior = json.loads(str(members["posterior_prior"]))
-        except KeyError as error:
-            raise ValueError(f"{error.args[0]} is missing") from error
-        finite = all(np.isfinite(array).all() for key, array in numbers.items() if key != "spans_mm")
-        shapes = numbers["sizes"].shape == (len(names), 4) and numbers["factor"].shape[:1] == numbers["mean"].shape
-        known = all(name in ERROR_INDEX for name in names) and isinstance(prior, dict)
-        if not (finite and shapes and known and numbers["spans_mm"].shape == (3, 2)):
-            raise ValueError("the parts of the posterior do not match")
-        x, y, z = (numbers[f"levels_{letter}_mm"] for letter in "xyz")
-        others = numbers["sizes"], numbers["mean"], numbers["factor"], numbers["spans_mm"]
-        return cls((x, y, z), names, *others, prior, bool(members.get("posterior_follows_table", True)))
 
 
 # --- systematic inputs on top of the random part -------------------------------------------------------------------
@@ -551,6 +488,8 @@ def _rotary_of(members: dict[str, NDArray[np.generic]]) -> tuple[tuple[str, ...]
 
 
 def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covariance:
+    from compgen.identification.posterior import StoredPosterior  # not needed where errors are only identified
+
     try:
         covariance = Covariance(
             error=tuple(str(name) for name in members["error"].ravel()),
@@ -560,7 +499,7 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
             factor=np.asarray(members["factor"], dtype=np.float64),
             machine=str(members["machine"]),
             errors_sha256=str(members["errors_sha256"]),
-            posterior=StoredPosterior.from_members(members),
+            posterior=StoredPosterior.from_members(members) if "posterior_names" in members else None,
             rotary=_rotary_of(members),
         )
     except (ValueError, TypeError) as error:

@@ -12,7 +12,16 @@ import numpy as np
 
 from compgen.data.arguments import of_kind, text_of
 from compgen.data.csv_files import FloatArray, read_csv
-from compgen.data.error_table import ARMS, SPANS_KEY, Curve, ErrorTable, ReversalCurves, format_spans
+from compgen.data.error_table import (
+    ARMS,
+    LARGEST_MM,
+    LARGEST_RAD,
+    SPANS_KEY,
+    Curve,
+    ErrorTable,
+    ReversalCurves,
+    format_spans,
+)
 from compgen.data.lengths import POSITION_COLUMNS, Lengths
 from compgen.data.machine import MM_PER_UNIT, Machine
 from compgen.data.names import (
@@ -368,8 +377,6 @@ ANGLES = {"urad": RAD_PER_URAD, "um/m": RAD_PER_URAD, "µrad": RAD_PER_URAD, "µ
           "arcsec": np.pi / 648000.0, '"': np.pi / 648000.0, "ppm": 1e-6}  # fmt: skip
 #: mm in each unit of a length; the first is meant where none is given.
 LENGTHS = {"um": MM_PER_UM, "µm": MM_PER_UM, "mm": 1.0}
-#: No machine tool has more; a larger number has another unit.
-LARGEST_MM, LARGEST_RAD = 2.0, 0.1
 _NUMBER = r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,3})?"
 _STATED = re.compile(
     rf"({_NUMBER})(?:\s*/\s*({_NUMBER}))?(?:\s*(?:±|\+-|\+/-)\s*({_NUMBER}))?\s*([a-zA-Zµ\"]+(?:/[a-z]+)?)?"

@@ -13,6 +13,7 @@ an error that no reading shows keeps its prior exactly.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -28,9 +29,7 @@ from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARE
 from compgen.data.prior import DETERMINED, PriorSettings
 from compgen.errors import InputError
 from compgen.identification.adjust.determined import LEVER_MM, Observations
-from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters
-from compgen.identification.covariance import StoredPosterior
-from compgen.identification.result import state_names
+from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters, state_names
 from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.many_points import full_grid
 
@@ -563,6 +562,66 @@ def posterior_of_values(
     gauge = None if taken_off is None else taken_off[np.ix_(rows, rows)]
     read = Observations.of_values(layout, kept, at, value[rows], part @ part.T, taken_off=gauge)
     return solve_posterior(machine, layout, (Information.of(read),), spans, learn=False)
+
+
+@dataclass(frozen=True)
+class StoredPosterior:
+    """A posterior without its machine, as a covariance file keeps it.
+
+    ``levels_mm`` are the levels of the state on X, Y and Z; ``names`` the errors, ``sizes`` (errors, 4) of each the size
+    and the scale of its prior, its rough part, and the size of a measured slope; ``mean`` (p,) and ``factor`` (p, r) of the
+    state; ``spans_mm`` (3, 2) where the readings were; ``prior`` the section of the machine file, with what was raised.
+    """
+
+    levels_mm: tuple[FloatArray, FloatArray, FloatArray]
+    names: tuple[str, ...]
+    sizes: FloatArray
+    mean: FloatArray
+    factor: FloatArray
+    spans_mm: FloatArray
+    prior: dict[str, Any]
+    follows_table: bool = True
+
+    def of(self, machine: Machine) -> Posterior:
+        """Return the posterior of the errors of this machine."""
+        return restored(machine, self)
+
+    def members(self) -> dict[str, NDArray[np.generic]]:
+        """Return the members of the file."""
+        levels = {f"posterior_levels_{letter}_mm": at for letter, at in zip("xyz", self.levels_mm, strict=True)}
+        return {
+            **levels,
+            "posterior_names": np.array(self.names),
+            "posterior_sizes": self.sizes,
+            "posterior_mean": self.mean,
+            "posterior_factor": self.factor,
+            "posterior_spans_mm": self.spans_mm,
+            "posterior_prior": np.array(json.dumps(self.prior)),
+            "posterior_follows_table": np.array(self.follows_table),
+        }
+
+    @classmethod
+    def from_members(cls, members: dict[str, NDArray[np.generic]]) -> StoredPosterior | None:
+        """Return what a file contains; None if it has no posterior; ValueError for parts that do not match."""
+        if "posterior_names" not in members:
+            return None
+        try:
+            numbers = {
+                key: np.asarray(members[f"posterior_{key}"], dtype=np.float64)
+                for key in ("sizes", "mean", "factor", "spans_mm", *(f"levels_{letter}_mm" for letter in "xyz"))
+            }
+            names = tuple(str(name) for name in members["posterior_names"].ravel())
+            prior = json.loads(str(members["posterior_prior"]))
+        except KeyError as error:
+            raise ValueError(f"{error.args[0]} is missing") from error
+        finite = all(np.isfinite(array).all() for key, array in numbers.items() if key != "spans_mm")
+        shapes = numbers["sizes"].shape == (len(names), 4) and numbers["factor"].shape[:1] == numbers["mean"].shape
+        known = all(name in ERROR_INDEX for name in names) and isinstance(prior, dict)
+        if not (finite and shapes and known and numbers["spans_mm"].shape == (3, 2)):
+            raise ValueError("the parts of the posterior do not match")
+        x, y, z = (numbers[f"levels_{letter}_mm"] for letter in "xyz")
+        others = numbers["sizes"], numbers["mean"], numbers["factor"], numbers["spans_mm"]
+        return cls((x, y, z), names, *others, prior, bool(members.get("posterior_follows_table", True)))
 
 
 def restored(machine: Machine, stored: StoredPosterior) -> Posterior:

@@ -20,9 +20,9 @@ from compgen.errors import UndeterminedError
 from compgen.identification.adjust.propagation import Adjustment, Systematic
 from compgen.identification.adjust.residual_tests import Misfit, ResidualSeries, Whiteness, misfit_of, warn_of_residuals
 from compgen.identification.adjust.robust import Rejected, Segment
-from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters, state_names
 from compgen.identification.reversal_errors import Reversal
-from compgen.kinematics.first_order import modelled_errors, observable_errors
+from compgen.kinematics.first_order import observable_errors
 
 if TYPE_CHECKING:
     from compgen.data.deviations import Deviations
@@ -283,12 +283,6 @@ class Identification(Drawable):
             "reading minus model", "residual (um)", (PlottedLine("", number, residual_um),), x_label="reading"
         )
         return [*self.errors.panels(), drawn]
-
-
-def state_names(machine: Machine) -> tuple[str, ...]:
-    """Return the errors that a posterior contains: those of the model, and observable ones that the machine file leaves out."""
-    wanted = {*modelled_errors(machine), *observable_errors(machine)}
-    return tuple(name for name in ERROR_NAMES if name in wanted)
 
 
 def same_nodes(machine: Machine, result: Identification) -> bool:

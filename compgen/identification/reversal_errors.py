@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
+from compgen.data.error_table import SIGNIFICANT
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import approach_of
@@ -21,8 +22,6 @@ from compgen.identification.adjust.grid_problem import levels_of
 from compgen.identification.adjust.robust import time_order
 from compgen.identification.adjust.unknowns import IntArray
 
-#: A reversal below this many standard uncertainties is not removed from the readings.
-SIGNIFICANT = 5.0
 #: Cells are renumbered if there could be this many times more of them than readings.
 SPARSE = 8
 #: Fewer readings than this, of all stations or of one, are not evaluated.

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from compgen.data.csv_files import FloatArray
-from compgen.data.error_table import WORTH_MM, Curve, ReversalCurves
+from compgen.data.error_table import SIGNIFICANT, WORTH_MM, Curve, ReversalCurves
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
 from compgen.errors import CompgenWarning
 from compgen.identification.adjust.unknowns import check_axis_travel
 from compgen.identification.result import Identification, metadata_of, without_adjustment
-from compgen.identification.reversal_errors import SIGNIFICANT
 from compgen.instruments.interferometer import compensated, summary_of
 from compgen.instruments.sixdof_evaluation import (
     Evaluation,

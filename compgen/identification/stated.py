@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from compgen.data.axis_runs import AxisRuns
+from compgen.data.axis_runs import SAME_TARGET_MM, AxisRuns, two_way_mean
 from compgen.data.circles import Circles
 from compgen.data.comparison import normalized_error
 from compgen.data.csv_files import FloatArray
@@ -23,8 +23,8 @@ from compgen.effects.active import added, effects_reversal
 from compgen.errors import CompgenWarning, InputError, UndeterminedError
 from compgen.identification.adjust.determined import FINEST, Observations
 from compgen.identification.adjust.unknowns import ErrorParameters
-from compgen.identification.any_measurement import Measurement, MixedMeasurement
-from compgen.identification.axis_tests import SAME_TARGET_MM, identify_circles, two_way_mean, u_scale_of
+from compgen.identification.axis_tests import identify_circles, u_scale_of
+from compgen.identification.kinds import Measurement, MixedMeasurement
 from compgen.identification.options import STATED_SOURCE, StatedNumbers
 from compgen.identification.posterior import square_sd
 from compgen.identification.result import Identification

@@ -38,7 +38,7 @@ from compgen.identification.adjust.determined import (
 )
 from compgen.identification.adjust.residual_tests import misfit_of
 from compgen.identification.adjust.robust import Rejected, fit_accepted
-from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters
+from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters, state_names
 from compgen.identification.axis_tests import axis_observations, circle_observations, circle_readings
 from compgen.identification.covariance import (
     error_design,
@@ -69,7 +69,6 @@ from compgen.identification.result import (
     at_nodes,
     not_among,
     same_nodes,
-    state_names,
     table_of_values,
     uncertainty_scale,
     without_adjustment,

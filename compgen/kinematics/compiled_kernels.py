@@ -14,8 +14,7 @@ import numba
 import numpy as np
 from numba import types
 
-from compgen.kinematics.exact_chain import SERIES_BELOW
-from compgen.kinematics.kernel_switch import Function, compile_for, loop
+from compgen.kinematics.kernel_switch import SERIES_BELOW, Function, compile_for, loop
 
 Row = tuple[float, float, float, float]
 

@@ -13,7 +13,7 @@ from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, ERRORS
 from compgen.kinematics.first_order import tool_of
-from compgen.kinematics.kernel_switch import use_compiled
+from compgen.kinematics.kernel_switch import SERIES_BELOW, use_compiled
 from compgen.kinematics.many_points import (
     AxisTable,
     blocks,
@@ -36,8 +36,6 @@ from compgen.kinematics.many_points import (
 
 #: A vector at n points, by component.
 Vector = list[FloatArray]
-#: rad^2; below, the next terms of the series are less than 1e-21 (f1, f2) and 1e-16 (f3) of the result.
-SERIES_BELOW = 1e-4
 
 
 def rotation_factors(square: FloatArray) -> tuple[FloatArray, FloatArray]:

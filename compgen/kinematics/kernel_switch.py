@@ -35,6 +35,9 @@ VARIABLE = "COMPGEN_KERNELS"
 AUTO, COMPILED, PLAIN = "auto", "compiled", "plain"
 #: Sums may be taken in another order, and a*b + c in one step; infinities and nan keep their meaning.
 FAST = {"contract", "reassoc", "arcp"}
+#: rad^2; below, factors of a rotation are the first terms of their series, in both forms: the next ones are less than 1e-21
+#: (f1, f2) and 1e-16 (f3) of the result.
+SERIES_BELOW = 1e-4
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 

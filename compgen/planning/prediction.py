@@ -31,6 +31,7 @@ from compgen.identification.adjust.unknowns import (
     check_travel,
     dead_lengths_of,
     error_parameters,
+    state_names,
 )
 from compgen.identification.covariance import error_values
 from compgen.identification.options import IdentifyOptions, ReadingNoise, reading_noise
@@ -43,7 +44,7 @@ from compgen.identification.posterior import (
     solve_posterior,
     state_layout,
 )
-from compgen.identification.result import at_nodes, state_names, table_of_values
+from compgen.identification.result import at_nodes, table_of_values
 from compgen.kinematics.first_order import c_matrix, modelled_errors, tool_of
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.kinematics.many_points import MOST_POINTS, volume_grid

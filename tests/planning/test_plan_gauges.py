@@ -14,12 +14,12 @@ from compgen.data.lengths import Points
 from compgen.data.names import SQUARENESS_NAMES, error_named
 from compgen.data.prior import PriorSettings
 from compgen.errors import CompgenWarning
+from compgen.identification.adjust.unknowns import state_names
 from compgen.identification.any_measurement import MixedMeasurement, identify_measurement
 from compgen.identification.axis_tests import identify_circles
 from compgen.identification.options import IdentifyOptions
 from compgen.identification.positions import identify_artefact
 from compgen.identification.posterior import processes_of, symmetric_root
-from compgen.identification.result import state_names
 from compgen.identification.together import Source, identify_together
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import c_matrix

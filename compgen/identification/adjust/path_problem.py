@@ -21,8 +21,8 @@ from compgen.data.names import SQUARENESS_NAMES
 from compgen.identification.adjust.grid_problem import ENTRIES, MotionMap, add_own_blocks, lever_directions, motion_map
 from compgen.identification.adjust.unknowns import ErrorParameters, IntArray, KnownPositions, State, TracerUnknowns
 from compgen.kinematics.compiled_kernels import rotation_factors
-from compgen.kinematics.exact_chain import SERIES_BELOW, passing_order, travel_directions
-from compgen.kinematics.kernel_switch import FAST, loop
+from compgen.kinematics.exact_chain import passing_order, travel_directions
+from compgen.kinematics.kernel_switch import FAST, SERIES_BELOW, loop
 
 # Compiled pass over readings at any positions (numba, ``pip install compgen[fast]``): cost, gradient, normal matrix.
 

@@ -13,7 +13,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import free_basis, hat_matrix, spline_matrix
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.data.names import AXES, ERROR_INDEX, SQUARENESS_NAMES, ErrorName, error_named
+from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.data.records import POSITION_COLUMNS
 from compgen.errors import InputError
 from compgen.kinematics.exact_chain import tip_position
@@ -367,3 +367,9 @@ def outside_travel(machine: Machine, axis: int, position_mm: FloatArray) -> int 
     if not len(position_mm) or (position_mm.min() >= low - _ROUNDING_MM and position_mm.max() <= high + _ROUNDING_MM):
         return None
     return int(np.flatnonzero((position_mm < low - _ROUNDING_MM) | (position_mm > high + _ROUNDING_MM))[0])
+
+
+def state_names(machine: Machine) -> tuple[str, ...]:
+    """Return the errors that a posterior contains: those of the model, and observable ones that the machine file leaves out."""
+    wanted = {*modelled_errors(machine), *observable_errors(machine)}
+    return tuple(name for name in ERROR_NAMES if name in wanted)
