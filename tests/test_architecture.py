@@ -14,6 +14,7 @@ ORDER = (
     ("data",),
     ("new_machine",),
     ("kinematics",),
+    ("parallel",),
     ("effects",),
     ("instruments",),
     ("simulation",),

@@ -37,7 +37,7 @@ from compgen.resources import data_folder
 
 if TYPE_CHECKING:
     from compgen.identification.heat_of_readings import HeatSource
-    from compgen.kinematics.parallel import Map
+    from compgen.parallel import Map
     from compgen.tables.active import ActiveTables
 
 
@@ -133,7 +133,7 @@ def mapper(workers: int, cluster: str | None) -> Iterator[Map]:
     if workers == 1 and cluster is None:
         yield map
         return
-    from compgen.kinematics.parallel import opened_workers, spread
+    from compgen.parallel import opened_workers, spread
     from compgen.plugins import with_plugins
 
     found = opened_workers(workers, cluster)

@@ -37,7 +37,7 @@ from compgen.fleet.records import (
 )
 from compgen.fleet.store import Clock, Store, open_store
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.parallel import (
+from compgen.parallel import (
     ClusterError,
     LostError,
     Packed,
@@ -525,7 +525,7 @@ def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = Fa
     """Return the workers for the machines of the store ``url``: a cluster, or processes of this computer.
 
     Even a single worker is a separate process: a measurement that crashes it, or takes too long, ends only that pass.
-    ``copied`` as for :class:`compgen.kinematics.parallel.Processes`.
+    ``copied`` as for :class:`compgen.parallel.Processes`.
 
     Raises
     ------
@@ -533,7 +533,7 @@ def open_fleet(url: str, workers: int, cluster: str | None, *, copied: bool = Fa
         if the cluster cannot be used, for example not with this store.
     """
     if cluster is not None:
-        from compgen.kinematics.parallel import Cluster  # an optional library
+        from compgen.parallel import Cluster  # an optional library
 
         return Cluster(cluster, same_host=LOCAL_STORE if sqlite_path(url) is not None else "")
     return Processes(workers, copied=copied and workers == 1, died=partial(note_death, url))

@@ -21,7 +21,7 @@ from compgen.identification.options import IdentifyOptions
 from compgen.identification.result import Identification
 from compgen.identification.tracer_lengths import identify
 from compgen.kinematics.kernel_switch import one_thread
-from compgen.kinematics.parallel import Map
+from compgen.parallel import Map
 
 
 def sample_errors(covariance: Covariance, count: int, seed: int = 0) -> FloatArray:

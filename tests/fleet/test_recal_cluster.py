@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
+from compgen import parallel
+from compgen import parallel as cluster
 from compgen.cli import cli
 from compgen.cli.common import run_command
 from compgen.data.deviations import Deviations, format_deviations
@@ -31,11 +33,9 @@ from compgen.fleet.runner import run_jobs
 from compgen.fleet.store import open_store
 from compgen.fleet.watch import Watch
 from compgen.identification import identify, self_check
-from compgen.kinematics import parallel
-from compgen.kinematics import parallel as cluster
 from compgen.kinematics.exact_chain import exact_error
 from compgen.kinematics.many_points import volume_grid
-from compgen.kinematics.parallel import LostError, Packed, Processes, RemoteError, StoppedError, spread
+from compgen.parallel import LostError, Packed, Processes, RemoteError, StoppedError, spread
 
 _SPEC = importlib.util.spec_from_file_location("compgen_postgres", Path(__file__).resolve().parents[1] / "postgres.py")
 postgres = importlib.util.module_from_spec(_SPEC)
@@ -427,7 +427,7 @@ def test_what_is_stopped_is_not_begun():
 
 def test_worker_processes_end_with_the_one_that_started_them_even_if_it_is_killed(tmp_path):
     text = (
-        "from compgen.kinematics.parallel import *\n"
+        "from compgen.parallel import *\n"
         "if __name__ == '__main__':\n"
         "    sleeping = \"print(__import__('os').getpid(), flush=True) or __import__('time').sleep(600)\"\n"
         "    list(spread(Processes(1), eval, [sleeping]))\n"

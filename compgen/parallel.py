@@ -483,7 +483,7 @@ class Cluster:
             raise ClusterError(f"the cluster {self.address} cannot be used: {reason}{why}")
 
     def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
-        """Return ``function(item)``; see :class:`compgen.kinematics.parallel.Workers`."""
+        """Return ``function(item)``; see :class:`compgen.parallel.Workers`."""
         if stop():
             raise StoppedError("not started: stopped")
         if self._empty_since is not None:
