@@ -18,7 +18,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.names import CURVE_NAMES, error_named
 from compgen.data.toml_files import option
 from compgen.drawing.display import Drawable, Overview, Panel, shortened
-from compgen.errors import ConvergenceError, InputError, nearest
+from compgen.errors import ConvergenceError, InputError, Message, nearest
 from compgen.fitting.smoother import Method, Smoother
 from compgen.fitting.zeroing import FrameChange
 from compgen.kinematics.kernel_switch import lapack
@@ -376,10 +376,27 @@ class FitOptions:
                     raise InputError(message, field=bound)
         for key, direction in self.monotone.items():
             if key not in CURVE_NAMES:
-                raise InputError(f"{key!r} is not one of the curves; {nearest(key, CURVE_NAMES)}", field="monotone")
+                raise InputError(
+                    Message(
+                        "curve-unknown",
+                        "{key!r} is not one of the curves; {key2}",
+                        key=key,
+                        key2=nearest(key, CURVE_NAMES),
+                    ),
+                    field="monotone",
+                )
             if direction not in DIRECTIONS:
                 allowed = ", ".join(DIRECTIONS)
-                raise InputError(f"{direction!r} for {key} is not allowed; give one of {allowed}", field="monotone")
+                raise InputError(
+                    Message(
+                        "direction-unknown",
+                        "{direction!r} for {key} is not allowed; give one of {allowed}",
+                        direction=direction,
+                        key=key,
+                        allowed=allowed,
+                    ),
+                    field="monotone",
+                )
 
     @classmethod
     def from_file_units(
@@ -431,7 +448,15 @@ def _unit(bound: str, key: str) -> float:
 def _check_key(bound: str, key: str) -> None:
     if key not in CURVE_NAMES and key not in ERROR_KINDS:
         known = (*ERROR_KINDS, *CURVE_NAMES)
-        raise InputError(f"{key!r} is neither a curve nor a kind of error; {nearest(key, known)}", field=bound)
+        raise InputError(
+            Message(
+                "bound-name-unknown",
+                "{key!r} is neither a curve nor a kind of error; {key2}",
+                key=key,
+                key2=nearest(key, known),
+            ),
+            field=bound,
+        )
 
 
 # One curve with a given smoothness within its bounds.
@@ -513,7 +538,10 @@ def fit_bounded(smoother: Smoother, mu: float, y: FloatArray, rows: Rows) -> Cur
         if found is not None:
             return CurveSolution(*found, solver)
     raise ConvergenceError(
-        "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness"
+        Message(
+            "fit-no-optimum",
+            "the bounded fit found no optimum that passes its check; loosen the bounds or the smoothness",
+        )
     )
 
 

@@ -17,7 +17,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.names import error_named
-from compgen.errors import ConvergenceError, InputError
+from compgen.errors import ConvergenceError, InputError, Message
 from compgen.fitting.bounds import (
     ACTIVE_SET,
     ROUNDING,
@@ -430,7 +430,13 @@ def robust(curves: Mapping[str, FixedCurve], options: FitOptions) -> tuple[list[
         if count >= _SEARCHES and change <= _SETTLED:
             return prepared, weighted
         trusts = fresh
-    raise ConvergenceError(f"the robust fit did not converge in {_ROUNDS} rounds; fit without it or give a smoothness")
+    raise ConvergenceError(
+        Message(
+            "fit-robust-not-converged",
+            "the robust fit did not converge in {value} rounds; fit without it or give a smoothness",
+            value=_ROUNDS,
+        )
+    )
 
 
 def running_median(y: FloatArray) -> FloatArray:
@@ -501,11 +507,24 @@ def solve_constrained(
     if problem.status in ("infeasible", "infeasible_inaccurate"):
         raise InputError(_relaxation(cp, rules, own), field="constraints")
     if problem.status not in _STATES:
-        raise ConvergenceError(f"the fit with your constraints ended with {problem.status}; scale or loosen them")
+        raise ConvergenceError(
+            Message(
+                "constraints-solver-status",
+                "the fit with your constraints ended with {status}; scale or loosen them",
+                status=problem.status,
+            )
+        )
     for name, rule in own.items():
         broken = float(np.max(rule.violation(), initial=0.0))
         if not broken <= TOLERANCE:
-            raise ConvergenceError(f"{name} is violated by {broken:.3g} in the solver's result; scale or loosen it")
+            raise ConvergenceError(
+                Message(
+                    "constraint-violated",
+                    "{name} is violated by {broken:.3g} in the solver's result; scale or loosen it",
+                    name=name,
+                    broken=broken,
+                )
+            )
     found = []
     for item in prepared:
         curve = item.smoother.expand(np.asarray(inner[item.name].value)[:, None])[:, 0]
@@ -541,12 +560,29 @@ def _named(cp: Any, given: Any) -> dict[str, Any]:
     elif isinstance(given, Iterable):
         own = {f"constraint {k} ({str(rule)[:80]})": rule for k, rule in enumerate(given, 1)}
     else:
-        raise InputError(f"the callable returned {type(given).__name__}; return a list of cvxpy constraints")
+        raise InputError(
+            Message(
+                "constraints-no-list",
+                "the callable returned {kind}; return a list of cvxpy constraints",
+                kind=type(given).__name__,
+            )
+        )
     for name, rule in own.items():
         if not isinstance(rule, cp.constraints.constraint.Constraint):
-            raise InputError(f"{name} is a {type(rule).__name__}; return cvxpy constraints", field="constraints")
+            raise InputError(
+                Message(
+                    "constraint-not-cvxpy",
+                    "{name} is a {kind}; return cvxpy constraints",
+                    name=name,
+                    kind=type(rule).__name__,
+                ),
+                field="constraints",
+            )
         if not rule.is_dcp():
-            raise InputError(f"{name} is not convex; write it as a convex one", field="constraints")
+            raise InputError(
+                Message("constraint-not-convex", "{name} is not convex; write it as a convex one", name=name),
+                field="constraints",
+            )
     return own
 
 
@@ -562,7 +598,9 @@ def _solve(cp: Any, problem: Any) -> None:
         if problem.status != "user_limit":
             return
     if problem.status is None:
-        raise ConvergenceError("no solver could handle your constraints; scale or loosen them")
+        raise ConvergenceError(
+            Message("constraints-no-solver", "no solver could handle your constraints; scale or loosen them")
+        )
 
 
 def _relaxation(cp: Any, rules: Sequence[Any], own: Mapping[str, Any]) -> str:
@@ -677,9 +715,16 @@ def _fit(
             backward = item.bounds.excess(item.fixed.position_mm, free)[3]
             unit = error_named(item.name).unit
             raise InputError(
-                f"{item.name} is zero at both ends of the travel, so a monotone one would be zero everywhere; remove the "
-                f"direction of {item.name} (least relaxation: its fit has slopes of {1e3 * backward:.4g} {unit}/m "
-                "against it)",
+                Message(
+                    "monotone-zero-ends",
+                    "{name} is zero at both ends of the travel, so a monotone one would be zero "
+                    "everywhere; remove the direction of {name2} (least relaxation: its fit has slopes "
+                    "of {backward:.4g} {unit}/m against it)",
+                    name=item.name,
+                    name2=item.name,
+                    backward=1000.0 * backward,
+                    unit=unit,
+                ),
                 field="monotone",
             )
     solved = solve(prepared, mu) if constraints is None else solve_constrained(prepared, mu, constraints)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.names import CURVE_NAMES
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.fitting.zeroing import SAME_POSITION_MM, FixedCurve, Row
 from compgen.identification.covariance import Covariance
 from compgen.kinematics.kernel_switch import lapack
@@ -543,7 +543,15 @@ def curve_covariances(errors: ErrorTable, covariance: Covariance | Mapping[str, 
         return _blocks(errors, covariance)
     for name in covariance:
         if name not in CURVE_NAMES:
-            raise InputError(f"{name!r} is not one of the 18 curves; {nearest(name, CURVE_NAMES)}", field="covariance")
+            raise InputError(
+                Message(
+                    "covariance-curve-unknown",
+                    "{name!r} is not one of the 18 curves; {name2}",
+                    name=name,
+                    name2=nearest(name, CURVE_NAMES),
+                ),
+                field="covariance",
+            )
     found = {name: np.asarray(covariance[name], dtype=float) for name in errors.curves if name in covariance}
     for name, matrix in found.items():
         _check(name, errors.curves[name], matrix)
@@ -560,8 +568,12 @@ def _blocks(errors: ErrorTable, covariance: Covariance) -> dict[str, FloatArray]
         same = len(at) == len(curve.position_mm)
         if not same or np.abs(covariance.position_mm[at] - curve.position_mm).max() > SAME_POSITION_MM:
             raise InputError(
-                f"the covariance of {name} belongs to other nodes than those of the table; give the one that was "
-                "written with it",
+                Message(
+                    "covariance-other-nodes",
+                    "the covariance of {name} belongs to other nodes than those of the table; give the "
+                    "one that was written with it",
+                    name=name,
+                ),
                 field="covariance",
             )
         rows = covariance.errors_factor[at]
@@ -572,10 +584,33 @@ def _blocks(errors: ErrorTable, covariance: Covariance) -> dict[str, FloatArray]
 def _check(name: str, curve: Curve, matrix: FloatArray) -> None:
     n = len(curve.position_mm)
     if matrix.shape != (n, n):
-        raise InputError(f"{name} has {n} nodes and a covariance of shape {matrix.shape}; it needs ({n}, {n})")
+        raise InputError(
+            Message(
+                "covariance-shape",
+                "{name} has {n} nodes and a covariance of shape {shape}; it needs ({n2}, {n3})",
+                name=name,
+                n=n,
+                shape=matrix.shape,
+                n2=n,
+                n3=n,
+            )
+        )
     top = float(np.abs(matrix).max()) if np.isfinite(matrix).all() else -1.0
     if top < 0 or np.abs(matrix - matrix.T).max() > _MATRIX_ROUNDING * top:
-        raise InputError(f"the covariance of {name} is not finite and symmetric; give that of its nodes")
+        raise InputError(
+            Message(
+                "covariance-not-symmetric",
+                "the covariance of {name} is not finite and symmetric; give that of its nodes",
+                name=name,
+            )
+        )
     lowest = float(np.linalg.eigvalsh(matrix)[0])
     if lowest < -_MATRIX_ROUNDING * top * n:
-        raise InputError(f"the covariance of {name} has a negative variance ({lowest:.3g}); give that of its nodes")
+        raise InputError(
+            Message(
+                "covariance-negative",
+                "the covariance of {name} has a negative variance ({lowest:.3g}); give that of its nodes",
+                name=name,
+                lowest=lowest,
+            )
+        )

@@ -12,7 +12,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable, about_own_lines, is_apart
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, SQUARENESS_NAMES, error_named
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, Message
 from compgen.kinematics import coefficients, modelled_errors, observable_errors
 
 # Curves that are zero at their fixed points: straightness at both travel ends, the others at the reference point.
@@ -93,17 +93,31 @@ def fix_to_zero(machine: Machine, name: str, given: Curve, covariance: FloatArra
     ``covariance`` (n, n) of the given nodes replaces their uncertainties.
     """
     if not (np.isfinite(given.value).all() and np.isfinite(given.position_mm).all()):
-        raise InputError("contains a value or position that is not finite; remove that node", field=name)
+        raise InputError(
+            Message("node-not-finite", "contains a value or position that is not finite; remove that node"), field=name
+        )
     if np.any(given.u < 0) or np.any(np.isinf(given.u)):
-        raise InputError("has a negative or infinite uncertainty; give a number >= 0 or leave it empty", field=name)
+        raise InputError(
+            Message("node-u-negative", "has a negative or infinite uncertainty; give a number >= 0 or leave it empty"),
+            field=name,
+        )
     curve, axis = given, error_named(name).axis
     low, high = machine.axes[axis].range_mm
     before, after = given.position_mm[0] > low + SAME_POSITION_MM, given.position_mm[-1] < high - SAME_POSITION_MM
     if before or after:  # add nodes with the end values at travel ends that the curve does not reach
         warnings.warn(
-            f"{name} is known from {given.position_mm[0]:g} to {given.position_mm[-1]:g} mm, but {AXES[axis]} travels "
-            f"from {low:g} to {high:g} mm; beyond that nothing was measured: its end values stand there, and only U of the "
-            "verification says how far they may be wrong",
+            Message(
+                "curve-beyond-known",
+                "{name} is known from {position_mm:g} to {position_mm2:g} mm, but {value} travels "
+                "from {low:g} to {high:g} mm; beyond that nothing was measured: its end values stand "
+                "there, and only U of the verification says how far they may be wrong",
+                name=name,
+                position_mm=given.position_mm[0],
+                position_mm2=given.position_mm[-1],
+                value=AXES[axis],
+                low=low,
+                high=high,
+            ),
             CompgenWarning,
             stacklevel=4,
         )
@@ -229,7 +243,12 @@ def decompose(machine: Machine, curves: Mapping[str, FixedCurve]) -> tuple[Frame
         for field, removed in zip(removed_fields(machine, name, fixed), fixed.removed, strict=True):
             parts = inverse @ field.ravel()
             if np.abs(basis @ parts - field.ravel()).max() > 1e-9 * np.abs(field).max():
-                raise InputError("leaves a field that neither squareness nor a rigid motion can absorb", field=name)
+                raise InputError(
+                    Message(
+                        "field-not-absorbed", "leaves a field that neither squareness nor a rigid motion can absorb"
+                    ),
+                    field=name,
+                )
             parts[np.abs(parts) < 1e-13 * np.abs(parts).max()] = 0.0
             total += parts * removed
             shares.append(parts * (abs(removed) > NOTHING))
@@ -298,9 +317,14 @@ def zero_ends(machine: Machine, errors: ErrorTable, covariance: Mapping[str, Flo
     told_apart = [name for name in curves if name not in one_tool]
     if told_apart and np.abs(np.subtract(change.tool_rotation_rad, change.rotation_rad)).max() > NOTHING:
         warnings.warn(
-            f"a rotation is removed from the curves; E stays the same for the machine's tool offset "
-            f"{machine.tool_offset_mm} mm and changes by a constant for the other tools that "
-            f"{', '.join(told_apart)} refer to",
+            Message(
+                "rotation-removed-tools",
+                "a rotation is removed from the curves; E stays the same for the machine's tool "
+                "offset {tool_offset_mm} mm and changes by a constant for the other tools that "
+                "{told_apart} refer to",
+                tool_offset_mm=machine.tool_offset_mm,
+                told_apart=", ".join(told_apart),
+            ),
             CompgenWarning,
             stacklevel=3,
         )
@@ -325,8 +349,16 @@ def _no_room(machine: Machine, name: str, value: float, curves: Mapping[str, Fix
     ]
     sources.sort(key=ERROR_NAMES.index)
     return InputError(
-        f"the end-to-end line or constant of {', '.join(sources)} is {1e6 * value:.3f} urad of {name}, which the "
-        f"machine's model leaves out; add {name} to its errors, or give curves that are zero at their ends",
+        Message(
+            "line-into-squareness",
+            "the end-to-end line or constant of {sources} is {value:.3f} urad of {name}, which "
+            "the machine's model leaves out; add {name2} to its errors, or give curves that are "
+            "zero at their ends",
+            sources=", ".join(sources),
+            value=1000000.0 * value,
+            name=name,
+            name2=name,
+        ),
         file=machine.source,
         field="errors",
     )

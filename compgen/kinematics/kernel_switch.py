@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.resources import cache_folder
 
 # The switch between compiled kernels (numba, ``pip install compgen[fast]``) and their plain forms (numpy).
@@ -45,7 +45,14 @@ def kernel_choice() -> str:
     """Value of ``COMPGEN_KERNELS``: auto, compiled or plain; InputError for anything else."""
     choice = os.environ.get(VARIABLE, "").strip().lower() or AUTO
     if choice not in (AUTO, COMPILED, PLAIN):
-        raise InputError(f"{VARIABLE} is {choice!r}; set it to auto, compiled or plain")
+        raise InputError(
+            Message(
+                "kernels-unknown-choice",
+                "{value} is {choice!r}; set it to auto, compiled or plain",
+                value=VARIABLE,
+                choice=choice,
+            )
+        )
     return choice
 
 
@@ -64,7 +71,11 @@ def use_compiled(size: int, enough: int) -> bool:
         return True
     if choice == COMPILED:
         raise InputError(
-            f"{VARIABLE} is 'compiled', but numba cannot be imported; install compgen[fast] or set it to auto or plain"
+            Message(
+                "kernels-no-numba",
+                "{value} is 'compiled', but numba cannot be imported; install compgen[fast] or set it to auto or plain",
+                value=VARIABLE,
+            )
         )
     return False
 

@@ -16,7 +16,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable
 from compgen.data.machine import Emphasis, Machine
 from compgen.data.names import ERRORS, error_named
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.first_order import coefficients, tool_of
 from compgen.kinematics.kernel_switch import one_thread, use_compiled
 
@@ -503,7 +503,13 @@ def checked_out(out: FloatArray | None, shape: tuple[int, ...]) -> FloatArray:
         return np.empty(shape)
     if out.shape != shape or out.dtype != np.float64 or not out.flags.c_contiguous or not out.flags.writeable:
         raise InputError(
-            f"out has the shape {out.shape} and type {out.dtype}; expected a writeable C-ordered float64 array {shape}"
+            Message(
+                "out-array-unfit",
+                "out has the shape {shape} and type {dtype}; expected a writeable C-ordered float64 array {shape2}",
+                shape=out.shape,
+                dtype=out.dtype,
+                shape2=shape,
+            )
         )
     return out
 
@@ -610,10 +616,18 @@ def volumetric_error_on_grid(
     """
     levels = [np.asarray(level, dtype=np.float64) for level in levels_mm]
     if len(levels) != 3 or any(level.ndim != 1 for level in levels):
-        raise InputError("a grid needs three lists of levels in mm: those of X, of Y and of Z")
+        raise InputError(
+            Message("grid-levels-missing", "a grid needs three lists of levels in mm: those of X, of Y and of Z")
+        )
     tool = tool_of(machine, tool_mm)
     if tool.shape != (3,):
-        raise InputError(f"tool offsets have the shape {tool.shape}; a grid has one tool, (3,) in mm")
+        raise InputError(
+            Message(
+                "grid-one-tool",
+                "tool offsets have the shape {shape}; a grid has one tool, (3,) in mm",
+                shape=tool.shape,
+            )
+        )
     shape = (len(levels[0]), len(levels[1]), len(levels[2]), 3)
     result = checked_out(out, shape)
     if result.size == 0:

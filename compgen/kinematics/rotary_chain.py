@@ -23,7 +23,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import OPPOSITE, ROTARY, Machine
 from compgen.data.names import AXES, ERROR_NAMES
 from compgen.data.rotary import RotaryErrors
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.exact_chain import cross_matrices, level_rotations, rotate, travel_vectors
 
 
@@ -34,7 +34,12 @@ def _own_axes(letter: str, direction: tuple[float, float, float]) -> FloatArray:
     cosine = float(along @ u)
     if cosine < -OPPOSITE:
         raise InputError(
-            f"direction of {letter} is opposite to its axis; reverse the sign of its angles", field="direction"
+            Message(
+                "rotary-direction-opposite",
+                "direction of {letter} is opposite to its axis; reverse the sign of its angles",
+                letter=letter,
+            ),
+            field="direction",
         )
     matrix = cross_matrices(np.cross(along, u)[None])[0]
     return np.asarray(np.eye(3) + matrix + matrix @ matrix / (1.0 + cosine))

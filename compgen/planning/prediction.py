@@ -21,7 +21,7 @@ from compgen.drawing.display import Drawable, Overview, Panel
 from compgen.effects import Card, Effect, Readings, catalogue
 from compgen.effects.all_effects import INVISIBLE, Pair, VisiblePart, alike_pairs, separating, visible_parts
 from compgen.effects.structure import SignError, Squareness
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identification.adjust.problem import LengthProblem, length_problem
 from compgen.identification.adjust.solver import ZERO_EIGENVALUE, Rank, describe_rank, unknown_names
@@ -143,7 +143,12 @@ def planned(machine: Machine, stations: PlannedStations, points: Points, noise: 
     if found.distances_mm()[nearest] < NEAREST_MM:
         where = ", ".join(f"{value:g}" for value in position_mm[nearest])
         raise InputError(
-            f"station {stations.names[station[nearest]]!r} coincides with the target at ({where}) mm; move it"
+            Message(
+                "station-at-target",
+                "station {names!r} coincides with the target at ({where}) mm; move it",
+                names=stations.names[station[nearest]],
+                where=where,
+            )
         )
     return found
 

@@ -14,7 +14,7 @@ from compgen.data.arguments import numbers, of_kind
 from compgen.data.csv_files import FloatArray, format_csv, read_csv
 from compgen.data.lengths import POSITION_COLUMNS
 from compgen.data.machine import Machine
-from compgen.errors import InputError, nearest, one_line
+from compgen.errors import InputError, Message, nearest, one_line
 
 #: Columns of the ``stations.csv`` of ``volcomp identify`` that a plan does not need.
 _OF_IDENTIFY = (
@@ -212,7 +212,14 @@ def regions_of(machine: Machine, stations: PlannedStations, boxes: Mapping[str, 
     """
     for name in boxes:
         if name not in stations.names:
-            raise InputError(f"the box {one_line(name)!r} belongs to no station; {nearest(name, stations.names)}")
+            raise InputError(
+                Message(
+                    "box-without-station",
+                    "the box {name!r} belongs to no station; {name2}",
+                    name=one_line(name),
+                    name2=nearest(name, stations.names),
+                )
+            )
     shell = shell_around(machine)
     return [boxes.get(name, shell) for name in stations.names]
 
@@ -225,9 +232,17 @@ def box_from_text(text: str) -> tuple[str, Box]:
     except ValueError:
         values = np.zeros(0)
     if not colon or not label or len(values) != 6 or not np.isfinite(values).all():
-        raise InputError(f"{one_line(text)!r} is not LABEL:xmin,xmax,ymin,ymax,zmin,zmax (mm)", field="--box")
+        raise InputError(
+            Message(
+                "box-not-readable", "{text!r} is not LABEL:xmin,xmax,ymin,ymax,zmin,zmax (mm)", text=one_line(text)
+            ),
+            field="--box",
+        )
     if np.any(values[0::2] > values[1::2]):
-        raise InputError(f"{one_line(text)!r} has a lower limit above the upper one", field="--box")
+        raise InputError(
+            Message("box-limits-crossed", "{text!r} has a lower limit above the upper one", text=one_line(text)),
+            field="--box",
+        )
     return label, Box(values[0::2], values[1::2])
 
 

@@ -14,7 +14,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.adjust.solver import factorise
 from compgen.identification.options import ReadingNoise
 from compgen.kinematics.kernel_switch import lapack, one_thread
@@ -264,7 +264,13 @@ def judge_trajectories(
     ``target_um`` is the largest allowed standard uncertainty of E in the volume, um.
     """
     if not (np.isfinite(target_um) and target_um > 0):
-        raise InputError(f"the target is {target_um:g} um; expected a number above zero")
+        raise InputError(
+            Message(
+                "target-not-positive",
+                "the target is {target_um:g} um; expected a number above zero",
+                target_um=target_um,
+            )
+        )
     judged: list[TrajectoryCandidate] = []
     with one_thread():
         for name, position_mm in candidate_trajectories(machine).items():
