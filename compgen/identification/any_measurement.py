@@ -19,7 +19,7 @@ from compgen.data.lengths import Lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import detect_format, may_be_large
-from compgen.errors import CompgenWarning, InputError, UndeterminedError, um_text
+from compgen.errors import CompgenWarning, InputError, Message, UndeterminedError, um_text
 from compgen.identification.adjust.propagation import SystematicInputs
 from compgen.identification.kinds import Measurement, MixedMeasurement, OneKind
 from compgen.identification.options import IdentifyOptions
@@ -170,7 +170,12 @@ def _least_squares(machine: Machine, measurement: OneKind, chosen: IdentifyOptio
     """Identify what the readings of one kind determine by themselves; InputError for options of another kind."""
     if isinstance(measurement, Lengths):
         if chosen.u_deviation_um is not None:
-            raise InputError("an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths")
+            raise InputError(
+                Message(
+                    "u-deviation-with-lengths",
+                    "an uncertainty of deviations (--u-deviation-um) was given, but the files contain lengths",
+                )
+            )
         return identify(machine, measurement, chosen)
     from compgen.data.length_archive import LengthArchive
 

@@ -18,7 +18,7 @@ from compgen.data.error_table import SIGNIFICANT, WORTH_MM, Curve, ErrorTable, R
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.prior import PriorSettings
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, Message, UndeterminedError
 from compgen.identification.adjust.determined import FINEST, USUAL_U, Observations
 from compgen.identification.adjust.unknowns import ErrorParameters, check_axis_travel, check_travel
 from compgen.identification.posterior import processes_of, root_of
@@ -72,8 +72,13 @@ def identify_axis_runs(machine: Machine, runs: AxisRuns) -> Identification:
     )
     letters = ", ".join(AXES[axis] for axis in runs.axes)
     warnings.warn(
-        f"positioning runs of {letters} show {', '.join(errors.names)} along the line that was measured; angular errors, "
-        "straightness and squareness were not measured",
+        Message(
+            "runs-show-positioning",
+            "positioning runs of {letters} show {names} along the line that was measured; "
+            "angular errors, straightness and squareness were not measured",
+            letters=letters,
+            names=", ".join(errors.names),
+        ),
         CompgenWarning,
         stacklevel=2,
     )
@@ -275,7 +280,11 @@ def identify_circles(machine: Machine, circles: Circles) -> Identification:
     errors = ErrorTable({}, squareness, metadata_of(machine, circles.metadata))
     for name in set(_of_planes(circles)) - set(rows):
         warnings.warn(
-            f"the arcs do not tell {name} from the centre, the scales or the servo mismatch",
+            Message(
+                "arcs-ambiguous",
+                "the arcs do not tell {name} from the centre, the scales or the servo mismatch",
+                name=name,
+            ),
             CompgenWarning,
             stacklevel=2,
         )
@@ -324,10 +333,20 @@ def check_ways(machine: Machine, circles: Circles) -> None:
         shown = " and ".join(f"{AXES[axis]} {value / MM_PER_UM:+.3g} um" for axis, value in ahead.items())
         first, second = list(PLANES)[plane]
         raise InputError(
-            f"the reversals of {shown} in {first}{second} say that both axes run ahead; an axis with play stays behind. Are "
-            f"clockwise and counter-clockwise exchanged? 1 is counter-clockwise, from +{first} to +{second}: exchange 1 and -1 "
-            "in the column direction, or, if the axes do run ahead (too much backlash compensation), add the comment "
-            f"'# {AHEAD} = true'",
+            Message(
+                "reversals-run-ahead",
+                "the reversals of {shown} in {first}{second} say that both axes run ahead; an axis "
+                "with play stays behind. Are clockwise and counter-clockwise exchanged? 1 is "
+                "counter-clockwise, from +{first2} to +{second2}: exchange 1 and -1 in the column "
+                "direction, or, if the axes do run ahead (too much backlash compensation), add the "
+                "comment '# {value} = true'",
+                shown=shown,
+                first=first,
+                second=second,
+                first2=first,
+                second2=second,
+                value=AHEAD,
+            ),
             file=file or None,
             field="column direction",
         )
@@ -443,13 +462,21 @@ class _Solution:
         inverse = (right[used].T / size[used]) @ left[:, used].T / scale[:, None]
         shown = np.einsum("ij,ij->j", right[used], right[used]) > 1 - 1e-6
         if not any(column.kind == "squareness" and shown[k] for k, column in enumerate(columns)):
-            raise UndeterminedError("the arcs are too short to tell squareness from the centre and the scales", [])
+            raise UndeterminedError(
+                Message("arcs-too-short", "the arcs are too short to tell squareness from the centre and the scales"),
+                [],
+            )
         value = inverse @ circles.deviation_mm
         residual = design @ value - circles.deviation_mm
         rank = int(np.count_nonzero(used))
         freedom = len(circles) - rank
         if freedom < 1:
-            raise UndeterminedError(f"{len(circles)} readings for {rank} unknowns", [])
+            raise UndeterminedError(
+                Message(
+                    "too-few-circle-readings", "{circles} readings for {rank} unknowns", circles=len(circles), rank=rank
+                ),
+                [],
+            )
         spread = float(np.sqrt(residual @ residual / freedom * correlated(circles, residual)))
         return cls(value, spread * inverse, shown, residual, freedom, spread, float(size[0] / size[used][-1]))
 
@@ -461,7 +488,11 @@ def circle_positions(machine: Machine, circles: Circles) -> FloatArray:
     if unknown.any():
         text = ", ".join(f"{AXES[k]} {middle[k]:g}" for k in range(3))
         warnings.warn(
-            f"the files do not state the centres of the circles; assumed in the middle of the travel ({text} mm)",
+            Message(
+                "circle-centres-assumed",
+                "the files do not state the centres of the circles; assumed in the middle of the travel ({text} mm)",
+                text=text,
+            ),
             CompgenWarning,
             stacklevel=3,
         )

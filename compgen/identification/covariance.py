@@ -25,7 +25,7 @@ from compgen.data.lengths import Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import ERROR_INDEX, LARGEST, SQUARENESS_NAMES, error_named
 from compgen.drawing.display import Displayed, Overview
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, Message
 from compgen.identification.adjust.propagation import Contribution, Systematic, SystematicInputs, responses
 from compgen.identification.adjust.unknowns import ErrorParameters
 from compgen.identification.result import Identification, table_of_values, worst_uncertainty
@@ -205,8 +205,14 @@ def posterior_with(machine: Machine, errors: ErrorTable, covariance: Covariance 
         found = covariance.posterior.of(machine)
         if replace(found.prior, factor=machine.prior.factor) != machine.prior:
             warnings.warn(
-                f"the errors were identified with the prior of class {found.prior.stated_class!r}, which stays; that stated now "
-                f"({machine.prior.stated_class!r}, [prior] of the machine file or --prior) counts when they are identified again",
+                Message(
+                    "prior-stays",
+                    "the errors were identified with the prior of class {stated_class!r}, which stays; "
+                    "that stated now ({stated_class2!r}, [prior] of the machine file or --prior) counts "
+                    "when they are identified again",
+                    stated_class=found.prior.stated_class,
+                    stated_class2=machine.prior.stated_class,
+                ),
                 CompgenWarning,
                 stacklevel=2,
             )
@@ -408,8 +414,14 @@ def read_covariance(path: str | Path, errors: str | Path | None = None) -> Covar
         digest = sha256_of(read_bytes(errors))
         if digest != covariance.errors_sha256:
             raise InputError(
-                f"belongs to another errors file (SHA-256 {covariance.errors_sha256[:12]}...) than {errors} "
-                f"({digest[:12]}...); give the errors file that was written with it, unchanged",
+                Message(
+                    "covariance-other-errors",
+                    "belongs to another errors file (SHA-256 {errors_sha256}...) than {errors} "
+                    "({digest}...); give the errors file that was written with it, unchanged",
+                    errors_sha256=covariance.errors_sha256[:12],
+                    errors=errors,
+                    digest=digest[:12],
+                ),
                 file=source,
             )
     return covariance
@@ -452,27 +464,49 @@ def covariance_named_by(path: Path, errors: ErrorTable) -> Covariance | None:
         own = covariance_or_independent(errors, None, found.machine)  # fitting added a squareness
         return None if own is None else replace(own, posterior=found.posterior)
     message = f"{covariance_file} belongs to another version of {path.name}; u_value is used instead"
-    warnings.warn(f"{message}, independent from node to node", CompgenWarning, stacklevel=2)
+    warnings.warn(
+        Message("node-independent", "{message}, independent from node to node", message=message),
+        CompgenWarning,
+        stacklevel=2,
+    )
     return None
 
 
 def parse_covariance(content: bytes, source: Path) -> Covariance:
     """Read the contents of a ``*.covariance.npz`` file; ``source`` is the name in messages."""
     if not content.startswith(b"PK"):
-        raise InputError("is not a covariance file (*.covariance.npz, written by volcomp identify)", file=source)
+        raise InputError(
+            Message(
+                "covariance-file-unknown", "is not a covariance file (*.covariance.npz, written by volcomp identify)"
+            ),
+            file=source,
+        )
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             members = {name: archive[name] for name in archive.files}
             for name, array in members.items():
                 if not isinstance(array, np.ndarray):  # numpy returns the bytes of what does not begin as an array
-                    raise ValueError(f"{name} is not an array")
+                    raise ValueError(Message("covariance-no-array", "{name} is not an array", name=name))
     except Exception as error:  # what reads archives raises errors of many kinds: struct, tokenize, zlib
-        raise InputError(f"cannot be read: is it truncated or damaged? ({error})", file=source) from error
+        raise InputError(
+            Message("covariance-damaged", "cannot be read: is it truncated or damaged? ({error})", error=error),
+            file=source,
+        ) from error
     if str(members.get("format", "")) != FORMAT:
-        raise InputError(f"is not a covariance file of this version (format {FORMAT!r})", file=source)
+        raise InputError(
+            Message("covariance-version", "is not a covariance file of this version (format {value!r})", value=FORMAT),
+            file=source,
+        )
     missing = [name for name in _MEMBERS if name not in members]
     if missing:
-        raise InputError(f"lacks {', '.join(missing)}; write it again with volcomp identify", file=source)
+        raise InputError(
+            Message(
+                "covariance-incomplete",
+                "lacks {missing}; write it again with volcomp identify",
+                missing=", ".join(missing),
+            ),
+            file=source,
+        )
     return _checked(source, members)
 
 
@@ -504,18 +538,45 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
         )
     except (ValueError, TypeError) as error:
         raise InputError(
-            f"contains something other than numbers where numbers are expected: {error}", file=source
+            Message(
+                "covariance-no-numbers",
+                "contains something other than numbers where numbers are expected: {error}",
+                error=error,
+            ),
+            file=source,
         ) from error
     unknown = [name for name in covariance.error if name not in ERROR_INDEX]
     if unknown:
-        raise InputError(f"contains {unknown[0]!r}, which is not one of the 21 errors", file=source)
+        raise InputError(
+            Message(
+                "covariance-error-unknown",
+                "contains {unknown!r}, which is not one of the 21 errors",
+                unknown=unknown[0],
+            ),
+            file=source,
+        )
     count = len(covariance.error)
     rows = count + 3 * len(covariance.stations) + len(covariance.station)
     shapes = (covariance.position_mm.shape, covariance.setup.shape, covariance.factor.shape[:1], covariance.factor.ndim)
     if shapes != ((count,), (len(covariance.station),), (rows,), 2):
-        raise InputError(f"its parts do not match: {count} error values, shapes {shapes}", file=source)
+        raise InputError(
+            Message(
+                "covariance-parts",
+                "its parts do not match: {count} error values, shapes {shapes}",
+                count=count,
+                shapes=shapes,
+            ),
+            file=source,
+        )
     if not (np.abs(covariance.factor) <= LARGEST).all():
-        raise InputError(f"the factor contains numbers that are not finite, or above {LARGEST:g}", file=source)
+        raise InputError(
+            Message(
+                "covariance-not-finite",
+                "the factor contains numbers that are not finite, or above {value:g}",
+                value=LARGEST,
+            ),
+            file=source,
+        )
     for name in dict.fromkeys(covariance.error):
         position = covariance.position_mm[np.array(covariance.error) == name]
         if name in SQUARENESS_NAMES:
@@ -523,5 +584,12 @@ def _checked(source: Path, members: dict[str, NDArray[np.generic]]) -> Covarianc
         else:
             right = bool(np.isfinite(position).all() and np.all(np.diff(position) > 0))
         if not right:
-            raise InputError(f"the positions of {name} are not those of one error in ascending order", file=source)
+            raise InputError(
+                Message(
+                    "covariance-positions",
+                    "the positions of {name} are not those of one error in ascending order",
+                    name=name,
+                ),
+                file=source,
+            )
     return covariance

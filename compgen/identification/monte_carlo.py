@@ -15,7 +15,7 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.covariance import Covariance
 from compgen.identification.options import IdentifyOptions
 from compgen.identification.result import Identification
@@ -82,7 +82,13 @@ def self_check(
     """
     adjustment = result.adjustment
     if replicates < 10 or adjustment is None or result.method != "joint":
-        raise InputError(f"a self-check needs at least 10 replicates of the joint method, not {replicates}")
+        raise InputError(
+            Message(
+                "self-check-few",
+                "a self-check needs at least 10 replicates of the joint method, not {replicates}",
+                replicates=replicates,
+            )
+        )
     used = np.flatnonzero(result.accepted)
     sigma_mm = adjustment.sigma_mm / np.sqrt(adjustment.weight[used])
     model_mm = (lengths.length_mm + result.residual_mm)[used]

@@ -34,7 +34,7 @@ from compgen.data.names import (
     error_named,
 )
 from compgen.data.toml_files import flag, not_negative, option
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.identification.adjust.propagation import SystematicInputs
 from compgen.identification.adjust.starts import station_start
 from compgen.identification.adjust.unknowns import IntArray, KnownPositions, State
@@ -125,7 +125,14 @@ def _locate(name: str, target_mm: FloatArray, length_mm: FloatArray, group: IntA
     groups = int(group.max()) + 1
     freedom = len(length_mm) - 3 - groups
     if freedom < 1:
-        raise InputError(f"station {name!r} has only {len(length_mm)} reading(s); it cannot be located")
+        raise InputError(
+            Message(
+                "station-few-readings",
+                "station {name!r} has only {length_mm} reading(s); it cannot be located",
+                name=name,
+                length_mm=len(length_mm),
+            )
+        )
     start = station_start(target_mm, length_mm, group, groups)
     unknowns = np.concatenate([start.position_mm, start.dead_length_mm])
     for _ in range(20):
@@ -273,7 +280,15 @@ class IdentifyOptions:
             ("nodes", ("machine", "from-data")),
         ):  # fmt: skip
             if text_of(name, getattr(self, name)) not in allowed:
-                raise InputError(f"{getattr(self, name)!r} is not known; give {' or '.join(allowed)}", field=name)
+                raise InputError(
+                    Message(
+                        "choice-unknown",
+                        "{value!r} is not known; give {allowed}",
+                        value=getattr(self, name),
+                        allowed=" or ".join(allowed),
+                    ),
+                    field=name,
+                )
         if not (isinstance(self.stations, str) and self.stations == "nominal"):
             of_kind("stations", self.stations, KnownStations, type(None))
 
@@ -320,7 +335,14 @@ def reading_noise(lengths: Lengths, options: IdentifyOptions) -> ReadingNoise:
         return ReadingNoise("assumed", ASSUMED_U_UM, ASSUMED_U_UM_PER_M, column)
     values = (constant or 0.0, proportional or 0.0)
     if min(values) < 0 or not sum(values) > 0 or not np.isfinite(sum(values)):
-        raise InputError(f"the uncertainty of a length is {values[0]:g} um + {values[1]:g} um/m; it must be above zero")
+        raise InputError(
+            Message(
+                "u-length-not-positive",
+                "the uncertainty of a length is {values:g} um + {values2:g} um/m; it must be above zero",
+                values=values[0],
+                values2=values[1],
+            )
+        )
     return ReadingNoise("stated", *values, column)
 
 
@@ -345,7 +367,9 @@ def number_in_comment(readings: Lengths | Deviations | Artefact, key: str) -> fl
         return float(text)
     except ValueError:
         file = readings.origin[0][0] if readings.origin else None
-        raise InputError(f"the comment {key} = {text!r} is not a number", file=file) from None
+        raise InputError(
+            Message("comment-not-number", "the comment {key} = {text!r} is not a number", key=key, text=text), file=file
+        ) from None
 
 
 def deviation_sigma(deviations: Deviations, options: IdentifyOptions) -> tuple[FloatArray, str]:
@@ -365,7 +389,13 @@ def stated_deviation_um(readings: Deviations | Artefact, options: IdentifyOption
     stated = options.u_deviation_um
     stated = number_in_comment(readings, key) if stated is None else stated
     if stated is not None and not 0 < stated < np.inf:
-        raise InputError(f"the uncertainty of a deviation is {stated:g} um; it must be above zero")
+        raise InputError(
+            Message(
+                "u-deviation-not-positive",
+                "the uncertainty of a deviation is {stated:g} um; it must be above zero",
+                stated=stated,
+            )
+        )
     return stated
 
 
@@ -478,16 +508,28 @@ class StatedNumbers:
             arms = tuple(float(match[k] or match[1]) * scale for k in (1, 2)) if match else (0.0, 0.0)
             if not min(arms) > 0.0:
                 raise InputError(
-                    f"{text!r} for {name}: {span.strip()!r} is no length of arms; give it in mm, such as 25±3@300, or that of "
-                    "both arms, 25±3@300x200",
+                    Message(
+                        "arms-no-length",
+                        "{text!r} for {name}: {span!r} is no length of arms; give it in mm, such as "
+                        "25±3@300, or that of both arms, 25±3@300x200",
+                        text=text,
+                        name=name,
+                        span=span.strip(),
+                    ),
                     field="--squareness",
                 )
             axes = [machine.axes[error_named(curve).axis] for curve in ARMS[name]]
             if all(arm > axis.length_mm + 1.0 for arm, axis in zip(arms, axes, strict=True)):
                 travels = " and ".join(f"{axis.length_mm:g}" for axis in axes)
                 raise InputError(
-                    f"{text!r} for {name}: the arms are longer than the travel of both axes ({travels} mm); give the length over "
-                    "which the square was read, mm",
+                    Message(
+                        "arms-too-long",
+                        "{text!r} for {name}: the arms are longer than the travel of both axes ({travels} "
+                        "mm); give the length over which the square was read, mm",
+                        text=text,
+                        name=name,
+                        travels=travels,
+                    ),
                     field="--squareness",
                 )
             found[name] = (arms[0], arms[1])
@@ -550,7 +592,9 @@ class StatedNumbers:
 
 def _axis(letter: str, option_name: str) -> str:
     if letter not in AXES:
-        raise InputError(f"{letter!r} is not an axis; expected X, Y or Z", field=option_name)
+        raise InputError(
+            Message("axis-unknown", "{letter!r} is not an axis; expected X, Y or Z", letter=letter), field=option_name
+        )
     return letter
 
 
@@ -561,21 +605,43 @@ def _value(text: str, units: Mapping[str, float], option_name: str, name: str) -
     if found is None or (unit is not None and unit not in units) or (found[2] and (units is LENGTHS or unit)):
         ratio = ", or a ratio such as 0.02/300" if units is ANGLES else ""
         raise InputError(
-            f"{text!r} for {name} is not understood; give a number, ±U if it is known, and a unit "
-            f"({', '.join(key for key in units if key.isascii())}; {next(iter(units))} without{ratio}), for example 25±3",
+            Message(
+                "stated-not-understood",
+                "{text!r} for {name} is not understood; give a number, ±U if it is known, and a unit "
+                "({units}; {units2} without{ratio}), for example 25±3",
+                text=text,
+                name=name,
+                units=", ".join(key for key in units if key.isascii()),
+                units2=next(iter(units)),
+                ratio=ratio,
+            ),
             field=option_name,
         )
     if unit is None and not found[2]:
         _check_size(found, units, option_name, name)
     length = float(found[2]) if found[2] else 1.0
     if not SMALLEST < length < LARGEST:
-        raise InputError(f"{text!r} for {name}: the length of a ratio is above zero, mm", field=option_name)
+        raise InputError(
+            Message(
+                "ratio-length-not-positive",
+                "{text!r} for {name}: the length of a ratio is above zero, mm",
+                text=text,
+                name=name,
+            ),
+            field=option_name,
+        )
     by = 1.0 / length if found[2] else units[unit or next(iter(units))]
     value, u = float(found[1]) * by, abs(float(found[3]) * by) if found[3] else np.nan
     most = LARGEST_MM if units is LENGTHS else LARGEST_RAD
     if not abs(value) <= most or u > most:
         raise InputError(
-            f"{text!r} for {name} is too large to be an error of a machine; check the unit", field=option_name
+            Message(
+                "stated-too-large",
+                "{text!r} for {name} is too large to be an error of a machine; check the unit",
+                text=text,
+                name=name,
+            ),
+            field=option_name,
         )
     return value, float(u)
 
@@ -589,7 +655,23 @@ def _check_size(found: re.Match[str], units: Mapping[str, float], option_name: s
         text = found[0].strip()
         usual = "um/m" if option_name == "--scale" else usual
         raise InputError(
-            f"{name}={text}: a number without a unit is {usual}, and this one looks like {larger}; write {name}={text}{larger} "
-            f"for {in_usual:g} {usual}, or {name}={text}{usual}",
+            Message(
+                "stated-unit-doubtful",
+                "{name}={text}: a number without a unit is {usual}, and this one looks like "
+                "{larger}; write {name2}={text2}{larger2} for {in_usual:g} {usual2}, or "
+                "{name3}={text3}{usual3}",
+                name=name,
+                text=text,
+                usual=usual,
+                larger=larger,
+                name2=name,
+                text2=text,
+                larger2=larger,
+                in_usual=in_usual,
+                usual2=usual,
+                name3=name,
+                text3=text,
+                usual3=usual,
+            ),
             field=option_name,
         )

@@ -18,7 +18,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import MEASURED_COLUMNS
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, Message, UndeterminedError
 from compgen.identification.adjust.determined import FAINTER, SHOWS, Determined, Observations, least_squares
 from compgen.identification.adjust.problem import SeparationProblem
 from compgen.identification.adjust.propagation import Adjustment
@@ -147,8 +147,13 @@ def identify_with_free_pose(machine: Machine, deviations: Deviations, options: I
     texts = [f"{name} at {', '.join(f'{value:g}' for value in nodes)} mm" for name, nodes in solution.unreached.items()]
     if texts:
         warnings.warn(
-            f"no reading reaches {'; '.join(texts[:6])}{' ...' if len(texts) > 6 else ''}: these nodes follow their "
-            "neighbours by smoothness, with the uncertainty of an extrapolation",
+            Message(
+                "nodes-not-reached",
+                "no reading reaches {texts}{texts2}: these nodes follow their neighbours by "
+                "smoothness, with the uncertainty of an extrapolation",
+                texts="; ".join(texts[:6]),
+                texts2=" ..." if len(texts) > 6 else "",
+            ),
             CompgenWarning,
             stacklevel=3,
         )
@@ -168,8 +173,13 @@ def _at_20_degrees(deviations: Deviations) -> Deviations:
         expansion = float(text) * 1e-6
     except ValueError:
         raise InputError(
-            f"has {' and '.join(n for n in names if n in deviations.covariates)}, but the comment expansion_um_per_m_k is "
-            f"{text!r}; give the part's coefficient of expansion, e.g. # expansion_um_per_m_k = 11.5",
+            Message(
+                "part-expansion-comment",
+                "has {names}, but the comment expansion_um_per_m_k is {text!r}; give the part's "
+                "coefficient of expansion, e.g. # expansion_um_per_m_k = 11.5",
+                names=" and ".join(n for n in names if n in deviations.covariates),
+                text=text,
+            ),
             file=deviations.origin[0][0] if deviations.origin else None,
         ) from None
     measured, machined = (np.nan_to_num(deviations.covariates.get(n, 20.0) - np.array(20.0)) for n in names)
@@ -396,8 +406,12 @@ def identify_artefact(machine: Machine, artefact: Artefact, options: IdentifyOpt
     errors, values_factor = values_with_factor(solution.layout, solution.unknowns, solution.factor * adjusted.u_scale)
     if not artefact.calibrated.all() and {"EXX", "EYY", "EZZ"} & set(solution.partly):
         warnings.warn(
-            f"an artefact that is not calibrated does not show a common scale of the axes: {_open_scale(machine)}; give a length "
-            "as well, for example an axis run (*.axis.csv)",
+            Message(
+                "artefact-scale-unknown",
+                "an artefact that is not calibrated does not show a common scale of the axes: "
+                "{machine}; give a length as well, for example an axis run (*.axis.csv)",
+                machine=_open_scale(machine),
+            ),
             CompgenWarning,
             stacklevel=3,
         )

@@ -27,7 +27,7 @@ from compgen.data.error_table import ARMS, Curve, ErrorTable
 from compgen.data.machine import Axis, Machine
 from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
 from compgen.data.prior import DETERMINED, PriorSettings
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.adjust.determined import LEVER_MM, Observations
 from compgen.identification.adjust.unknowns import ErrorParameters, error_parameters, state_names
 from compgen.kinematics.first_order import c_matrix
@@ -613,7 +613,7 @@ class StoredPosterior:
             names = tuple(str(name) for name in members["posterior_names"].ravel())
             prior = json.loads(str(members["posterior_prior"]))
         except KeyError as error:
-            raise ValueError(f"{error.args[0]} is missing") from error
+            raise ValueError(Message("part-missing", "{args} is missing", args=error.args[0])) from error
         finite = all(np.isfinite(array).all() for key, array in numbers.items() if key != "spans_mm")
         shapes = numbers["sizes"].shape == (len(names), 4) and numbers["factor"].shape[:1] == numbers["mean"].shape
         known = all(name in ERROR_INDEX for name in names) and isinstance(prior, dict)
@@ -635,7 +635,12 @@ def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
     layout = error_parameters(machine, stored.names)
     if far > OTHER_TRAVEL_MM or layout.size != len(stored.mean):
         raise InputError(
-            f"the covariance file belongs to another travel than that of machine {machine.name!r}; identify the errors again"
+            Message(
+                "posterior-other-travel",
+                "the covariance file belongs to another travel than that of machine {name!r}; "
+                "identify the errors again",
+                name=machine.name,
+            )
         )
     prior = PriorSettings.from_stated(stored.prior)
     sizes = dict(zip(stored.names, stored.sizes.tolist(), strict=True))
@@ -647,7 +652,12 @@ def restored(machine: Machine, stored: StoredPosterior) -> Posterior:
     squareness = {name: size[0] for name, size in sizes.items() if name in SQUARENESS_NAMES}
     columns = [name for name, _ in layout.columns()]
     if columns != list(stored.names):
-        raise InputError("the errors of the covariance file are not in their usual order; identify the errors again")
+        raise InputError(
+            Message(
+                "posterior-order",
+                "the errors of the covariance file are not in their usual order; identify the errors again",
+            )
+        )
     return Posterior(
         layout.machine, prior, processes, squareness, stored.names, stored.mean, stored.factor, stored.spans_mm,
         follows_table=stored.follows_table,
@@ -766,8 +776,11 @@ def solve_posterior(
         return _solved_posterior(machine, layout, information, spans_mm, learn=learn, passes=passes)
     except np.linalg.LinAlgError:
         raise InputError(
-            "the readings and their uncertainties differ so much in size that nothing is left after rounding; check the units of "
-            "values and uncertainties"
+            Message(
+                "readings-lost-in-rounding",
+                "the readings and their uncertainties differ so much in size that nothing is left "
+                "after rounding; check the units of values and uncertainties",
+            )
         ) from None
 
 

@@ -14,7 +14,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, Message
 from compgen.identification.adjust.propagation import Adjustment
 from compgen.identification.adjust.residual_tests import (
     ResidualSeries,
@@ -192,7 +192,14 @@ def reading_conditions(machine: Machine, lengths: Lengths, *, temperature: bool 
     text = lengths.metadata.get("wavelength_compensated", "true").lower()
     if text not in ("true", "yes", "1", "false", "no", "0"):
         file = lengths.origin[0][0] if lengths.origin else None
-        raise InputError(f"the comment wavelength_compensated = {text!r} is neither true nor false", file=file)
+        raise InputError(
+            Message(
+                "comment-not-boolean",
+                "the comment wavelength_compensated = {text!r} is neither true nor false",
+                text=text,
+            ),
+            file=file,
+        )
     if text in ("false", "no", "0"):
         # index of the air at each reading (n,), and the one assumed by the instrument
         temperature_c = lengths.covariates.get("temp_ambient_c")
@@ -230,8 +237,14 @@ def _growth(machine: Machine, lengths: Lengths) -> tuple[FloatArray, dict[str, A
         if axis.expansion_um_per_m_k is None:
             if spread > NOTABLE_K:
                 warnings.warn(
-                    f"the temperature of {name} varies by {spread:.1f} K, and the machine file has no "
-                    f"[axes.{name}] expansion_um_per_m_k: the readings are not corrected",
+                    Message(
+                        "temperature-not-corrected",
+                        "the temperature of {name} varies by {spread:.1f} K, and the machine file has no "
+                        "[axes.{name2}] expansion_um_per_m_k: the readings are not corrected",
+                        name=name,
+                        spread=spread,
+                        name2=name,
+                    ),
                     CompgenWarning,
                     stacklevel=5,
                 )
@@ -253,7 +266,7 @@ def _check_complete(lengths: Lengths, column: str, values: FloatArray) -> None:
     if missing.size:
         file, line = lengths.origin[int(missing[0])] if lengths.origin else (None, None)
         raise InputError(
-            "is known for only some of the readings; give it in every file or in none",
+            Message("known-for-some", "is known for only some of the readings; give it in every file or in none"),
             file=file,
             line=line,
             field=f"column {column}",
@@ -266,7 +279,17 @@ def _metadata_number(lengths: Lengths, key: str, default: float, allowed: tuple[
         return default
     if not allowed[0] <= value <= allowed[1]:
         file = lengths.origin[0][0] if lengths.origin else None
-        raise InputError(f"the comment {key} = {value:g} must be within {allowed[0]:g} ... {allowed[1]:g}", file=file)
+        raise InputError(
+            Message(
+                "comment-out-of-range",
+                "the comment {key} = {value:g} must be within {allowed:g} ... {allowed2:g}",
+                key=key,
+                value=value,
+                allowed=allowed[0],
+                allowed2=allowed[1],
+            ),
+            file=file,
+        )
     return value
 
 

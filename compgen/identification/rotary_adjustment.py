@@ -21,7 +21,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.data.prior import CLASSES
 from compgen.data.rotary import SPINDLE, RotaryErrors, position_names, si_per_unit, unit_of
-from compgen.errors import ConvergenceError
+from compgen.errors import ConvergenceError, Message
 from compgen.identification.rotary_linear import LinearAt, LinearState
 from compgen.identification.rotary_readings import PoseReadings, SpheresAt
 from compgen.kinematics.rotary_chain import linear_columns, pose_of_values
@@ -222,7 +222,10 @@ def solve(problem: Problem, u_mm: FloatArray, start: FloatArray | None = None) -
             break
     else:
         raise ConvergenceError(
-            "the position errors of the rotary axes were not found; are the angles and the chain right?"
+            Message(
+                "rotary-errors-not-found",
+                "the position errors of the rotary axes were not found; are the angles and the chain right?",
+            )
         )
     inverse = np.linalg.inv(normal)
     leverage = np.einsum("ij,jk,ik->i", jacobian, inverse, jacobian)

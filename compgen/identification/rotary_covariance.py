@@ -15,7 +15,7 @@ from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, SQUARENESS_NAMES
 from compgen.data.rotary import Poses, RotaryErrors, si_per_unit
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.covariance import Covariance, covariance_named_by
 from compgen.identification.rotary_linear import LinearState
 from compgen.kinematics.rotary_chain import linear_columns, pose_error
@@ -52,7 +52,12 @@ def known_covariance(errors: Path, rotary: RotaryErrors) -> Known:
     found = constant_covariance(errors, rotary)
     if (found is None and rotary.constants) or unknown:
         names = ", ".join(unknown or [name for name, (_, u) in rotary.constants.items() if np.isnan(u)])
-        raise InputError(f"states no uncertainty of {names}: --uncertainty needs u_value of each error", file=errors)
+        raise InputError(
+            Message(
+                "no-u-value", "states no uncertainty of {names}: --uncertainty needs u_value of each error", names=names
+            ),
+            file=errors,
+        )
     return ((), np.zeros((0, 0))) if found is None else found
 
 

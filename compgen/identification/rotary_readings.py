@@ -19,7 +19,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine
 from compgen.data.pose_readings import Bars, PosedDeviations, PosedLengths
 from compgen.data.rotary import TIP, RotaryErrors, SphereCentres
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.exact_chain import cross_matrices
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 
@@ -156,9 +156,14 @@ class BarsAt(PoseReadings):
         for row in np.flatnonzero(np.abs(commanded - bars.nominal_mm) > _OTHER_MM)[:1].tolist():
             file, line = bars.origin[row] if bars.origin else (None, None)
             raise InputError(
-                f"the commanded pose puts the balls {commanded[row]:.3f} mm apart, and the bar is {bars.nominal_mm[row]:g} mm "
-                "long; check the ball (workpiece frame, all axes at zero), the tool offset, '# coordinates' and the signs of "
-                "the angles",
+                Message(
+                    "bar-length-at-pose",
+                    "the commanded pose puts the balls {commanded:.3f} mm apart, and the bar is "
+                    "{nominal_mm:g} mm long; check the ball (workpiece frame, all axes at zero), the "
+                    "tool offset, '# coordinates' and the signs of the angles",
+                    commanded=commanded[row],
+                    nominal_mm=bars.nominal_mm[row],
+                ),
                 file=file,
                 line=line,
                 field="nominal_mm",
@@ -166,7 +171,13 @@ class BarsAt(PoseReadings):
         for k in range(int(found.setup.max()) + 1):
             if (found.setup == k).sum() < _FEWEST:
                 raise InputError(
-                    f"a set-up has {(found.setup == k).sum()} readings; at least {_FEWEST} are needed", file=bars.where
+                    Message(
+                        "setup-few-readings",
+                        "a set-up has {setup} readings; at least {value} are needed",
+                        setup=(found.setup == k).sum(),
+                        value=_FEWEST,
+                    ),
+                    file=bars.where,
                 )
         return found
 
@@ -277,7 +288,13 @@ class LengthsAt(PoseReadings):
         for k, name in enumerate(names):
             if (station == k).sum() < 2 * _FEWEST:
                 raise InputError(
-                    f"station {name} has {(station == k).sum()} lengths; at least {2 * _FEWEST} are needed",
+                    Message(
+                        "station-few-lengths",
+                        "station {name} has {station} lengths; at least {value} are needed",
+                        name=name,
+                        station=(station == k).sum(),
+                        value=2 * _FEWEST,
+                    ),
                     file=read.where,
                 )
         return cls(

@@ -12,7 +12,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import RAD_PER_URAD
 from compgen.data.rotary import RAD_PER_ARCSEC, RotaryCurve, RotaryErrors, RotaryRuns
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 
 #: An angle encoder is no better than this, and its zero moves between runs: added to the scatter, rad.
 _ENCODER = 0.25 * RAD_PER_ARCSEC
@@ -54,7 +54,14 @@ def identify_rotary_runs(machine: Machine, runs: RotaryRuns) -> RotaryPositionin
         own = letters == letter
         target = np.unique(runs.angle_deg[own])
         if len(target) < 3:
-            raise InputError(f"{letter} was measured at {len(target)} angles; at least 3 are needed")
+            raise InputError(
+                Message(
+                    "few-angles",
+                    "{letter} was measured at {target} angles; at least 3 are needed",
+                    letter=letter,
+                    target=len(target),
+                )
+            )
         mean, scatter, count = _statistics(runs, own, target)
         both = np.nanmean(mean, axis=0)
         if not np.isnan(mean).any():

@@ -18,7 +18,7 @@ from compgen.data.circles import PLANES, Circles
 from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 
 #: Deviations that are all smaller than this are refused: 100 um written in mm.
 SMALLEST_UM = 0.1
@@ -75,7 +75,11 @@ def _asked(measurement: Deviations | AxisRuns | Circles, what: str, row: int, la
             "thousand times too small for um? Give them in um"
         )
     file, line = measurement.origin[row] if measurement.origin else (None, None)
-    return InputError(f"{message}, or add --small-deviations if they are right", file=file, line=line if what else None)
+    return InputError(
+        Message("small-deviations-hint", "{message}, or add --small-deviations if they are right", message=message),
+        file=file,
+        line=line if what else None,
+    )
 
 
 def _groups(measurement: Deviations | AxisRuns | Circles) -> Iterator[tuple[str, NDArray[np.int64], FloatArray]]:

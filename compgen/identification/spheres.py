@@ -26,7 +26,7 @@ from compgen.data.names import COVERAGE, MM_PER_UM
 from compgen.data.pose_readings import Bars, PosedDeviations, PosedLengths
 from compgen.data.rotary import TIP, RotaryErrors, SphereCentres, si_per_unit, unit_of
 from compgen.drawing.display import Displayed, Overview
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.posterior import Posterior, root_of
 from compgen.identification.rotary_adjustment import (
     DETERMINED,
@@ -206,7 +206,9 @@ def senses(machine: Machine, spheres: SphereCentres) -> tuple[Sense, ...]:
         joints = joints_of_tip(machine, joints, spheres.angle_deg, spheres.tool_mm)
     place, letters = spheres.places[0], tuple(machine.rotary)
     if len(spheres) < 2:
-        raise InputError("contains one pose; two poses of one sphere are needed", file=_file_of(spheres))
+        raise InputError(
+            Message("one-pose", "contains one pose; two poses of one sphere are needed"), file=_file_of(spheres)
+        )
     moved: dict[tuple[float, ...], float] = {}
     for signs in product((1.0, -1.0), repeat=len(letters)):
         angle = {letter: sign * spheres.angle_deg[letter] for letter, sign in zip(letters, signs, strict=True)}
@@ -326,13 +328,24 @@ def _check_spheres(machine: Machine, spheres: SphereCentres) -> None:
     wrong = [sense.text for sense in senses(machine, spheres) if sense.verdict == "reversed"]
     if wrong:
         raise InputError(
-            f"{'; '.join(wrong)}. Reverse the sign of its angles in the file, or find out which way it turns",
+            Message(
+                "rotary-sign-reversed",
+                "{wrong}. Reverse the sign of its angles in the file, or find out which way it turns",
+                wrong="; ".join(wrong),
+            ),
             file=_file_of(spheres),
         )
     place, names = spheres.places
     for k, name in enumerate(names):
         if (place == k).sum() < 4:
-            raise InputError(f"{name} was found at {(place == k).sum()} poses; at least 4 are needed to say anything")
+            raise InputError(
+                Message(
+                    "few-poses",
+                    "{name} was found at {place} poses; at least 4 are needed to say anything",
+                    name=name,
+                    place=(place == k).sum(),
+                )
+            )
 
 
 def _adjusted(

@@ -20,7 +20,7 @@ from compgen.data.error_table import SPANS_KEY, Curve, ErrorTable, square_spans_
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, COVERAGE, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.effects.active import added, effects_reversal
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, Message, UndeterminedError
 from compgen.identification.adjust.determined import FINEST, Observations
 from compgen.identification.adjust.unknowns import ErrorParameters
 from compgen.identification.axis_tests import identify_circles, u_scale_of
@@ -198,9 +198,21 @@ def _compare(option: str, name: str, typed: tuple[float, float], found: tuple[fl
     hint = " It has the opposite sign: docs/instruments.md has a drawing of each." if turned else ""
     stated = "not given, 5 assumed" if np.isnan(typed[1]) else f"{typed_u / RAD_PER_URAD:.3g}"
     raise InputError(
-        f"{name} = {typed[0] / RAD_PER_URAD:.4g} {unit} (u: {stated}) contradicts what was measured, "
-        f"{found[0] / RAD_PER_URAD:.4g} {unit} (u: {found_u / RAD_PER_URAD:.3g}): En = {en:.1f}, 1 is the limit.{hint} Check "
-        "sign and unit, or leave one of the two out",
+        Message(
+            "stated-contradicts",
+            "{name} = {typed:.4g} {unit} (u: {stated}) contradicts what was measured, "
+            "{found:.4g} {unit2} (u: {found_u:.3g}): En = {en:.1f}, 1 is the limit.{hint} Check "
+            "sign and unit, or leave one of the two out",
+            name=name,
+            typed=typed[0] / RAD_PER_URAD,
+            unit=unit,
+            stated=stated,
+            found=found[0] / RAD_PER_URAD,
+            unit2=unit,
+            found_u=found_u / RAD_PER_URAD,
+            en=en,
+            hint=hint,
+        ),
         field=option,
     )
 
@@ -273,10 +285,23 @@ def _compare_reversal(axis: int, typed: tuple[float, float], source: str, curve:
     letter = AXES[axis]
     stated = f"not given, {ASSUMED_UM:g} assumed" if np.isnan(typed[1]) else f"{typed[1] / MM_PER_UM:.3g}"
     raise InputError(
-        f"{letter}: a reversal value B of {typed[0] / MM_PER_UM:+.4g} um (u: {stated}) contradicts that of {source}, "
-        f"B = {mean / MM_PER_UM:+.4g} um (u: {u_mean / MM_PER_UM:.3g}): En = {en:.1f}, 1 is the limit.{turned} B is negative "
-        f"where the axis stays behind, and --backlash positive: B = -6 um is {letter}=6, or {letter}=B=-6. Correct the "
-        "number, or leave it out",
+        Message(
+            "stated-reversal-contradicts",
+            "{letter}: a reversal value B of {typed:+.4g} um (u: {stated}) contradicts that of "
+            "{source}, B = {mean:+.4g} um (u: {u_mean:.3g}): En = {en:.1f}, 1 is the "
+            "limit.{turned} B is negative where the axis stays behind, and --backlash positive: "
+            "B = -6 um is {letter2}=6, or {letter3}=B=-6. Correct the number, or leave it out",
+            letter=letter,
+            typed=typed[0] / MM_PER_UM,
+            stated=stated,
+            source=source,
+            mean=mean / MM_PER_UM,
+            u_mean=u_mean / MM_PER_UM,
+            en=en,
+            turned=turned,
+            letter2=letter,
+            letter3=letter,
+        ),
         field="--backlash",
     )
 
@@ -316,10 +341,23 @@ def check_signs(numbers: StatedNumbers, shown: Mapping[int, object]) -> None:
         if value > 0.0 and not numbers.says_reversal_value(letter) and AXES.index(letter) not in shown:
             um = value / MM_PER_UM
             raise InputError(
-                f"{letter}={numbers.backlash[letter]}: is that an axis that runs ahead, or the reversal value B of ISO 230-2, "
-                f"which is negative where the axis stays behind? For a printed B = {-um:.4g} um write {letter}=B={-um:.4g}, the "
-                f"same as {letter}={um:.4g}; for an axis that runs ahead {letter}=B=+{um:.4g}. The backlash parameter of a "
-                "control is positive for play",
+                Message(
+                    "stated-reversal-negative",
+                    "{letter}={backlash}: is that an axis that runs ahead, or the reversal value B of "
+                    "ISO 230-2, which is negative where the axis stays behind? For a printed B = "
+                    "{um:.4g} um write {letter2}=B={um2:.4g}, the same as {letter3}={um3:.4g}; for an "
+                    "axis that runs ahead {letter4}=B=+{um4:.4g}. The backlash parameter of a control is "
+                    "positive for play",
+                    letter=letter,
+                    backlash=numbers.backlash[letter],
+                    um=-um,
+                    letter2=letter,
+                    um2=-um,
+                    letter3=letter,
+                    um3=um,
+                    letter4=letter,
+                    um4=um,
+                ),
                 field="--backlash",
             )
 

@@ -22,7 +22,7 @@ from compgen.data.lengths import MOST_WHOLE, Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import POSITION_COLUMNS
-from compgen.errors import ConvergenceError, InputError
+from compgen.errors import ConvergenceError, InputError, Message
 from compgen.identification.adjust.path_problem import Chunk, DistanceNoise, PathModel, Sums, chunk_of, path_model
 from compgen.identification.adjust.problem import LengthProblem
 from compgen.identification.adjust.propagation import SystematicInputs
@@ -83,7 +83,11 @@ class _Stream:
                 for row in np.flatnonzero((self.setups[group] != np.stack([station, setup], axis=1)).any(axis=1))[:1]:
                     name = self.archive.stations[int(station[row])]
                     message = f"setup {setup[row]} of station {name!r} has so few readings that the sample contains none of them"
-                    raise InputError(f"{message}; remove them", file=self.archive.path, field="setup")
+                    raise InputError(
+                        Message("remove-readings-hint", "{message}; remove them", message=message),
+                        file=self.archive.path,
+                        field="setup",
+                    )
             x, y, z = (columns[name][rows] for name in POSITION_COLUMNS)
             yield chunk_of((x, y, z), station, group, columns["length_mm"][rows])
 
@@ -160,8 +164,14 @@ class _Stream:
                 return _Optimum(self, noise, state, factor, rank, sums, rejected, passes)
             previous, sums = length, self.sums(state, noise, rejected, matrix=False)
         raise ConvergenceError(
-            f"{count - used:.0f} of {count} readings do not fit the model of a sample of them; look for beam breaks (readings "
-            "after one need a separate setup), and check station labels and units"
+            Message(
+                "readings-misfit-sample",
+                "{count:.0f} of {count2} readings do not fit the model of a sample of them; look for "
+                "beam breaks (readings after one need a separate setup), and check station labels "
+                "and units",
+                count=count - used,
+                count2=count,
+            )
         )
 
 
@@ -207,8 +217,13 @@ def identify_archive(
     _, conditions = reading_conditions(machine, sample, temperature=chosen.temperature)
     if conditions.needs_geometry or conditions.notes:
         raise InputError(
-            "needs a correction for temperature, air or effects of the machine file, which an archive of more than "
-            f"{MOST_WHOLE} readings does not support; correct the readings beforehand, or write some of them to another archive",
+            Message(
+                "archive-needs-correction",
+                "needs a correction for temperature, air or effects of the machine file, which an "
+                "archive of more than {value} readings does not support; correct the readings "
+                "beforehand, or write some of them to another archive",
+                value=MOST_WHOLE,
+            ),
             file=archive.path,
         )
     found = identify(machine, sample, chosen)
@@ -283,8 +298,11 @@ def _with_all(
     assert found.adjustment is not None
     if any(item.segment for item in found.stations):
         raise ConvergenceError(
-            "the sample of the readings shows beam breaks, after which the dead length of a station differs; give "
-            "the readings after each a separate setup"
+            Message(
+                "archive-beam-breaks",
+                "the sample of the readings shows beam breaks, after which the dead length of a "
+                "station differs; give the readings after each a separate setup",
+            )
         )
     layout, tool_mm = found.layout, common_tool(machine, None)
     setups = np.array([(archive.stations.index(item.station), item.setup) for item in found.stations], dtype=np.int64)

@@ -25,7 +25,7 @@ from compgen.data.error_table import Curve, ErrorTable, ReversalCurves
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
-from compgen.errors import CompgenWarning, InputError, UndeterminedError
+from compgen.errors import CompgenWarning, InputError, Message, UndeterminedError
 from compgen.identification.adjust.determined import (
     FAINT,
     FAINTER,
@@ -122,7 +122,9 @@ class Source:
             return length_observations(machine, layout, self.measurement, options, start)
         if self.alone is None:
             text = f"{self.name}: the readings do not determine the errors and the other unknowns of this measurement"
-            raise UndeterminedError(f"{text}; identify it alone to see what is missing", [])
+            raise UndeterminedError(
+                Message("identify-alone-hint", "{text}; identify it alone to see what is missing", text=text), []
+            )
         if isinstance(self.measurement, Circles):
             return circle_observations(machine, layout, self.measurement, self.alone)
         if self.alone.method == "sixdof" and self.alone.has_covariance:
@@ -214,7 +216,9 @@ def identify_together(machine: Machine, parts: Sequence[Source], options: Identi
     """
     known = [part.alone for part in parts if part.alone is not None]
     if not known:
-        raise UndeterminedError("none of the measurements alone determines any of the machine's errors", [])
+        raise UndeterminedError(
+            Message("none-determines", "none of the measurements alone determines any of the machine's errors"), []
+        )
     listed = list(chain.from_iterable(result.errors.names for result in known))
     direct = all(part.measurement is None or isinstance(part.measurement, AxisRuns | Circles) for part in parts)
     if any(isinstance(part.measurement, Circles) for part in parts):  # guides that are bent change what circles show
@@ -308,7 +312,12 @@ def with_prior(
     typed = {name for part in parts if part.alone and given_numbers(part.alone) for name in part.alone.errors.names}
     listed = [name for name in ERROR_NAMES if name in found.shown or name in whole or name in typed]
     if not listed:
-        raise UndeterminedError("the readings show none of the machine's errors better than the prior does", [])
+        raise UndeterminedError(
+            Message(
+                "none-better-than-prior", "the readings show none of the machine's errors better than the prior does"
+            ),
+            [],
+        )
     curves, squareness, positions = {}, {}, []
     known = _in_its_gauge(machine, result.errors.only(*whole), found)
     for name in listed:
@@ -922,7 +931,12 @@ def _check(machine: Machine, first: Identification, second: Identification) -> N
         message = f"the six-DOF readings lack {', '.join(missing)}; merging requires all three axes"
         raise InputError(message + "; otherwise identify the files separately")
     if not first.has_covariance or not second.has_covariance:
-        raise InputError("one of the measurements has no uncertainties, so they cannot be compared or averaged")
+        raise InputError(
+            Message(
+                "merge-without-uncertainty",
+                "one of the measurements has no uncertainties, so they cannot be compared or averaged",
+            )
+        )
 
 
 def _points(machine: Machine) -> FloatArray:

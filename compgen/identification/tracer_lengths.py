@@ -17,7 +17,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, Message, UndeterminedError
 from compgen.identification.adjust.grid_problem import GridProblem, grid_problem
 from compgen.identification.adjust.propagation import Adjustment
 from compgen.identification.adjust.residual_tests import EXPLAINS, Cause, drift_of_repeats, labels_of, split_labels
@@ -109,10 +109,16 @@ def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
     """Raise InputError for fewer than ``least`` stations, positions outside the travel, and positions in metres."""
     if len(lengths.stations) < least:
         raise InputError(
-            f"contains readings of {len(lengths.stations)} station(s) ({', '.join(lengths.stations)}); identification "
-            f"needs at least {least}: with fewer unknown stations a function-valued ambiguity remains. Add the "
-            "missing station, measure with the same tracer from more places, give known stations, or give other measurements "
-            "as well (axis runs, a plate)",
+            Message(
+                "too-few-stations",
+                "contains readings of {stations} station(s) ({stations2}); identification needs at "
+                "least {least}: with fewer unknown stations a function-valued ambiguity remains. Add "
+                "the missing station, measure with the same tracer from more places, give known "
+                "stations, or give other measurements as well (axis runs, a plate)",
+                stations=len(lengths.stations),
+                stations2=", ".join(lengths.stations),
+                least=least,
+            ),
             file=lengths.origin[0][0] if lengths.origin else None,
         )
     check_travel(machine, lengths.position_mm, lengths.origin)
@@ -121,7 +127,14 @@ def check_readings(machine: Machine, lengths: Lengths, least: int) -> None:
     if np.all(span_mm < SHARE_OF_METRES * travel_mm):
         k = int(np.argmax(span_mm))
         raise InputError(
-            f"the positions look like metres: they span {span_mm[k]:g} of {travel_mm[k]:g} mm of {AXES[k]}; convert them to mm",
+            Message(
+                "positions-in-metres",
+                "the positions look like metres: they span {span_mm:g} of {travel_mm:g} mm of "
+                "{value}; convert them to mm",
+                span_mm=span_mm[k],
+                travel_mm=travel_mm[k],
+                value=AXES[k],
+            ),
             file=lengths.origin[0][0] if lengths.origin else None,
             field="columns x_mm, y_mm, z_mm",
         )
@@ -439,7 +452,7 @@ def identify(machine: Machine, lengths: Lengths, options: IdentifyOptions | None
     of_kind("lengths", lengths, Lengths)
     of_kind("options", options, IdentifyOptions, type(None))
     if not len(lengths):
-        raise InputError("contains no reading", field="lengths")
+        raise InputError(Message("no-reading", "contains no reading"), field="lengths")
     chosen = options or IdentifyOptions()
     with one_thread():
         if chosen.nodes == "from-data":  # tried without warnings; those of the nodes that are taken come below
@@ -541,7 +554,11 @@ def _identify(machine: Machine, lengths: Lengths, options: IdentifyOptions) -> I
             message = (
                 "the stations were located with the machine assumed perfect: its errors are part of their positions"
             )
-            warnings.warn(f"{message} (to {known.u_mm.max() * 1e3:.1f} um)", CompgenWarning, stacklevel=4)
+            warnings.warn(
+                Message("rounded-to", "{message} (to {u_mm:.1f} um)", message=message, u_mm=known.u_mm.max() * 1000.0),
+                CompgenWarning,
+                stacklevel=4,
+            )
         start = with_known_start(start, known, lengths, task.target_mm, task.group)
         observed = known_positions(known, lengths.stations, float(sigma_mm.min()))
         task = replace(task, problem=replace(task.problem, known=observed))
@@ -585,7 +602,10 @@ def _two_step_result(
     """Identify by self-calibration, transformation and separation (Zha & Zhang 2024, sections 4 and 5)."""
     if options.stations is not None:
         raise InputError(
-            "known stations require the joint method; in the two-step method the tracers locate themselves"
+            Message(
+                "stations-need-joint",
+                "known stations require the joint method; in the two-step method the tracers locate themselves",
+            )
         )
     from compgen.identification.two_step import TracerReadings, solve_in_two_steps
 
@@ -660,8 +680,13 @@ def length_observations(
         spread = np.linalg.svd(targets_mm - targets_mm.mean(axis=0), compute_uv=False)
         if spread[2] < FLAT * spread[0] and (known is None or name not in known.names):
             raise UndeterminedError(
-                f"all targets of station {name!r} lie in a plane, so its lengths do not show on which side of it the station "
-                "is: measure at another height as well, or give the place of the station (--stations)",
+                Message(
+                    "targets-in-plane",
+                    "all targets of station {name!r} lie in a plane, so its lengths do not show on which "
+                    "side of it the station is: measure at another height as well, or give the place of "
+                    "the station (--stations)",
+                    name=name,
+                ),
                 [],
             )
     n, stations, rows = len(lengths), 3 * len(lengths.stations), np.arange(len(lengths))

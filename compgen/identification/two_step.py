@@ -13,7 +13,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Deviations
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
-from compgen.errors import ConvergenceError, InputError, UndeterminedError
+from compgen.errors import ConvergenceError, InputError, Message, UndeterminedError
 from compgen.identification.adjust.problem import (
     LEVER_MM,
     LinesOfSight,
@@ -120,7 +120,11 @@ def solved(information: FloatArray, right: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(information, right))
     except np.linalg.LinAlgError:
         raise UndeterminedError(
-            "a point is in line with its stations, or all its stations are on one line; it cannot be located", []
+            Message(
+                "point-in-line",
+                "a point is in line with its stations, or all its stations are on one line; it cannot be located",
+            ),
+            [],
         ) from None
 
 
@@ -223,7 +227,9 @@ def self_calibrate(sightings: Sightings, start: Frame) -> SelfCalibration:
     x = (along - origin) / np.linalg.norm(along - origin)
     y = (across - origin) - x * float(x @ (across - origin))
     if (length := float(np.linalg.norm(y))) < 1e-6:
-        raise UndeterminedError("all stations are on one line; the tracers cannot locate themselves", [])
+        raise UndeterminedError(
+            Message("stations-on-line", "all stations are on one line; the tracers cannot locate themselves"), []
+        )
     y /= length
     rotation = np.stack([x, y, np.cross(x, y)])
     frame = start.moved(rotation, -rotation @ origin)
@@ -273,7 +279,11 @@ def _minimise(data: Network, start: Frame) -> tuple[Frame, Linear, int]:
             return frame, linear, iteration
         damping = damping / 10.0 if damping > 1e-8 else 0.0
     raise ConvergenceError(
-        "the self-calibration of the tracers found no optimum; check station labels and units, or use the joint method"
+        Message(
+            "self-calibration-no-optimum",
+            "the self-calibration of the tracers found no optimum; check station labels and "
+            "units, or use the joint method",
+        )
     )
 
 
@@ -306,9 +316,15 @@ def _check_rank(linear: Linear, data: Network) -> None:
     coordinates = linear.equations.force.size
     if len(linear.residual_mm) < coordinates + len(data.free):
         raise UndeterminedError(
-            f"the self-calibration has {len(linear.residual_mm)} readings for {coordinates} coordinates "
-            f"of points and {len(data.free)} unknowns of the stations; measure more points with four stations, or use "
-            "the joint method, which has no unknown points",
+            Message(
+                "self-calibration-few-readings",
+                "the self-calibration has {residual_mm} readings for {coordinates} coordinates of "
+                "points and {free} unknowns of the stations; measure more points with four stations, "
+                "or use the joint method, which has no unknown points",
+                residual_mm=len(linear.residual_mm),
+                coordinates=coordinates,
+                free=len(data.free),
+            ),
             [],
         )
     scale = 1.0 / np.sqrt(np.diag(linear.equations.own))
@@ -316,8 +332,13 @@ def _check_rank(linear: Linear, data: Network) -> None:
     open_directions = int(np.count_nonzero(eigenvalues < ZERO_EIGENVALUE))
     if open_directions:
         raise UndeterminedError(
-            f"the tracers cannot locate themselves: {open_directions} direction(s) of the stations remain undetermined (all "
-            "stations, or all points, in a plane?); use the joint method, which uses the model of the machine",
+            Message(
+                "self-calibration-undetermined",
+                "the tracers cannot locate themselves: {open_directions} direction(s) of the "
+                "stations remain undetermined (all stations, or all points, in a plane?); use the "
+                "joint method, which uses the model of the machine",
+                open_directions=open_directions,
+            ),
             [],
         )
 
@@ -373,7 +394,10 @@ def place(
     moment = (target_mm - there).T @ (w[:, None] * (points_mm - here))
     size = np.linalg.svd(moment, compute_uv=False)
     if size[1] <= 1e-12 * size[0]:
-        raise UndeterminedError("the points are on one line; the rotation of the frame about it is undetermined", [])
+        raise UndeterminedError(
+            Message("points-on-line", "the points are on one line; the rotation of the frame about it is undetermined"),
+            [],
+        )
     # the best rotation, and the best mirror image: a rotation of the points mirrored in their centre
     rotation, image = best_rotation(moment), -best_rotation(-moment)
     rms_mm, rms_of_image = (
@@ -475,17 +499,42 @@ def locatable_readings(readings: TracerReadings, pose: IntArray, keep: NDArray[n
     )
     file = lengths.origin[0][0] if lengths.origin else None
     if by_pose.max() < MIN_STATIONS:
-        raise InputError(f"no point is seen by more than {by_pose.max()} of {len(names)} stations{advice}", file=file)
+        raise InputError(
+            Message(
+                "points-seen-by-few",
+                "no point is seen by more than {by_pose} of {names} stations{advice}",
+                by_pose=by_pose.max(),
+                names=len(names),
+                advice=advice,
+            ),
+            file=file,
+        )
     located = by_pose >= LOCATING_STATIONS
     lonely = [name for name, sees in zip(names, seen[located].any(axis=0), strict=True) if not sees]
     if lonely:
-        raise InputError(f"station {lonely[0]!r} shares no point with three others{advice}", file=file)
+        raise InputError(
+            Message(
+                "station-shares-no-point",
+                "station {lonely!r} shares no point with three others{advice}",
+                lonely=lonely[0],
+                advice=advice,
+            ),
+            file=file,
+        )
     rows = located[pose]
     groups = np.setdiff1d(readings.group, readings.group[keep & rows])
     if len(groups):
         row = int(np.flatnonzero(readings.group == groups[0])[0])
         name = names[lengths.station[row]]
-        raise InputError(f"a set-up of station {name!r} shares no point with three others{advice}", file=file)
+        raise InputError(
+            Message(
+                "setup-shares-no-point",
+                "a set-up of station {name!r} shares no point with three others{advice}",
+                name=name,
+                advice=advice,
+            ),
+            file=file,
+        )
     return np.asarray(rows)
 
 

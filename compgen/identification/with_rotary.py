@@ -33,7 +33,7 @@ from compgen.data.rotary import (
     read_rotary_runs,
     read_spheres,
 )
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification import covariance
 from compgen.identification.posterior import posterior_of_values
 from compgen.identification.result import Identification, without_adjustment
@@ -163,8 +163,12 @@ def identify_rotary(
     before = None if linear is None else linear.posterior
     if linear is not None and before is None:
         raise InputError(
-            "linear and rotary axes are adjusted together with what is assumed of errors that were not measured, and the class "
-            "'none' assumes nothing; state a class, or identify them separately",
+            Message(
+                "joint-without-prior",
+                "linear and rotary axes are adjusted together with what is assumed of errors that "
+                "were not measured, and the class 'none' assumes nothing; state a class, or identify "
+                "them separately",
+            ),
             field="--prior",
         )
     placed = identify_at_poses(machine, files.at_poses, u_um=options.u_deviation_um, known=known, linear=before)

@@ -14,7 +14,7 @@ from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.pose_readings import Bars
 from compgen.data.rotary import JOINTS, RotaryErrors
 from compgen.data.toml_files import setting
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 from compgen.simulation.spheres import RotaryTruth
 from compgen.simulation.trajectory import check_stops
@@ -23,7 +23,9 @@ from compgen.simulation.trajectory import check_stops
 @toml_files.accepts({"type": "array", "items": {"enum": list(AXES)}, "minItems": 1})
 def _directions(value: object) -> tuple[str, ...]:
     if not isinstance(value, list) or not value or not set(value) <= set(AXES):
-        raise ValueError('expected axes that the bar points along, such as ["X", "Y", "Z"]')
+        raise ValueError(
+            Message("bar-axes-expected", 'expected axes that the bar points along, such as ["X", "Y", "Z"]')
+        )
     return tuple(value)
 
 
@@ -54,7 +56,13 @@ class RotaryBallbar(RotaryTruth):
     def measure(self, machine: Machine, errors: ErrorTable, rotary: RotaryErrors, rng: np.random.Generator) -> Bars:
         """Lengths between the balls, with noise; the ball on the table is off by its set-up, the bar by its length."""
         if not machine.rotary:
-            raise InputError(f"the machine {machine.name} has no rotary axis; see [axes.C] in docs/five-axis.md")
+            raise InputError(
+                Message(
+                    "machine-without-rotary-axis",
+                    "the machine {name} has no rotary axis; see [axes.C] in docs/five-axis.md",
+                    name=machine.name,
+                )
+            )
         each = self.poses * len(self.directions)
         count = each * len(self.balls_mm)
         ball = np.repeat(self.balls_mm, each, axis=0)

@@ -17,7 +17,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, SECONDS_PER_MIN, error_named
 from compgen.effects import ANY_STATION, DisplacementEffect, Effect, catalogue, listed, readings_of_points
 from compgen.effects.active import STATION_NAME, dead_path_stations, keys_schema, read_values, station_pattern
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.kinematics.exact_chain import tip_position
 from compgen.registry import Registry, call_problem, why_missing
 from compgen.simulation.trajectory import Stops
@@ -214,12 +214,30 @@ def off_between(name: str) -> Callable[[Values, Values], RunEffect]:
     def made(p: Values, settings: Values) -> RunEffect:
         first, last = settings["first"], settings["last"]
         if last < first:
-            raise InputError(f"{name}: last is {last:g}, before first, {first:g}", field="[[effects]]")
+            raise InputError(
+                Message(
+                    "effect-range-reversed",
+                    "{name}: last is {last:g}, before first, {first:g}",
+                    name=name,
+                    last=last,
+                    first=first,
+                ),
+                field="[[effects]]",
+            )
 
         def change(time_s: FloatArray) -> FloatArray:
             number = np.arange(len(time_s))
             if first > number[-1] or last < 0:
-                raise InputError(f"{name}: there are readings 0 to {number[-1]}, none from {first:g} to {last:g}")
+                raise InputError(
+                    Message(
+                        "effect-without-readings",
+                        "{name}: there are readings 0 to {number}, none from {first:g} to {last:g}",
+                        name=name,
+                        number=number[-1],
+                        first=first,
+                        last=last,
+                    )
+                )
             return np.where((number < first) | (number > last), 0.0, p["c_um"])
 
         return RunEffect(name, change)
@@ -553,14 +571,27 @@ def _built_in(name: str, p: Mapping[str, float], settings: Mapping[str, float]) 
 def _of_columns(effect: Effect, values: FloatArray) -> Displacement:
     """Simulate an effect of a plug-in's family by its columns."""
     if not isinstance(effect, DisplacementEffect):
-        raise InputError(f"{effect.card.name} does not move the tip, so a plug-in must provide a reader for it")
+        raise InputError(
+            Message(
+                "effect-without-reader",
+                "{name} does not move the tip, so a plug-in must provide a reader for it",
+                name=effect.card.name,
+            )
+        )
 
     def moved(machine: Machine, stops: Stops) -> FloatArray:
         covariates = {"time_s": stops.time_s, **stops.covariates}
         points = Points(stops.position_mm, stops.tool_mm, stops.approach, covariates)
         found = effect.displacement(readings_of_points(machine, points))
         if found is None:
-            raise InputError(f"the scenario lacks what {effect.card.name} needs: {', '.join(effect.card.covariates)}")
+            raise InputError(
+                Message(
+                    "scenario-lacks-channel",
+                    "the scenario lacks what {name} needs: {covariates}",
+                    name=effect.card.name,
+                    covariates=", ".join(effect.card.covariates),
+                )
+            )
         return found @ values
 
     return moved

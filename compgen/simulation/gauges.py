@@ -20,7 +20,7 @@ from compgen.data.deviations import Artefact
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import MM_PER_UM, SECONDS_PER_MIN
 from compgen.data.toml_files import part_setting, setting
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.exact_chain import rotate
 from compgen.simulation.effects import LengthEffect, RunEffect, SimulatedEffect
 from compgen.simulation.lasers import stop_times_s
@@ -42,7 +42,12 @@ def _moving_only(effects: Sequence[SimulatedEffect], what: str) -> None:
     for effect in effects:
         if isinstance(effect, LengthEffect | RunEffect):
             of = "the lengths of a laser-tracer" if isinstance(effect, LengthEffect) else "axis runs"
-            raise InputError(f"{effect.name} acts on {of}, not on {what}", field="[[effects]]")
+            raise InputError(
+                Message(
+                    "effect-acts-elsewhere", "{name} acts on {of}, not on {what}", name=effect.name, of=of, what=what
+                ),
+                field="[[effects]]",
+            )
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, SECONDS_PER_MIN
 from compgen.data.toml_files import part_setting, setting
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.simulation.effects import LengthEffect, RunEffect, SimulatedEffect
 from compgen.simulation.trajectory import (
     Stops,
@@ -224,7 +224,14 @@ def along_beam(
     deviation = np.einsum("ij,ij->i", moved_mm, unit)
     for effect in effects:
         if isinstance(effect, LengthEffect):
-            raise InputError(f"{effect.name} acts on the lengths of a laser-tracer, not on {what}")
+            raise InputError(
+                Message(
+                    "effect-needs-lengths",
+                    "{name} acts on the lengths of a laser-tracer, not on {what}",
+                    name=effect.name,
+                    what=what,
+                )
+            )
         if isinstance(effect, RunEffect):
             deviation = deviation + effect.change(stops.time_s)
     return np.asarray(deviation)

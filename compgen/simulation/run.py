@@ -34,7 +34,7 @@ from compgen.data.records import ARCHIVE
 from compgen.data.rotary import RotaryErrors, SphereCentres, format_machine_errors, format_spheres
 from compgen.data.toml_files import part_setting, setting
 from compgen.drawing.display import Displayed, Overview
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.instruments.sixdof_instrument import SixDof, format_sixdof
 from compgen.kinematics.exact_chain import tip_position
 from compgen.registry import Registry, call_problem
@@ -324,7 +324,16 @@ def actual_tips(machine: Machine, truth: ErrorTable, stops: Stops, effects: Sequ
         ):
             name = getattr(effect, "__qualname__", type(effect).__qualname__)
             expected = f"an array {stops.position_mm.shape} of finite numbers in mm"
-            raise InputError(f"the effect {name} returns {moved_mm.dtype} {moved_mm.shape}; expected {expected}")
+            raise InputError(
+                Message(
+                    "effect-returns-other",
+                    "the effect {name} returns {dtype} {shape}; expected {expected}",
+                    name=name,
+                    dtype=moved_mm.dtype,
+                    shape=moved_mm.shape,
+                    expected=expected,
+                )
+            )
         tip_mm = tip_mm + moved_mm.astype(np.float64)
     return tip_mm
 
@@ -365,11 +374,19 @@ def simulate(
     seeds = np.random.SeedSequence(used_seed)
     instrument = scenario.instrument
     if isinstance(instrument, SimulatedSixDof):
-        raise InputError("is a six-DOF instrument, which has no lengths; call simulate_sixdof", file=scenario.source)
+        raise InputError(
+            Message("instrument-six-dof", "is a six-DOF instrument, which has no lengths; call simulate_sixdof"),
+            file=scenario.source,
+        )
     if isinstance(instrument, OwnPath):
-        raise InputError("brings its own path and has no lengths; call simulate_axis_runs", file=scenario.source)
+        raise InputError(
+            Message("instrument-own-path", "brings its own path and has no lengths; call simulate_axis_runs"),
+            file=scenario.source,
+        )
     if isinstance(instrument, LaserTracer) and instrument.rate_hz is not None:
-        raise InputError("reads while the machine moves; call simulate_moving", file=scenario.source)
+        raise InputError(
+            Message("instrument-moving", "reads while the machine moves; call simulate_moving"), file=scenario.source
+        )
     for effect in scenario.effects:
         if isinstance(effect, RunEffect):
             message = f"{effect.name} acts on axis runs only; their instrument has type = 'axis-laser'"
@@ -409,7 +426,11 @@ def _changed(
     """Add the effects of tracers and air to the lengths."""
     if not isinstance(instrument, LaserTracer):
         raise InputError(
-            f"{effects[0].name} acts on the lengths of a laser-tracer, which this instrument does not measure"
+            Message(
+                "effect-not-measured",
+                "{name} acts on the lengths of a laser-tracer, which this instrument does not measure",
+                name=effects[0].name,
+            )
         )
     stop, station = instrument.rows(len(stops))
     places = np.array([item.position_mm for item in instrument.stations])
@@ -491,7 +512,11 @@ def simulate_sixdof(machine: Machine, scenario: Scenario, seed: int | None = Non
     """Measure a virtual machine with the six-DOF instrument of the scenario; InputError for another instrument."""
     instrument = scenario.instrument
     if not isinstance(instrument, SimulatedSixDof):
-        raise InputError("is not a six-DOF instrument; call simulate", file=scenario.source, field="[instrument] type")
+        raise InputError(
+            Message("instrument-not-six-dof", "is not a six-DOF instrument; call simulate"),
+            file=scenario.source,
+            field="[instrument] type",
+        )
     return _measured(machine, scenario, seed, lambda truth, rng: instrument.measure(machine, truth, rng))
 
 
@@ -500,7 +525,10 @@ def simulate_axis_runs(machine: Machine, scenario: Scenario, seed: int | None = 
     instrument = scenario.instrument
     if not isinstance(instrument, OwnPath):
         raise InputError(
-            "is not a laser along axes or diagonals, ballbar or touch probe; call simulate",
+            Message(
+                "instrument-not-along-axes",
+                "is not a laser along axes or diagonals, ballbar or touch probe; call simulate",
+            ),
             file=scenario.source,
             field="[instrument] type",
         )
@@ -523,7 +551,11 @@ def _at_poses(
     """Read at poses; the errors of the rotary axes come from the stream of errors, after those of the linear axes."""
     if scenario.effects or scenario.temperatures:
         raise InputError(
-            "measurements at poses of rotary axes take no effects and no temperatures; omit them", file=scenario.source
+            Message(
+                "poses-without-effects",
+                "measurements at poses of rotary axes take no effects and no temperatures; omit them",
+            ),
+            file=scenario.source,
         )
     drawn: list[RotaryErrors] = []
     used_seed = scenario.seed if seed is None else seed

@@ -15,7 +15,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import part_setting, setting
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.instruments.sixdof_instrument import (
     DIRECTIONS,
     RAD_PER_ARCSEC,
@@ -394,7 +394,9 @@ def _positions(value: Any) -> tuple[float, ...]:
     if not isinstance(value, dict):
         return toml_files.ascending(value)
     if set(value) != set(_SPAN):
-        raise ValueError("expected a list of positions, or { from = .., to = .., step = .. }")
+        raise ValueError(
+            Message("positions-expected", "expected a list of positions, or {{ from = .., to = .., step = .. }}")
+        )
     low, high, step = (toml_files.number(value[key]) for key in _SPAN)
     if not (high > low and step > 0 and (high - low) / step < 10000):
         raise ValueError("expected from below to, and a step above zero")
@@ -475,7 +477,15 @@ class SimulatedSixDof:
         low, high = machine.axes[axis].range_mm
         if there.min() < low - 1e-9 or there.max() > high + 1e-9:
             raise InputError(
-                f"positions from {there.min():g} to {there.max():g} mm exceed the travel of {AXES[axis]}, {low:g} to {high:g} mm",
+                Message(
+                    "positions-exceed-travel",
+                    "positions from {there:g} to {there2:g} mm exceed the travel of {value}, {low:g} to {high:g} mm",
+                    there=there.min(),
+                    there2=there.max(),
+                    value=AXES[axis],
+                    low=low,
+                    high=high,
+                ),
                 field=f"[instrument.positions_mm] {AXES[axis]}",
             )
         if not self.there_and_back:

@@ -24,7 +24,7 @@ from compgen.data.rotary import (
     unit_of,
 )
 from compgen.data.toml_files import setting
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.kinematics.rotary_chain import joints_of_tip, tip_pose
 from compgen.simulation.trajectory import check_stops
 
@@ -38,7 +38,14 @@ def _constants(value: Any) -> dict[str, float]:
     found = toml_files.table(value)
     for name in found:
         if name not in ROTARY_NAMES or name[2] != "0":
-            raise ValueError(f"{name!r} is no position error of a rotary axis; {nearest(name, ROTARY_NAMES)}")
+            raise ValueError(
+                Message(
+                    "rotary-error-unknown",
+                    "{name!r} is no position error of a rotary axis; {name2}",
+                    name=name,
+                    name2=nearest(name, ROTARY_NAMES),
+                )
+            )
     return {name: toml_files.number(number) for name, number in found.items()}
 
 
@@ -87,7 +94,13 @@ class RotaryTruth:
         for name in self.rotary_errors or {}:
             if name not in constants:
                 raise InputError(
-                    f"{name} is an error of an axis that the machine {machine.name} lacks", field="rotary_errors"
+                    Message(
+                        "error-of-lacking-axis",
+                        "{name} is an error of an axis that the machine {name2} lacks",
+                        name=name,
+                        name2=machine.name,
+                    ),
+                    field="rotary_errors",
                 )
         return RotaryErrors(curves, constants)
 
@@ -114,7 +127,13 @@ class SphereProbe(RotaryTruth):
     ) -> SphereCentres:
         """Positions of the axes at which the true tip is at the spheres, with noise."""
         if not machine.rotary:
-            raise InputError(f"the machine {machine.name} has no rotary axis; see [axes.C] in docs/five-axis.md")
+            raise InputError(
+                Message(
+                    "machine-without-rotary-axis",
+                    "the machine {name} has no rotary axis; see [axes.C] in docs/five-axis.md",
+                    name=machine.name,
+                )
+            )
         count = self.poses * len(self.spheres_mm) * len(self.probe_lengths_mm)
         place = np.repeat(self.spheres_mm, self.poses * len(self.probe_lengths_mm), axis=0)
         length = np.tile(np.repeat(self.probe_lengths_mm, self.poses), len(self.spheres_mm))

@@ -20,7 +20,7 @@ from compgen.data.machine import Machine, Vector3
 from compgen.data.names import AXES, SECONDS_PER_HOUR, SECONDS_PER_MIN
 from compgen.data.records import approach_of
 from compgen.data.toml_files import part_setting, setting
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.simulation.truth import counts
 
 # The trajectory of a simulated measurement: the points that the machine visits, with order and time.
@@ -242,8 +242,16 @@ def check_stops(points: FloatArray, machine: Machine) -> None:
         row, axis = np.argwhere(outside)[0]
         low, high = machine.axes[axis].range_mm
         raise InputError(
-            f"{AXES[axis]} = {points[row, axis]:g} mm is outside the travel {low:g} ... {high:g} mm of "
-            f"{machine.name}; choose levels within it",
+            Message(
+                "level-outside-travel",
+                "{value} = {points:g} mm is outside the travel {low:g} ... {high:g} mm of {name}; "
+                "choose levels within it",
+                value=AXES[axis],
+                points=points[row, axis],
+                low=low,
+                high=high,
+                name=machine.name,
+            ),
             field="[trajectory]",
         )
 

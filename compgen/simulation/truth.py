@@ -21,7 +21,7 @@ from compgen.data.names import (
     ErrorName,
     error_named,
 )
-from compgen.errors import nearest
+from compgen.errors import Message, nearest
 from compgen.kinematics import modelled_errors
 
 #: Number of harmonics in a drawn curve; harmonic k has k half-waves over the travel.
@@ -166,7 +166,13 @@ def _curve_name(value: Any) -> str:
     if value in SQUARENESS_NAMES:
         raise ValueError("a squareness error is a constant; give it in [errors.squareness_urad]")
     if value not in CURVE_NAMES:
-        raise ValueError(f"expected the name of one of the 18 error curves; {nearest(str(value), CURVE_NAMES)}")
+        raise ValueError(
+            Message(
+                "curve-name-expected",
+                "expected the name of one of the 18 error curves; {value}",
+                value=nearest(str(value), CURVE_NAMES),
+            )
+        )
     return str(value)
 
 

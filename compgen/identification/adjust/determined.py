@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import ErrorTable, hat_matrix
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, error_named
-from compgen.errors import UndeterminedError
+from compgen.errors import Message, UndeterminedError
 from compgen.identification.adjust.unknowns import CurveParameters, ErrorParameters, error_parameters
 
 #: Directions whose singular value is below this share of the largest are not determined; columns have unit length.
@@ -246,7 +246,9 @@ def least_squares(
     seen = np.einsum("ij,ij->i", shown, shown)  # how much of each unknown is determined, 0 to 1
     kept = [name for name, columns in layout.columns() if seen[columns].max(initial=0.0) > SEEN]
     if not kept:
-        raise UndeterminedError("the readings determine none of the machine's errors", [])
+        raise UndeterminedError(
+            Message("errors-undetermined", "the readings determine none of the machine's errors"), []
+        )
     smaller = error_parameters(layout.machine, kept)
     columns = np.concatenate([np.arange(span.start, span.stop) for name, span in layout.columns() if name in kept])
     curves = [curve.error.name in kept for curve in layout.curves]

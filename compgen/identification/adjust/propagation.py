@@ -15,7 +15,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.toml_files import option
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.adjust.solver import Factor
 from compgen.identification.adjust.unknowns import ErrorParameters, IntArray, State
 
@@ -109,7 +109,14 @@ class SystematicInputs:
     def __post_init__(self) -> None:
         for name, value in self.items():
             if not (np.isfinite(value) and value >= 0):
-                raise InputError(f"the uncertainty {name} is {value:g}; expected a finite number, zero or more")
+                raise InputError(
+                    Message(
+                        "uncertainty-not-number",
+                        "the uncertainty {name} is {value:g}; expected a finite number, zero or more",
+                        name=name,
+                        value=value,
+                    )
+                )
 
     def items(self) -> Iterator[tuple[str, float]]:
         """Names and values."""
@@ -202,7 +209,10 @@ def _temperature(machine: Machine, lengths: Lengths, sight: Sight) -> FloatArray
     for name, axis in zip(AXES, machine.axes, strict=True):
         if axis.expansion_um_per_m_k is None:
             raise InputError(
-                "is missing; an uncertainty of temperature requires it: give it for all three axes",
+                Message(
+                    "expansion-missing",
+                    "is missing; an uncertainty of temperature requires it: give it for all three axes",
+                ),
                 file=machine.source,
                 field=f"[axes.{name}] expansion_um_per_m_k",
             )

@@ -18,7 +18,7 @@ from compgen.data.error_table import ErrorTable
 from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM
-from compgen.errors import CompgenWarning
+from compgen.errors import CompgenWarning, Message
 from compgen.identification.adjust.grid_problem import levels_of
 from compgen.identification.adjust.robust import median, time_order
 from compgen.identification.adjust.unknowns import IntArray
@@ -239,9 +239,16 @@ def warn_of_misfit(reduced_chi_square: float, u_source: str) -> None:
     """Warn of residuals that are too large for the model to be right."""
     if reduced_chi_square > LARGEST_CHI_SQUARE[u_source]:
         warnings.warn(
-            f"the model does not describe the readings: the residuals are {np.sqrt(reduced_chi_square):.0f} times their "
-            f"{u_source} uncertainty (reduced chi-square {reduced_chi_square:.3g}); check the chain and the errors of the "
-            "machine file, the order and the signs of the axes, and the uncertainty of a length",
+            Message(
+                "model-misfit",
+                "the model does not describe the readings: the residuals are "
+                "{reduced_chi_square:.0f} times their {u_source} uncertainty (reduced chi-square "
+                "{reduced_chi_square2:.3g}); check the chain and the errors of the machine file, the "
+                "order and the signs of the axes, and the uncertainty of a length",
+                reduced_chi_square=np.sqrt(reduced_chi_square),
+                u_source=u_source,
+                reduced_chi_square2=reduced_chi_square,
+            ),
             CompgenWarning,
             stacklevel=4,
         )
@@ -592,8 +599,16 @@ def warn_of_weakness(
         times = value * MM_PER_UM / sigma_mm
         if times > WEAK:
             warnings.warn(
-                f"{name} is weakly determined: its standard uncertainty is {value:.3g} {unit}, {times:.0f} "
-                f"times that of a reading; {advice}",
+                Message(
+                    "unknown-weakly-determined",
+                    "{name} is weakly determined: its standard uncertainty is {value:.3g} {unit}, "
+                    "{times:.0f} times that of a reading; {advice}",
+                    name=name,
+                    value=value,
+                    unit=unit,
+                    times=times,
+                    advice=advice,
+                ),
                 CompgenWarning,
                 stacklevel=4,
             )
@@ -610,8 +625,14 @@ def warn_of_weakness(
             weak.append(name)
     if weak:
         warnings.warn(
-            f"{', '.join(weak)} {'are' if len(weak) > 1 else 'is'} weakly determined: the standard uncertainty is more than a "
-            f"sixth of the largest value; {advice}",
+            Message(
+                "weakly-determined",
+                "{weak} {weak2} weakly determined: the standard uncertainty is more than a sixth of "
+                "the largest value; {advice}",
+                weak=", ".join(weak),
+                weak2="are" if len(weak) > 1 else "is",
+                advice=advice,
+            ),
             CompgenWarning,
             stacklevel=4,
         )
@@ -621,4 +642,13 @@ def warn_of_residuals(whiteness: Whiteness, reduced_chi_square: float, u_source:
     """Warn of residuals that are not white, unless they are too large for the model to be right."""
     if whiteness.messages and reduced_chi_square <= LARGEST_CHI_SQUARE[u_source]:
         more = f"; and {len(whiteness.messages) - 1} more in identify.json" if len(whiteness.messages) > 1 else ""
-        warnings.warn(f"the residuals are not white: {whiteness.messages[0]}{more}", CompgenWarning, stacklevel=4)
+        warnings.warn(
+            Message(
+                "residuals-not-white",
+                "the residuals are not white: {messages}{more}",
+                messages=whiteness.messages[0],
+                more=more,
+            ),
+            CompgenWarning,
+            stacklevel=4,
+        )

@@ -15,7 +15,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import MM_PER_UM
 from compgen.data.records import DEVIATION_COLUMNS
-from compgen.errors import CompgenWarning, ConvergenceError
+from compgen.errors import CompgenWarning, ConvergenceError, Message
 from compgen.identification.adjust.solver import Factor, LeastSquaresSolution, solve
 from compgen.identification.adjust.starts import robust_spread
 from compgen.identification.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State, distinct_poses
@@ -415,7 +415,15 @@ def check_rejected(keep: NDArray[np.bool_], advice: str) -> None:
     """Raise ConvergenceError if more than ``MOST_REJECTED`` of the readings (n,) are not kept."""
     rejected = int(np.count_nonzero(~keep))
     if rejected > MOST_REJECTED * len(keep):
-        raise ConvergenceError(f"{rejected} of {len(keep)} {advice} before anything is rejected")
+        raise ConvergenceError(
+            Message(
+                "advice-before-rejection",
+                "{rejected} of {keep} {advice} before anything is rejected",
+                rejected=rejected,
+                keep=len(keep),
+                advice=advice,
+            )
+        )
 
 
 @dataclass(frozen=True)
@@ -667,8 +675,12 @@ def fit_robustly(
     fit = _rejected(problem, group, solution, readings)
     if 1.0 - np.mean(fit.accepted) > MANY_REJECTED or _shares(fit.accepted, readings).max() > MANY_REJECTED_OF_STATION:
         warnings.warn(
-            f"{_suspicion(fit.accepted, readings)}; they were excluded, but their number suggests a mistake in the "
-            "readings, their labels or the machine file",
+            Message(
+                "many-rejected",
+                "{accepted}; they were excluded, but their number suggests a mistake in the "
+                "readings, their labels or the machine file",
+                accepted=_suspicion(fit.accepted, readings),
+            ),
             CompgenWarning,
             stacklevel=4,
         )
@@ -753,7 +765,9 @@ def _weighted(
         keep = np.asarray(weight > SUSPICIOUS_WEIGHT)
         if keep.all():
             raise
-        raise ConvergenceError(f"{_suspicion(keep, readings)}; for the rest: {error}") from error
+        raise ConvergenceError(
+            Message("rest-undetermined", "{keep}; for the rest: {error}", keep=_suspicion(keep, readings), error=error)
+        ) from error
 
 
 def _suspicion(keep: NDArray[np.bool_], readings: WeightedReadings) -> str:

@@ -14,7 +14,7 @@ from numpy.linalg import LinAlgError
 from numpy.typing import NDArray
 
 from compgen.data.csv_files import FloatArray
-from compgen.errors import ConvergenceError, UndeterminedError
+from compgen.errors import ConvergenceError, Message, UndeterminedError
 from compgen.identification.adjust.unknowns import ErrorParameters, IntArray, LeastSquaresProblem, State
 from compgen.kinematics.kernel_switch import lapack
 
@@ -134,7 +134,10 @@ def solve(problem: LeastSquaresProblem, start: State, factor: Factor | None = No
                 damping = max(10.0 * damping, 1e-6)
                 if damping > 1e6:
                     raise ConvergenceError(
-                        "the iteration found no step that reduces the residuals; check stations and units"
+                        Message(
+                            "no-reducing-step",
+                            "the iteration found no step that reduces the residuals; check stations and units",
+                        )
                     )
             factor = None
             continue
@@ -149,8 +152,12 @@ def solve(problem: LeastSquaresProblem, start: State, factor: Factor | None = No
             factor = None
         previous, fresh = size, False
     raise ConvergenceError(
-        f"no optimum after {MAX_ITERATIONS} passes (last step {size * 1000:.3g} um); "
-        "the data may not determine all unknowns"
+        Message(
+            "no-optimum",
+            "no optimum after {value} passes (last step {size:.3g} um); the data may not determine all unknowns",
+            value=MAX_ITERATIONS,
+            size=size * 1000,
+        )
     )
 
 
@@ -160,7 +167,12 @@ def _positive_factor(matrix: FloatArray, damping: float) -> tuple[Factor, float]
             return factorise(matrix, damping), damping
         except LinAlgError:
             damping = max(10.0 * damping, 1e-6)
-    raise ConvergenceError("the normal matrix is not positive definite; the data do not determine the unknowns")
+    raise ConvergenceError(
+        Message(
+            "normal-matrix-singular",
+            "the normal matrix is not positive definite; the data do not determine the unknowns",
+        )
+    )
 
 
 def step_levers(parameters: ErrorParameters, size: int) -> FloatArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.lengths import Lengths
 from compgen.data.names import AXES
-from compgen.errors import ConvergenceError, InputError
+from compgen.errors import ConvergenceError, InputError, Message
 from compgen.identification.adjust.grid_problem import GridProblem, LevelGrid, nominal_targets
 from compgen.identification.adjust.solver import factorise
 from compgen.identification.adjust.unknowns import IntArray, State
@@ -444,7 +444,12 @@ def _no_place(
             row = int(np.flatnonzero(station == k)[0])
             file, line = lengths.origin[row] if lengths.origin else (None, None)
             return InputError(
-                f"the readings of station {lengths.stations[k]!r} fit {slip}",
+                Message(
+                    "station-slip",
+                    "the readings of station {stations!r} fit {slip}",
+                    stations=lengths.stations[k],
+                    slip=slip,
+                ),
                 file=file,
                 line=line,
                 field="column length_mm",
@@ -452,14 +457,27 @@ def _no_place(
     names = ", ".join(lengths.stations[k] for k in bad)
     if len(bad) > 1 and len(bad) > len(lengths.stations) / 2:
         return ConvergenceError(
-            f"the lengths do not fit the commanded positions: the readings of {len(bad)} of {len(lengths.stations)} "
-            f"stations ({names}) fit no position, the worst {lengths.stations[worst]!r} with {misfit_mm[worst]:.3g} mm; "
-            "check axis order, signs and unit of x_mm, y_mm, z_mm, and the station labels"
+            Message(
+                "lengths-without-positions",
+                "the lengths do not fit the commanded positions: the readings of {bad} of {stations} "
+                "stations ({names}) fit no position, the worst {stations2!r} with {misfit_mm:.3g} "
+                "mm; check axis order, signs and unit of x_mm, y_mm, z_mm, and the station labels",
+                bad=len(bad),
+                stations=len(lengths.stations),
+                names=names,
+                stations2=lengths.stations[worst],
+                misfit_mm=misfit_mm[worst],
+            )
         )
     return ConvergenceError(
-        f"the readings of station {lengths.stations[worst]!r} fit no position: their misfit is "
-        f"{misfit_mm[worst]:.3g} mm; check its unit, and whether readings of another station or of other points "
-        "are labelled with its name"
+        Message(
+            "station-without-position",
+            "the readings of station {stations!r} fit no position: their misfit is "
+            "{misfit_mm:.3g} mm; check its unit, and whether readings of another station or of "
+            "other points are labelled with its name",
+            stations=lengths.stations[worst],
+            misfit_mm=misfit_mm[worst],
+        )
     )
 
 

@@ -15,7 +15,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, ERROR_NAMES, SQUARENESS_NAMES, ErrorName, error_named
 from compgen.data.records import POSITION_COLUMNS
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.exact_chain import tip_position
 from compgen.kinematics.first_order import modelled_errors, observable_errors, tool_of
 
@@ -335,8 +335,17 @@ def check_travel(
         low, high = machine.axes[axis].range_mm
         file, line = origin[row] if len(origin) else (None, None)
         raise InputError(
-            f"{along[row]:g} mm{'' if len(origin) else f' (point {row + 1})'} is outside the travel {low:g} ... {high:g} mm "
-            f"of {AXES[axis]} of machine {machine.name!r}: wrong machine file, wrong axis order or wrong unit?",
+            Message(
+                "outside-travel",
+                "{along:g} mm{origin} is outside the travel {low:g} ... {high:g} mm of {value} of "
+                "machine {name!r}: wrong machine file, wrong axis order or wrong unit?",
+                along=along[row],
+                origin="" if len(origin) else f" (point {row + 1})",
+                low=low,
+                high=high,
+                value=AXES[axis],
+                name=machine.name,
+            ),
             file=file,
             line=line,
             field=f"column {columns[axis]}",
