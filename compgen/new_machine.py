@@ -15,7 +15,7 @@ from compgen.data import toml_files
 from compgen.data.machine import CHAINS, ROTARY, Axis, Chain, Emphasis, Interval, Machine, RotaryAxis, Vector3
 from compgen.data.names import AXES
 from compgen.data.prior import CLASS_WORDS, USUAL_CLASS
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 
 #: What carries an axis: words (beginnings, umlauts spelt out), whether it is on the side of the tool (None: either), and how
 #: far it is from the foundation on its side.
@@ -95,7 +95,15 @@ def chains_of(words: str) -> tuple[Chain, ...]:
     moving = [(letter, carrier) for letter, carrier in pairs if letter not in ROTARY]
     lost = [letter for letter in waiting if letter in ROTARY]
     if lost:
-        raise InputError(f"{words!r} names {', '.join(lost)}, and not what carries it: table or head", field="--chain")
+        raise InputError(
+            Message(
+                "chain-carrier-missing",
+                "{words!r} names {lost}, and not what carries it: table or head",
+                words=words,
+                lost=", ".join(lost),
+            ),
+            field="--chain",
+        )
     table, head, usual = _rotary_of(words, turning)
     if usual and not moving:
         return (Chain(usual),)
@@ -121,7 +129,15 @@ def _linear_chains(
         for letter, item in found.items()
     }
     if not carried:
-        raise InputError(f"{words!r} names no axes that move; write for example {EXAMPLES}", field="--chain")
+        raise InputError(
+            Message(
+                "chain-no-axes",
+                "{words!r} names no axes that move; write for example {value}",
+                words=words,
+                value=EXAMPLES,
+            ),
+            field="--chain",
+        )
     fits = [Chain(name) for name in CHAINS if _allows(Chain(name), carried)]
     return tuple(sorted(fits, key=lambda chain: _turned(chain, carried)))
 
@@ -149,7 +165,15 @@ def _rotary_of(words: str, pairs: Sequence[tuple[str, re.Match[str]]]) -> tuple[
     for letter, carrier in pairs:
         _add(found, words, letter, carrier)
         if found[letter].tool_side is None:
-            raise InputError(f"{words!r}: is {letter} an axis of the table or of the head?", field="--chain")
+            raise InputError(
+                Message(
+                    "chain-table-or-head",
+                    "{words!r}: is {letter} an axis of the table or of the head?",
+                    words=words,
+                    letter=letter,
+                ),
+                field="--chain",
+            )
     order = sorted(found, key=lambda letter: letter != "C")
     table = "".join(letter for letter in order if not found[letter].tool_side)
     head = "".join(letter for letter in order if found[letter].tool_side)

@@ -33,7 +33,7 @@ from pathlib import Path
 from socket import gethostname
 from typing import Any, Protocol, TypeVar
 
-from compgen.errors import CompgenError, CompgenWarning, InputError
+from compgen.errors import CompgenError, CompgenWarning, InputError, Message
 from compgen.kinematics.kernel_switch import one_thread
 
 Item = TypeVar("Item")
@@ -266,7 +266,13 @@ class Processes:
             self._stop = context.RawValue("b", 0)  # without a lock, which a killed process might keep
             self._lanes = [_Lane(context, self._stop, context.RawArray("d", 2)) for _ in range(count)]
         except OSError as error:  # shared memory is a file to the system
-            raise CompgenError(f"processes cannot be started here: {error.strerror or error}") from error
+            raise CompgenError(
+                Message(
+                    "processes-not-possible",
+                    "processes cannot be started here: {strerror}",
+                    strerror=error.strerror or error,
+                )
+            ) from error
         self._idle: queue.LifoQueue[_Lane] = queue.LifoQueue()
         for lane in self._lanes:
             self._idle.put(lane)
@@ -277,7 +283,7 @@ class Processes:
         try:
             for _ in range(2):
                 if stop() or self._stop.value:
-                    raise StoppedError("not started: stopped")
+                    raise StoppedError(Message("not-started", "not started: stopped"))
                 try:
                     future = lane.perform(function, item)
                     while True:
@@ -293,10 +299,12 @@ class Processes:
                     lane.close()
                     self._died(item.value(), lane.pid, late)
                 if late:
-                    raise LostError("the process that worked on it took too long and was ended")
+                    raise LostError(
+                        Message("worker-too-long", "the process that worked on it took too long and was ended")
+                    )
         finally:
             self._idle.put(lane)
-        raise LostError("the process that worked on it was killed, twice (out of memory?)")
+        raise LostError(Message("worker-killed", "the process that worked on it was killed, twice (out of memory?)"))
 
     def close(self) -> None:
         """Start nothing more, wait for running work, end the processes."""
@@ -454,8 +462,14 @@ class Cluster:
         except (OSError, TimeoutError, ValueError, KeyError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise ClusterError(
-                f"no Dask scheduler answers at {address} within {CONNECT_S:.0f} s ({reason}); start one with "
-                "`dask scheduler`, or give its address, for example tcp://10.0.0.5:8786"
+                Message(
+                    "scheduler-no-answer",
+                    "no Dask scheduler answers at {address} within {value:.0f} s ({reason}); start one "
+                    "with `dask scheduler`, or give its address, for example tcp://10.0.0.5:8786",
+                    address=address,
+                    value=CONNECT_S,
+                    reason=reason,
+                )
             ) from error
         try:
             self._check()
@@ -480,12 +494,20 @@ class Cluster:
     def _refuse(self, reason: str) -> None:
         if reason:
             why = f"; {self._same_host}" if " runs on " in reason else ""
-            raise ClusterError(f"the cluster {self.address} cannot be used: {reason}{why}")
+            raise ClusterError(
+                Message(
+                    "cluster-unfit",
+                    "the cluster {address} cannot be used: {reason}{why}",
+                    address=self.address,
+                    reason=reason,
+                    why=why,
+                )
+            )
 
     def call(self, function: Packed, item: Packed, stop: Stop) -> Any:
         """Return ``function(item)``; see :class:`compgen.parallel.Workers`."""
         if stop():
-            raise StoppedError("not started: stopped")
+            raise StoppedError(Message("not-started", "not started: stopped"))
         if self._empty_since is not None:
             self._look()
         for _ in range(2):  # another task may have killed the worker: try once more
@@ -496,7 +518,7 @@ class Cluster:
             if isinstance(answer, str):
                 self._refuse(answer)
             return answer.value()
-        raise LostError("every worker of the cluster that worked on it was lost")
+        raise LostError(Message("cluster-workers-lost", "every worker of the cluster that worked on it was lost"))
 
     def _answer(self, function: Packed, item: Packed, stop: Stop) -> Any:
         """Submit the item and wait for it; polled, because the cluster may be lost and the user may request a stop."""
@@ -513,15 +535,27 @@ class Cluster:
                 except KilledWorker as error:
                     raise _BlamedError from error
                 except CancelledError as error:
-                    raise LostError(f"the scheduler {self.address} was lost") from error
+                    raise LostError(
+                        Message("scheduler-lost", "the scheduler {address} was lost", address=self.address)
+                    ) from error
                 except TimeoutError:
                     if stop():
                         raise StoppedError(
-                            "stopped; results of what still runs on the cluster are kept when it ends"
+                            Message(
+                                "cluster-stopped",
+                                "stopped; results of what still runs on the cluster are kept when it ends",
+                            )
                         ) from None
                     self._look()
                 except Exception as error:  # the worker could not start it: the error is not from the item
-                    raise ClusterError(f"the cluster {self.address} cannot run compgen: {error}") from error
+                    raise ClusterError(
+                        Message(
+                            "cluster-cannot-run",
+                            "the cluster {address} cannot run compgen: {error}",
+                            address=self.address,
+                            error=error,
+                        )
+                    ) from error
         finally:
             if not future.done():
                 future.cancel()
@@ -530,15 +564,24 @@ class Cluster:
     def _look(self) -> None:
         """Raise LostError if the scheduler is gone, or there has been no worker for a while."""
         if self._client.status != "running":
-            raise LostError(f"the scheduler {self.address} was lost")
+            raise LostError(Message("scheduler-lost", "the scheduler {address} was lost", address=self.address))
         try:
             workers = self._client.nthreads()
         except (OSError, TimeoutError) as error:
-            raise LostError(f"the scheduler {self.address} was lost") from error
+            raise LostError(
+                Message("scheduler-lost", "the scheduler {address} was lost", address=self.address)
+            ) from error
         now = time.monotonic()
         since = self._empty_since = None if workers else self._empty_since or now
         if since is not None and now - since > NO_WORKER_S:
-            raise LostError(f"the cluster {self.address} has had no worker for {NO_WORKER_S:.0f} s")
+            raise LostError(
+                Message(
+                    "cluster-without-worker",
+                    "the cluster {address} has had no worker for {value:.0f} s",
+                    address=self.address,
+                    value=NO_WORKER_S,
+                )
+            )
 
     def close(self) -> None:
         """Disconnect from the cluster, which drops tasks that were not started."""

@@ -31,7 +31,7 @@ from compgen.data.lengths import Lengths
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
 from compgen.drawing.display import Bars, Drawable, Overview, Panel
-from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, UndeterminedError
+from compgen.errors import CompgenError, CompgenWarning, ConvergenceError, InputError, Message, UndeterminedError
 from compgen.foreign.answers import ImportOptions
 from compgen.foreign.heads import FileHead, heads_of
 from compgen.foreign.opening import open_measurement
@@ -379,8 +379,12 @@ def identify_bare(
         return identify_mixed(machine, measurement, options or IdentifyOptions(), known)
     if active is None or not isinstance(measurement, Lengths | Deviations | Circles):
         raise InputError(
-            "active tables (--active) can be removed from lengths, deviations and circles only; measure anything else with "
-            "the compensation off, and state it (no --active; in `volcomp recal` active_table = none or measured_with = bare)"
+            Message(
+                "active-kind-not-possible",
+                "active tables (--active) can be removed from lengths, deviations and circles only; "
+                "measure anything else with the compensation off, and state it (no --active; in "
+                "`volcomp recal` active_table = none or measured_with = bare)",
+            )
         )
     wider, moved, report = without_active(machine, measurement, active)
     result = identify_measurement(wider, moved, options)
@@ -525,7 +529,11 @@ def _apart(name: str, failed: dict[str, str], of: int) -> Iterator[None]:
         failed[name] = str(error)
         if len(failed) == of:
             raise
-        warnings.warn(f"{name}: no tables: {error}", CompgenWarning, stacklevel=3)
+        warnings.warn(
+            Message("control-no-tables", "{name}: no tables: {error}", name=name, error=error),
+            CompgenWarning,
+            stacklevel=3,
+        )
 
 
 def _add_failed(output: OutputFolder, failed: Mapping[str, str]) -> None:
@@ -629,7 +637,7 @@ def run(  # noqa: PLR0913  (the options of the whole chain, all by keyword)
     path_of("folder", folder)
     sub_folders = {name: name if len(set(controllers)) > 1 else "" for name in controllers}
     if not sub_folders:
-        raise InputError("no controller was given; give at least one")
+        raise InputError(Message("no-controller", "no controller was given; give at least one"))
     for name, sub_folder in sub_folders.items():
         OutputFolder(Path(folder) / sub_folder)
         controller_named(name)

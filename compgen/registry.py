@@ -22,7 +22,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from compgen.errors import CompgenWarning, InputError, one_line
+from compgen.errors import CompgenWarning, InputError, Message, one_line
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -136,9 +136,16 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
     source = Path(path).resolve()
     file = source / "__init__.py" if source.is_dir() else source
     if not file.is_file():
-        raise InputError("no such plug-in; give a .py file or a folder with an __init__.py", file=file)
+        raise InputError(
+            Message("plugin-missing", "no such plug-in; give a .py file or a folder with an __init__.py"), file=file
+        )
     if file.suffix != ".py":
-        raise InputError("is not a Python file; a plug-in is a .py file or a folder with an __init__.py", file=file)
+        raise InputError(
+            Message(
+                "plugin-no-python", "is not a Python file; a plug-in is a .py file or a folder with an __init__.py"
+            ),
+            file=file,
+        )
     origin = f"{PATH_ORIGIN}{source}"
     if any(origin in kind.registry.origins.values() for kind in kinds):
         return
@@ -148,11 +155,28 @@ def load_file(path: str | Path, kinds: Sequence[Kind]) -> None:
     for kind in kinds:
         things = getattr(module, kind.attribute, None)
         if things is not None and not isinstance(things, Mapping):
-            raise InputError(f"{origin}: {kind.attribute} must be a dict from names to {kind.word}s", file=file)
+            raise InputError(
+                Message(
+                    "plugin-no-dict",
+                    "{origin}: {attribute} must be a dict from names to {word}s",
+                    origin=origin,
+                    attribute=kind.attribute,
+                    word=kind.word,
+                ),
+                file=file,
+            )
         found += [(kind, name, thing) for name, thing in (things or {}).items()]
     if not found:
         dicts = ", ".join(f"{kind.attribute} ({kind.word}s by name)" for kind in kinds)
-        raise InputError(f"{origin} contains nothing to register; expected at least one dict: {dicts}", file=file)
+        raise InputError(
+            Message(
+                "plugin-empty",
+                "{origin} contains nothing to register; expected at least one dict: {dicts}",
+                origin=origin,
+                dicts=dicts,
+            ),
+            file=file,
+        )
     with restored(kinds, only_after_errors=True):
         for kind, name, thing in found:
             kind.register(name, thing, origin)
@@ -211,7 +235,9 @@ def load_entry_points(kinds: Sequence[Kind]) -> None:
                 except InputError as error:
                     if entry.name not in kind.registry:
                         kind.registry.broken[entry.name] = str(error)
-                    warnings.warn(f"left out: {error}", CompgenWarning, stacklevel=4)
+                    warnings.warn(
+                        Message("plugin-left-out", "left out: {error}", error=error), CompgenWarning, stacklevel=4
+                    )
 
 
 def _origin(entry: EntryPoint) -> str:

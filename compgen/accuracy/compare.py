@@ -52,7 +52,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, MM_PER_UM, error_named
 from compgen.data.toml_files import option
 from compgen.drawing.display import Bars, Drawable, Overview, Panel
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.first_order import tool_of
 from compgen.kinematics.gauge import common_gauge_part
 
@@ -74,7 +74,13 @@ def refuse(what: str, before: Sequence[object], after: Sequence[object], ways: s
             shown = ", ".join(str(x) for x in only[:3]) + (", ..." if len(only) > 3 else "")
             parts.append(f"only {name} has {shown}")
     return InputError(
-        f"BEFORE and AFTER do not have the same {what}: {'; '.join(parts)}. A comparison needs the same points; {ways}",
+        Message(
+            "compare-points-differ",
+            "BEFORE and AFTER do not have the same {what}: {parts}. A comparison needs the same points; {ways}",
+            what=what,
+            parts="; ".join(parts),
+            ways=ways,
+        ),
         field="--align",
     )
 
@@ -111,7 +117,7 @@ def paired_errors(before: ErrorSource, after: ErrorSource, align: str | None) ->
         )
         texts = [[f"{x:g} mm" for x in table.curves[name].position_mm] for table in (first, second)]
         ways = "--align interpolate compares both at all positions of both, --align common at those that both have"
-        raise refuse(f"positions of {name}", texts[0], texts[1], ways)
+        raise refuse(Message("positions-of-error", "positions of {name}", name=name), texts[0], texts[1], ways)
     nodes = {
         name: _joined(first.curves[name], second.curves[name], str(align)) for name in names if name in first.curves
     }
@@ -137,7 +143,9 @@ def _joined(first: Curve, second: Curve, align: str) -> FloatArray:
         both = both[np.concatenate([[True], np.diff(both) > SAME_MM])]
         kept = both[(both >= low) & (both <= high)]
     if len(kept) == 0:
-        raise InputError("BEFORE and AFTER have no position in common", field="--align")
+        raise InputError(
+            Message("compare-no-common-position", "BEFORE and AFTER have no position in common"), field="--align"
+        )
     return np.asarray(kept)
 
 
@@ -226,7 +234,10 @@ def paired_fields(
     """Return both at the same points; InputError if they differ and ``align`` is not ``"common"``."""
     if before.measured != after.measured:
         raise InputError(
-            "BEFORE and AFTER do not measure the same components dx, dy, dz; measure the same, or identify both"
+            Message(
+                "compare-components-differ",
+                "BEFORE and AFTER do not measure the same components dx, dy, dz; measure the same, or identify both",
+            )
         )
     known = set(after.keys)
     common = [key for key in before.keys if key in known]
@@ -279,13 +290,22 @@ def paired_runs(
         rows, columns = np.nonzero(near)
         if len(rows) < 2:
             raise InputError(
-                f"{axis}: BEFORE and AFTER have {len(rows)} targets in common; at least two are needed", field="--align"
+                Message(
+                    "compare-few-targets",
+                    "{axis}: BEFORE and AFTER have {rows} targets in common; at least two are needed",
+                    axis=axis,
+                    rows=len(rows),
+                ),
+                field="--align",
             )
         return _picked(before, rows), _picked(after, columns), f"{axis}: the {len(rows)} targets that both have"
     if align == "interpolate":
         rows = np.flatnonzero((first >= second[0]) & (first <= second[-1]))
         if len(rows) < 2:
-            raise InputError(f"{axis}: fewer than two targets of BEFORE are within AFTER", field="--align")
+            raise InputError(
+                Message("compare-few-within", "{axis}: fewer than two targets of BEFORE are within AFTER", axis=axis),
+                field="--align",
+            )
         at = first[rows]
         values = np.vstack([np.interp(at, second, row) for row in after.values])
         count = np.vstack([np.interp(at, second, row) for row in after.count])
@@ -295,7 +315,7 @@ def paired_runs(
     ways = (
         "--align common compares the targets that both have, --align interpolate interpolates AFTER at those of BEFORE"
     )
-    raise refuse(f"targets of {axis}", texts[0], texts[1], ways)
+    raise refuse(Message("targets-of-axis", "targets of {axis}", axis=axis), texts[0], texts[1], ways)
 
 
 def _picked(statistics: RunStatistics, rows: np.ndarray) -> RunStatistics:
@@ -534,7 +554,12 @@ def compare_fields(
     first, second, text = paired_fields(before, after, chosen.align)
     alignment, measured = chosen.alignment or "as-given", first.measured
     if alignment != "as-given" and not all(measured):
-        raise InputError("a rigid motion can be removed only if dx, dy and dz were measured; use --alignment as-given")
+        raise InputError(
+            Message(
+                "rigid-motion-needs-all",
+                "a rigid motion can be removed only if dx, dy and dz were measured; use --alignment as-given",
+            )
+        )
     sides = [aligned(machine, side.field, alignment) for side in (first, second)]
     gone = [f"V_{axis}" for axis, there in zip("XYZ", measured, strict=True) if not there]
     groups = []
@@ -572,11 +597,23 @@ def _compare_tests(
 ) -> Comparison:
     """Compare tests of the axes or diagonals that both sides have."""
     if options.align == "model" or options.alignment is not None:
-        raise InputError(f"{what[0]} cannot be aligned by a rigid motion or a model; use --align common or interpolate")
+        raise InputError(
+            Message(
+                "compare-no-alignment",
+                "{what} cannot be aligned by a rigid motion or a model; use --align common or interpolate",
+                what=what[0],
+            )
+        )
     names = [name for name in before if name in after]
     if set(before) != set(after) and (options.align != "common" or not names):
         raise InputError(
-            f"BEFORE has {', '.join(before)}, AFTER {', '.join(after)}; --align common compares the {what[1]} that both have",
+            Message(
+                "compare-counts-differ",
+                "BEFORE has {before}, AFTER {after}; --align common compares the {what} that both have",
+                before=", ".join(before),
+                after=", ".join(after),
+                what=what[1],
+            ),
             field="--align",
         )
     pairs = {name: pair(name, before[name], after[name], options.align) for name in names}

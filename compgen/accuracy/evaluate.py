@@ -28,7 +28,7 @@ from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, BODY_DIAGONALS, ERROR_INDEX, MM_PER_UM, RAD_PER_URAD, error_named
 from compgen.drawing.display import Bars, Drawable, Overview, Panel, shortened
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.first_order import c_matrix
 from compgen.kinematics.many_points import volume_grid
 
@@ -92,9 +92,16 @@ def slope_weights(position_mm: FloatArray, line: str, value: FloatArray | None =
 
 def _check(position_mm: FloatArray, line: str) -> None:
     if line not in LINES:
-        raise InputError(f"{line!r} is not a reference line; use one of {', '.join(LINES)}")
+        raise InputError(
+            Message(
+                "reference-line-unknown",
+                "{line!r} is not a reference line; use one of {value}",
+                line=line,
+                value=", ".join(LINES),
+            )
+        )
     if len(position_mm) < 2:
-        raise InputError("straightness needs values at two or more positions")
+        raise InputError(Message("straightness-few-positions", "straightness needs values at two or more positions"))
 
 
 def _contacts(position_mm: FloatArray, rest: FloatArray) -> tuple[int, int, int, float]:

@@ -23,7 +23,7 @@ from compgen.data.error_table import Curve, ErrorTable, hat_matrix
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine
 from compgen.data.names import COVERAGE, ERROR_INDEX, ERRORS, MM_PER_UM, SQUARENESS_NAMES, error_named
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.identification.covariance import Covariance, covariance_or_independent, posterior_with
 from compgen.identification.posterior import Posterior, assumed_text, worse_text
 from compgen.kinematics.exact_chain import exact_error
@@ -260,7 +260,12 @@ def _to_axes(machine: Machine, field: ErrorField) -> ErrorField:
         if distance[rows[-1]] > _SAME_MM:
             where = ", ".join(f"{value:g}" for value in point)
             raise InputError(
-                f"the alignment to the axes needs the point ({where}) mm, which is missing; use --alignment as-given or best-fit"
+                Message(
+                    "alignment-point-missing",
+                    "the alignment to the axes needs the point ({where}) mm, which is missing; use "
+                    "--alignment as-given or best-fit",
+                    where=where,
+                )
             )
     parameters = np.zeros((6, len(field), 3))
     first, second = (0, 1) if machine.squareness_reference == "X" else (1, 0)

@@ -15,7 +15,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, BODY_DIAGONALS, MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES
 from compgen.data.toml_files import option
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.first_order import c_matrix
 
 # Contribution of the set-up of a positioning test to the uncertainty of its figures, in the manner of ISO/TR 230-9.
@@ -162,9 +162,16 @@ def run_statistics(position_mm: FloatArray, direction: FloatArray, deviation_mm:
                 values[2 + row, k] = here.std(ddof=1)
         if 0 < np.count_nonzero(count[row]) < len(position):
             missing = position[np.flatnonzero(count[row] == 0)[0]]
-            raise InputError(f"no reading at {missing:g} mm in direction {sign:+d}; every target needs both directions")
+            raise InputError(
+                Message(
+                    "target-without-direction",
+                    "no reading at {missing:g} mm in direction {sign:+d}; every target needs both directions",
+                    missing=missing,
+                    sign=sign,
+                )
+            )
     if len(position) < 2:
-        raise InputError("a positioning test needs at least two targets")
+        raise InputError(Message("positioning-few-targets", "a positioning test needs at least two targets"))
     return RunStatistics(position, values, count)
 
 
@@ -289,7 +296,14 @@ def positioning_test(
     budget : contribution of the set-up to the uncertainties.
     """
     if edition not in EDITIONS:
-        raise InputError(f"edition {edition} of ISO 230-2 is not available; use {' or '.join(map(str, EDITIONS))}")
+        raise InputError(
+            Message(
+                "edition-unknown",
+                "edition {edition} of ISO 230-2 is not available; use {str}",
+                edition=edition,
+                str=" or ".join(map(str, EDITIONS)),
+            )
+        )
     k = EDITIONS[edition]
     found: dict[str, tuple[Combination, str]] = {}
     if statistics.bidirectional:
@@ -401,7 +415,9 @@ def vdi_3441(statistics: RunStatistics, budget: SetupBudget = NO_BUDGET) -> dict
         if a direction is missing or nothing was repeated: the guideline has no such test.
     """
     if not (statistics.bidirectional and statistics.repeated):
-        raise InputError("VDI/DGQ 3441 needs both directions, each repeated at every target")
+        raise InputError(
+            Message("vdi-needs-both-directions", "VDI/DGQ 3441 needs both directions, each repeated at every target")
+        )
     count = len(statistics.position_mm)
     signs = np.sign(statistics.values[MEAN_UP] - statistics.values[MEAN_DOWN]).tolist()
     middle = [[(0.5, MEAN_UP, i), (0.5, MEAN_DOWN, i)] for i in range(count)]
@@ -507,7 +523,12 @@ def diagonal_runs(machine: Machine, diagonals: Diagonals) -> dict[str, DiagonalR
             own = run_statistics(distance, diagonals.direction[rows].astype(np.float64), diagonals.deviation_mm[rows])
         except InputError as error:
             file = diagonals.origin[int(rows[0])][0] if diagonals.origin else None
-            raise InputError(f"{name}, distance along it: {error.message}", file=file) from None
+            raise InputError(
+                Message(
+                    "distance-along-line", "{name}, distance along it: {message}", name=name, message=error.message
+                ),
+                file=file,
+            ) from None
         found[name] = DiagonalRun(name, points[int(np.argmin(distance))], points[int(np.argmax(distance))], own)
     return found
 

@@ -40,7 +40,7 @@ from compgen.data.files import read_bytes
 from compgen.data.lengths import POSITION_COLUMNS, Lengths, Points
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
-from compgen.errors import InputError, UndeterminedError
+from compgen.errors import InputError, Message, UndeterminedError
 from compgen.identification import (
     Identification,
     IdentifyOptions,
@@ -95,7 +95,14 @@ class Side:
             return self
         measurement = self.lengths or self.deviations or self.circles
         if measurement is None:
-            raise InputError(f"contains {self.kind}, which do not determine the errors of the machine", file=self.path)
+            raise InputError(
+                Message(
+                    "kind-without-errors",
+                    "contains {kind}, which do not determine the errors of the machine",
+                    kind=self.kind,
+                ),
+                file=self.path,
+            )
         chosen = IdentifyOptions(u_deviation_um=self.u_um if self.lengths is None else None)
         found = identify_measurement(self.machine, measurement, chosen)
         return replace(
@@ -132,7 +139,10 @@ def read_side(
     if source.is_dir():  # of a command that wrote its errors
         source = source / "identified.errors.csv"
         if not source.is_file():
-            raise InputError("is a folder without identified.errors.csv; give a file", file=source.parent)
+            raise InputError(
+                Message("folder-without-errors", "is a folder without identified.errors.csv; give a file"),
+                file=source.parent,
+            )
     text = read_bytes(source, _LOOKED_AT).decode(
         "utf-8-sig", errors="replace"
     )  # only to detect the kind; the readers are strict
@@ -196,7 +206,11 @@ def _read_predicted(machine: Machine, path: Path) -> ErrorField:
         tool = np.column_stack([table.numbers(f"tool_{k}_mm") for k in "xyz"])
         if np.max(np.abs(tool - np.array(machine.tool_offset_mm))) > 1e-6:
             raise InputError(
-                "has a tool offset that differs from the machine file; predict with that of the machine file", file=path
+                Message(
+                    "tool-offset-differs",
+                    "has a tool offset that differs from the machine file; predict with that of the machine file",
+                ),
+                file=path,
             )
     return ErrorField(position, position + tool, error, lambda _: 0.0)
 
@@ -219,12 +233,23 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
     if before.predicted is not None or after.predicted is not None:
         side = before if before.predicted is not None else after
         raise InputError(
-            "contains predicted errors at points; compare them with a measurement: --predicted", file=side.path
+            Message(
+                "prediction-not-measured",
+                "contains predicted errors at points; compare them with a measurement: --predicted",
+            ),
+            file=side.path,
         )
     for alone, name in (("runs", "axis runs"), ("diagonals", "measured diagonals")):
         if getattr(before, alone) is not None or getattr(after, alone) is not None:
             raise InputError(
-                f"BEFORE contains {before.kind}, AFTER {after.kind}; {name} can only be compared with {name}"
+                Message(
+                    "compare-kinds-differ",
+                    "BEFORE contains {kind}, AFTER {kind2}; {name} can only be compared with {name2}",
+                    kind=before.kind,
+                    kind2=after.kind,
+                    name=name,
+                    name2=name,
+                )
             )
     if options.align != "model" and (before.deviations is not None or after.deviations is not None):
         return _at_positions(before, after, options)
@@ -314,9 +339,14 @@ def _both_fields(predicted: Side, measured: Side, options: CompareOptions) -> tu
     machine = predicted.machine
     for side in (measured, predicted):
         if side.runs is not None or side.diagonals is not None:
-            raise InputError(f"{side.kind} cannot be compared with a prediction of errors", file=side.path)
+            raise InputError(
+                Message("kind-not-predicted", "{kind} cannot be compared with a prediction of errors", kind=side.kind),
+                file=side.path,
+            )
     if measured.predicted is not None:
-        raise InputError("AFTER is also a prediction; expected a measurement", file=measured.path)
+        raise InputError(
+            Message("prediction-twice", "AFTER is also a prediction; expected a measurement"), file=measured.path
+        )
     alignment: Alignment = options.alignment or ("as-given" if measured.deviations is not None else "axes")
     if predicted.predicted is not None:
         alignment = options.alignment or "as-given"
@@ -341,11 +371,19 @@ def _exact(side: Side) -> ErrorSource:
 def _own_tool(side: Side) -> MeasuredField:
     found = side.measured()
     if not all(found.measured):
-        raise InputError("a comparison with a prediction needs dx, dy and dz; not all were measured", file=side.path)
+        raise InputError(
+            Message(
+                "prediction-needs-all", "a comparison with a prediction needs dx, dy and dz; not all were measured"
+            ),
+            file=side.path,
+        )
     offset = found.field.tip_mm - found.field.position_mm - np.array(side.machine.tool_offset_mm)
     if float(np.max(np.abs(offset))) > 1e-6:
         raise InputError(
-            "was measured with a tool offset other than that of the machine file, which the prediction uses",
+            Message(
+                "prediction-other-tool",
+                "was measured with a tool offset other than that of the machine file, which the prediction uses",
+            ),
             file=side.path,
         )
     return found
@@ -361,8 +399,14 @@ def _predicted_at(predicted: Side, measured: ErrorField) -> ErrorField:
     missing = [key for key in points if key not in index]
     if missing:
         raise InputError(
-            f"has no prediction for {len(missing)} of {len(points)} measured points, the first is {missing[0]} mm; "
-            "predict at the measured points",
+            Message(
+                "points-not-predicted",
+                "has no prediction for {missing} of {points} measured points, the first is "
+                "{missing2} mm; predict at the measured points",
+                missing=len(missing),
+                points=len(points),
+                missing2=missing[0],
+            ),
             file=predicted.path,
         )
     return given.at_rows(np.array([index[key] for key in points], dtype=np.int64))

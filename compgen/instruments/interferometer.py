@@ -11,7 +11,7 @@ import numpy as np
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 
 if TYPE_CHECKING:
     from compgen.instruments.sixdof_instrument import SixDof, SixDofInstrument
@@ -68,7 +68,12 @@ def needs_air(readings: SixDof) -> bool:
     text = readings.metadata.get("wavelength_compensated", "true").lower()
     if text not in ("true", "yes", "1", "false", "no", "0"):
         raise InputError(
-            f"the comment wavelength_compensated = {text!r} is neither true nor false", file=_file(readings)
+            Message(
+                "comment-not-boolean",
+                "the comment wavelength_compensated = {text!r} is neither true nor false",
+                text=text,
+            ),
+            file=_file(readings),
         )
     return text in ("false", "no", "0")
 
@@ -165,7 +170,10 @@ def _metadata_number(readings: SixDof, key: str, default: float, allowed: tuple[
     try:
         value = float(text)
     except ValueError:
-        raise InputError(f"the comment {key} = {text!r} is not a number", file=_file(readings)) from None
+        raise InputError(
+            Message("comment-not-number", "the comment {key} = {text!r} is not a number", key=key, text=text),
+            file=_file(readings),
+        ) from None
     if not allowed[0] <= value <= allowed[1]:
         message = f"the comment {key} = {value:g} must lie within {allowed[0]:g} ... {allowed[1]:g}"
         raise InputError(message, file=_file(readings))

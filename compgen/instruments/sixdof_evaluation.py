@@ -11,7 +11,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.error_table import Curve, ErrorTable, fitted_line
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, MM_PER_UM, error_named
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.instruments.interferometer import growth_mm
 from compgen.instruments.sixdof_instrument import ERRORS_OF_AXIS, RAD_PER_ARCSEC, SixDof, SixDofInstrument
 from compgen.instruments.sixdof_reduction import (
@@ -264,7 +264,13 @@ def largest_differences(errors: ErrorTable, reference: ErrorTable, line: str = "
             )
             at = other.position_mm[within]
             if len(at) < 2:
-                raise InputError(f"the reference has fewer than two positions of {name} within the measured travel")
+                raise InputError(
+                    Message(
+                        "reference-few-positions",
+                        "the reference has fewer than two positions of {name} within the measured travel",
+                        name=name,
+                    )
+                )
             difference = own.at(at) - other.at(at)
             if error_named(name).is_straightness:
                 constant, slope = fitted_line(at, difference, line)

@@ -22,7 +22,7 @@ from compgen.data.machine import Vector3
 from compgen.data.names import AXES, MM_PER_UM
 from compgen.data.records import AXIS, RUN, Field, Schema, within
 from compgen.data.toml_files import part_setting, setting
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 
 # Constants of the six-DOF laser instrument, and which error of which axis each of its channels sees.
 #
@@ -594,11 +594,23 @@ def read_sixdof(files: str | Path | Sequence[str | Path]) -> SixDof:
             message = "contains both of them" if kinds else "contains neither of them"
             field = "columns displacement_mm, phase_rad"
             raise InputError(
-                f"{message}; give the one that was read from the interferometer", file=table.path, field=field
+                Message(
+                    "interferometer-value",
+                    "{message}; give the one that was read from the interferometer",
+                    message=message,
+                ),
+                file=table.path,
+                field=field,
             )
         if kinds[0] not in tables[0].columns:
             raise InputError(
-                f"has {kinds[0]}, but {tables[0].path} does not; use the same column in all files", file=table.path
+                Message(
+                    "columns-differ",
+                    "has {kinds}, but {path} does not; use the same column in all files",
+                    kinds=kinds[0],
+                    path=tables[0].path,
+                ),
+                file=table.path,
             )
     parts = [SixDof(**_SIXDOF.values(table)) for table in tables]
     # the displacement is nan if the phase was read; the second spot counts only if all files have it

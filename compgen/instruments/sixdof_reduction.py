@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from compgen.data.csv_files import FloatArray
 from compgen.data.machine import Machine
 from compgen.data.names import AXES
-from compgen.errors import CompgenWarning, InputError
+from compgen.errors import CompgenWarning, InputError, Message
 from compgen.instruments.sixdof_instrument import (
     DIRECTIONS,
     ROTATIONS,
@@ -93,7 +93,13 @@ def reduce_runs(readings: SixDof, instrument: SixDofInstrument, expected_away: d
             raise InputError(message, file=instrument.source)
         if len(np.unique(readings.position_mm[rows])) < 2:
             file, line = readings.origin[int(rows[0])] if readings.origin else (None, None)
-            raise InputError(f"run {run} of {AXES[axis]} has fewer than two positions", file=file, line=line)
+            raise InputError(
+                Message(
+                    "run-few-positions", "run {run} of {value} has fewer than two positions", run=run, value=AXES[axis]
+                ),
+                file=file,
+                line=line,
+            )
         first.setdefault(axis, float(readings.position_mm[rows[0]]))
         set_up, position = instrument.axes[axis], readings.position_mm[rows]
         away, nominal = _travel(readings, axis, run, rows, set_up, expected_away[axis])
@@ -161,8 +167,15 @@ def _travel(
     if abs(slope - nearest) > LARGEST_SCALE_ERROR:
         file, line = readings.origin[int(rows[0])] if readings.origin else (None, None)
         raise InputError(
-            f"run {run} of {AXES[axis]}: displacement_mm changes by {slope:.4f} mm per mm of position_mm; expected 1, -1, or 0 "
-            "(deviations only): check units, position_mm, and the interferometer",
+            Message(
+                "displacement-slope",
+                "run {run} of {value}: displacement_mm changes by {slope:.4f} mm per mm of "
+                "position_mm; expected 1, -1, or 0 (deviations only): check units, position_mm, and "
+                "the interferometer",
+                run=run,
+                value=AXES[axis],
+                slope=slope,
+            ),
             file=file,
             line=line,
             field="column displacement_mm",
@@ -188,8 +201,14 @@ def _distance(
     distance = entry.distance_first_mm + entry.set_up.beam_direction * travel_mm
     if distance.min() < 0.0:
         raise InputError(
-            f"the optical distance would become {distance.min():g} mm; check distance_first_mm (now "
-            f"{entry.distance_first_mm:g}), beam_direction and mode of {letter}",
+            Message(
+                "optical-distance-negative",
+                "the optical distance would become {distance:g} mm; check distance_first_mm (now "
+                "{distance_first_mm:g}), beam_direction and mode of {letter}",
+                distance=distance.min(),
+                distance_first_mm=entry.distance_first_mm,
+                letter=letter,
+            ),
             file=instrument.source,
             field=f"[axes.{letter}] distance_first_mm",
         )
