@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -363,43 +364,11 @@ _FLAGS = {
     "line": "--line",
 }
 _ONE_AXIS = ("axis", "error", "sign", "directions", "line", "dates")
-#: What each format leaves open to the user.
-_TAKES: dict[str, tuple[str, ...]] = {
-    "renishaw": ("units", *_ONE_AXIS, "zero_runs"),
-    "renishaw-capture": ("dates",),
-    "ecmc-iso230": _ONE_AXIS[:-1],
-    "etalon-exchange": ("sign", "units"),
-    "probe-log": (),
-    "dmis": ("units", "ignore"),
-    "qif": ("units", "ignore"),
-    "table": tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs")),
-    "xlsx": tuple(name for name in _FLAGS if name != "zero_runs"),
-}
 
 
 def form_of(path: Path) -> str:
     """Return the name of a foreign file's format."""
-    check_size(path, MOST_CAPTURE_BYTES)
-    head = read_head(path)
-    if head.startswith(b"PK\x03\x04"):
-        return "xlsx"
-    if is_capture(head) or path.suffix.lower() == ".rtx":
-        return "renishaw-capture"
-    text = decode_head(head)
-    if is_renishaw_text(text) or path.suffix.lower() in REFUSED:
-        return "renishaw"
-    if is_ecmc(text):
-        return "ecmc-iso230"
-    if is_exchange_text(text.lstrip("\ufeff")):
-        return "etalon-exchange"
-    if is_probe_log(text):
-        return "probe-log"
-    if is_qif(text):
-        return "qif"
-    if is_dmis(text):
-        return "dmis"
-    check_size(path, MOST_BYTES)
-    return "table"
+    return _format_of(path).name
 
 
 def _with_line(item: Imported, options: ImportOptions) -> Imported:
@@ -444,20 +413,21 @@ def import_file(path: str | Path, options: ImportOptions | None = None) -> Impor
         with file, line and column for one that is damaged, truncated, too large or unknown.
     """
     source, chosen = Path(path), options or ImportOptions()
-    form = form_of(source)
+    reader = _format_of(source)
+    form = reader.name
     # an option that is silently ignored would mislead
     for name, flag in _FLAGS.items():
-        if getattr(chosen, name) and name not in _TAKES[form]:
-            taken = ", ".join(_FLAGS[key] for key in _TAKES[form]) or "none"
+        if getattr(chosen, name) and name not in reader.takes:
+            taken = ", ".join(_FLAGS[key] for key in reader.takes) or "none"
             raise InputError(f"does not apply to a file of the format {form}; {taken} do", file=source, field=flag)
     for key in chosen.units:
-        if form == "renishaw" and key not in ("value", "deviation"):
+        if form == "renishaw" and key not in reader.units:
             raise InputError("in this format only the unit of the values is open", file=source, field=f"--unit {key}")
-        if form == "etalon-exchange" and key not in ("linear", "angle"):
+        if reader.units and key not in reader.units:
             raise InputError("give linear= or angle= for this format", file=source, field=f"--unit {key}")
         if key not in ("value", "linear", "angle"):
             check_field(key, "--unit")
-    item = _of_text(source, chosen) if form == "table" else READERS[form](source, chosen)
+    item = reader.read(source, chosen)
     if chosen.sign not in (None, *TABLE_SIGNS) and "sign_of_squareness" not in str(item.understood):
         raise InputError(f"{chosen.sign} applies to squareness, and there is none", file=source, field="--sign")
     base_mm = chosen.base_length_mm
@@ -712,13 +682,75 @@ def _import_qif(path: Path, options: ImportOptions) -> Imported:
     return imported_features(read_qif(path, options), "qif", options)
 
 
-READERS: dict[str, Callable[[Path, ImportOptions], Imported]] = {
-    "renishaw": import_renishaw,
-    "renishaw-capture": import_capture,
-    "ecmc-iso230": import_ecmc,
-    "etalon-exchange": import_exchange,
-    "probe-log": import_probe_log,
-    "dmis": _import_dmis,
-    "qif": _import_qif,
-    "xlsx": _import_workbook,
-}
+@dataclass(frozen=True)
+class Head:
+    """The first bytes of a file, and their text."""
+
+    path: Path
+    content: bytes
+
+    @cached_property
+    def text(self) -> str:
+        """The bytes as text."""
+        return decode_head(self.content)
+
+
+@dataclass(frozen=True)
+class Format:
+    """One kind of foreign file: how it is recognised, who reads it, and what it leaves open to the user.
+
+    ``takes`` are the options (names of :data:`_FLAGS`) that a file of the format may need, ``units`` the quantities whose
+    unit may be given; none: those of all columns.
+    """
+
+    name: str
+    recognised: Callable[[Head], bool]
+    read: Callable[[Path, ImportOptions], Imported]
+    takes: tuple[str, ...] = ()
+    units: tuple[str, ...] = ()
+
+
+#: In the order in which they are tried, those that are recognised by their first bytes before those by their text; what is none
+#: of them is a table.
+FORMATS = (
+    Format(
+        "xlsx",
+        lambda head: head.content.startswith(b"PK\x03\x04"),
+        _import_workbook,
+        tuple(name for name in _FLAGS if name != "zero_runs"),
+    ),
+    Format(
+        "renishaw-capture",
+        lambda head: is_capture(head.content) or head.path.suffix.lower() == ".rtx",
+        import_capture,
+        ("dates",),
+    ),
+    Format(
+        "renishaw",
+        lambda head: is_renishaw_text(head.text) or head.path.suffix.lower() in REFUSED,
+        import_renishaw,
+        ("units", *_ONE_AXIS, "zero_runs"),
+        ("value", "deviation"),
+    ),
+    Format("ecmc-iso230", lambda head: is_ecmc(head.text), import_ecmc, _ONE_AXIS[:-1]),
+    Format(
+        "etalon-exchange",
+        lambda head: is_exchange_text(head.text.lstrip("\ufeff")),
+        import_exchange,
+        ("sign", "units"),
+        ("linear", "angle"),
+    ),
+    Format("probe-log", lambda head: is_probe_log(head.text), import_probe_log),
+    Format("qif", lambda head: is_qif(head.text), _import_qif, ("units", "ignore")),
+    Format("dmis", lambda head: is_dmis(head.text), _import_dmis, ("units", "ignore")),
+    Format("table", lambda _: True, _of_text, tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs"))),
+)
+
+
+def _format_of(path: Path) -> Format:
+    check_size(path, MOST_CAPTURE_BYTES)
+    head = Head(path, read_head(path))
+    found = next(item for item in FORMATS if item.recognised(head))
+    if found.name == "table":
+        check_size(path, MOST_BYTES)
+    return found
