@@ -37,14 +37,13 @@ from compgen.foreign.heads import FileHead, heads_of
 from compgen.foreign.opening import open_measurement
 from compgen.identification import Identification, IdentifyOptions, covariance
 from compgen.identification.any_measurement import (
-    Measurement,
-    MixedMeasurement,
     describe,
     evidence_files,
     identify_measurement,
     identify_mixed,
     known_alone,
 )
+from compgen.identification.kinds import Measurement, MixedMeasurement
 from compgen.identification.options import StatedNumbers
 from compgen.kinematics.kernel_switch import one_thread
 from compgen.resources import LANGUAGES

@@ -16,8 +16,10 @@ PAGE = Path(__file__).resolve().parent / "commands.md"
 BEGIN, END = "<!-- options, written by docs/option_tables.py -->\n", "<!-- end of options -->\n"
 #: Described in the section "What all commands share".
 SHARED = {"--machines", "--json", "--quiet", "--verbose", "--plugin", "--language", "--units", "--prior", "--help"}
-#: Where more about an option stands.
+#: Where more about an option stands; for one command, with its name in front.
 SEE = {
+    "run --heat": "heat.md#readings-of-known-temperatures",
+    "run --temperatures": "heat.md#readings-of-known-temperatures",
     "--allow-misfit": "method.md#what-is-accepted",
     "--certificate": "report.md",
     "--cluster": "recal.md#many-machines",
@@ -74,7 +76,8 @@ def table(names, before):
             if first != name:
                 known.setdefault(first, []).append(f"`{words[0]}`")
                 continue
-            see = next((f" See [{SEE[word].partition('#')[0]}]({SEE[word]})." for word in words if word in SEE), "")
+            page = next((SEE[key] for word in words for key in (f"{name} {word}", word) if key in SEE), "")
+            see = f" See [{page.partition('#')[0]}]({page})." if page else ""
             who = f" (`{name}`)" if len(names) > 1 else ""
             rows.append(f"| `{shown.replace('|', chr(92) + '|')}`{who} | {in_a_table(meaning)}{see} |\n")
     lines = ["| option | meaning |\n", "|---|---|\n", *rows] if rows else []

@@ -48,8 +48,8 @@ from compgen.identification import (
     joint_covariance,
     read_measurement,
 )
-from compgen.identification.any_measurement import Measurement
 from compgen.identification.covariance import covariance_named_by
+from compgen.identification.kinds import Measurement
 from compgen.tables import ReadTables
 
 # What the two sides of a comparison can be: error files, measurements of any kind, predictions.

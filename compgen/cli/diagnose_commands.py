@@ -17,9 +17,9 @@ from compgen.cli.common import (
     language_option,
     options_of,
     out_option,
-    print_json,
 )
 from compgen.cli.identify_commands import diagnose_rotary, of_rotary_axes
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import (
     heat_of_readings_options,
     instrument_option,

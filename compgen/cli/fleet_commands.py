@@ -23,9 +23,9 @@ from compgen.cli.common import (
     fleet_options,
     json_option,
     options_of,
-    print_json,
     stopped_by_signals,
 )
+from compgen.cli.output import print_json
 from compgen.cli.terminal import answer, complain, say, stdout
 from compgen.errors import InputError
 from compgen.fleet.dashboard.settings import DashboardSettings, default_users, read_token

@@ -19,8 +19,8 @@ from compgen.cli.common import (
     language_option,
     options_of,
     out_option,
-    print_json,
 )
+from compgen.cli.output import print_json
 from compgen.cli.shared_options import covariance_of, machine_argument, prior_option
 from compgen.cli.terminal import answer, progress, say, say_paths, stdout
 from compgen.data.csv_files import FloatArray

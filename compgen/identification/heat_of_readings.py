@@ -36,8 +36,8 @@ from compgen.heat.joining import (
 )
 from compgen.heat.model import HeatModel, read_heat
 from compgen.heat.sessions import COLDEST_C, HOTTEST_C, Temperatures
-from compgen.identification.any_measurement import Measurement, MixedMeasurement
 from compgen.identification.covariance import with_response
+from compgen.identification.kinds import Measurement, MixedMeasurement
 from compgen.identification.options import locate_stations
 from compgen.identification.result import Identification
 from compgen.kinematics.first_order import tool_of
