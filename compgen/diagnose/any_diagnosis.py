@@ -34,7 +34,7 @@ from compgen.diagnose.observed import Measurement, Observed, ObservedDeviations,
 from compgen.diagnose.verdict import advice_of, compared, verdict_of
 from compgen.effects import catalogue
 from compgen.effects.active import active_effects
-from compgen.errors import CompgenError, InputError, nearest
+from compgen.errors import CompgenError, InputError, Message, messages_of, nearest
 from compgen.identification.adjust.starts import robust_state
 from compgen.identification.adjust.unknowns import State, dead_lengths_of
 from compgen.instruments.sixdof_health import Suspicion, sixdof_health, turning_beams
@@ -598,7 +598,11 @@ def _completed(
     if before is not analysis.fit:
         misfit = replace(misfit, train=replace(misfit.train, before_mm=before.rms_mm))
     if analysis.fit.rms_mm > HOPELESS_MM:
-        text = f"the readings do not fit the commanded positions: {analysis.fit.rms_mm:.3g} mm rms"
+        text = Message(
+            "positions-do-not-fit",
+            "the readings do not fit the commanded positions: {rms:.3g} mm rms",
+            rms=analysis.fit.rms_mm,
+        )
         verdict = replace(verdict, word="not_decidable", reasons=(*verdict.reasons, text))
     advice = advice_of(analysis, verdict)
     observed = analysis.fit.observed
@@ -616,12 +620,23 @@ def _completed(
 # identify it; only changes with direction, time or order are visible. Names are tentative: a machine may bend that way.
 
 
-NOTE = "an optical error that depends only on the distance equals a geometric error: no statistical test can distinguish the two"
+NOTE = Message(
+    "distance-is-geometry",
+    "an optical error that depends only on the distance equals a geometric error: no statistical test can distinguish the two",
+)
 #: How to separate instrument and machine.
 ADVICE = (
-    "turn the target by 180 degrees and measure again: separates crosstalk fixed to the target from straightness",
-    "measure with a second target offset: separates crosstalk and detector gains from straightness",
-    "measure forth and back three times: separates the drift of the beam from straightness",
+    Message(
+        "turn-the-target",
+        "turn the target by 180 degrees and measure again: separates crosstalk fixed to the target from straightness",
+    ),
+    Message(
+        "second-target-offset",
+        "measure with a second target offset: separates crosstalk and detector gains from straightness",
+    ),
+    Message(
+        "measure-three-times", "measure forth and back three times: separates the drift of the beam from straightness"
+    ),
 )
 
 
@@ -652,6 +667,7 @@ class SixDofDiagnosis:
             "advice": list(ADVICE),
             "reasons": [],
             "notes": [NOTE],
+            **messages_of([*(item.text for item in self.suspicions), *ADVICE, NOTE]),
         }
 
 

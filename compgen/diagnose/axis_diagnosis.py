@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -29,6 +30,7 @@ from compgen.diagnose.axis_model import (
     candidates_of,
     invisible_of,
     noise_of,
+    paused_warmups,
 )
 from compgen.diagnose.axis_session import ORDER_TEXTS, AxisSession, Order, sessions_of
 from compgen.diagnose.engine import ALIAS, LEAST_BESIDE, LEAST_GAIN, SMALL_BESIDE, Candidate, NoiseGrid
@@ -36,17 +38,20 @@ from compgen.diagnose.layout import IntArray
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Effect, active_effects, catalogue, section_text
 from compgen.effects.all_effects import belongs_to, what_to_do
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.kernel_switch import one_thread
 
 Grade = Literal["confirmed", "beside_unknown", "tentative"]
 Show = Callable[[str], None]
 
 #: What statistics cannot decide.
-WARM_UP_NOTE = (
-    "a warm-up of the machine and one of the sensor look alike: only a stationary drift test distinguishes them"
+WARM_UP_NOTE = Message(
+    "warm-up-of-what",
+    "a warm-up of the machine and one of the sensor look alike: only a stationary drift test distinguishes them",
 )
-NO_REPEATS = "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
+NO_REPEATS = Message(
+    "noise-assumed", "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
+)
 #: Figures shown, um: reversal, range of mean bidirectional deviation, systematic deviation, repeatability, accuracy.
 SHOWN = ("B", "M", "E", "R", "A")
 #: Least degrees of freedom after fitting the means of the targets, and after fitting those of the cells.
@@ -75,7 +80,11 @@ HARDLY_LEVELS = 1.5
 #: movement in the first half, and if no more than this share of their movement remains.
 LEVELS_OFF, LEAST_FOLLOWED = 0.8, 0.5
 #: Why a drift is tentative if part of it differs along the axis or by direction.
-NOT_THE_SAME = "the drift is not the same at all positions and in both directions"
+NOT_THE_SAME = Message("drift-not-the-same", "the drift is not the same at all positions and in both directions")
+PAUSE = Message(
+    "pause-as-good",
+    "a pause during the drift looks the same, and no times are logged (time_s): it is no step if there was one",
+)
 #: Limits for the whitened residuals to count as noise: excess kurtosis (the largest in 200 sessions with noise of
 #: memory up to 0.85 was 2.0), and skewness over its standard error.
 JUMPS, LEANS = 3.0, 4.5
@@ -271,7 +280,12 @@ def _findings(
         static = [_doubted(item, "the reversal changes with time") for item in static]
     elif unknown:
         least = LEAST_WITH_UNKNOWN_RUNS if any("run" in other.covariates for other in unknown) else LEAST_WITH_UNKNOWN
-        static = [_doubted(i, "small compared with the unexplained part") if i.gain < least else i for i in static]
+        static = [
+            _doubted(i, Message("small-beside-unknown", "small compared with the unexplained part"))
+            if i.gain < least
+            else i
+            for i in static
+        ]
     largest = max((item.gain for item in effects), default=0.0)
     static = [
         _doubted(item, "it is small beside what changes with time")
@@ -288,7 +302,14 @@ def _findings(
         effects = [replace(e, grade="beside_unknown") if e.grade == "confirmed" else e for e in effects]
     if not unknown and effects and all(e.grade == "tentative" for e in effects) and repeated:
         first = effects[0]
-        unknown = [AxisUnknown(f"resembles {first.name} but {first.reasons[0]}", (), np.nan, first.name)]
+        unknown = [
+            AxisUnknown(
+                Message("resembles", "resembles {name} but {reasons}", name=first.name, reasons=first.reasons[0]),
+                (),
+                np.nan,
+                first.name,
+            )
+        ]
     effects = [_common_part(session, item, effects, changes) for item in effects]
     removed, left_out, taken, figures, notes = _removal(session, effects)
     effects = [item if item.name in taken else replace(item, remains="") for item in effects]
@@ -335,7 +356,33 @@ def _changes_found(changes: AxisFit, most: int) -> tuple[list[AxisEffect], list[
         text = "the runs do not repeat: more than one run deviates, or more than two are separated by steps"
         covariates = ("run", *_one_way(changes.session, effects))
         unknown.append(AxisUnknown(text, covariates, np.nan, of_runs[0].name))
+    effects = [_doubted(item, PAUSE) if _may_be_pause(changes, item, effects) else item for item in effects]
     return sorted(effects, key=lambda item: -item.gain), unknown
+
+
+def _may_be_pause(changes: AxisFit, step: AxisEffect, effects: Sequence[AxisEffect]) -> bool:
+    """Whether a step is what a drift does while nobody measures: only without times, and in the drift's own sense.
+
+    During a pause a warm-up goes on, and afterwards it is slower than before. So one warm-up with a pause, of any length, is
+    compared with the drift and the step.
+    """
+    search, session = changes.search, changes.session
+    drift = next((item for item in effects if item.name in DRIFTS), None)
+    if session.timed or step.name != "step_between_runs" or drift is None:
+        return False
+    rises, steps = (item.shift_mm[-1] - item.shift_mm[0] for item in (drift, step))
+    if rises * steps <= 0:
+        return False
+    own = [search.candidates[k] for k in changes.members]
+    kept = [c for c in own if c.name not in (*DRIFTS, step.name)]
+    both = [c for c in own if c.name in (*DRIFTS, step.name)]
+    at = next(c.effect.settings["at"] for c in own if c.name == step.name and c.effect is not None)
+    paused = paused_warmups(session, int(at))
+    again = AxisSearch(session, search.grid, [*kept, *both, *paused])
+    first = list(range(len(kept)))
+    as_steps = again.total([*first, *range(len(kept), len(own))])
+    as_pause = max(again.total([*first, k]) for k in range(len(own), len(own) + len(paused)))
+    return as_pause > as_steps - ALIAS
 
 
 def _one_way(session: AxisSession, effects: Sequence[AxisEffect]) -> tuple[str, ...]:
@@ -544,15 +591,21 @@ def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect
     if item.name in DRIFTS and "time" in of_generic and of_generic & {"x", "approach"}:
         reasons.append(NOT_THE_SAME)
     if item.name in (*OF_RUNS, *DRIFTS) and "run" in of_generic:
-        reasons.append("every run differs from the others")
+        reasons.append(Message("every-run-differs", "every run differs from the others"))
     if item.columns.shape[1] == 1:
         p, share = _uneven(changes, member, shift)
         if p < UNEVEN_P and share > UNEVEN_SHARE:
-            reasons.append(f"does not behave like it at all positions, directions and times (p = {p:.1e})")
+            reasons.append(
+                Message(
+                    "not-alike-everywhere",
+                    "does not behave like it at all positions, directions and times (p = {p:.1e})",
+                    p=p,
+                )
+            )
     unnamed = sum(float(search.criteria([k for k in changes.members if k != g])[0][g]) for g in generic)
     share = LEAST_SHARE_OF_DRIFT if item.name in DRIFTS and "time" in of_generic else LEAST_SHARE
     if unnamed and gains[member] < share * unnamed:
-        reasons.append("small compared with the unexplained part")
+        reasons.append(Message("small-beside-unknown", "small compared with the unexplained part"))
     own = np.array([float(values.mean())]) if item.free else values
     u = np.sqrt(np.diag(covariance))
     first = float(np.mean(u)) if item.free else float(u[0])
@@ -563,7 +616,7 @@ def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect
     parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
     reasons += _size_reasons(item, own, parameters, covariance if len(own) == len(covariance) else np.diag(u[:1] ** 2))
     if item.name.rpartition("_")[0] in LOGGED and not _holds(changes, member):
-        reasons.append("it does not hold in runs left out of the fit")
+        reasons.append(Message("fails-left-out", "it does not hold in runs left out of the fit"))
     if item.name in DRIFTS:  # refer the readings to the end of the session, the warm state
         shift = shift - shift[-1]
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
@@ -581,11 +634,21 @@ def _size_reasons(
     reasons = []
     finite = bool(np.isfinite(covariance).all())
     if not finite or float(values @ np.linalg.pinv(covariance, hermitian=True) @ values) < LEAST_SIZE**2:
-        reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+        reasons.append(
+            Message(
+                "within-its-uncertainty",
+                "it is smaller than {LEAST_SIZE:g} times its standard uncertainty",
+                LEAST_SIZE=LEAST_SIZE,
+            )
+        )
     for own in item.effect.card.parameters if item.effect is not None else ():
         value, u = parameters.get(own.name, (0.0, None))
         if own.plausible > 0 and abs(value) - LEAST_SIZE * (u or 0.0) > PLAUSIBLE * own.plausible:
-            reasons.append(f"its size, {own.name} = {value:.3g}, is not plausible")
+            reasons.append(
+                Message(
+                    "size-not-plausible", "its size, {name} = {value:.3g}, is not plausible", name=own.name, value=value
+                )
+            )
     return reasons
 
 
@@ -765,11 +828,15 @@ class _Reversal:
         varies = min(self._p(left_0 - left_2, len(smooth) - 1), self._p(left_0, count - 1)) < 0.5 * REVERSAL_P
         irregular = count > 3 and self._p(left_2, count - len(smooth)) < 0.5 * REVERSAL_P
         law = left_0 - left_2 >= SMOOTH_SHARE * left_0
-        reasons = ("the noise is assumed, not measured",) if source == "assumed" else ()
+        reasons = (Message("noise-not-measured", "the noise is assumed, not measured"),) if source == "assumed" else ()
         effects, unknown = [], []
         varies = (varies and (not only or lost in only)) or lost in add
         if varies:
-            why = reasons if law or not irregular else (*reasons, "it does not vary smoothly along the axis")
+            why = (
+                reasons
+                if law or not irregular
+                else (*reasons, Message("reversal-irregular", "it does not vary smoothly along the axis"))
+            )
             effects.append(self._lost_motion(lost, smooth, covariance, left_0, why, exact=not irregular))
         if irregular and (not varies or not law):
             rest = self.half - self._shapes(2) @ smooth
@@ -784,7 +851,11 @@ class _Reversal:
             small = abs(float(mean[0])) < max(
                 LEAST_SIZE * float(np.sqrt(square[0, 0])), LEAST_OF_SCATTER * self.sigma_mm
             )
-            why = (*reasons, "it is small compared with the scatter of the readings") if small else reasons
+            why = (
+                (*reasons, Message("small-beside-scatter", "it is small compared with the scatter of the readings"))
+                if small
+                else reasons
+            )
             item = self._backlash(backlash, mean, square, everything - left_0, why)
             effects.append(item if varies else replace(item, alias=self._alias(backlash, lost, left_0)))
         return effects, unknown
@@ -904,7 +975,14 @@ def _removal(
         if not kept_effects or (after and not grows):
             break
         item = kept_effects.pop()
-        notes.append(f"{item.name} is named but not removed: {' and '.join(grows) or 'the figures'} would not improve")
+        notes.append(
+            Message(
+                "named-not-removed",
+                "{name} is named but not removed: {grows} would not improve",
+                name=item.name,
+                grows=" and ".join(grows) or Message("the-figures", "the figures"),
+            )
+        )
     figures = {key: {"before": before[key], "after": after.get(key, before[key])} for key in before}
     return removed, left_out, tuple(item.name for item in kept_effects), figures, notes
 
@@ -1013,7 +1091,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
             "secondary": [],
             "gap": self._misfit(),
             "advice": self._advice(),
-            "reasons": [f"{', '.join(assumed)}: {NO_REPEATS}"] if assumed else [],
+            "reasons": [_on_axis(", ".join(assumed), NO_REPEATS)] if assumed else [],
             "notes": self._notes(),
             "noise": {part.session.letter: _noise_dict(part) for part in self.axes}
             if several
@@ -1057,42 +1135,97 @@ class AxisDiagnosis(DisplayedDiagnosis):
             for item in part.effects:
                 others = [name for name, _ in item.alias if name != item.name]
                 if others and item.effect.card.breaker:
-                    found.append(f"{item.effect.card.breaker}: separates {item.name} from {', '.join(others)}")
+                    found.append(
+                        Message(
+                            "measure-to-separate",
+                            "{breaker}: separates {name} from {other}",
+                            breaker=item.effect.card.breaker,
+                            name=item.name,
+                            other=", ".join(others),
+                        )
+                    )
             if part.noise_source != "repeats":
-                found.append("measure at least three runs in each direction: only repeats separate noise from effects")
+                found.append(
+                    Message(
+                        "measure-three-runs",
+                        "measure at least three runs in each direction: only repeats separate noise from effects",
+                    )
+                )
             if any(item.covariates for item in part.unknown):
                 depends = ", ".join(part.unknown[0].covariates)
                 found.append(
-                    f"two more runs with the temperatures logged: show whether the dependence on {depends} repeats"
+                    Message(
+                        "measure-two-more-runs",
+                        "two more runs with the temperatures logged: show whether the dependence on {depends} repeats",
+                        depends=depends,
+                    )
                 )
             shown: dict[str, list[str]] = {}
             for name in part.invisible:
                 shown.setdefault(known[name].card.breaker, []).append(name)
-            found += [f"{how}: would show {', '.join(names)}, which these runs cannot" for how, names in shown.items()]
+            found += [
+                Message(
+                    "measure-to-show",
+                    "{how}: would show {names}, which these runs cannot",
+                    how=how,
+                    names=", ".join(names),
+                )
+                for how, names in shown.items()
+            ]
         return list(dict.fromkeys(found))
 
     def _notes(self) -> list[str]:
         found = []
         for part in self.axes:
             letter = part.session.letter
-            found.append(f"{letter}: time order: {ORDER_TEXTS[part.session.order]}")
-            found += [f"{letter}: {text}" for text in part.notes]
+            found.append(
+                Message(
+                    "time-order", "{letter}: time order: {order}", letter=letter, order=ORDER_TEXTS[part.session.order]
+                )
+            )
+            found += [_on_axis(letter, text) for text in part.notes]
             if part.phi > MEMORY and part.noise_source == "repeats":
                 found.append(
-                    f"{letter}: the scatter is autocorrelated (neighbouring readings by {part.phi:.2f}, "
-                    f"{part.sigma_mm / MM_PER_UM:.3g} um): repeats do not agree, and no known effect explains it; check "
-                    "clamping, sensor and air before making tables"
+                    Message(
+                        "scatter-autocorrelated",
+                        "{letter}: the scatter is autocorrelated (neighbouring readings by {phi:.2f}, {sigma:.3g} um): repeats "
+                        "do not agree, and no known effect explains it; check clamping, sensor and air before making tables",
+                        letter=letter,
+                        phi=part.phi,
+                        sigma=part.sigma_mm / MM_PER_UM,
+                    )
                 )
             if any(item.name in ("warmup_drift", "linear_drift") for item in part.effects):
-                found.append(f"{letter}: {WARM_UP_NOTE}")
-            found += [f"{letter}: {item.name} is tentative; {item.remains}" for item in part.effects if item.remains]
+                found.append(_on_axis(letter, WARM_UP_NOTE))
+            found += [
+                Message(
+                    "tentative-remains",
+                    "{letter}: {name} is tentative; {remains}",
+                    letter=letter,
+                    name=item.name,
+                    remains=item.remains,
+                )
+                for item in part.effects
+                if item.remains
+            ]
             grown = [key for key, pair in part.figures.items() if pair["after"] > pair["before"] * 1.001]
             if grown and part.taken_off:
                 found.append(
-                    f"{letter}: {', '.join(grown)} are a little larger without the removed effects, which had hidden part of them"
+                    Message(
+                        "figures-grown",
+                        "{letter}: {grown} are a little larger without the removed effects, which had hidden part of them",
+                        letter=letter,
+                        grown=", ".join(grown),
+                    )
                 )
             if part.taken_off:
-                found.append(f"{letter}: removed.csv lists what was removed from each reading")
+                found.append(
+                    Message(
+                        "removed-listed",
+                        "{letter}: removed.csv lists what was removed from each reading",
+                        letter=letter,
+                    )
+                )
         return found
 
     def extended(self) -> str:
@@ -1143,6 +1276,14 @@ class AxisDiagnosis(DisplayedDiagnosis):
             if item.remains
         }
         return format_csv(table, common, digits | {name: 4 for name in table if name.endswith("_um")})
+
+
+def _on_axis(letter: str, said: str) -> str:
+    """A note with the letter of its axis in front; a message keeps its code and values."""
+    if not isinstance(said, Message):
+        return f"{letter}: {said}"
+    filled = partial(Message, said.code)
+    return filled("{letter}: " + said.template, letter=letter, **said.values)
 
 
 def _sections(part: AxisFindings) -> list[str]:

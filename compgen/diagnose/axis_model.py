@@ -129,6 +129,8 @@ MOST_LOGGED_SCANS = 6
 LEAST_OF_STEP = 5
 #: A step within a run is charged as this many scan positions each: outliers next to the end of a run are more common.
 RARE = 8.0
+#: Lengths of a pause, and time constants of a warm-up that it interrupts, as shares of the session.
+PAUSES, PAUSED_TAU = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2), (0.1, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.5, 5.0)
 #: Burst lengths (readings) that are tried; in bursts up to LONGEST_FREE each reading may have a separate value.
 BURSTS, LONGEST_FREE = (1, 2, 3, 5, 8), 3
 
@@ -185,6 +187,16 @@ def _steps(session: AxisSession, known: Mapping[str, Effect]) -> list[Candidate]
         scans = _runs(session) if between else RARE * float(len(session))
         found.append(_candidate(session, step.at(float(k)), scans, f"step before {where}"))
     return [item for item in found if item is not None]
+
+
+def paused_warmups(session: AxisSession, first: int) -> list[Candidate]:
+    """Warm-ups that went on during a pause before the reading ``first``, with time constants and pauses of many lengths."""
+    share = (session.time - session.time[0]) / (session.time[-1] - session.time[0])
+    after = np.arange(len(session)) >= first
+    return [
+        Candidate("warmup_drift", "named", -np.expm1(-(share + pause * after) / tau)[:, None], WARMUP_SCANS)
+        for pause in PAUSES for tau in PAUSED_TAU
+    ]  # fmt: skip
 
 
 def _runs(session: AxisSession) -> float:

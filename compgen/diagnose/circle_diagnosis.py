@@ -33,10 +33,11 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.files import read_text
 from compgen.data.machine import Machine
 from compgen.data.names import AXES, ERROR_INDEX, MM_PER_UM, SECONDS_PER_MIN
+from compgen.diagnose.circle_shapes import best_shapes
 from compgen.diagnose.verdict import DisplayedDiagnosis
 from compgen.effects import Readings, active_effects, catalogue, section_text
 from compgen.effects.all_effects import belongs_to
-from compgen.errors import InputError, nearest
+from compgen.errors import InputError, Message, nearest
 from compgen.identification.axis_tests import SQUARENESS_OF, circle_positions, correlated
 from compgen.kinematics.first_order import c_matrix
 
@@ -49,6 +50,12 @@ NAMED_CHI2 = 30.0
 #: Root mean square of what an effect explains of the readings that it acts on, below which it has no name, mm: a fifth of
 #: the resolution of a ballbar. Many readings show less, but also what the equations above leave out.
 NAMED_MM = 2e-5
+#: Chi-square that a shape without a name has to explain in addition to what a name must.
+SHAPE_HANDICAP = 8.0
+#: A shape that explains the readings as well as a name but for this chi-square leaves the name tentative (99 %).
+AS_GOOD_CHI2 = 9.2
+#: Shapes that are taken into the model of which the rest is the noise, at most.
+MOST_SHAPES = 3
 #: Share of what is left that a spike or a periodic error has to explain.
 SEARCHED_SHARE = 0.2
 #: Names in each plane for each one of ``--max-effects``: a plane has two axes.
@@ -138,12 +145,13 @@ WORDS = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CircleCandidate:
     """An effect that may be named: its columns (n, k), a parameter each with the SI unit of its name.
 
     ``trials`` counts the places at which it was tried; ``settings`` are the ones found, ``slope`` the derivative of the
-    columns by the logarithm of the setting (n, k), ``make`` the same effect with another setting.
+    columns by the logarithm of the setting (n, k), ``make`` the same effect with another setting. ``shape`` describes one
+    that has no name.
     """
 
     name: str
@@ -154,6 +162,7 @@ class CircleCandidate:
     settings: Mapping[str, float] = field(default_factory=dict)
     slope: FloatArray | None = None
     make: Callable[[float], CircleCandidate] | None = None
+    shape: str = ""
 
     @property
     def words(self) -> tuple[str, str]:
@@ -198,8 +207,10 @@ class CircleSpace:
         seen = self.without(columns)
         if np.linalg.norm(seen) < LEAST_VISIBLE * np.linalg.norm(columns):
             return 0.0
-        found = np.linalg.lstsq(seen, self.left, rcond=1e-6)[0]
-        return float(np.sum((seen @ found) ** 2))
+        value, turn = np.linalg.eigh(seen.T @ seen)
+        along = (turn.T @ (seen.T @ self.left)) ** 2
+        kept = value > 1e-12 * value[-1]
+        return float(np.sum(along[kept] / value[kept]))
 
     def are_alike(self, first: FloatArray, second: FloatArray) -> bool:
         """Whether two sets of columns (n, k) say the same outside the space; not if the second is hardly seen there."""
@@ -259,32 +270,48 @@ def base_columns(circles: Circles) -> FloatArray:
     return np.hstack([own, own * cosine, own * sine])
 
 
-def spike(circles: Circles, axis: int, trials: int, decay: float) -> CircleCandidate:
+@dataclass(frozen=True)
+class AxisOnCircles:
+    """What spikes and periods of one axis depend on, (n,) each: computed once, since many settings are tried.
+
+    ``along`` is the share of a displacement of the axis in the radius, ``late`` the same with the sign of its travel,
+    ``since`` the angle since its last reversal, rad, ``speed`` the angular speed, rad/s.
+    """
+
+    axis: int
+    along: FloatArray
+    late: FloatArray
+    since: FloatArray
+    position_mm: FloatArray
+    speed: FloatArray | None
+
+    @classmethod
+    def of(cls, circles: Circles, position_mm: FloatArray, axis: int) -> AxisOnCircles:
+        """The first axis of a plane reverses at 0 and 180 degrees, the second at 90 and 270."""
+        second = np.array(list(PLANES.values()))[circles.plane, 1] == axis
+        since = circles.direction * (circles.angle_rad - 0.5 * np.pi * second) % np.pi
+        along = circles.radial()[:, axis]
+        late = along * circles.travel()[:, axis]
+        return cls(axis, along, late, since, position_mm[:, axis], angular_speed(circles))
+
+
+def spike(own: AxisOnCircles, trials: int, decay: float) -> CircleCandidate:
     """Spikes of one axis that decay in ``decay`` ms, or degrees without feeds."""
-    speed, key = angular_speed(circles), "decay_deg"
-    angle = np.full(len(circles), np.radians(decay))
-    if speed is not None:
-        angle, key = speed * decay * 1e-3, "decay_ms"
-    # progress since the last reversal: of the first axis of the plane at 0 and 180 degrees, of the second at 90 and 270
-    second = np.array(list(PLANES.values()))[circles.plane, 1] == axis
-    since = circles.direction * (circles.angle_rad - 0.5 * np.pi * second) % np.pi
-    stuck = -circles.radial()[:, axis] * circles.travel()[:, axis] * np.exp(-since / angle)
-    slope = (stuck * since / angle)[:, None]
-    name, parameters = f"reversal_spike_{AXES[axis]}", (("c_um", MM_PER_UM),)
-    return CircleCandidate(name, AXES[axis], stuck[:, None], parameters, trials, {key: decay}, slope)
+    angle, key = (math.radians(decay), "decay_deg") if own.speed is None else (own.speed * decay * 1e-3, "decay_ms")
+    stuck = -own.late * np.exp(-own.since / angle)
+    slope = (stuck * own.since / angle)[:, None]
+    letter, parameters = AXES[own.axis], (("c_um", MM_PER_UM),)
+    return CircleCandidate(f"reversal_spike_{letter}", letter, stuck[:, None], parameters, trials, {key: decay}, slope)
 
 
-def periodic(
-    circles: Circles, position_mm: FloatArray, axis: int, trials: int, found: bool, pitch_mm: float
-) -> CircleCandidate:
+def periodic(own: AxisOnCircles, trials: int, found: bool, pitch_mm: float) -> CircleCandidate:
     """A periodic error of one axis, of a known pitch or one that was ``found``."""
-    turn = 2 * np.pi * position_mm[:, axis] / pitch_mm
-    radial = circles.radial()[:, axis]
-    columns = np.column_stack([radial * np.sin(turn), radial * np.cos(turn)])
+    turn = 2 * np.pi * own.position_mm / pitch_mm
+    columns = np.column_stack([own.along * np.sin(turn), own.along * np.cos(turn)])
     phase = turn - turn.mean()  # about the middle of the circle, so that the pitch does not shift the phase
     slope = np.column_stack([-columns[:, 1] * phase, columns[:, 0] * phase]) if found else None
-    parameters, settings = (("s1_um", MM_PER_UM), ("c1_um", MM_PER_UM)), {"pitch_mm": pitch_mm}
-    return CircleCandidate(f"periodic_{AXES[axis]}", AXES[axis], columns, parameters, trials, settings, slope)
+    letter, parameters = AXES[own.axis], (("s1_um", MM_PER_UM), ("c1_um", MM_PER_UM))
+    return CircleCandidate(f"periodic_{letter}", letter, columns, parameters, trials, {"pitch_mm": pitch_mm}, slope)
 
 
 def sharpened(make: Callable[[float], CircleCandidate], space: CircleSpace, at: float, ratio: float) -> CircleCandidate:
@@ -307,14 +334,15 @@ def _explained(make: Callable[[float], CircleCandidate], space: CircleSpace, set
 def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space: CircleSpace) -> list[CircleCandidate]:
     """Spikes and periodic errors of every axis, with the settings that explain most beside ``space``."""
     found: list[CircleCandidate] = []
-    axes = [axis for axis in range(3) if np.any(circles.radial()[:, axis])]
+    radial = circles.radial()
+    axes = {axis: AxisOnCircles.of(circles, position_mm, axis) for axis in range(3) if np.any(radial[:, axis])}
     speed = angular_speed(circles)
     grid: tuple[float, ...] = SPIKE_DEG if speed is None else SPIKE_MS
     if speed is not None:  # the slower the circle, the longer a spike of the same angle
         longer = [SPIKE_MS[-1] * 2.0**k for k in range(1, 9)]
         grid = (*SPIKE_MS, *(ms for ms in longer if float(speed.min()) * ms * 1e-3 < MOST_SPIKE_RAD))
-    for axis in axes:
-        make = partial(spike, circles, axis, len(grid))
+    for own in axes.values():
+        make = partial(spike, own, len(grid))
         best = max(grid, key=partial(_explained, make, space))
         found.append(sharpened(make, space, best, 2.0))
     # with the spikes that matter, so that a short period does not take their place
@@ -322,14 +350,14 @@ def searched(machine: Machine, circles: Circles, position_mm: FloatArray, space:
     left = CircleSpace.of(np.hstack([space.basis, *strong]), space.left)
     path = np.diff(np.sort(circles.angle_rad[circles.run == circles.run[0]]))
     step_mm = float(np.median(path[path > 1e-9])) * float(circles.radius_mm.max()) if np.any(path > 1e-9) else 0.0
-    for axis in axes:
+    for axis, own in axes.items():
         extent = float(np.ptp(position_mm[:, axis]))
         longest, known = PITCH_SHARE * float(circles.radius_mm.max()), machine.axes[axis].screw_pitch_mm
         shortest = max(PITCH_STEPS * step_mm, longest / MOST_PITCHES)
         # a quarter of a period more or less over the circle does not hide a period
         pitches = [known] if known else (1.0 / np.arange(1.0 / longest, 1.0 / shortest, 0.25 / extent)).tolist()
         if pitches:
-            make = partial(periodic, circles, position_mm, axis, len(pitches), not known)
+            make = partial(periodic, own, len(pitches), not known)
             best = max(pitches, key=lambda pitch, make=make: left.gain(make(pitch).columns))
             found.append(make(best) if known else sharpened(make, left, best, 1.0 + 0.25 * best / extent))
     return found
@@ -520,7 +548,14 @@ class CircleDiagnosis(DisplayedDiagnosis):
             },
             "advice": self._advice(),
             "reasons": list(self.reasons),
-            "notes": [*self.notes, f"lines left out: sectors of {SECTOR_DEG:g} degrees, a quarter of them at a time"],
+            "notes": [
+                *self.notes,
+                Message(
+                    "left-out-sectors",
+                    "lines left out: sectors of {SECTOR_DEG:g} degrees, a quarter of them at a time",
+                    SECTOR_DEG=SECTOR_DEG,
+                ),
+            ],
             "evidence": {"readings": len(self.circles), "planes": list(self.circles.planes)},
         }
 
@@ -557,14 +592,29 @@ class CircleDiagnosis(DisplayedDiagnosis):
         }
         alike = [f"{name} from {', '.join(same)}" for name, same in others.items() if same]
         if alike:
-            found.append(f"measure whole circles in both directions: separates {'; '.join(alike)}")
+            found.append(
+                Message(
+                    "measure-both-directions",
+                    "measure whole circles in both directions: separates {alike}",
+                    alike="; ".join(alike),
+                )
+            )
         delay = [name for name in self.invisible if name.startswith("servo_delay")]
         if delay:
             found.append(
-                f"measure at two feeds (feed_mm_min), one of them high: would show {', '.join(delay)}, which these circles cannot"
+                Message(
+                    "measure-two-feeds",
+                    "measure at two feeds (feed_mm_min), one of them high: would show {delay}, which these circles cannot",
+                    delay=", ".join(delay),
+                )
             )
         if self.floor_source == "neighbouring readings":
-            found.append("measure each circle twice (column run): only repeats separate noise from short patterns")
+            found.append(
+                Message(
+                    "measure-circles-twice",
+                    "measure each circle twice (column run): only repeats separate noise from short patterns",
+                )
+            )
         return found
 
 
@@ -627,27 +677,91 @@ def diagnose_circles(
         )
     show("naming effects")
     floor_mm, source = noise_floor(circles, full.left, u_um)
+    shapes = shapes_of(circles, (start, linear))
+    if source == "repeats":  # otherwise a shape may be noise that wanders, and has to be large beside it
+        full = _with_shapes(full, shapes, floor_mm**2 * correlated(circles, full.left))
+    freedom = max(len(circles) - full.basis.shape[1], 1)
     variance = max(float(full.left @ full.left) / freedom, floor_mm**2) * correlated(circles, full.left)
     most_named = NAMES_PER_MOST * most * len(circles.planes)
     allowed = [item for item in every if (not only or item.name in only) and item.name not in add]
     forced = [item for item in every if item.name in add]
-    named = chosen_of(circles, base, allowed, forced, (variance, floor_mm), most_named)
+    choose = partial(chosen_of, circles, base, forced=forced, noise=(variance, floor_mm), most=most_named)
+    # many names at once look like a shape before all of them are found: so also names first, and shapes beside them
+    named = choose(allowed)
+    sets = (named, choose([*allowed, *shapes], begin=named), choose([*allowed, *shapes]))
+    members = max(sets, key=partial(criterion, circles, base, variance=variance))
     chi2 = {}
-    for item in named:
-        others = CircleSpace.of(np.hstack([base, *(one.columns for one in named if one is not item)]), value)
+    for item in members:
+        others = CircleSpace.of(np.hstack([base, *(one.columns for one in members if one is not item)]), value)
         chi2[item.name] = others.gain(item.columns) / variance
-    effects, after = solved(circles, base, named, every, chi2)
-    unknown = unknown_of(circles, after, floor_mm)
+    effects, after, parts = solved(circles, base, members, every, chi2)
+    effects = [_without_rival(circles, base, item, members, shapes, variance) for item in effects]
+    found_shapes = [(item.shape, item.of, part) for item, part in zip(members, parts, strict=True) if item.shape]
+    unknown = [_shape_dict(*one) for one in found_shapes] + unknown_of(circles, after, floor_mm)
+    after = after + sum((part for _, _, part in found_shapes), np.zeros(len(circles)))
     curves = [item for item in effects if item.candidate.columns.shape[1] > 1]
     effects = [_beside(circles, item, unknown, (after, floor_mm), variance) for item in effects]
     doubtful = [item.chi2 * variance for item in curves if item not in effects]
     effects = [_beside(circles, item, unknown, (after, floor_mm), variance, sum(doubtful)) for item in effects]
+    named = [item for item in members if not item.shape]
     reasons = [] if unknown or source != "neighbouring readings" else undecided(circles, after, floor_mm)
     show("testing on sectors left out")
     return CircleDiagnosis(
         machine, circles, tuple(effects), tuple(unknown), invisible_of(circles, start, every), start.left, after,
         left_out(circles, base, named), floor_mm, source, tuple(reasons),
     )  # fmt: skip
+
+
+def _with_shapes(full: CircleSpace, shapes: Sequence[CircleCandidate], variance: float) -> CircleSpace:
+    """The space of all names with the shapes that are plainly there, so that what is left is noise."""
+    for _ in range(MOST_SHAPES):
+        gains = [full.gain(item.columns) for item in shapes]
+        if max(gains, default=0.0) <= max(SEARCHED_SHARE * float(full.left @ full.left), NAMED_CHI2 * variance):
+            break
+        full = CircleSpace.of(np.hstack([full.basis, shapes[int(np.argmax(gains))].columns]), full.left)
+    return full
+
+
+def _without_rival(
+    circles: Circles,
+    base: FloatArray,
+    item: NamedCircleEffect,
+    members: Sequence[CircleCandidate],
+    shapes: Sequence[CircleCandidate],
+    variance: float,
+) -> NamedCircleEffect:
+    """A name, tentative if a shape without a name explains the readings as well in its place."""
+    rest = [one.columns for one in members if one is not item.candidate]
+    space = CircleSpace.of(np.hstack([base, *rest]), circles.deviation_mm)
+    own = space.gain(item.candidate.columns) / variance - price(circles, item.candidate)
+    rivals = [one for one in shapes if one.of == item.candidate.of or len(item.candidate.of) == 1]
+    worth = [space.gain(one.columns) / variance - price(circles, one) for one in rivals]
+    if worth and max(worth) > own - AS_GOOD_CHI2:
+        text = rivals[int(np.argmax(worth))].shape
+        return replace(
+            item,
+            reasons=(
+                *item.reasons,
+                Message("unnamed-shape-as-good", "what has no name explains the readings as well: {text}", text=text),
+            ),
+        )
+    return item
+
+
+def _shape_dict(text: str, plane: str, part_mm: FloatArray) -> dict[str, Any]:
+    """A shape without a name as in ``diagnosis.json``; the size of waves is their amplitude, of others all their height."""
+    own = part_mm[part_mm != 0]
+    height = float(np.ptp(own)) / MM_PER_UM if len(own) else 0.0
+    what, comma, how = text.partition(", ")
+    if "waves a turn" in text:
+        said = f"strongest: {what}, {0.5 * height:.2g} um{comma}{how}"
+    else:
+        said = f"it looks like {text}, {height:.2g} um"
+    return {
+        "covariates": ["angle_deg"], "direction": plane,
+        "rms_um": float(np.sqrt(np.mean(own**2))) / MM_PER_UM if len(own) else 0.0,
+        "text": f"{plane}: a pattern that none of the effects explains; {said}", "resembles": None, "plane": plane,
+    }  # fmt: skip
 
 
 def _beside(
@@ -670,7 +784,9 @@ def _beside(
     structure = float(np.sum(after[rows] ** 2)) - np.count_nonzero(rows) * floor_mm**2 + doubtful
     any_curve = item.candidate.columns.shape[1] > 1
     if item.chi2 * variance < (LEAST_OF_ANY_CURVE if any_curve else LEAST_OF_UNKNOWN) * structure:
-        return replace(item, reasons=(*item.reasons, "small compared with the unexplained part"))
+        return replace(
+            item, reasons=(*item.reasons, Message("small-beside-unknown", "small compared with the unexplained part"))
+        )
     return item
 
 
@@ -686,8 +802,13 @@ def undecided(circles: Circles, left: FloatArray, floor_mm: float) -> list[str]:
         ):
             size = float(np.sqrt(np.mean(left[rows] ** 2))) / MM_PER_UM
             found.append(
-                f"{plane}: {size:.2g} um rms are left over that change slowly along the path; without repeats noise of the "
-                "gauge cannot be told from an effect without a name"
+                Message(
+                    "noise-or-unknown",
+                    "{plane}: {size:.2g} um rms are left over that change slowly along the path; without repeats noise of the "
+                    "gauge cannot be told from an effect without a name",
+                    plane=plane,
+                    size=size,
+                )
             )
     return found
 
@@ -767,8 +888,22 @@ def changing(circles: Circles, space: CircleSpace) -> list[CircleCandidate]:
 
 
 def price(circles: Circles, item: CircleCandidate) -> float:
-    """Chi-square that every parameter beyond the first has to bring: four columns always fit better than one."""
-    return float((item.columns.shape[1] - 1) * math.log(len(circles)))
+    """Chi-square that every parameter beyond the first has to bring: four columns always fit better than one.
+
+    A shape without a name was tried at many places, and must be better than a name.
+    """
+    own = float((item.columns.shape[1] - 1) * math.log(len(circles)))
+    return own + (2.0 * math.log(item.trials) + SHAPE_HANDICAP if item.shape else 0.0)
+
+
+def shapes_of(circles: Circles, spaces: Sequence[CircleSpace]) -> list[CircleCandidate]:
+    """Shapes without a name, the best of each kind beside each of the spaces."""
+    found = []
+    for shape in best_shapes(circles, [(space.basis, space.left) for space in spaces]):
+        names = tuple((f"c{k + 1}_um", MM_PER_UM) for k in range(shape.columns.shape[1]))
+        name = f"{shape.plane}: {shape.text}"
+        found.append(CircleCandidate(name, shape.plane, shape.columns, names, shape.trials, shape=shape.text))
+    return found
 
 
 def chosen_of(
@@ -778,19 +913,26 @@ def chosen_of(
     forced: Sequence[CircleCandidate],
     noise: tuple[float, float],
     most: int,
+    begin: Sequence[CircleCandidate] = (),
 ) -> list[CircleCandidate]:
     """The effects that the readings show: ``forced`` ones, then the one that explains most, and so on, at most ``most``.
 
-    Names that are no longer needed beside later ones are taken back. ``noise`` is the variance (mm^2) that stands for one
-    in chi-square, and the standard deviation of a reading by itself (mm).
+    The search begins with ``forced``, or with ``begin``, which contains these. Names that are no longer needed beside later
+    ones are taken back. ``noise`` is the variance (mm^2) that stands for one in chi-square, and the standard deviation of a
+    reading by itself (mm).
     """
     variance, floor_mm = noise
-    named, value = list(forced), circles.deviation_mm
+    named, value, kept = list(begin or forced), circles.deviation_mm, {item.name for item in forced}
+
+    def but(items: Sequence[CircleCandidate]) -> list[CircleCandidate]:
+        names = {item.name for item in items}
+        return [item for item in allowed if item.name not in names]
 
     def worth(item: CircleCandidate, space: CircleSpace) -> float:
         """Chi-square of an effect beside ``space``; 0 if that is too little for a name."""
         gain = space.gain(item.columns)
-        least = variance * (NAMED_CHI2 + 2.0 * math.log(item.trials) + price(circles, item))
+        scans = 0.0 if item.shape else 2.0 * math.log(item.trials)  # those of a shape are in its price
+        least = variance * (NAMED_CHI2 + scans + price(circles, item))
         least = max(least, NAMED_MM**2 * np.count_nonzero(item.columns.any(axis=1)))
         if item.settings:  # of many settings one always imitates a part of what has no name
             least = max(least, SEARCHED_SHARE * (float(space.left @ space.left) - len(value) * floor_mm**2))
@@ -801,7 +943,7 @@ def chosen_of(
 
     while len(named) < most + len(forced):
         space = beside(named)
-        others = [item for item in allowed if item not in named]
+        others = but(named)
         gains = [worth(item, space) for item in others]
         if max(gains, default=0.0) <= 0.0:
             break
@@ -810,19 +952,19 @@ def chosen_of(
     # what was taken first may have stood for two of the others
     for _ in range(MOST_SWAPS if any(item.columns.shape[1] > 1 for item in named) else 0):
         before = [item.name for item in named]
-        for item in [one for one in named if one not in forced]:
+        for item in [one for one in named if one.name not in kept]:
             rest = [one for one in named if one is not item]
-            space, others = beside(rest), [one for one in allowed if one not in rest]
+            space, others = beside(rest), but(rest)
             own = worth(item, space)
             best = max(others, key=partial(worth, space=space))
             named = [*rest, best if worth(best, space) > own + ALIKE_CHI2 else item]
-        space, others = beside(named), [one for one in allowed if one not in named]
+        space, others = beside(named), but(named)
         more = max(others, key=partial(worth, space=space), default=None)
         if more is not None and worth(more, space) > 0.0 and len(named) < most + len(forced):
             named.append(more)
         if [item.name for item in named] == before:
             break
-    for item in [one for one in reversed(named) if one not in forced]:
+    for item in [one for one in reversed(named) if one.name not in kept]:
         rest = [one for one in named if one is not item]
         if worth(item, beside(rest)) <= 0.0:
             named = rest
@@ -836,14 +978,22 @@ def chosen_of(
     return named
 
 
+def criterion(circles: Circles, base: FloatArray, members: Sequence[CircleCandidate], variance: float) -> float:
+    """What a set of effects explains, as chi-square less the price of its parameters and of the places tried."""
+    left = CircleSpace.of(np.hstack([base, *(item.columns for item in members)]), circles.deviation_mm).left
+    own = math.log(len(circles))
+    paid = sum(own + price(circles, item) + (0.0 if item.shape else 2.0 * math.log(item.trials)) for item in members)
+    return -float(left @ left) / variance - paid
+
+
 def solved(
     circles: Circles,
     base: FloatArray,
     named: Sequence[CircleCandidate],
     every: Sequence[CircleCandidate],
     chi2: Mapping[str, float],
-) -> tuple[list[NamedCircleEffect], FloatArray]:
-    """Values and uncertainties of the named effects in one adjustment, and the residuals without them (n,), mm."""
+) -> tuple[list[NamedCircleEffect], FloatArray, list[FloatArray]]:
+    """Values and uncertainties of the named effects in one adjustment, residuals (n,), and what each member adds (n,), mm."""
     blocks, names = [item.columns for item in named], {item.name for item in named}
     columns = np.hstack([base, *blocks])
     value = circles.deviation_mm
@@ -862,8 +1012,11 @@ def solved(
     inverse = np.linalg.pinv(wide / size, rcond=1e-7) / size[:, None]
     variance = float(after @ after) / max(len(value) - wide.shape[1], 1) * correlated(circles, after)
     u = np.sqrt(variance) * np.linalg.norm(inverse, axis=1)
-    effects = []
+    effects, parts = [], []
     for item, at in zip(named, starts, strict=False):
+        parts.append(item.columns @ found[at : at + item.columns.shape[1]])
+        if item.shape:
+            continue
         values = {
             key: (float(found[at + k]) / unit, float(u[at + k]) / unit) for k, (key, unit) in enumerate(item.parameters)
         }
@@ -882,20 +1035,31 @@ def solved(
             if weight / total >= LEAST_WEIGHT or name == item.name
         ]
         visible = float(np.linalg.norm(own) / np.linalg.norm(item.columns))
-        shape = item.columns @ found[at : at + item.columns.shape[1]]
-        reasons = [*_implausible(item, values), *_uneven(circles, item, wide, after, shape, variance)]
+        reasons = [*_implausible(item, values), *_uneven(circles, item, wide, after, parts[-1], variance)]
         effects.append(NamedCircleEffect(item, values, chi2[item.name], tuple(alias), visible, tuple(reasons)))
-    return effects, after
+    return effects, after, parts
 
 
 def _implausible(item: CircleCandidate, values: Mapping[str, tuple[float, float]]) -> list[str]:
     """Why the amount speaks against an effect: smaller than its uncertainty allows, or no drive does that."""
     reasons = []
     if max(abs(value) / u if u else math.inf for value, u in values.values()) < LEAST_SIZE:
-        reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+        reasons.append(
+            Message(
+                "within-its-uncertainty",
+                "it is smaller than {LEAST_SIZE:g} times its standard uncertainty",
+                LEAST_SIZE=LEAST_SIZE,
+            )
+        )
     square = values.get("tau_squared_ms2", (0.0, 0.0))[0]
     if square < -MOST_LEAD_MS2:
-        reasons.append(f"its size, tau_squared_ms2 = {square:.3g}, is not plausible: no drive leads by so much")
+        reasons.append(
+            Message(
+                "size-not-plausible-lead",
+                "its size, tau_squared_ms2 = {square:.3g}, is not plausible: no drive leads by so much",
+                square=square,
+            )
+        )
     return reasons
 
 
@@ -923,7 +1087,9 @@ def _uneven(
     p = float(chdtrc(int(kept.sum()), float(moved @ moved) / variance))
     varies = extra[:, kept] @ value
     if p < UNEVEN_P and float(varies @ varies) > UNEVEN_SHARE * float(shape @ shape):
-        return [f"it is not alike in all quadrants and both directions (p = {p:.1e})"]
+        return [
+            Message("not-alike-on-circle", "it is not alike in all quadrants and both directions (p = {p:.1e})", p=p)
+        ]
     return []
 
 

@@ -35,7 +35,7 @@ from compgen.data.names import MM_PER_UM
 from compgen.diagnose.axis_session import LEAST_MM
 from compgen.diagnose.engine import LEAST_BESIDE, SMALL_BESIDE, Candidate, Fit, NoiseGrid, Search
 from compgen.diagnose.verdict import DisplayedDiagnosis
-from compgen.errors import InputError
+from compgen.errors import InputError, Message
 from compgen.kinematics.kernel_switch import one_thread
 
 #: Degrees of freedom beside pose and machine that a diagnosis needs.
@@ -63,7 +63,7 @@ LEFT_OVER_SHARE, AS_GOOD = 0.12, 5.0
 #: Scan positions charged for the direction of a line: neighbours are nearly alike.
 LINE_SCANS = 2.0
 #: Why a name is tentative that a field without a name could replace.
-OF_FIELD = "a smooth field without a name explains the features nearly as well"
+OF_FIELD = Message("field-as-good", "a smooth field without a name explains the features nearly as well")
 #: p-value of the residuals against the stated uncertainty, below which something has no name.
 MISFIT_P = 1e-4
 #: Set-ups whose frames are further apart than this have poses of their own, mm.
@@ -104,12 +104,19 @@ WORDS = {
         "look for a burr or a chip, and measure this feature again; it is left out of everything else",
     ),
 }
+#: What separates the machine from the part, if something has no name.
+TURNED = Message(
+    "turn-the-part",
+    "measure it once more, turned by 90 degrees: what turns with it belongs to the part, what stays to the machine",
+)
 MISSING = {
-    "tool_wear": "repeat the first feature at the end: shows a drift (tool_wear)",
-    "clamp_slip": "repeat the first feature at the end: shows a clamp that slipped",
-    "setup_step": "measure one feature in both set-ups: shows a step between them",
-    "part_temperature": "log temp_part_c and temp_machined_c: tells the temperature of the part from the scales",
-    "probe_lobing": "probe a ring of at least 12 features or points: shows lobes of the probe",
+    "tool_wear": Message("repeat-first-drift", "repeat the first feature at the end: shows a drift (tool_wear)"),
+    "clamp_slip": Message("repeat-first-clamp", "repeat the first feature at the end: shows a clamp that slipped"),
+    "setup_step": Message("measure-in-both-setups", "measure one feature in both set-ups: shows a step between them"),
+    "part_temperature": Message(
+        "log-temperatures", "log temp_part_c and temp_machined_c: tells the temperature of the part from the scales"
+    ),
+    "probe_lobing": Message("probe-a-ring", "probe a ring of at least 12 features or points: shows lobes of the probe"),
 }
 
 
@@ -465,11 +472,17 @@ class FeatureDiagnosis(DisplayedDiagnosis):
                 "noise_floor_um": self.sigma_mm / MM_PER_UM,
                 "noise_floor_source": self.source,
             },
-            "advice": [MISSING[name] for name in self.missing if name in MISSING],
+            "advice": [
+                *([TURNED] if self.unknown else []),
+                *(MISSING[name] for name in self.missing if name in MISSING),
+            ],
             "reasons": list(self.reasons),
             "notes": [
-                "the order of the features in time is taken as that of the rows",
-                "squareness, difference of the scales and bows of the guides are errors of the machine: identify shows them",
+                Message("order-of-rows", "the order of the features in time is taken as that of the rows"),
+                Message(
+                    "errors-of-machine",
+                    "squareness, difference of the scales and bows of the guides are errors of the machine: identify shows them",
+                ),
             ],
             "evidence": {"readings": len(self.features.row), "features": len(self.features.position_mm)},
         }
@@ -541,7 +554,7 @@ def diagnose_features(
         effects = tuple(_graded(search, always, named, k, fields) for k in named)
     largest = max((item.gain for item in effects), default=0.0)
     effects = tuple(
-        replace(item, reasons=(*item.reasons, "it is small beside the others"))
+        replace(item, reasons=(*item.reasons, Message("small-beside-others", "it is small beside the others")))
         if item.gain < SMALL_BESIDE * largest and item.clear < LEAST_BESIDE
         else item
         for item in effects
@@ -593,11 +606,17 @@ def _graded(
     alias = search.alternatives(criteria, member, lambda k: search.plausible(rest, k))
     reasons = []
     if not float(np.max(np.abs(value) / np.where(u > 0, u, np.inf))) >= LEAST_SIZE:
-        reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+        reasons.append(
+            Message(
+                "within-its-uncertainty",
+                "it is smaller than {LEAST_SIZE:g} times its standard uncertainty",
+                LEAST_SIZE=LEAST_SIZE,
+            )
+        )
     own = dict(alias)[item.name]
     rival = next((name for name, weight in alias if name != item.name and weight > 0.5 * own), "")
     if rival:
-        reasons.append(f"{rival} explains the features nearly as well")
+        reasons.append(Message("rival-as-good", "{rival} explains the features nearly as well", rival=rival))
     smooth = [float(criteria[k]) for k, one in enumerate(search.candidates) if one.tier == "generic" and k not in rest]
     if max(smooth, default=-np.inf) > float(criteria[member]) - AS_GOOD:
         reasons.append(OF_FIELD)
@@ -608,13 +627,15 @@ def _graded(
     }
     for k, one in enumerate(search.candidates):
         if one.tier == "generic" and k not in rest and left_over[k] > limits[bool(one.only_one)] and not reasons:
-            reasons.append("something without a name is left over, of which it may be a part")
+            reasons.append(
+                Message("unknown-left-over", "something without a name is left over, of which it may be a part")
+            )
     unnamed = sum(float(search.gains([k for k in (*always, *named) if k != g])[g]) for g in fields)
     if fields and float(gains[member]) < LEAST_OF_UNKNOWN * unnamed:
-        reasons.append("small compared with the unexplained part")
+        reasons.append(Message("small-beside-unknown", "small compared with the unexplained part"))
     others = [k for k in named if k != member]
     if item.name != "outliers" and _left_out(search, always, named)[1] >= _left_out(search, always, others)[1]:
-        reasons.append("it does not hold on features left out")
+        reasons.append(Message("fails-left-out", "it does not hold on features left out"))
     largest = float(np.abs(moved).max()) if len(value) == 1 else float(np.linalg.norm(value))
     return NamedFeatureEffect(
         item, values, float(gains[member]), alias, tuple(reasons), largest, float(criteria[member])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from html import escape
 from typing import Any
 
@@ -29,6 +29,7 @@ from compgen.drawing.charts import (
     picture_grid,
     svg,
 )
+from compgen.errors import Message, messages_of
 
 # Figures of a diagnosis: residuals before and after over all quantities they may depend on, and the suspects.
 
@@ -378,17 +379,39 @@ def told(data: dict[str, Any]) -> dict[str, Any]:
     """The content of ``diagnosis.json`` with the sentence and the steps that a page begins with."""
     steps = [text for item in _ranked(data) if item["grade"] != "tentative" and (text := _action(item))]
     steps = list(dict.fromkeys([*steps[: MOST_STEPS - 1], *data["advice"], *steps]))[:MOST_STEPS]
-    return {**data, "headline": _headline(data), "left_over": _left_over(data["gap"]), "next_steps": steps}
+    said = {"headline": _headline(data), "left_over": _left_over(data["gap"]), "next_steps": steps}
+    return {**data, **said, **messages_of([said["headline"], said["left_over"], *_findings(data)])}
 
 
-def _ranked(data: dict[str, Any]) -> list[dict[str, Any]]:
+def _findings(data: Mapping[str, Any]) -> Iterator[str]:
+    """Everything that was found, as messages: a program reads their codes and values in place of the sentences."""
+    names = [item["name"] for item in _ranked(data) if item["grade"] != "tentative"]
+    if names:
+        yield Message("verdict-named", "named: {names}", names=", ".join(names))
+    codes = {
+        "confirmed": "effect-confirmed",
+        "beside_unknown": "effect-beside-unknown",
+        "tentative": "effect-tentative",
+    }
+    for item in data["effects"]:
+        yield Message(codes[item["grade"]], "effect {name}: {grade}", name=item["name"], grade=SURE[item["grade"]])
+        yield from item.get("reasons", ())
+    for item in data["unknown"]:
+        yield Message("unknown-effect", "unknown: {text}", text=item["text"])
+    for key in ("reasons", "advice", "notes"):
+        yield from data[key]
+
+
+def _ranked(data: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The effects, sure ones first, in the order in which they were found."""
     return sorted(data["effects"], key=lambda item: list(SURE).index(item["grade"]))
 
 
 def _headline(data: dict[str, Any]) -> str:
     if data["verdict"] == "not_decidable":
-        return f"Not decidable: {'; '.join(data['reasons']) or 'see the notes'}."
+        return Message(
+            "verdict-not-decidable", "Not decidable: {reasons}.", reasons="; ".join(data["reasons"]) or "see the notes"
+        )
     effects = _ranked(data)
     firm = [item for item in effects if item["grade"] != "tentative"]
     if firm:
@@ -396,10 +419,18 @@ def _headline(data: dict[str, Any]) -> str:
         return f"{_what(firm[0])} ({SURE[firm[0]['grade']]}){rest}: {_briefly(_action(firm[0]))}."
     if data["unknown"]:
         step = data["advice"][0] if data["advice"] else "measure again, everything twice"
-        return f"Something that no known effect explains: {data['unknown'][0]['text']}. Next: {step}."
+        return Message(
+            "verdict-unknown",
+            "Something that no known effect explains: {text}. Next: {step}.",
+            text=data["unknown"][0]["text"],
+            step=step,
+        )
     if effects:
-        return f"Perhaps {_what(effects[0])} (not certain: {'; '.join(effects[0].get('reasons', [])) or 'no repeats'})."
-    return "Nothing is wrong that these readings show beyond their noise."
+        reasons = "; ".join(effects[0].get("reasons", [])) or "no repeats"
+        return Message(
+            "verdict-perhaps", "Perhaps {effects} (not certain: {reasons}).", effects=_what(effects[0]), reasons=reasons
+        )
+    return Message("verdict-none", "Nothing is wrong that these readings show beyond their noise.")
 
 
 def _what(item: Mapping[str, Any]) -> str:
@@ -450,8 +481,23 @@ def _left_over(gap: Mapping[str, Any]) -> str:
     held = gap.get("heldout_lines") or gap.get("heldout_times")
     out = f", {held['after_rms_um']:.3g} um on readings left out" if held else ""
     if after <= LIKE_NOISE * floor:
-        return f"What is left ({after:.3g} um rms{out}) is the noise of the instrument ({floor:.3g} um, {source})."
-    return f"What is left ({after:.3g} um rms{out}) is {after / floor:.1f} times the noise ({floor:.3g} um, {source})."
+        return Message(
+            "left-over-is-noise",
+            "What is left ({after:.3g} um rms{out}) is the noise of the instrument ({floor:.3g} um, {source}).",
+            after=after,
+            out=out,
+            floor=floor,
+            source=source,
+        )
+    return Message(
+        "left-over-is-more",
+        "What is left ({after:.3g} um rms{out}) is {after2:.1f} times the noise ({floor:.3g} um, {source}).",
+        after=after,
+        out=out,
+        after2=after / floor,
+        floor=floor,
+        source=source,
+    )
 
 
 # The files of a diagnosis: JSON, text, extended machine.

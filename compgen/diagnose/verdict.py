@@ -27,6 +27,7 @@ from compgen.diagnose.search import (
 )
 from compgen.drawing.display import Bars, Drawable, Overview, Panel
 from compgen.effects import catalogue
+from compgen.errors import Message
 from compgen.kinematics.exact_chain import tip_position
 
 # The verdict: named effects in three grades, unnamed effects, and effects the plan cannot show.
@@ -164,12 +165,25 @@ def verdict_of(analysis: Analysis) -> Verdict:
     word: Word = "named" if firm else "unknown" if unknown or graded else "none"
     if word == "unknown" and not unknown:
         first = graded[0]
-        text = f"resembles {first.name} but {first.reasons[0] if first.reasons else 'is not certain'}"
+        text = Message(
+            "resembles",
+            "resembles {name} but {reasons}",
+            name=first.name,
+            reasons=first.reasons[0] if first.reasons else Message("not-certain", "is not certain"),
+        )
         covariates = tuple(sorted(plain_covariates(design.groups[first.group].covariates)))
         unknown = [Unknown(covariates, "", float("nan"), text, None, first.name)]
     if unknown:
         graded = [replace(item, grade="beside_unknown") if item.grade == "confirmed" else item for item in graded]
-    reasons = [] if repeats else ["no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"]
+    reasons = (
+        []
+        if repeats
+        else [
+            Message(
+                "noise-assumed", "no repeats and no stated uncertainty: the noise is assumed, so no name is confirmed"
+            )
+        ]
+    )
     return Verdict(
         word,
         tuple(graded),
@@ -220,13 +234,13 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     slight = support.uneven[group] < SLIGHTLY_UNEVEN * chi2
     inexact = inexact or (p < HOMOGENEITY_P and slight)
     if p < (HOMOGENEITY_WITH_UNKNOWN_P if generic else HOMOGENEITY_P) and not (inexact or slight):
-        reasons.append(f"does not behave like it everywhere (p = {p:.1e})")
+        reasons.append(Message("not-alike-everywhere", "does not behave like it everywhere (p = {p:.1e})", p=p))
     if support.misfits and chi2 < support.excess:
-        reasons.append("explains less than what remains unexplained")
+        reasons.append(Message("less-than-unexplained", "explains less than what remains unexplained"))
     failed = [g for g, own in support.homogeneity_p.items() if g != group and own < HOMOGENEITY_P]
     share = LEAST_JUMP_SHARE if name == "machine_jump" else LEAST_SHARE
     if generic and chi2 < share * sum(support.chi2[g] for g in (*generic, *failed)):
-        reasons.append("small compared with the unexplained part")
+        reasons.append(Message("small-beside-unknown", "small compared with the unexplained part"))
     if name in NEVER_CONFIRMED or visible < LEAST_VISIBLE:
         reasons.append(
             f"the measurement shows only {100 * visible:.1f} % of it: almost any misfit could be explained by it"
@@ -234,14 +248,20 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     if (effect := design.groups[group].effect) is not None:
         values, covariance, _ = contribution(design, analysis.chosen, group)
         if float(values @ np.linalg.pinv(covariance, hermitian=True) @ values) < LEAST_SIZE**2 * len(values):
-            reasons.append(f"it is smaller than {LEAST_SIZE:g} times its standard uncertainty")
+            reasons.append(
+                Message(
+                    "within-its-uncertainty",
+                    "it is smaller than {LEAST_SIZE:g} times its standard uncertainty",
+                    LEAST_SIZE=LEAST_SIZE,
+                )
+            )
         for parameter, value, u in zip(effect.card.parameters, values, np.sqrt(np.diag(covariance)), strict=False):
             size = (abs(value) - 2 * u) / parameter.si_per_unit
             if parameter.plausible > 0 and size > 3 * parameter.plausible:
                 reasons.append(f"its size, {parameter.name} = {value / parameter.si_per_unit:.3g}, is not plausible")
                 break
     if analysis.noise.source == "assumed":
-        reasons.append("the noise is assumed, not measured")
+        reasons.append(Message("noise-not-measured", "the noise is assumed, not measured"))
     others = tuple(alternatives(design, analysis.rules, analysis.chosen, group))
     weight = next((item.weight for item in others if item.name == name), 0.0)
     return Named(  # the name of what was fitted and is added, whatever else explains the readings as well
@@ -272,9 +292,16 @@ def _unknown(analysis: Analysis, generic: list[int], jumps: list[int], names: li
             nearest = _nearest(analysis, item.group, item.log_ratio)
             found.append(Unknown(group.covariates, group.direction, float("nan"), group.name, item.group, nearest))
     if not found and support.lack_of_fit_z > 3.0 and not shaped:
-        found.append(Unknown((), "", float("nan"), "lines disagree with the model by more than their repeats do"))
+        found.append(
+            Unknown(
+                (),
+                "",
+                float("nan"),
+                Message("lack-of-fit", "lines disagree with the model by more than their repeats do"),
+            )
+        )
     if support.changes_between_runs:
-        found.append(Unknown(("run",), "", float("nan"), "not repeatable from run to run"))
+        found.append(Unknown(("run",), "", float("nan"), Message("not-repeatable", "not repeatable from run to run")))
     return found
 
 
@@ -343,17 +370,44 @@ def advice_of(analysis: Analysis, verdict: Verdict) -> tuple[str, ...]:
         for other in [*others, *relatives(analysis.design, item.group, others)]:
             breaker = cards[item.name].breaker or cards[other].breaker
             if breaker:
-                found.append(f"{breaker}: separates {item.name} from {other}")
+                found.append(
+                    Message(
+                        "measure-to-separate",
+                        "{breaker}: separates {name} from {other}",
+                        breaker=breaker,
+                        name=item.name,
+                        other=other,
+                    )
+                )
     if analysis.noise.source != "repeats":
-        found.append("measure every line at least twice, in random order: only repeats separate noise from effects")
+        found.append(
+            Message(
+                "measure-lines-twice",
+                "measure every line at least twice, in random order: only repeats separate noise from effects",
+            )
+        )
     if verdict.unknown and verdict.unknown[0].covariates:
         depends = ", ".join(verdict.unknown[0].covariates)
-        found.append(f"vary {depends} separately, each line twice: shows how the unexplained part depends on them")
+        found.append(
+            Message(
+                "vary-separately",
+                "vary {depends} separately, each line twice: shows how the unexplained part depends on them",
+                depends=depends,
+            )
+        )
     shown: dict[str, list[str]] = {}
     for name in verdict.invisible:
         if name in cards and cards[name].breaker:
             shown.setdefault(cards[name].breaker, []).append(name)
-    found += [f"{how}: would show {', '.join(names)}, which this measurement cannot" for how, names in shown.items()]
+    found += [
+        Message(
+            "measure-to-show",
+            "{how}: would show {names}, which this measurement cannot",
+            how=how,
+            names=", ".join(names),
+        )
+        for how, names in shown.items()
+    ]
     return tuple(dict.fromkeys(found))
 
 

@@ -655,3 +655,15 @@ def test_a_weak_change_that_many_names_explain_has_none(tmp_path, kind, seed, ri
     sure = [item for item in found["effects"] if item["grade"] != "tentative"]
     assert [item["name"] for item in sure] == ([] if right == "none" else [right])
     assert all(len(item["alias_set"]) < 4 or item["chi2"] > 25.0 for item in sure)
+
+
+@pytest.mark.parametrize(("pause", "step_um", "sure"), [(25, 0.0, False), (0, 12.0, True), (0, -12.0, True)])
+def test_a_pause_in_a_warm_up_without_times_is_no_sure_step(gantry, pause, step_um, sure):
+    """After a pause a warm-up goes on from where it is then, and more slowly; after a step it is as fast as before."""
+
+    def effect(k, direction, run, s):
+        return 40.0 * -np.expm1(-(k + pause * (k >= 28)) / 30.0) + step_um * (k >= 28)
+
+    found = diagnose(gantry, session(5, sigma_um=0.4, effect=effect)).axes[0]
+    firm = {item.name for item in found.effects if item.grade != "tentative"}
+    assert firm == ({"warmup_drift", "step_between_runs"} if sure else firm & {"warmup_drift"})

@@ -281,3 +281,51 @@ def test_the_extended_machine_explains_the_next_circles(tmp_path):
     assert "[effects.backlash_X]" in path.read_text() and "[effects.periodic_Y]" in path.read_text()
     again, named = found_in(compgen.load_machine(path), circles_of(both, seed=8))
     assert not named and again["verdict"] == "none"
+
+
+def away(t, degrees):
+    return (t - np.radians(degrees) + np.pi) % (2 * np.pi) - np.pi
+
+
+#: What no name stands for, in um, and how the page describes it.
+NAMELESS = {
+    "one-sided bump": (lambda t, d, w: 0.8 * np.exp(-0.5 * (away(t, 143) / 0.25) ** 2) * (d > 0), "a bump at 14"),
+    "bump": (lambda t, d, w: -1.0 * np.exp(-0.5 * (away(t, 61) / 0.4) ** 2), "a bump at 6"),
+    "kink at half a turn": (lambda t, d, w: 3.0 * np.abs(away(t, 180)) / np.pi, "kinks at "),
+    "slope that begins": (lambda t, d, w: 1.5 * np.maximum(away(t, 200), 0) / np.pi, "a slope that begins at 200"),
+    "step and back": (lambda t, d, w: 0.6 * (np.abs(away(t, 100)) < np.radians(30)), "a step at"),
+    "wave along a diagonal": (
+        lambda t, d, w: 0.8 * np.cos(t - np.pi / 4) * np.sin(2 * np.pi * 100 * np.cos(t - np.pi / 4) / 42), "waves along",
+    ),
+    "three lobes that turn": (lambda t, d, w: 0.4 * d * np.cos(3 * t + 1), "3 waves a turn, 0.4"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", NAMELESS)
+def test_a_shape_without_a_name_gets_none(machine, kind):
+    """Two, three and four lobes of a bump are no wrong scale and no bent guides, also where noise hides the others."""
+    effect, words = NAMELESS[kind]
+    result, named = found_in(machine, circles_of(effect, count=180))
+    assert result["verdict"] == "unknown"
+    assert not [name for name, item in named.items() if item["grade"] != "tentative"]
+    assert words in result["unknown"][0]["text"]
+
+
+def test_a_name_beside_a_shape_keeps_its_amount(machine):
+    both = circles_of(lambda t, d, w: NAMELESS["bump"][0](t, d, w) + EFFECTS["squareness_C0Y"][2](t, d, w), count=360)
+    result, named = found_in(machine, both)
+    assert {name: item["grade"] for name, item in named.items()} == {"squareness_C0Y": "beside_unknown"}
+    close(named["squareness_C0Y"], "c_urad", 30.0, 1.0)
+    assert "a bump at 6" in result["unknown"][0]["text"]
+
+
+def test_messages_have_codes_and_names_as_values(machine, tmp_path):
+    path, out = tmp_path / "a.circle.csv", tmp_path / "out"
+    path.write_text(format_circles(circles_of(EFFECTS["squareness_C0Y"][2], directions=(1,), count=180)))
+    assert run_command(cli, ["diagnose", str(machine.source), str(path), "--out", str(out)]) == 0
+    data = json.loads((out / "diagnosis.json").read_text())
+    said = {item["code"]: item for item in data["messages"]}
+    assert said["effect-tentative"]["values"]["name"] == "squareness_C0Y"
+    assert said["measure-both-directions"]["text"] in data["advice"]
+    assert said["left-out-sectors"]["text"] in data["notes"]
+    assert data["headline"] == said["verdict-perhaps"]["text"]

@@ -128,6 +128,7 @@ def test_what_has_no_name_is_unknown_and_rows_hide_a_drift(mill):
     twist = np.column_stack([0 * s[:, 0], 25 * s[:, 0] * s[:, 1]])
     found, named = effects_of(mill, part_of(place, nothing_um + twist))
     assert not named and found["verdict"] == "unknown" and "x with y" in found["unknown"][0]["text"]
+    assert "turned by 90 degrees" in found["advice"][0]
     # row after row, wear and the place change together: what is missing is said
     assert "tool_wear" in found["invisible"] and any("first feature" in text for text in found["advice"])
 
