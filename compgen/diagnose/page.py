@@ -399,7 +399,7 @@ def _findings(data: Mapping[str, Any]) -> Iterator[str]:
     for item in data["unknown"]:
         yield Message("unknown-effect", "unknown: {text}", text=item["text"])
     for key in ("reasons", "advice", "notes"):
-        yield from data[key]
+        yield from data.get(key, ())
 
 
 def _ranked(data: Mapping[str, Any]) -> list[dict[str, Any]]:
