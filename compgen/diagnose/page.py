@@ -426,7 +426,7 @@ def _headline(data: dict[str, Any]) -> str:
             step=step,
         )
     if effects:
-        reasons = "; ".join(effects[0].get("reasons", [])) or "no repeats"
+        reasons = "; ".join(effects[0].get("reasons", [])) or Message("no-repeats", "no repeats")
         return Message(
             "verdict-perhaps", "Perhaps {effects} (not certain: {reasons}).", effects=_what(effects[0]), reasons=reasons
         )
