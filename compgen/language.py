@@ -128,6 +128,9 @@ class Texts:
         found = self._complete(english, least)
         if found is None:
             found = " ".join(self._part(piece, least) or piece for piece in _SENTENCES.split(english))
+        name = english.partition(": ")[0]  # a heading before several sentences
+        if found != english and name in self._headings and found.startswith(f"{name}: "):
+            found = self._headings[name] + found[len(name) :]
         return found
 
     def message(self, said: Message) -> str:
@@ -197,6 +200,8 @@ class Texts:
                     texts = match.groupdict()
                     if any(self._is_verdict(name) for text in texts.values() for name in text.split(": ")[:-1]):
                         continue  # a verdict and its sentence are translated one after the other
+                    if letters < _WEAK and any(", " in text for text in texts.values()):
+                        continue  # each item of a list by itself
                     if letters < least and any(_LETTERS.search(text) for text in texts.values()):
                         continue
                     values = {name: self._word(text) or self._complete(text) for name, text in texts.items()}

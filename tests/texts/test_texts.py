@@ -231,8 +231,10 @@ def test_a_sentence_is_never_a_mixture():
             "der verbleibenden Unsicherheit aus.",
         ),
         (
-            "what was not measured may cost, rms over the volume: EC0Y 35.1 um, EYY 15.1 um and 12 others",
-            "was nicht gemessen wurde, kann kosten (effektiv über das Volumen): EC0Y 35.1 µm, EYY 15.1 µm und 12 weitere",
+            "what was not measured may cost, rms over the volume: EC0Y 35.1 um, EYY 15.1 um, EB0Z 12.3 um, EA0Z 12.3 um "
+            "and 12 others",
+            "was nicht gemessen wurde, kann kosten (effektiv über das Volumen): EC0Y 35.1 µm, EYY 15.1 µm, EB0Z 12.3 µm, "
+            "EA0Z 12.3 µm und 12 weitere",
         ),
     ],
 )
