@@ -200,8 +200,12 @@ class Texts:
                     texts = match.groupdict()
                     if any(self._is_verdict(name) for text in texts.values() for name in text.split(": ")[:-1]):
                         continue  # a verdict and its sentence are translated one after the other
-                    if letters < _WEAK and any(", " in text for text in texts.values()):
-                        continue  # each item of a list by itself
+                    if (
+                        message.endswith(("} um", "} urad"))
+                        and letters < _WEAK
+                        and any(", " in t for t in texts.values())
+                    ):
+                        continue  # each item of a list of sizes by itself
                     if letters < least and any(_LETTERS.search(text) for text in texts.values()):
                         continue
                     values = {name: self._word(text) or self._complete(text) for name, text in texts.items()}
