@@ -295,8 +295,8 @@ def _plan_gauges(
 def _plan_next(machine: Machine, errors: Path | None, out: Path, language: str, *, as_json: bool) -> int:
     """Say what to measure next, from the errors that are known, or from nothing but the prior."""
     from compgen.identification.posterior import not_measured
-    from compgen.planning.measurement_order import ORDER_NAME, order_page
     from compgen.planning.next_measurement import next_best, next_page, unmeasured
+    from compgen.report.measurement_order import ORDER_NAME, order_page
 
     if machine.prior.is_none:
         raise InputError(

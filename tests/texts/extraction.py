@@ -34,7 +34,7 @@ MODULES = (
     "language.py", "new_machine.py", "registry.py",
     "effects/*.py", "fitting/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identification/*.py",
     "identification/adjust/*.py", "instruments/*.py", "pipeline.py", "planning/*.py", "programs/correct.py",
-    "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py",
+    "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py", "report/measurement_order.py",
     "report/html/*.py", "report/pdf.py", "report/options_text.py",
     "report/part_page.py", "report/sheets.py", "report/summary.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip

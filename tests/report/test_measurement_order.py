@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from compgen.planning.measurement_order import RUNS, order_page, order_sheets
 from compgen.planning.next_measurement import (
     ALONG,
     BALLS,
@@ -15,6 +14,7 @@ from compgen.planning.next_measurement import (
     candidates,
     unmeasured,
 )
+from compgen.report.measurement_order import RUNS, order_page, order_sheets
 
 
 @pytest.fixture(scope="module")
