@@ -597,7 +597,7 @@ def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect
         if p < UNEVEN_P and share > UNEVEN_SHARE:
             reasons.append(
                 Message(
-                    "not-alike-everywhere",
+                    "not-alike-in-session",
                     "does not behave like it at all positions, directions and times (p = {p:.1e})",
                     p=p,
                 )
@@ -616,7 +616,7 @@ def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect
     parameters |= {key: (value, None) for key, value in item.effect.used(session.readings).items()}
     reasons += _size_reasons(item, own, parameters, covariance if len(own) == len(covariance) else np.diag(u[:1] ** 2))
     if item.name.rpartition("_")[0] in LOGGED and not _holds(changes, member):
-        reasons.append(Message("fails-left-out", "it does not hold in runs left out of the fit"))
+        reasons.append(Message("fails-left-out-runs", "it does not hold in runs left out of the fit"))
     if item.name in DRIFTS:  # refer the readings to the end of the session, the warm state
         shift = shift - shift[-1]
     window = np.arange(item.first, item.last + 1) if lost else np.zeros(0, dtype=np.int64)
@@ -1165,7 +1165,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
                 shown.setdefault(known[name].card.breaker, []).append(name)
             found += [
                 Message(
-                    "measure-to-show",
+                    "measure-runs-to-show",
                     "{how}: would show {names}, which these runs cannot",
                     how=how,
                     names=", ".join(names),

@@ -635,7 +635,7 @@ def _graded(
         reasons.append(Message("small-beside-unknown", "small compared with the unexplained part"))
     others = [k for k in named if k != member]
     if item.name != "outliers" and _left_out(search, always, named)[1] >= _left_out(search, always, others)[1]:
-        reasons.append(Message("fails-left-out", "it does not hold on features left out"))
+        reasons.append(Message("fails-left-out-features", "it does not hold on features left out"))
     largest = float(np.abs(moved).max()) if len(value) == 1 else float(np.linalg.norm(value))
     return NamedFeatureEffect(
         item, values, float(gains[member]), alias, tuple(reasons), largest, float(criteria[member])
