@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -113,7 +114,27 @@ Progress = Callable[[str], None]
     metavar="PLANE:RADIUS[:X,Y,Z]",
     help="Circular test: plane, radius and centre in mm (XY:150; the middle of the travel), or a TOML file.",
 )
-@click.option("--program", metavar="CONTROLLER", help="Write the program that probes the artefact, probe-program.nc.")
+@click.option("--program", metavar="CONTROLLER", help="Write the program that probes artefact or spheres.")
+@click.option(
+    "--sphere",
+    multiple=True,
+    metavar="X,Y,Z",
+    help="Rotary axes: a sphere on the table, workpiece frame with all axes at zero, mm (may be given several times).",
+)
+@click.option(
+    "--probe-length",
+    "probe_lengths",
+    multiple=True,
+    type=NUMBER,
+    help="Length of the probe for --sphere along -Z, mm (may be given several times; default: 100).",
+)
+@click.option("--count", type=click.IntRange(min=4, max=1000), help="Number of poses for --sphere (default: 40).")
+@click.option(
+    "--u-sphere-um", type=NUMBER, help="Standard uncertainty of a coordinate of a sphere's centre, um (default: 2)."
+)
+@click.option(
+    "--probing", type=PATH, help="TOML with the section [probing] of spheres, for --sphere; docs/five-axis.md."
+)
 @click.option(
     "--errors",
     type=PATH,
@@ -151,6 +172,11 @@ def plan_command(
     pose: tuple[str, ...],
     circle: tuple[str, ...],
     program: str | None,
+    sphere: tuple[str, ...],
+    probe_lengths: tuple[float, ...],
+    count: int | None,
+    u_sphere_um: float | None,
+    probing: Path | None,
     errors: Path | None,
     readings: IdentifyOptions,
     search: bool,
@@ -170,6 +196,8 @@ def plan_command(
     one adjustment; plan.html then shows deviation arrows and the polar diagram for --errors, with a slider for each error.
     With --program also the NC program that probes the artefact (mm); volcomp import reads its log. With none of these: what to
     measure next, of what a workshop has, where --errors are known (*.errors.csv of volcomp identify or run), or nothing is.
+    With --sphere: the poses of a machine with rotary axes at which its probe finds the sphere, chosen for what they say of the
+    rotary axes; --program writes sphere-program.nc (mm, degrees), whose log volcomp import reads.
 
     Writes plan.json and plan.errors.csv (um, urad; values zero, u_value predicted) to DIR, with --suggest also
     suggested.stations.csv, with --target-um proposed.points.csv (mm); what to measure next with order.html, a sheet to print
@@ -186,6 +214,14 @@ def plan_command(
       volcomp plan zha-gantry --stations identified/stations.csv --grid --out plan/
     """
     OutputFolder(out)
+    if sphere:
+        if artefact or circle or pose or stations or points or grid or search or errors or target_um is not None:
+            raise InputError("--sphere plans poses of rotary axes alone; leave out what belongs to other measurements")
+        return _plan_spheres(
+            machine, sphere, probe_lengths or (100.0,), count, u_sphere_um, probing, program, out, as_json
+        )
+    if probe_lengths or count is not None or u_sphere_um is not None or probing:
+        raise InputError("--probe-length, --count, --u-sphere-um and --probing belong to --sphere, which is not given")
     if artefact or circle:
         if search or target_um is not None:
             raise InputError(
@@ -244,6 +280,62 @@ def plan_command(
     answer(as_json, summary, *shown, visibility_table(visible))
     reached = judged is None or judged[1] is not None
     return 0 if result.determined and reached else 1
+
+
+def _plan_spheres(
+    machine: Machine,
+    sphere: tuple[str, ...],
+    lengths_mm: tuple[float, ...],
+    count: int | None,
+    u_um: float | None,
+    probing: Path | None,
+    program: str | None,
+    out: Path,
+    as_json: bool,
+) -> int:
+    """Choose the poses at which spheres are probed, and write the program that probes them."""
+    from compgen.planning.sphere_poses import plan_spheres
+    from compgen.report.terminal import sphere_plan_table
+    from compgen.tables.sphere_program import PROGRAM_NAME as SPHERE_PROGRAM
+    from compgen.tables.sphere_program import height_of, reach_of, sphere_program
+
+    if program and probing is None:
+        raise InputError("--program needs the section [probing] of a file: give --probing FILE", field="--program")
+    for value, name in ((u_um, "--u-sphere-um"), *((length, "--probe-length") for length in lengths_mm)):
+        if value is not None and not 0.0 < value < 2000.0:
+            raise InputError(f"{value:g} is not possible; expected more than 0, less than 2000", field=name)
+    touched = None if probing is None else read_probing(probing)
+    with progress(quiet=as_json) as show:
+        show("choosing poses")
+        found = plan_spheres(
+            machine,
+            [_place(text) for text in sphere],
+            sorted(set(lengths_mm)),
+            count=40 if count is None else count,
+            u_um=2.0 if u_um is None else u_um,
+            reach=None if touched is None else reach_of(touched),
+            height_mm=None if touched is None else height_of(machine, touched),
+        )
+    folder = OutputFolder(out)
+    for name, text in found.files().items():
+        folder.add(name, text)
+    if program and touched is not None:
+        folder.add(SPHERE_PROGRAM, sphere_program(found, touched, program))
+    folder.add("plan.json", json.dumps(found.summary(), indent=2) + "\n")
+    folder.commit()
+    answer(as_json, found.summary(), sphere_plan_table(found))
+    return 0
+
+
+def _place(text: str) -> tuple[float, float, float]:
+    """The place of a sphere, ``X,Y,Z`` in mm."""
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not max(abs(x), abs(y), abs(z)) < 1e5:
+        raise InputError(f"{text!r} is not a place; expected X,Y,Z in mm, for example 60,30,40", field="--sphere")
+    return x, y, z
 
 
 def _plan_gauges(

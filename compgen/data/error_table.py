@@ -415,9 +415,14 @@ def errors_of_table(table: CsvTable) -> ErrorTable:
     squareness: dict[str, tuple[float, float]] = {}
     for row, name in enumerate(names):
         if name not in ERROR_INDEX:
-            known = nearest(name, ERROR_NAMES)
             if _OF_ROTARY_AXES.fullmatch(name):
-                known += ". It is an error of a rotary axis; here are those of X, Y and Z only (docs/five-axis.md)"
+                raise table.fail(
+                    row,
+                    "error",
+                    f"{name!r} is an error of a rotary axis; here are those of X, Y and Z only: give linear.errors.csv, which "
+                    "identify writes beside it if the linear axes were measured, too (docs/five-axis.md)",
+                )
+            known = nearest(name, ERROR_NAMES)
             raise table.fail(row, "error", f"{name!r} is not an error of ISO 230-1 here; {known}")
     for name, rows in _grouped(names).items():
         unit = error_named(name).si_per_unit

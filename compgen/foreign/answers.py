@@ -13,7 +13,7 @@ from compgen.data.toml_files import option
 from compgen.errors import InputError
 from compgen.foreign.column_names import MM_PER_LENGTH, RAD_PER_ANGLE, covariate_unit, known_unit
 
-Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle", "artefact", "part"]
+Kind = Literal["axis", "lengths", "deviations", "errors", "capture", "circle", "artefact", "part", "sphere"]
 KINDS: tuple[Kind, ...] = ("axis", "lengths", "deviations", "errors", "capture", "circle", "artefact", "part")
 #: Answers to ``--sign`` for all tables; the others are for squareness.
 TABLE_SIGNS = ("error", "correction")

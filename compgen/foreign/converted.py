@@ -41,6 +41,7 @@ from compgen.data.error_table import (
 from compgen.data.lengths import Lengths, join_lengths, read_lengths
 from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM, RAD_PER_URAD, SQUARENESS_NAMES, error_named
+from compgen.data.rotary import SphereCentres
 from compgen.errors import CompgenWarning, InputError
 from compgen.fitting import FitOptions, fit
 from compgen.fitting.zeroing import zero_ends
@@ -182,6 +183,11 @@ def _measured(path: Path, kind: str | None, answers: ImportOptions) -> Sequence[
     item = _settled(path, answers)
     if isinstance(item.data, Capture):
         raise InputError("contains a capture over time, from which no errors are identified", file=path)
+    if isinstance(item.data, SphereCentres):
+        raise InputError(
+            f"is the log of a sphere program; 'volcomp import FILE --out DIR' writes {item.file_name}, for identify and run",
+            file=path,
+        )
     data = item.data.deviations() if isinstance(item.data, Part) else item.data
     return [data] if item.other_errors is None else [data, item.other_errors]
 

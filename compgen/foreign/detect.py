@@ -70,6 +70,7 @@ from compgen.foreign.source import (
     read_source,
     shown,
 )
+from compgen.foreign.sphere_log import import_sphere_log, is_sphere_log
 from compgen.foreign.table_kinds import check_largest, import_table, merged_sheets, runs_of
 
 MOST_EXCHANGE_BYTES = 16_000_000
@@ -741,6 +742,7 @@ FORMATS = (
         ("linear", "angle"),
     ),
     Format("probe-log", lambda head: is_probe_log(head.text), import_probe_log),
+    Format("sphere-log", lambda head: is_sphere_log(head.text), import_sphere_log),
     Format("qif", lambda head: is_qif(head.text), _import_qif, ("units", "ignore")),
     Format("dmis", lambda head: is_dmis(head.text), _import_dmis, ("units", "ignore")),
     Format("table", lambda _: True, _of_text, tuple(name for name in _FLAGS if name not in ("sheet", "zero_runs"))),

@@ -21,6 +21,7 @@ from compgen.data.csv_files import FloatArray
 from compgen.data.deviations import Artefact, Deviations, Part, format_artefact, format_deviations, format_part
 from compgen.data.error_table import ErrorTable, ReversalCurves, format_errors, format_reversal
 from compgen.data.lengths import Lengths, format_lengths
+from compgen.data.rotary import SphereCentres, format_spheres
 from compgen.errors import InputError
 from compgen.foreign.answers import ImportOptions, Kind
 from compgen.foreign.cells import Table
@@ -47,8 +48,9 @@ SUFFIXES = {
     "circle": ".circle.csv",
     "artefact": ".artefact.csv",
     "part": ".part.csv",
+    "sphere": ".sphere.csv",
 }
-Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact | Part
+Data = AxisRuns | Lengths | Deviations | ErrorTable | Capture | Circles | Artefact | Part | SphereCentres
 _WRITERS: dict[type, Callable[[Any], str]] = {
     AxisRuns: format_axis_runs,
     Lengths: format_lengths,
@@ -58,6 +60,7 @@ _WRITERS: dict[type, Callable[[Any], str]] = {
     Circles: format_circles,
     Artefact: format_artefact,
     Part: format_part,
+    SphereCentres: format_spheres,
 }
 
 

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from compgen.data.names import COVERAGE, error_named
+from compgen.data.rotary import si_per_unit, unit_of
 from compgen.errors import number_text, one_line, um_text
 
 if TYPE_CHECKING:
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from compgen.planning import Plan, PlanVisibility, Suggestion, TrajectoryCandidate, VolumeUncertainty
     from compgen.planning.gauges import GaugePlan
     from compgen.planning.next_measurement import NextBest
+    from compgen.planning.sphere_poses import SpherePlan
     from compgen.tables import Residuals, Verification
     from compgen.tables.active import MergeReport, TableDifference
     from compgen.tables.signs import CrashTest
@@ -173,6 +175,26 @@ def sphere_table(result: SphereIdentification) -> Group:
         *_fit_lines(result),
         *(f"cannot be told apart: {words}; {cure}" for words, cure in result.inseparable),
         *(f"note: {text}" for text in result.notes),
+    ]
+    return Group(table, *(Text(line) for line in lines))
+
+
+def sphere_plan_table(plan: SpherePlan) -> Group:
+    """Return what planned poses will determine of the rotary axes, and what they cannot tell apart."""
+    title = (
+        f"{sum(plan.determined)} of {len(plan.names)} position errors, {plan.rank} combinations determined by "
+        f"{len(plan.spheres)} of {plan.candidates} poses"
+    )
+    table = Table(
+        "error", "u (k = 1)", "assumed before", "unit", "", title=title, box=box.SIMPLE_HEAD, title_justify="left"
+    )
+    for name, u, size, known in zip(plan.names, plan.u, plan.sizes, plan.determined, strict=True):
+        unit = si_per_unit(name)
+        table.add_row(name, f"{u / unit:.2f}", f"{size / unit:.0f}", unit_of(name), "" if known else "not determined")
+    lines = [
+        f"for centres with a standard uncertainty of {plan.u_um:g} um in each coordinate; errors of the linear axes that are not "
+        "measured enter with the sizes of their class",
+        *(f"cannot be told apart: {words}; {cure}" for words, cure in plan.inseparable),
     ]
     return Group(table, *(Text(line) for line in lines))
 

@@ -362,7 +362,7 @@ def test_other_commands_say_what_they_do_with_rotary_axes(folder, call):
     assert "cannot be told apart" in Path("d/diagnosis.md").read_text()
     call("identify", "five.toml", "sim/trunnion.sphere.csv", "--out", "found")
     code, out, err = call("fit", "five.toml", "found/identified.errors.csv", "--out", "x")
-    assert code == 2 and "It is an error of a rotary axis" in " ".join(err.split())
+    assert code == 2 and "is an error of a rotary axis; here" in " ".join(err.split())
     code, out, err = call("accuracy", "five.toml", "sim/trunnion.sphere.csv", "--out", "x")
     assert code == 2 and "volcomp identify gives its figures" in " ".join(err.split())
     words = ["run", "five.toml", "sim/trunnion.sphere.csv", "--controller", "linuxcnc-rotary-comp", "--out", "x"]
