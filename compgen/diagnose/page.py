@@ -388,13 +388,8 @@ def _findings(data: Mapping[str, Any]) -> Iterator[str]:
     names = [item["name"] for item in _ranked(data) if item["grade"] != "tentative"]
     if names:
         yield Message("verdict-named", "named: {names}", names=", ".join(names))
-    codes = {
-        "confirmed": "effect-confirmed",
-        "beside_unknown": "effect-beside-unknown",
-        "tentative": "effect-tentative",
-    }
     for item in data["effects"]:
-        yield Message(codes[item["grade"]], "effect {name}: {grade}", name=item["name"], grade=SURE[item["grade"]])
+        yield Message("effect-found", "effect {name}: {grade}", name=item["name"], grade=SURE[item["grade"]])
         yield from item.get("reasons", ())
     for item in data["unknown"]:
         yield Message("unknown-effect", "unknown: {text}", text=item["text"])

@@ -325,7 +325,7 @@ def test_messages_have_codes_and_names_as_values(machine, tmp_path):
     assert run_command(cli, ["diagnose", str(machine.source), str(path), "--out", str(out)]) == 0
     data = json.loads((out / "diagnosis.json").read_text())
     said = {item["code"]: item for item in data["messages"]}
-    assert said["effect-tentative"]["values"]["name"] == "squareness_C0Y"
+    assert said["effect-found"]["values"] == {"name": "squareness_C0Y", "grade": "not certain"}
     assert said["measure-both-directions"]["text"] in data["advice"]
     assert said["left-out-sectors"]["text"] in data["notes"]
     assert data["headline"] == said["verdict-perhaps"]["text"]
