@@ -8,6 +8,7 @@ then only the size is given.
 from __future__ import annotations
 
 import re
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -81,7 +82,7 @@ def _periodic(item: Mapping[str, Any], values: Mapping[str, tuple[float, float |
     """Say how close the points of a table have to be, and over which travel a short table holds them."""
     pitch_mm = item.get("settings", {}).get("pitch_mm")
     first, second = (
-        float(np.hypot(*(values.get(key, (0.0, None))[0] for key in keys)))
+        math.hypot(*(values.get(key, (0.0, None))[0] for key in keys))
         for keys in (("s1_um", "c1_um"), ("s2_um", "c2_um"))
     )
     left_um = first * (1.0 - np.cos(np.pi * SHARE)) + second * (1.0 - np.cos(2.0 * np.pi * SHARE))
