@@ -631,7 +631,7 @@ def _size_reasons(
     item: Candidate, values: FloatArray, parameters: Mapping[str, tuple[float, float | None]], covariance: FloatArray
 ) -> list[str]:
     """Why the amount of an effect speaks against it: within its uncertainty, or beyond what machines do."""
-    reasons = []
+    reasons: list[str] = []
     finite = bool(np.isfinite(covariance).all())
     if not finite or float(values @ np.linalg.pinv(covariance, hermitian=True) @ values) < LEAST_SIZE**2:
         reasons.append(
@@ -1175,7 +1175,7 @@ class AxisDiagnosis(DisplayedDiagnosis):
         return list(dict.fromkeys(found))
 
     def _notes(self) -> list[str]:
-        found = []
+        found: list[str] = []
         for part in self.axes:
             letter = part.session.letter
             found.append(

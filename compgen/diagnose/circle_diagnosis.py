@@ -585,7 +585,7 @@ class CircleDiagnosis(DisplayedDiagnosis):
         }
 
     def _advice(self) -> list[str]:
-        found = []
+        found: list[str] = []
         others = {
             item.candidate.name: [name for name, _ in item.alias if name != item.candidate.name]
             for item in self.effects
@@ -792,7 +792,7 @@ def _beside(
 
 def undecided(circles: Circles, left: FloatArray, floor_mm: float) -> list[str]:
     """Planes in which one pass leaves a structure over that may be noise: only a repeat would show it."""
-    found = []
+    found: list[str] = []
     for k, plane in enumerate(PLANES):
         rows = np.flatnonzero(circles.plane == k)
         if (
@@ -1042,7 +1042,7 @@ def solved(
 
 def _implausible(item: CircleCandidate, values: Mapping[str, tuple[float, float]]) -> list[str]:
     """Why the amount speaks against an effect: smaller than its uncertainty allows, or no drive does that."""
-    reasons = []
+    reasons: list[str] = []
     if max(abs(value) / u if u else math.inf for value, u in values.values()) < LEAST_SIZE:
         reasons.append(
             Message(

@@ -87,7 +87,7 @@ def best_shapes(circles: Circles, spaces: Sequence[tuple[FloatArray, FloatArray]
 
     A space is an orthonormal basis (n, r) and the readings without it (n,).
     """
-    found = []
+    found: list[Shape] = []
     for k, plane in enumerate(PLANES):
         rows = np.flatnonzero(circles.plane == k)
         if not rows.size:
@@ -186,7 +186,7 @@ def _bump(w: float, a: float) -> Named:
 
 def _step(w: float, a: float) -> Named:
     text = f"a step at {(a - 0.5 * w) % 360:.0f} degrees, and back at {(a + 0.5 * w) % 360:.0f}"
-    return _each(lambda p: np.abs(p.away(a)) < 0.5 * math.radians(w)), text
+    return _each(lambda p: (np.abs(p.away(a)) < 0.5 * math.radians(w)).astype(np.float64)), text
 
 
 def _kink(a: float) -> Named:

@@ -230,7 +230,7 @@ def _graded(analysis: Analysis, group: int, generic: list[int], inexact: bool) -
     design, support = analysis.design, analysis.support
     name, chi2, p = design.groups[group].name, support.chi2[group], support.homogeneity_p[group]
     visible = float(design.visible[group])
-    reasons = []
+    reasons: list[str] = []
     slight = support.uneven[group] < SLIGHTLY_UNEVEN * chi2
     inexact = inexact or (p < HOMOGENEITY_P and slight)
     if p < (HOMOGENEITY_WITH_UNKNOWN_P if generic else HOMOGENEITY_P) and not (inexact or slight):
