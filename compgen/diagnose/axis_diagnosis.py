@@ -585,7 +585,8 @@ def _change(changes: AxisFit, member: int, generic: Sequence[int]) -> AxisEffect
     alias = search.alternatives(criteria, member)
     values, covariance = changes.estimate(np.hstack([changes.grid.base, search.columns_of(rest)]), item.columns)
     shift = item.columns @ values
-    reasons, p = [], 1.0
+    reasons: list[str] = []
+    p = 1.0
     lost = item.name in LEFT_OUT
     of_generic = set[str]().union(*(search.candidates[k].covariates for k in generic))
     if item.name in DRIFTS and "time" in of_generic and of_generic & {"x", "approach"}:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -253,7 +254,7 @@ def _reachable(
 
 def _joined(parts: Sequence[SphereCentres]) -> SphereCentres:
     names = ("found_mm", "deviation_mm", "tool_mm", "setup", "u_mm", "diameter_mm", "time_s")
-    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     angle = {letter: np.concatenate([part.angle_deg[letter] for part in parts]) for letter in parts[0].angle_deg}
     sphere = [name for part in parts for name in part.sphere]
     return SphereCentres(**arrays, coordinates=JOINTS, angle_deg=angle, sphere=sphere, metadata=parts[0].metadata)
@@ -306,7 +307,8 @@ def _chosen(problem: Problem, place: NDArray[np.int64], count: int, u_mm: float)
     scaled = problem.columns(problem.start()) * np.where(free, 1.0, problem.sizes) / u_mm
     blocks = scaled.reshape(len(place), 3, -1)
     covariance = np.diag(np.where(free, 1.0 / _RIDGE, 1.0))
-    spheres, taken = int(place.max()) + 1, []
+    taken: list[int] = []
+    spheres = int(place.max()) + 1
     for turn in range(count):
         across = blocks @ covariance
         inner = np.eye(3) + across @ blocks.transpose(0, 2, 1)
@@ -325,8 +327,8 @@ def _in_order(spheres: SphereCentres, rows: Sequence[int]) -> NDArray[np.intp]:
     """Rows by length of the probe, then by the angles, so that tools and slow axes change seldom."""
     letters = list(spheres.angle_deg)
     keys = [spheres.angle_deg[letter][list(rows)] for letter in reversed(letters)]
-    order = np.lexsort((*keys, [int(name[1:]) for name in np.array(spheres.sphere)[list(rows)]],
-                        -spheres.tool_mm[list(rows), 2]))  # fmt: skip
+    number = np.array([int(spheres.sphere[row][1:]) for row in rows])
+    order = np.lexsort((*keys, number, -spheres.tool_mm[list(rows), 2]))
     return np.asarray(rows, dtype=np.intp)[order]
 
 
