@@ -7,8 +7,8 @@ then only the size is given.
 
 from __future__ import annotations
 
-import re
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
