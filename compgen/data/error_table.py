@@ -278,7 +278,8 @@ class ErrorTable(Drawable, Tabular):
     def overview(self) -> Overview:
         """Largest value of each error with its position, and its largest standard uncertainty."""
         machine = f" of {self.metadata['machine']}" if "machine" in self.metadata else ""
-        title = f"{len(self.names)} errors{machine}: {shortened(self.names)}" if self.names else "no errors"
+        count = f"{len(self.names)} error{'s' * (len(self.names) != 1)}"
+        title = f"{count}{machine}: {shortened(self.names)}" if self.names else "no errors"
         rows = tuple(self._row(name) for name in self.names)
         return Overview(title, ("error", "largest", "at (mm)", "u (k = 1)", "unit"), rows)
 

@@ -269,7 +269,8 @@ class Identification(Drawable):
         table = self.errors.overview()
         used = f"{self.readings_used} of {self.readings} readings"
         quality = f"residual {self.rms_um:.3f} um rms, reduced chi-square {self.reduced_chi_square:.3f}"
-        title = f"{len(self.errors.names)} errors from {used} ({self.method}), {quality}"
+        count = len(self.errors.names)
+        title = f"{count} error{'s' * (count != 1)} from {used} ({self.method}), {quality}"
         notes = (f"rank {self.rank} of {self.unknowns} unknowns", *self.objections)
         return Overview(title, table.header, table.rows, notes)
 

@@ -160,7 +160,7 @@ class NextBest:
                 chosen.append(found[0])
         first, *others = chosen
         said = f"{_capital(first.candidate.what)} would reduce u from {um_text(self.u_um)} to {um_text(first.u_after_um)} um"
-        said += "".join(f", {item.candidate.what} down to {um_text(item.u_after_um)}" for item in others)
+        said += "".join(f", {item.candidate.what} down to {um_text(item.u_after_um)} um" for item in others)
         return f"{self.sentence} {said} (rms over the volume)."
 
     def summary(self) -> dict[str, Any]:
@@ -414,7 +414,7 @@ def _runs(at: _Places, axis: int) -> Iterator[Candidate]:
         comments = " and ".join(f"# line_{AXES[k].lower()}_mm = {line[0, k]:g}" for k in lever)
         yield Candidate(
             "axis_run",
-            f"a pitch run along {letter} at {at.text(line[0], lever)}",
+            f"a pitch run along {letter} at {at.text(line[0], lever)} mm",
             f"laser or step gauge along {letter} with {at.text(line[0], lever)} mm; *.axis.csv with the comments {comments}",
             1,
             axis_observations(at.machine, at.layout, runs, at.found.prior),
@@ -491,7 +491,7 @@ def _circles(at: _Places, plane: str) -> Iterator[Candidate]:
         where = ",".join(f"{value:g}" for value in centre)
         yield Candidate(
             "circle",
-            f"a circle in {plane}, radius {radius_mm:g} mm, at {AXES[third]} {centre[third]:g}",
+            f"a circle in {plane}, radius {radius_mm:g} mm, at {AXES[third]} {centre[third]:g} mm",
             f"ballbar, centre {at.text(centre, range(3))} mm, both directions; *.circle.csv with the columns centre_x_mm, "
             "centre_y_mm, centre_z_mm",
             1,
@@ -584,11 +584,11 @@ def _plate(
         metadata={"u_probe_um": f"{U_PROBE_UM:g}"},
     )
     observed, _, _ = artefact_observations(at.machine, at.layout, artefact, IdentifyOptions(), np.zeros(at.layout.size))
-    where = "; ".join(f"centre {at.text(centre, range(3))} mm" for centre, _ in poses)
+    where = "; ".join(f"{at.text(centre, range(3))} mm" for centre, _ in poses)
     return Candidate(
         code,
         what,
-        f"calibrated plate of {BALLS} x {BALLS} balls, {edge_mm:g} mm, with the machine's probe ({where}); *.artefact.csv",
+        f"calibrated plate of {BALLS} x {BALLS} balls, {edge_mm:g} mm, with the machine's probe, centre at {where}; *.artefact.csv",
         count,
         observed,
         tuple(lines),

@@ -101,7 +101,7 @@ def _filled(own: Candidate, machine: Machine) -> tuple[tuple[str, ...], tuple[Or
                 "Approach every target of a run from the same side; drive past the ends before the direction changes.",
             ),
             (_of_runs(own),),
-            f"{run} x.axis.csv --controller NAME --out tables/",
+            f"{run} {AXES[_along(own.lines_mm[0])[0]].lower()}.axis.csv --controller NAME --out tables/",
         )
     if own.code in ("straightedge", "square"):
         return (
@@ -167,7 +167,7 @@ def _of_runs(own: Candidate) -> OrderTable:
 def _of_dial(line_mm: FloatArray) -> OrderTable:
     axis, places = _along(line_mm)
     heading = f"Readings along {AXES[axis]} in µm, at {_others(line_mm, axis)} mm; plunger towards: ____"
-    columns = (f"{AXES[axis]} mm", "there", "back", "turned over, there", "turned over, back")
+    columns = (f"{AXES[axis]} mm", "as set up, there", "as set up, back", "turned over, there", "turned over, back")
     return OrderTable(heading, columns, tuple((_number(place),) for place in places))
 
 
@@ -178,9 +178,9 @@ def _of_angles(own: Candidate) -> OrderTable:
 
 
 def _of_circle() -> OrderTable:
-    columns = ("run", "direction", "feed mm/min", "file", "largest µm", "smallest µm")
+    columns = ("run no.", "circle direction", "feed mm/min", "file name", "largest µm", "smallest µm")
     rows = tuple((f"{run}", way) for run in (1, 2, 3) for way in ("counter-clockwise", "clockwise"))
-    return OrderTable("Circles", columns, rows)
+    return OrderTable("Circles in both directions", columns, rows)
 
 
 def _of_plates(own: Candidate) -> tuple[OrderTable, ...]:
@@ -191,7 +191,7 @@ def _of_plates(own: Candidate) -> tuple[OrderTable, ...]:
         first = np.unique(np.round(part, 6), axis=0, return_index=True)[1]  # a ball has a row for each coordinate
         balls = part[np.sort(first)].tolist()
         rows = tuple((f"{n}", *(_number(value) for value in ball)) for n, ball in enumerate(balls, 1))
-        columns = ("ball", "X mm", "Y mm", "Z mm", "measured X", "measured Y", "measured Z")
+        columns = ("ball no.", "X mm", "Y mm", "Z mm", *(f"measured {axis} mm" for axis in AXES))
         tables.append(OrderTable(f"Set-up {k}", columns, rows))
     return tuple(tables)
 
@@ -202,10 +202,10 @@ def _of_tracer(own: Candidate) -> tuple[OrderTable, ...]:
     targets = places[: len(places) // own.set_ups]
     rows = tuple((f"{n}", *(_number(v) for v in place)) for n, place in enumerate(targets.tolist(), 1))
     return (
-        OrderTable("Stations, about", ("station", "X mm", "Y mm", "Z mm", "set up at", "temperature °C"), stations),
+        OrderTable("Stations, about", ("station no.", "X mm", "Y mm", "Z mm", "set up at", "temperature °C"), stations),
         OrderTable(
             "Targets, in this order",
-            ("target", "X mm", "Y mm", "Z mm", *(f"length {k} mm" for k in range(1, own.set_ups + 1))),
+            ("target no.", "X mm", "Y mm", "Z mm", *(f"station {k}: length, mm" for k in range(1, own.set_ups + 1))),
             rows,
         ),
     )

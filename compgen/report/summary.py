@@ -162,16 +162,21 @@ def _counts(weights: Sequence[Weight], open_um: Mapping[str, float]) -> list[str
     found, partly, missing = (
         sum(item.state == state for item in weights) for state in ("found", "partly", "not measured")
     )
-    lines = [f"{found} errors found, {partly} partly, {missing} not measured"]
+    lines = [
+        f"1 error found, {partly} partly, {missing} not measured"
+        if found == 1
+        else f"{found} errors found, {partly} partly, {missing} not measured"
+    ]
     costs = [item for item in weights if item.state == "not measured" and item.name in open_um]
     if costs:
         listed = ", ".join(f"{item.name} {um_text(item.rms_um)} um" for item in costs[:4])
         further = len(costs) - 4
-        lines.append(
-            f"what was not measured may cost, rms over the volume: {listed}"
-            if further <= 0
-            else f"what was not measured may cost, rms over the volume: {listed} and {further} others"
-        )
+        if further <= 0:
+            lines.append(f"what was not measured may cost, rms over the volume: {listed}")
+        elif further == 1:
+            lines.append(f"what was not measured may cost, rms over the volume: {listed} and 1 other")
+        else:
+            lines.append(f"what was not measured may cost, rms over the volume: {listed} and {further} others")
     return lines
 
 

@@ -41,7 +41,7 @@ def test_squareness_over_the_travel_the_largest_error_and_what_is_not_measured()
         f"largest error: EC0Y +100 urad, +50.0 um over the 500 mm of Y; moves the tool tip by {rms:.1f} um rms",
         "squareness over the travel: EC0Y +50.0 ± 10.0 um over 500 mm",
         "backlash: X +3.25 um",
-        "1 errors found, 1 partly, 2 not measured",
+        "1 error found, 1 partly, 2 not measured",
         "what was not measured may cost, rms over the volume: EYY 15.6 um, EXY 2.30 um",
     )
     (picture,) = draw_summary(found)

@@ -486,9 +486,12 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
             "headline": "The errors are not determined",
             "text": str(identify.get("error", "")),
         }
+    used, readings = identify.get("readings_used", "–"), identify.get("readings", "–")
+    residual_rms_um, count = um(identify.get("residual_rms_um")), len(identify.get("identified", []))
     text = (
-        f"{len(identify.get('identified', []))} errors from {identify.get('readings_used', '–')} of "
-        f"{identify.get('readings', '–')} readings; residual {um(identify.get('residual_rms_um'))} µm rms."
+        f"1 error from {used} of {readings} readings; residual {residual_rms_um} µm rms."
+        if count == 1
+        else f"{count} errors from {used} of {readings} readings; residual {residual_rms_um} µm rms."
     )
     return {"state": "neutral", "headline": "Errors identified", "text": text}
 
