@@ -66,7 +66,7 @@ _NAME = r"(?:[uµμ]m/m|[uµμ]rad/m|mm/min|mm/s|[uµμ]m|mm|[uµμ]rad)"
 _END = r"(?![\w²³^]|/(?!K\b|h\b|min\b|s\b|°C)|\.\w|-\w)"
 _NUMBER = r"(?:\d{1,3}(?:\u202f\d{3})+|\d+)(?:\.\d+)?(?:e[+-]?\d+)?"
 _SIGN = r"(?:[+\-−±<>≤≥~≈]|\+/?-|&lt;|&gt;)*\s?"
-_BETWEEN = rf"(?:\s*(?:/|->|→|…|\.{{2,3}}|±|\+/?-)\s*|\s(?:to|bis|a|and|und|y|or|oder)\s|,?\s[XYZ]\s?=?\s?){_SIGN}"
+_BETWEEN = rf"(?:\s*(?:/|->|→|…|\.{{2,3}}|±|\+/?-)\s*|\s(?:to|bis|auf|a|and|und|y|or|oder)\s|,?\s[XYZ]\s?=?\s?){_SIGN}"
 _LIST = rf"{_NUMBER}(?:{_BETWEEN}{_NUMBER})*"
 _SPAN = rf"{_LIST}(?:\s\({_SIGN}{_LIST}\)|\s?\[{_SIGN}{_LIST}\])?"
 _TUPLE = rf"\({_SIGN}{_NUMBER}(?:,\s{_SIGN}{_NUMBER})+\)"
@@ -74,7 +74,7 @@ _QUANTITY = re.compile(rf"(?<![\w.#&])(?P<all>{_SPAN}|{_TUPLE})(?P<blank>[\s\u20
 _HEADING = re.compile(rf"(?<![\w/`$\u202f])(?<!\d\s)(?P<unit>{_NAME}){_END}")
 _ASCII_UM = re.compile(r"\bum\b")
 _ANY_NUMBER = re.compile(rf"(?<![\w.]){_NUMBER}")
-_WITHIN = re.compile(r"(?:[\s,;/±()\[\]…<>=~≈+\-−→.]|->|\b(?:to|bis|a|x|[XYZ])\b)*")
+_WITHIN = re.compile(r"(?:[\s,;/±()\[\]…<>=~≈+\-−→.]|->|\b(?:to|bis|auf|a|x|[XYZ])\b)*")
 _UNIT_CELL = re.compile(rf"\s*(?P<unit>{_NAME})\s*")
 _CODE = re.compile(r"(`[^`]*`)")
 #: A text that names inch compares units, or asks for one.

@@ -15,7 +15,7 @@ import numpy as np
 
 from compgen.data.names import AXES, CURVE_NAMES, describe_error
 from compgen.drawing.charts import Picture, Plot, svg
-from compgen.errors import CompgenError
+from compgen.errors import CompgenError, InputError
 from compgen.foreign.cells import grid_of_text, read_sheets
 from compgen.foreign.columns import Preview, guessed_field, preview_of
 from compgen.foreign.source import read_source
@@ -182,11 +182,39 @@ def with_column(answers: Sequence[str], column: ColumnChoice, field: str, unit: 
         ]
         if field:
             found.append(f"--ignore={column.name}" if field == "ignore" else f"--map={field}={column.name}")
-    if unit and field not in ("", "ignore"):
-        key = "deviation" if field in RUN_WORDS else field
-        key = ("angle" if field[1] in "ABC" else "linear") if field in CURVE_NAMES else key
+    if unit and (key := _unit_key(field)):
         found = [word for word in found if not word.startswith(f"--unit={key}=")] + [f"--unit={key}={unit}"]
     return found
+
+
+def with_columns(answers: Sequence[str], chosen: Sequence[tuple[ColumnChoice, str, str]]) -> list[str]:
+    """Return the answers with what each column is, as (column, field, unit).
+
+    Raises
+    ------
+    InputError
+        for two columns that share a unit and are given different ones: the last one would count for both.
+    """
+    found, said = list(answers), dict[str, tuple[str, str]]()
+    for column, field, unit in chosen:
+        found = with_column(found, column, field, unit)
+        if unit and (key := _unit_key(field)):
+            name, first = said.setdefault(key, (column.name, unit))
+            if first != unit:
+                raise InputError(
+                    f"{name!r} is in {first} and {column.name!r} in {unit}; both need the same unit: "
+                    "convert one column in the file"
+                )
+    return found
+
+
+def _unit_key(field: str) -> str:
+    """Return what ``--unit`` calls a field: all runs share a unit, all linear and all angular errors; "" without a unit."""
+    if field in RUN_WORDS:
+        return "deviation"
+    if field in CURVE_NAMES:
+        return "angle" if field[1] in "ABC" else "linear"
+    return "" if field == "ignore" else field
 
 
 def _preview(path: Path, answers: Sequence[str]) -> Preview | None:

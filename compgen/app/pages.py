@@ -678,11 +678,13 @@ def choose_columns(runner: Runner, state: ProjectState, item: int) -> str | None
     chooser = asked.columns_shown(runner.project.path(found.file), answers, found.step.data["summary"])
     if chooser is None:
         raise InputError("this file has no columns to choose")
+    chosen = []
     for k, column in enumerate(chooser.columns):
         field_, unit = _field(f"field-{k}", 40), _field(f"unit-{k}", 20)
         if field_ not in (*dict(chooser.fields), "ignore", "") or unit not in ("", *asked.COLUMN_UNITS):
             raise InputError("choose one of the answers")
-        answers = asked.with_column(answers, column, field_, unit)
+        chosen.append((column, field_, unit))
+    answers = asked.with_columns(answers, chosen)
     for word in answers:
         _checked_answer(word)
     folder = runner.project.new_folder("measurement")

@@ -161,7 +161,8 @@ class NextBest:
         first, *others = chosen
         said = f"{_capital(first.candidate.what)} would reduce u from {um_text(self.u_um)} to {um_text(first.u_after_um)} um"
         said += "".join(f", {item.candidate.what} down to {um_text(item.u_after_um)} um" for item in others)
-        return f"{self.sentence} {said} (rms over the volume)."
+        gain = f"{said} (rms over the volume)."
+        return f"{self.sentence} {gain}"
 
     def summary(self) -> dict[str, Any]:
         """Return the keys ``next_measurements`` and ``next_text`` of the JSON files."""
@@ -588,7 +589,8 @@ def _plate(
     return Candidate(
         code,
         what,
-        f"calibrated plate of {BALLS} x {BALLS} balls, {edge_mm:g} mm, with the machine's probe, centre at {where}; *.artefact.csv",
+        f"calibrated plate of {BALLS} x {BALLS} balls, {edge_mm:g} mm, with the machine's probe, centre at {where}; "
+        "*.artefact.csv",
         count,
         observed,
         tuple(lines),

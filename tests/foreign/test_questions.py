@@ -5,7 +5,7 @@ import json
 import pytest
 
 from compgen import InputError
-from compgen.app.asked import ColumnChoice, columns_shown, questions_shown, with_column
+from compgen.app.asked import ColumnChoice, columns_shown, questions_shown, with_column, with_columns
 from compgen.foreign import ImportOptions, import_file
 from compgen.foreign.questions import OpenColumnsError
 
@@ -76,3 +76,19 @@ def test_a_cell_without_a_number_is_named_with_its_line(tmp_path):
     path.write_text("X axis\nPosition [mm];Deviation [um]\n0;0\n100;n/a\n200;1\n", encoding="utf-8")
     with pytest.raises(InputError, match=r"n\.csv:4: column Deviation \[um\]: 'n/a' is not a number"):
         import_file(path)
+
+
+def test_columns_that_share_a_unit_are_not_given_two():
+    """The unit of the last one counted for all: runs in um were read as mm."""
+    place, up, down = (ColumnChoice(name, "", ()) for name in ("Ort", "a", "b"))
+    given = [(place, "position", "mm"), (up, "run1+", "um"), (down, "run1-", "um")]
+    assert [word for word in with_columns([], given) if word.startswith("--unit")] == [
+        "--unit=position=mm",
+        "--unit=deviation=um",
+    ]
+    with pytest.raises(InputError, match="'a' is in um and 'b' in mm; both need the same unit"):
+        with_columns([], [*given[:2], (down, "run1-", "mm")])
+    with pytest.raises(InputError, match="same unit"):
+        with_columns([], [(up, "EAX", "urad"), (down, "EBX", "arcsec")])
+    words = with_columns([], [(up, "EXX", "um"), (down, "EBX", "arcsec")])
+    assert words == ["--map=EXX=a", "--unit=linear=um", "--map=EBX=b", "--unit=angle=arcsec"]

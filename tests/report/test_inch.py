@@ -149,6 +149,7 @@ def test_a_sentence_in_inch(text, inch):
 
 def test_german_has_no_zehntel_because_these_are_tenths_of_a_millimetre():
     assert Inch("de").text("2.54 µm bis 5.08 µm, 3 um") == "1.00 × 0.0001 in bis 2.00 × 0.0001 in, 1.2 × 0.0001 in"
+    assert Inch("de").text("von 25.4 auf 5.08 µm") == "von 10.00 auf 2.00 × 0.0001 in"
     assert Inch("de").text("es geht um 3 Punkte; µm") == "es geht um 3 Punkte; 0.0001 in"
 
 

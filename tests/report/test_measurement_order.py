@@ -70,3 +70,40 @@ def test_plan_writes_the_order_in_the_language_of_the_reader(small_machine, tmp_
     page = (tmp_path / "order.html").read_text()
     assert "Durchgeführt von" in page
     assert "Instrument, serial number" not in page
+
+
+def test_balls_of_a_plate_that_lies_is_turned_and_stands_are_where_the_probe_finds_them(small_machine):
+    """By hand: at (x, y) of the plate from its centre c, flat c + (x, y, 0), turned about Z by +90 degrees c + (-y, x, 0),
+    upright in ZX c + (x, 0, y), upright in YZ c + (0, y, x); a ball has the same number in every set-up."""
+    places = {
+        "flat": lambda x, y: (x, y, 0.0),
+        "turned": lambda x, y: (-y, x, 0.0),
+        "ZX": lambda x, y: (x, 0.0, y),
+        "YZ": lambda x, y: (0.0, y, x),
+    }
+    seen = set()
+    for item in candidates(unmeasured(small_machine)):
+        if item.code not in ("plate", "plate_turned", "plate_upright"):
+            continue
+        edge_mm = float(re.search(r"balls, ([\d.]+) mm", item.how)[1])
+        centre = np.array([float(v) for v in re.search(r"at X (\S+), Y (\S+), Z (\S+) mm", item.how).groups()])
+        side = [(k / (BALLS - 1) - 0.5) * edge_mm for k in range(BALLS)]
+        second = "turned" if item.code == "plate_turned" else item.what[-2:]
+        found = NextBest(small_machine, 3.0, (NextMeasurement(item, 3.0, 2.0, ("EXX",)),))
+        for table, lies in zip(order_sheets(found)[0].tables, ("flat", second), strict=False):
+            by_hand = [centre + places[lies](x, y) for x in side for y in side]
+            assert np.array([row[1:] for row in table.rows], dtype=float) == pytest.approx(np.array(by_hand), abs=0.051)
+            seen.add(lies)
+    assert seen == set(places)
+
+
+def test_a_sheet_in_german_and_inch_has_no_english_heading_and_no_place_in_mm(small_machine, tmp_path, call):
+    options = ("--language", "de", "--units", "inch", "--out", tmp_path)
+    assert call("plan", small_machine.source, *options)[0] == 0
+    page = (tmp_path / "order.html").read_text()
+    cells = set(re.findall(r"<t[hd][^>]*>([^<>]+)<", page))
+    assert {"Kugel Nr.", "Ziel Nr.", "Station 4: Länge, in", "gemessen X in"} <= cells
+    assert not cells & {"target no.", "ball no.", "run no.", "circle direction", "file name", "as set up, there"}
+    assert "centre at" not in page
+    headings = re.findall(r"<h1>([^<]+)</h1>", page)
+    assert all(text.endswith(" in") for text in headings if " bei " in text), headings
