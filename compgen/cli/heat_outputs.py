@@ -17,6 +17,7 @@ from compgen.data.machine import Machine
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError, visible
 from compgen.heat import HeatModel, read_heat, read_temperatures
+from compgen.heat.sessions import check_machine
 from compgen.tables.heat_outputs import HeatExport, export_heat, judged_output
 
 
@@ -136,6 +137,7 @@ def read_output(
     output = output_of(machine, controller)
     parsed = output.parse(from_folder(output, tables))
     read = read_temperatures(temperatures)
+    check_machine(read.machine, machine.name, temperatures)
     added = parsed.added(read) / MM_PER_UM
     columns = {"time_s": read.time_s, **{f"c{axis}_um": added[:, k] for k, axis in enumerate("xyz")}}
     digits = {"time_s": 3, **dict.fromkeys(("cx_um", "cy_um", "cz_um"), 4)}

@@ -229,6 +229,8 @@ def volume_points(machine: Machine) -> FloatArray:
 # to the last node, and ``bow``, the height of the middle above the ends. A squareness error has one figure, ``value``.
 
 
+#: The channels of X, Y and Z, for which scales are corrected.
+SCALE_CHANNELS = ("temp_x_c", "temp_y_c", "temp_z_c")
 #: The state of a machine that the active tables are for.
 STATE_NOW = -1
 #: Key in the figures of tables: whether nothing makes it doubtful what the measurement behind them shows.
@@ -249,13 +251,12 @@ class Calibration:
     temperatures_c: Mapping[str, float] = field(default_factory=dict)
 
 
-def axis_temperatures(channels: Mapping[str, Mapping[str, float]]) -> FloatArray | None:
-    """Return the mean temperature of each scale, (3,), degC: its own channel, else the mean of all; None without any."""
-    means = {name: float(figures["mean"]) for name, figures in channels.items()}
-    if not means:
-        return None
-    rest = sum(means.values()) / len(means)
-    return np.array([means.get(f"temp_{letter}_c", means.get("temp_ambient_c", rest)) for letter in "xyz"])
+def axis_temperatures(channels: Mapping[str, Mapping[str, float]]) -> FloatArray:
+    """Return the mean temperature of each scale, (3,), degC, nan where its own channel was not read.
+
+    Readings are corrected for these channels alone: a spindle or the air does not tell how warm a scale is.
+    """
+    return np.array([float(channels.get(name, {}).get("mean", np.nan)) for name in SCALE_CHANNELS])
 
 
 @dataclass(frozen=True)
@@ -790,10 +791,8 @@ def _warm(data: Aligned, history: Sequence[Calibration], axis: int, *, corrected
 
 def _temperatures_of(history: Sequence[Calibration], axis: int) -> FloatArray | None:
     """Temperature of a scale in every calibration, (n,), degC; None unless all logged it."""
-    found = [
-        axis_temperatures({name: {"mean": mean} for name, mean in item.temperatures_c.items()}) for item in history
-    ]
-    return None if any(item is None for item in found) else np.array([item[axis] for item in found if item is not None])
+    found = np.array([item.temperatures_c.get(SCALE_CHANNELS[axis], np.nan) for item in history])
+    return found if np.isfinite(found).all() else None
 
 
 def _step(series: Series, level: NDArray[np.int_], before: NDArray[np.bool_], last: NDArray[np.intp]) -> Step:

@@ -378,8 +378,8 @@ class DriftSizes:
     growth: float
 
     @classmethod
-    def between(cls, machine: Machine, days: float, kelvin: FloatArray | None, *, corrected: bool) -> DriftSizes:
-        """Return the sizes for a time, and for temperatures that differ by ``kelvin`` (3,), None if they are not known.
+    def between(cls, machine: Machine, days: float, kelvin: FloatArray, *, corrected: bool) -> DriftSizes:
+        """Return the sizes for a time, and for temperatures that differ by ``kelvin`` (3,), nan where none is known.
 
         ``corrected`` says whether scales were corrected for these temperatures where the machine file has a coefficient.
         """
@@ -388,8 +388,9 @@ class DriftSizes:
         scale = np.zeros(3)
         for k, axis in enumerate(machine.axes):
             follows = corrected and axis.expansion_um_per_m_k is not None
-            repeats = known.scale(temperatures=kelvin is not None and follows)
-            warm = 0.0 if kelvin is None else (axis.u_expansion if follows else UNCORRECTED_PER_K) * kelvin[k]
+            read = bool(np.isfinite(kelvin[k]))
+            repeats = known.scale(temperatures=read and follows)
+            warm = 0.0 if not read else (axis.u_expansion if follows else UNCORRECTED_PER_K) * kelvin[k]
             scale[k] = np.sqrt(2.0 * repeats**2 + (1e-6 * known.drift_scale_um_per_m * growth) ** 2 + warm**2)
         own = 2.0 * known.squareness_urad**2 + (known.drift_squareness_urad * growth) ** 2
         return cls(scale, 1e-6 * float(np.sqrt(own)), growth)

@@ -489,10 +489,6 @@ def _temperatures(content: bytes) -> dict[str, dict[str, float]]:
     return found
 
 
-#: Columns of the scales, whose temperatures may be those of a log.
-_OF_SCALES = ("temp_x_c", "temp_y_c", "temp_z_c")
-
-
 def _logged(log: Path, contents: Mapping[str, bytes]) -> dict[str, dict[str, float]]:
     """Return lowest, mean and highest temperature of each scale in a log while the files were measured; none where it has none.
 
@@ -501,6 +497,7 @@ def _logged(log: Path, contents: Mapping[str, bytes]) -> dict[str, dict[str, flo
     import numpy as np  # imported here: few machines have a log
 
     from compgen.data.csv_files import comment_of
+    from compgen.fleet.change import SCALE_CHANNELS
     from compgen.heat.joining import columns_at, moments_of, on_clock, read_stretches, stretch_of
 
     try:
@@ -515,7 +512,7 @@ def _logged(log: Path, contents: Mapping[str, bytes]) -> dict[str, dict[str, flo
     except InputError:
         return {}
     means: dict[str, dict[str, float]] = {}
-    for column in _OF_SCALES:
+    for column in SCALE_CHANNELS:
         values = part.celsius.get(column[len("temp_") : -len("_c")])
         if values is not None:
             at_s = [on_clock(part, item.at_s, epoch=item.epoch) for item in moments]

@@ -642,12 +642,12 @@ def _drift_sizes(case: Case, last: IdentificationRecord) -> DriftSizes:
     """What the machine may drift since the errors that the change is relative to."""
     days = abs(case.measurement.measured_at - last.measured_at) / timedelta(days=1)
     measured = {item.id: item for item in case.past.measurements}
-    kelvin = None
+    kelvin = np.full(3, np.nan)
     if last.measurement_id in measured:
         now, then = (
             axis_temperatures(item.temperatures_c) for item in (case.measurement, measured[last.measurement_id])
         )
-        kelvin = None if now is None or then is None else now - then
+        kelvin = now - then
     return DriftSizes.between(
         case.machine, days, kelvin, corrected=case.job.identify.get("temperature", True) is not False
     )

@@ -19,7 +19,14 @@ from compgen.data.files import sha256_of_file
 from compgen.data.names import MM_PER_UM
 from compgen.errors import InputError, nearest, visible_line
 from compgen.heat.model import HeatModel
-from compgen.heat.sessions import COLDEST_C, DIRECTIONS, HOTTEST_C, Temperatures, read_temperatures
+from compgen.heat.sessions import (
+    COLDEST_C,
+    DIRECTIONS,
+    HOTTEST_C,
+    Temperatures,
+    check_machine,
+    read_temperatures,
+)
 
 TEMPERATURES, AT, ZERO = "--temperatures", "--heat-at", "--heat-zero"
 _AXES = ("dx", "dy", "dz")
@@ -146,6 +153,7 @@ def _in_hull(model: HeatModel, celsius: Mapping[str, float], field: str) -> None
 
 
 def _sound(model: HeatModel, read: Temperatures, file: str) -> None:
+    check_machine(read.machine, model.machine, file)
     broken = [name for name in model.sensors if name in read.broken]
     if broken:
         raise InputError(f"temp_{broken[0]}_c jumps, and the model of heat needs it; mend the sensor", file=file)

@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 
 from compgen.data.csv_files import CsvTable, FloatArray, read_csv
 from compgen.errors import InputError, visible_line
-from compgen.heat.sessions import LONGEST_GAP_S, Temperatures, gaps_of, temperatures_of, times_of
+from compgen.heat.sessions import LONGEST_GAP_S, LONGEST_OFFSET_S, Temperatures, gaps_of, temperatures_of, times_of
 
 #: Comments of a measurement: when ``time_s`` was 0; seconds to add to the clock of its computer; seconds to add to ``time_s`` to
 #: get ``time_s`` of the temperatures, where those have no time of the day.
@@ -124,8 +124,11 @@ def _seconds(comments: Mapping[str, str], key: str, file: str | Path | None) -> 
         found = float(comments[key])
     except ValueError:
         found = math.nan
-    if not math.isfinite(found):
-        raise InputError(f"{key} = {visible_line(comments[key])[:40]} is not a number of seconds", file=file)
+    if not abs(found) < LONGEST_OFFSET_S:
+        raise InputError(
+            f"{key} = {visible_line(comments[key])[:40]} is not a number of seconds below {LONGEST_OFFSET_S:g}",
+            file=file,
+        )
     return found
 
 
@@ -186,8 +189,15 @@ def _span(time_s: FloatArray, *, epoch: bool) -> str:
     """Words for a span of time."""
     if not epoch:
         return f"from time_s {time_s[0]:g} to {time_s[-1]:g}"
-    ends = [datetime.fromtimestamp(float(value), UTC).isoformat(timespec="seconds") for value in time_s[[0, -1]]]
-    return f"from {ends[0]} to {ends[1]}"
+    return f"from {_in_words(float(time_s[0]))} to {_in_words(float(time_s[-1]))}"
+
+
+def _in_words(epoch_s: float) -> str:
+    """Return a moment in UTC; one beyond the calendar, from a wrong offset of a clock, as its year."""
+    try:
+        return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=epoch_s)).isoformat(timespec="seconds")
+    except OverflowError:
+        return f"the year {1970 + epoch_s / 31556952.0:.0f}"
 
 
 def on_clock(part: Temperatures, at_s: FloatArray, *, epoch: bool) -> FloatArray:

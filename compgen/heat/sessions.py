@@ -32,6 +32,14 @@ JUMP_K, JUMP_STEPS = 1.5, 20.0
 STUCK_ROWS = 30
 #: Fewest rows of a session: from fewer no step of time is usual, and nothing is learned of a lag.
 FEWEST_ROWS = 3
+#: A stated offset of a clock beyond a hundred years is a typing error, s.
+LONGEST_OFFSET_S = 3.2e9
+#: A sensor that read other values rests if one value stands so many times as many rows as any other: coarse steps alternate.
+REST_TIMES = 10
+#: A scale, or the air, is colder than this in every workshop, degC: a log of 20 degC in degF reads 68.
+WARMEST_HALL_C = 50.0
+#: Sensors that are corrected for or compared by their name, whatever a model of heat says.
+OF_THE_HALL = ("x", "y", "z", "ambient")
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,8 @@ class Temperatures:
     since: float | None = None
     notes: tuple[str, ...] = ()
     broken: tuple[str, ...] = ()
+    #: The machine that the comment ``machine`` of the file names; "" if it names none.
+    machine: str = ""
 
     def __len__(self) -> int:
         """Return the number of readings."""
@@ -112,6 +122,17 @@ def write_temperatures(temperatures: Temperatures, metadata: Mapping[str, object
     return format_csv(columns, metadata, {"time_s": 3, **dict.fromkeys(list(columns)[1:], 4)})
 
 
+def check_machine(stated: str, machine: str, file: str | Path | None) -> None:
+    """Refuse temperatures whose comment ``machine`` names another machine than ``machine``; InputError."""
+    if stated.strip() and stated.strip().casefold() != machine.casefold():
+        raise InputError(
+            f"has temperatures of {visible_line(stated.strip())[:40]}, not of {machine}; give those of this machine, or correct "
+            "the comment",
+            file=file,
+            field="comment machine",
+        )
+
+
 def temperatures_of(table: CsvTable) -> Temperatures:
     """Return the temperatures of a table, up to its first long gap; it warns of what was bridged."""
     return _temperatures(table)[0]
@@ -129,18 +150,49 @@ def _temperatures(table: CsvTable) -> tuple[Temperatures, int]:
         values = _plausible(table, column)[:count]
         values, said = _bridged(table, column, time_s[:count], values)
         notes += said
-        if len(values) >= STUCK_ROWS and np.ptp(values) == 0.0:
-            notes.append(
-                f"{table.path.name}: {column} is {values[0]:g} degC in all {len(values)} rows: a sensor that is stuck says "
-                "nothing of the machine; leave the column out if it is"
-            )
-        if _jumps(values):
+        jumps = _jumps(values)
+        notes += [] if jumps else _stuck(table, column, values)
+        _check_unit(table, sensor, column, values, notes)
+        if jumps:
             broken.append(sensor)
             notes.append(f"{table.path.name}: {column} jumps as no machine warms: the sensor is not used")
         readings[sensor] = values
     for text in notes:
         warnings.warn(text, CompgenWarning, stacklevel=3)
-    return Temperatures(time_s[:count], readings, since, tuple(notes), tuple(broken)), count
+    return Temperatures(
+        time_s[:count], readings, since, tuple(notes), tuple(broken), table.metadata.get("machine", "")
+    ), count
+
+
+def _stuck(table: CsvTable, column: str, values: FloatArray) -> list[str]:
+    """Return what is said of a sensor that reads the same in all rows, or that read other values and rests now."""
+    if len(values) < STUCK_ROWS:
+        return []
+    begins = np.flatnonzero(np.concatenate([[True], np.diff(values) != 0.0]))
+    lasts = np.diff(np.append(begins, len(values)))
+    longest = int(np.argmax(lasts))
+    rows, first = int(lasts[longest]), int(begins[longest])
+    if rows == len(values):
+        where = f"all {rows} rows"
+    elif rows >= STUCK_ROWS and rows >= REST_TIMES * int(np.delete(lasts, longest).max()):
+        where = f"{rows} rows in succession (lines {table.lines[first]} to {table.lines[first + rows - 1]})"
+    else:
+        return []
+    return [
+        f"{table.path.name}: {column} is {values[first]:g} degC in {where}: a sensor that is stuck says nothing of the "
+        "machine; leave the column out if it is"
+    ]
+
+
+def _check_unit(table: CsvTable, sensor: str, column: str, values: FloatArray, notes: list[str]) -> None:
+    """Refuse scales or air that are always hotter than any workshop, as in degF; note it of any other sensor."""
+    coldest = float(values.min())
+    if coldest < WARMEST_HALL_C:
+        return
+    text = f"is never below {coldest:g} degC; is the log in degF? Temperatures are in degC: (degF - 32) / 1.8"
+    if sensor.lower() in OF_THE_HALL:
+        raise table.fail(int(np.argmin(values)), column, text)
+    notes.append(f"{table.path.name}: {column} {text}")
 
 
 def times_of(table: CsvTable) -> tuple[FloatArray, float | None]:
@@ -186,8 +238,11 @@ def _clock_offset_s(table: CsvTable) -> float:
         offset = float(stated)
     except ValueError:
         offset = math.nan
-    if not math.isfinite(offset):
-        raise InputError(f"clock_offset_s = {visible_line(stated)} is not a number of seconds", file=table.path)
+    if not abs(offset) < LONGEST_OFFSET_S:
+        raise InputError(
+            f"clock_offset_s = {visible_line(stated)[:40]} is not a number of seconds below {LONGEST_OFFSET_S:g}",
+            file=table.path,
+        )
     return offset
 
 

@@ -321,6 +321,7 @@ def unseen(machine: Machine, parts: Sequence[OneKind | ErrorTable]) -> tuple[str
     """Return what no residual of these readings shows: a plate that is not square, runs at another temperature."""
     from compgen.data.axis_runs import AxisRuns
     from compgen.data.deviations import Artefact
+    from compgen.identification.axis_tests import temperatures_read
 
     found: list[str] = []
     for k, part in enumerate(parts):
@@ -328,7 +329,7 @@ def unseen(machine: Machine, parts: Sequence[OneKind | ErrorTable]) -> tuple[str
         if isinstance(part, Artefact) and part.calibrated.all():
             found += _unseen_in_plate(part, others)
         elif isinstance(part, AxisRuns):
-            if not any(name.startswith("temp_") for name in part.covariates):
+            if not temperatures_read(part):
                 found.append(_unseen_in_runs(machine, part))
             found += _assumed_of_lines(machine, part)
     return tuple(dict.fromkeys(found))
@@ -342,9 +343,9 @@ def _unseen_in_runs(machine: Machine, runs: AxisRuns) -> str:
     letters = ", ".join(AXES[axis] for axis in runs.axes)
     return (
         f"runs of {letters} at another temperature than 20 degC, or than the instrument assumed, would have the same residuals "
-        f"and a wrong scale ({max(stated):.3g} um/m for each K); their file has no temperatures, so u allows for "
-        f"{U_NOT_READ_K:g} K. Read the temperatures of axis and instrument (columns temp_x_c ...), or measure a length standard "
-        "at the other end of the travel"
+        f"and a wrong scale ({max(stated):.3g} um/m for each K); their file has no temperatures of axes or material, so u allows "
+        f"for {U_NOT_READ_K:g} K. Read the temperatures of axis and instrument (columns temp_x_c ...), or measure a length "
+        "standard at the other end of the travel"
     )
 
 

@@ -116,10 +116,16 @@ U_LASER, U_READ_K, U_NOT_READ_K = 1.5e-6, 0.05, 0.3
 USUAL_EXPANSION = 11.5e-6
 
 
+def temperatures_read(runs: AxisRuns) -> bool:
+    """Whether the temperature of every axis, or of the material, was read: that of a spindle or the air is another one."""
+    of_axes = all(f"temp_{AXES[axis].lower()}_c" in runs.covariates for axis in runs.axes)
+    return of_axes or any(name.startswith(("temp_material", "temp_measured")) for name in runs.covariates)
+
+
 def u_scale_of(machine: Machine, runs: AxisRuns) -> float:
     """Standard uncertainty of the scale of axis runs, per mm: of the laser, and of the temperature."""
     expansion = np.mean([axis.expansion_um_per_m_k or 1e6 * USUAL_EXPANSION for axis in machine.axes]) * 1e-6
-    read = any(name.startswith("temp_") for name in runs.covariates)
+    read = temperatures_read(runs)
     return float(np.hypot(U_LASER, expansion * (U_READ_K if read else U_NOT_READ_K)))
 
 

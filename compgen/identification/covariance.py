@@ -251,10 +251,11 @@ def with_systematic(
     return _including(result, Systematic(tuple(contributions), result.worst_u))
 
 
-def _including(result: Identification, systematic: Systematic) -> Identification:
-    """Return the identification with these contributions in its standard uncertainties."""
+def _including(result: Identification, systematic: Systematic, errors: ErrorTable | None = None) -> Identification:
+    """Return the identification with these contributions in its standard uncertainties; ``errors`` may have them already."""
     joint = joint_covariance(replace(result, systematic=systematic))
-    errors = _with_u(result.errors, joint.errors_factor)
+    if errors is None:
+        errors = _with_u(result.errors, joint.errors_factor)
     u = np.sqrt(np.einsum("ij,ij->i", joint.factor, joint.factor))[len(joint.error) :]
     order, first = {name: k for k, name in enumerate(joint.stations)}, 3 * len(joint.stations)
     stations = tuple(
@@ -283,18 +284,21 @@ def with_response(result: Identification, others: Sequence[Identification], name
     """
     if not others:
         return result
+    moved = np.array([item.errors.values() - result.errors.values() for item in others]).T / share
     if result.values_factor is not None or result.adjustment is None:
-        columns = np.array([item.errors.values() - result.errors.values() for item in others]).T / share
-        factor = columns if result.values_factor is None else np.hstack([result.values_factor, columns])
+        factor = moved if result.values_factor is None else np.hstack([result.values_factor, moved])
         errors = _with_u(result.errors, factor)
         found = replace(result, errors=errors, values_factor=factor, worst_u=worst_uncertainty(errors))
     else:
         columns = np.array([_unknowns(item) - _unknowns(result) for item in others]).T / share
-        rows = [matrix @ columns[own] for _, _, own, matrix in error_values(result.layout)]
-        worst = worst_uncertainty(_with_u(result.errors, np.vstack(rows)))
+        of_cause = _with_u(result.errors, moved)
+        worst = worst_uncertainty(of_cause)
+        # u of the errors may hold more than the adjustment knows, such as the shape of a curve between the targets
+        u = np.hypot(result.errors.uncertainties(), of_cause.uncertainties())
         known = () if result.systematic is None else result.systematic.contributions
         before = result.worst_u if result.systematic is None else result.systematic.random_worst
-        found = _including(result, Systematic((*known, Contribution(name, 1.0, columns, worst)), before))
+        systematic = Systematic((*known, Contribution(name, 1.0, columns, worst)), before)
+        found = _including(result, systematic, result.errors.with_values(u=u))
     if result.posterior_source is None:
         return found
 

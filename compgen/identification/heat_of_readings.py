@@ -35,7 +35,7 @@ from compgen.heat.joining import (
     stretch_of,
 )
 from compgen.heat.model import HeatModel, read_heat
-from compgen.heat.sessions import COLDEST_C, HOTTEST_C, Temperatures
+from compgen.heat.sessions import COLDEST_C, HOTTEST_C, Temperatures, check_machine
 from compgen.identification.covariance import with_response
 from compgen.identification.kinds import Measurement, MixedMeasurement
 from compgen.identification.options import locate_stations
@@ -89,6 +89,8 @@ def heat_source(
     if read is not None and read.machine != machine.name:
         raise InputError(f"is the model of heat of {read.machine}, not of {machine.name}", file=model)
     stretches = () if temperatures is None else read_stretches(temperatures)
+    for item in stretches:
+        check_machine(item.table.metadata.get("machine", ""), machine.name, item.table.path)
     return HeatSource(read, stretches, temperatures, u_clock_s)
 
 

@@ -32,15 +32,16 @@ MODULES = (
     "controls/shared/tables.py", "data/*.py",
     "diagnose/*.py", "drawing/*.py",
     "language.py", "new_machine.py", "registry.py",
-    "effects/*.py", "fitting/*.py", "fleet/drift.py", "fleet/history_page.py", "foreign/*.py", "identification/*.py",
-    "identification/adjust/*.py", "instruments/*.py", "pipeline.py", "planning/*.py", "programs/correct.py",
+    "effects/*.py", "fitting/*.py", "fleet/drift.py", "heat/joining.py", "fleet/history_page.py", "foreign/*.py",
+    "identification/*.py", "identification/adjust/*.py", "instruments/*.py", "pipeline.py", "planning/*.py",
+    "programs/correct.py",
     "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py", "report/measurement_order.py",
     "report/html/*.py", "report/pdf.py", "report/options_text.py",
     "report/part_page.py", "report/sheets.py", "report/summary.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
 WITH_ERRORS = re.compile(
-    r"compgen/(accuracy|app|data|diagnose|drawing|fitting|foreign|identification|instruments|planning|programs|tables)/|"
+    r"compgen/(accuracy|app|data|diagnose|drawing|fitting|foreign|heat|identification|instruments|planning|programs|tables)/|"
     r"compgen/(cli/common|cli/\w+_commands|pipeline|language|new_machine|registry)\.py"
 )
 ERRORS = re.compile(r"(Error|fail|warn|refused|refuse)$")
