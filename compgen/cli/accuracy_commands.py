@@ -153,7 +153,11 @@ def accuracy_command(
     with progress(quiet=as_json) as show:
         show("reading and evaluating")
         if of_rotary_axes(file):
-            raise InputError("is of rotary axes; volcomp identify gives its figures (ISO 230-2, arcsec)", file=file)
+            raise InputError(
+                "is of rotary axes; volcomp identify gives its figures: of runs those of ISO 230-2 (arcsec), of spheres and bars "
+                "the position errors of the axes",
+                file=file,
+            )
         side = read_side(machine, file, instrument, u_deviation_um, _reader(axis, file))
         if side.runs is not None:
             found = accuracy_of_runs(side.runs, options.edition, options.budgets)

@@ -439,8 +439,10 @@ def _rotary(
         )
         if text is None:
             text = "endless" if letter == "C" and (letter, False) in chain.passed else "-90..90"
+            travel = "without end" if text == "endless" else f"{text} degrees"
             questions.append(
-                f"[axes.{letter}]: a travel {text} degrees is assumed; give it: --travel {letter}=-110..30"
+                f"[axes.{letter}]: a travel {travel} is assumed; give it in degrees: --travel {letter}=-110..30, or "
+                f"{letter}=endless"
             )
         place, usual = given["--point"].get(letter), "mm"
         if place is None and asks:

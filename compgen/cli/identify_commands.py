@@ -270,7 +270,8 @@ def _with_summary(machine: Machine, measurements: Sequence[Path], result: Rotary
     """The files of an identification with rotary axes."""
     import json
 
-    data = {**result.summary(), "provenance": dict(provenance_of(machine.source, *measurements).inputs)}
+    named = {"machine": machine.name, "chain": machine.chain.name}
+    data = {**named, **result.summary(), "provenance": dict(provenance_of(machine.source, *measurements).inputs)}
     return {**result.files(), "identify.json": json.dumps(data, indent=2) + "\n"}
 
 

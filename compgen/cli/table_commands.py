@@ -558,7 +558,14 @@ def crash_test_command(
     with progress(quiet=as_json) as show:
         for name in _usable(machine, controllers):
             show(f"trying wrong tables: {name}")
-            results.append(crash_test(machine, table, name, entries))
+            try:
+                results.append(crash_test(machine, table, name, entries))
+            except InputError as error:  # settings that only the tables themselves show to be missing
+                if controllers:
+                    raise
+                complain(f"{name} is skipped: {error}")
+    if not results:
+        raise InputError(f"no tables can be made for any control of {machine.name}; add a section [controllers.NAME]")
     passed = all(item.passed for item in results)
     if as_json:
         data: dict[str, Any] = {item.controller: item.summary() for item in results}

@@ -421,7 +421,8 @@ def errors_of_table(table: CsvTable) -> ErrorTable:
                     row,
                     "error",
                     f"{name!r} is an error of a rotary axis; here are those of X, Y and Z only: give linear.errors.csv, which "
-                    "identify writes beside it if the linear axes were measured, too (docs/five-axis.md)",
+                    "identify writes beside it if the linear axes were measured, too; predict takes both, and export and verify "
+                    "for controls of rotary axes (docs/five-axis.md)",
                 )
             known = nearest(name, ERROR_NAMES)
             raise table.fail(row, "error", f"{name!r} is not an error of ISO 230-1 here; {known}")

@@ -75,6 +75,42 @@ def unit_of(name: str) -> str:
     return "um" if name[1] in AXES else "urad"
 
 
+def axis_line_name(name: str) -> str:
+    """Name by ISO 230-7 of an offset or tilt of an axis line; empty for zeros, motions and the spindle.
+
+    >>> axis_line_name("EX0C"), axis_line_name("EC0C"), axis_line_name("EXC")
+    ('XOC', '', '')
+    """
+    letter, part, constant = _PLACES[name]
+    own = not letter or not constant or part == 3 + ROTARY.index(letter)
+    return "" if own else f"{name[1]}O{letter}"
+
+
+def describe_rotary_error(name: str) -> str:
+    """Return an error of a rotary axis in words.
+
+    >>> describe_rotary_error("EA0C"), describe_rotary_error("EZC")
+    ('Tilt of the axis line of C about X', 'Axial error motion of C')
+    """
+    letter, part, constant = _PLACES[name]
+    toward, along = AXES[part % 3], letter != "" and part % 3 == ROTARY.index(letter)
+    if not letter:
+        return f"Gauge point of the spindle in {toward}"
+    if constant:
+        if along:
+            return f"Zero of {letter}"
+        return (
+            f"Offset of the axis line of {letter} in {toward}"
+            if part < 3
+            else f"Tilt of the axis line of {letter} about {toward}"
+        )
+    if along:
+        return f"Axial error motion of {letter}" if part < 3 else f"Positioning of {letter}"
+    return (
+        f"Radial error motion of {letter} in {toward}" if part < 3 else f"Tilt error motion of {letter} about {toward}"
+    )
+
+
 # Errors.
 
 RAD_PER_ARCSEC = np.pi / 648000.0

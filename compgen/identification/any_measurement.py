@@ -66,7 +66,10 @@ def read_measurement(paths: Sequence[str | Path], instrument: str | Path | None 
         raise InputError(text, file=kinds["diagonals"][0])
     for kind in ("sphere", "bar"):
         if kind in kinds:
-            text = "contains readings at poses of rotary axes, which volcomp identify, run and diagnose evaluate"
+            text = (
+                "contains readings at poses of rotary axes, which volcomp identify, run and diagnose evaluate; to compare two of "
+                "them, identify each and compare their errors and u in identify.json"
+            )
             raise InputError(text, file=kinds[kind][0])
     if "sixdof" in kinds and instrument is None:
         message = (

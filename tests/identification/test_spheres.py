@@ -368,3 +368,36 @@ def test_other_commands_say_what_they_do_with_rotary_axes(folder, call):
     words = ["run", "five.toml", "sim/trunnion.sphere.csv", "--controller", "linuxcnc-rotary-comp", "--out", "x"]
     code, out, err = call(*words)
     assert code == 2 and "contains no positioning" in " ".join(err.split()) and not Path("x").exists()
+
+
+def test_report_states_errors_names_and_what_is_not_determined(folder, call):
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    assert call("identify", "five.toml", "sim/trunnion.sphere.csv", "--out", "found")[0] == 0
+    code, out, err = call("report", "found", "--json")
+    assert code == 0, err
+    rotary, known = json.loads(out)["rotary"], json.loads(Path("found/identify.json").read_text())
+    rows = {row["error"]: row for row in rotary["errors"]}
+    assert {name: (row["largest"], row["u_k1"], row["unit"], row["determined"]) for name, row in rows.items()} == {
+        name: (own["value"], own["u"], own["unit"], own["determined"]) for name, own in known["errors"].items()
+    }
+    assert rows["EY0A"]["axis_name"] == "YOA" and rows["EC0C"]["axis_name"] == ""
+    # both axes carry the workpiece: their lines lie at minus the error (docs/five-axis.md)
+    assert all(row["axis_line"] == -row["largest"] for row in rows.values() if row["axis_name"])
+    page = Path("found/report.html").read_text()
+    assert "Not determined, and what would separate it" in page
+    assert all(item["separated_by"] in page for item in known["inseparable"])
+    assert "three linear axes only" not in page
+
+
+def test_report_of_parameters_of_rotary_axes(folder, call):
+    assert call("simulate", "five.toml", "--scenario", "s.toml", "--out", "sim")[0] == 0
+    words = ["run", "five.toml", "sim/trunnion.sphere.csv", "--controller", "siemens-toolcarrier", "--out", "tables"]
+    assert call(*words)[0] == 0
+    code, out, err = call("report", "tables", "--json")
+    assert code == 0, err
+    (control,), result = json.loads(out)["controls"], json.loads(Path("tables/result.json").read_text())
+    assert {row["name"]: row["value"] for row in control["rotary"]["numbers"]} == result["numbers"]
+    assert [item["name"] for item in control["files"]] == ["TOOLCARRIER.SPF"] and control["files"][0]["intact"]
+    Path("tables/TOOLCARRIER.SPF").write_text("changed")
+    code, out, err = call("report", "tables", "--out", "again")
+    assert code == 0 and "is not the file that was verified" in " ".join(err.split())

@@ -37,7 +37,7 @@ MODULES = (
     "programs/correct.py",
     "programs/features.py", "programs/part.py", "report/cards.py", "report/handover.py", "report/measurement_order.py",
     "report/html/*.py", "report/pdf.py", "report/options_text.py",
-    "report/part_page.py", "report/sheets.py", "report/summary.py", "report/terminal.py", "tables/*.py",
+    "report/part_page.py", "report/rotary_axes.py", "report/sheets.py", "report/summary.py", "report/terminal.py", "tables/*.py",
 )  # fmt: skip
 #: Those whose errors and warnings are shown, too.
 WITH_ERRORS = re.compile(

@@ -26,7 +26,7 @@ from compgen.report.dcc.xml import (
     said,
     serialised,
 )
-from compgen.report.html.write import PROBABILITY, UNITS, calibration_record
+from compgen.report.html.write import PROBABILITY, UNITS, all_errors, calibration_record
 
 # What a certificate says about itself: what it is and is not, signs, uncertainties, limitations, the laboratory's text.
 
@@ -409,7 +409,7 @@ class Results:
             yield self._result("Figures of ISO 230", method, results, self._accuracy_evidence())
 
     def _accuracy_evidence(self) -> list[tuple[str, str]]:
-        return [] if self.data["errors"] else self._evidence()
+        return [] if all_errors(self.data) else self._evidence()
 
     def _rows(self, rows: Sequence[Mapping[str, Any]]) -> Iterator[Element]:
         for row in rows:

@@ -17,13 +17,15 @@ from compgen.controls.shared.base import Term
 from compgen.data.circles import DIAGRAM, Circles, circles_of_columns
 from compgen.data.csv_files import FloatArray, read_csv
 from compgen.data.error_table import ErrorTable, read_errors
-from compgen.data.files import read_bytes, read_text, sha256_of
+from compgen.data.files import REJECTED_PREFIX, read_bytes, read_text, sha256_of
 from compgen.data.lengths import Points
 from compgen.data.machine import Machine, read_machine
 from compgen.data.names import AXES, CURVE_NAMES, MM_PER_UM, SQUARENESS_NAMES, error_named
+from compgen.data.rotary import read_machine_errors
 from compgen.errors import CompgenError, CompgenWarning, InputError, one_line
 from compgen.identification.any_measurement import MEASURED_WITH
 from compgen.pipeline import NOT_MADE
+from compgen.report.rotary_axes import of_rotary_axes
 from compgen.tables import ReadTables, read_tables
 from compgen.tables.synthesis import projector
 from compgen.tables.verification import ERROR_DECIMALS, POSITION_DECIMALS, Verification
@@ -164,12 +166,14 @@ def read_folder(
     machine = _machine(base, notes)
     for path in sorted(base.glob(f"*/{NOT_MADE}")):  # a control whose tables could not be made beside those of others
         notes.append(f"{path.parent.name}: no tables: {read_text(path).strip()}")
+    identify = _json(base / "identify.json")
+    read_identified = _linear_errors if of_rotary_axes(identify) else _errors
     # Accepted tables first, partial ones after those, rejected ones last.
     return ResultFolder(
         base,
         kind,
-        identify=_json(base / "identify.json"),
-        identified=_errors(base / "identified.errors.csv"),
+        identify=identify,
+        identified=read_identified(base / "identified.errors.csv"),
         fitted=_errors(base / "fitted.errors.csv"),
         fit=_json(base / "fit.json"),
         machine=machine,
@@ -233,6 +237,12 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _errors(path: Path) -> ErrorTable | None:
     return read_errors(path) if path.is_file() else None
+
+
+def _linear_errors(path: Path) -> ErrorTable | None:
+    """The errors of X, Y, Z beside those of rotary axes; None if the file has none."""
+    table = read_machine_errors(path)[0] if path.is_file() else None
+    return table if table is not None and table.names else None
 
 
 def _machine(base: Path, notes: list[str]) -> Machine | None:
@@ -302,7 +312,11 @@ def _control(folder: Path, machine: Machine | None, known: KnownTables) -> Contr
 def _files(folder: Path, result: Mapping[str, Any]) -> list[ListedFile]:
     """Return the control's files that ``result.json`` lists and that are in its folder; never a path outside the folder."""
     found = []
-    for item in result.get("files", []):
+    listed = result.get("files", [])
+    if isinstance(listed, dict):  # of rotary axes: hash by name, the prefix of rejected files apart
+        rejected = "" if result.get("accepted") else REJECTED_PREFIX
+        listed = [{"name": f"{rejected}{name}", "sha256": digest} for name, digest in listed.items()]
+    for item in listed:
         name = str(item.get("name", "")) if isinstance(item, dict) else ""
         path = folder / name
         if not name or Path(name).name != name or not path.is_file():

@@ -52,6 +52,7 @@ from compgen.report.html.pictures import (
     thousands,
     uncertainty_um,
 )
+from compgen.report.rotary_axes import of_rotary_axes, rotary_result, rotary_section
 from compgen.report.summary import Summary, draw_summary, summary_of
 from compgen.resources import LANGUAGES, data_folder
 from compgen.tables import REPORT_FILES, program_version
@@ -192,6 +193,15 @@ ALWAYS = (
 )
 
 
+#: In place of the second of these, where errors of rotary axes were identified.
+WITH_ROTARY = "Quasi-static geometric errors only: no thermal drift, load, dynamics or errors of the running spindle."
+#: Rotary axes that were identified without files of the linear ones.
+ROTARY_ALONE = (
+    "the linear axes were not measured; of each position error of a rotary axis the size in the column \u201cassumed\u201d was "
+    "taken before the measurement (k = 1), and what the readings do not determine keeps it as its uncertainty"
+)
+
+
 def in_part_of(identify: Mapping[str, Any]) -> list[str]:
     """Return the errors that are listed in ``identify.json`` although the readings do not determine them."""
     if "determined" not in identify:
@@ -203,6 +213,8 @@ def limitations(source: ResultFolder) -> list[str]:
     """Return the limitations of this report."""
     found = list(ALWAYS) if source.controls else list(ALWAYS[1:])
     identify = source.identify
+    if of_rotary_axes(identify) or any(rotary_result(item.result) for item in source.controls):
+        found[found.index(ALWAYS[1])] = WITH_ROTARY
     in_part = in_part_of(identify)
     if in_part:
         found.append(
@@ -273,11 +285,12 @@ def content(source: ResultFolder) -> dict[str, Any]:
     if source.machine is None:
         named = chain(
             (made.get("machine", {}).get("name") for made in manifests),
-            [identified.get("machine")],
+            [identified.get("machine"), identify.get("machine")],
             (data.get("machine") for data in results),
         )
         title = next((str(name) for name in named if name), title)
-    inputs = identify.get("inputs", []) or (manifests[0].get("inputs", []) if manifests else [])
+    inputs = identify.get("inputs") or _hashed(identify.get("provenance"))
+    inputs = inputs or (_hashed(manifests[0].get("inputs", [])) if manifests else [])
     return {
         "format": "compgen report 1",
         "kind": source.kind,
@@ -286,8 +299,9 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "controls": controls,
         "summary": None if (seen := _summary(source)) is None else seen.as_dict(),
         "errors": _errors(source.identified, in_part_of(identify)),
+        "rotary": rotary_section(identify),
         "assumed": assumptions_of(identify) if identify and identify.get("identified") is not False else [],
-        "measurement": {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})},
+        "measurement": _measurement(identify),
         "next": _proposed(source),
         "accuracy": accuracy_groups(source),
         "compare": comparison_groups(source),
@@ -308,6 +322,20 @@ def content(source: ResultFolder) -> dict[str, Any]:
         "limitations": limitations(source),
         "notes": list(source.notes),
     }
+
+
+def _hashed(inputs: Any) -> list[Any]:
+    """Files with their hashes as a list; results of rotary axes have them by name."""
+    if isinstance(inputs, Mapping):
+        return [{"name": str(name), "sha256": str(digest)} for name, digest in inputs.items()]
+    return list(inputs or [])
+
+
+def _measurement(identify: Mapping[str, Any]) -> dict[str, Any]:
+    """What the report says of the readings of the linear axes; those of the rotary ones have their own section."""
+    if of_rotary_axes(identify) and "readings" not in identify:
+        return {}
+    return {key: identify[key] for key in MEASUREMENT if identify.get(key) not in (None, [], {})}
 
 
 def _summary(source: ResultFolder) -> Summary | None:
@@ -336,7 +364,7 @@ def proposed_rows(listed: Any) -> Iterator[dict[str, Any]]:
 
 def judged(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
     """Return what ``result.json`` of a control says, and the verdict in words: ``said`` in short, ``text`` with figures."""
-    state = _state(result)
+    state, rotary = _state(result), rotary_result(result)
     found = {
         "name": name,
         "state": state,
@@ -346,7 +374,8 @@ def judged(name: str, result: Mapping[str, Any]) -> dict[str, Any]:
         "measured": str(_mapping(result.get("measured")).get("text", "")),
         "uncertainty": dict(_mapping(result.get("after_uncertainty"))),
         "limits": _limits(_mapping(result.get("probable"))),
-        "assumed": assumptions_of(result),
+        "assumed": [] if rotary else assumptions_of(result),
+        "rotary": rotary,
         "probability_better": result.get("probability_better"),
         "before": _mapping(result.get("before")),
         "after": _mapping(result.get("after")),
@@ -365,6 +394,8 @@ WITHOUT_PRIOR = (
 
 def assumptions_of(result: Mapping[str, Any]) -> list[str]:
     """Return what ``result.json`` or ``identify.json`` says is assumed of errors that were not measured."""
+    if of_rotary_axes(result) and "prior" not in result:
+        return [ROTARY_ALONE] if result.get("errors") else []
     if _mapping(result.get("prior")).get("class", "none") == "none":
         return [WITHOUT_PRIOR]
     probable = _mapping(result.get("probable")) or result
@@ -486,6 +517,8 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
             "headline": "The errors are not determined",
             "text": str(identify.get("error", "")),
         }
+    if of_rotary_axes(identify):
+        return _rotary_verdict(identify)
     used, readings = identify.get("readings_used", "–"), identify.get("readings", "–")
     residual_rms_um, count = um(identify.get("residual_rms_um")), len(identify.get("identified", []))
     text = (
@@ -494,6 +527,14 @@ def _verdict(source: ResultFolder, controls: Sequence[Mapping[str, Any]]) -> dic
         else f"{count} errors from {used} of {readings} readings; residual {residual_rms_um} µm rms."
     )
     return {"state": "neutral", "headline": "Errors identified", "text": text}
+
+
+def _rotary_verdict(identify: Mapping[str, Any]) -> dict[str, str]:
+    """Headline and sentence of an identification of rotary axes."""
+    text = rotary_section(identify)["title"]
+    if identify.get("determined_combinations") == 0:
+        return {"state": "rejected", "headline": "The errors are not determined", "text": text}
+    return {"state": "neutral", "headline": "Errors of the rotary axes identified", "text": text}
 
 
 def _headline(state: str, controls: Sequence[Mapping[str, Any]]) -> str:
@@ -517,6 +558,11 @@ def _verdict_text(controls: Sequence[Mapping[str, Any]]) -> str:
     best = min(loadable, key=lambda item: item["after"].get("rms_um", math.inf))
     before, after = best["before"], best["after"]
     name = f"With {best['name']} the" if len(controls) > 1 else "The"
+    if best["rotary"]:
+        return (
+            f"{name} error of the tool tip over the travel, all angles and tools of 0 to 200 mm, with the part set up, goes from "
+            f"{um(before.get('rms_um'))} to {um(after.get('rms_um'))} µm rms, as read back from the files."
+        )
     if "as_it_stands" in best["limits"]:
         one, low, high, left, most = best["limits"]["as_it_stands"]
         text = (
@@ -723,7 +769,7 @@ _SPECIAL = "\\`*_{}[]<>()#+!|&~"
 TABLES = ("name", "format", "evidence", "settings", "sign_statement", "parameters", "files")
 VERIFICATION = (
     "name", "state", "headline", "measured", "objections", "points", "before", "after", "before_rigid", "after_rigid",
-    "unrepresentable_um", "uncorrected", "reasons", "notes",
+    "unrepresentable_um", "uncorrected", "reasons", "notes", "rotary",
 )  # fmt: skip
 
 
@@ -736,11 +782,12 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
         "handover": data["handover"],
         "model": {
             "kinematic_chain": data["machine"].get("chain"),
-            "errors": [item["error"] for item in data["errors"]],
+            "errors": [item["error"] for item in all_errors(data)],
             "convention": "names and signs of ISO 230-1: actual minus commanded, tool relative to workpiece",
         },
         "identification": data["measurement"],
         "identified_errors": data["errors"],
+        "rotary_axes": data["rotary"],
         "tables": [{key: item[key] for key in TABLES} for item in data["controls"]],
         "verification": [{key: item[key] for key in VERIFICATION} for item in data["controls"]],
         "accuracy": data["accuracy"],
@@ -748,6 +795,12 @@ def dossier_data(data: Mapping[str, Any]) -> dict[str, Any]:
         "limits": data["limitations"],
         "provenance": data["provenance"],
     }
+
+
+def all_errors(data: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the errors of linear axes, then constants and motions of rotary ones, from the numbers of the report."""
+    rotary = data["rotary"]
+    return [*data["errors"], *rotary.get("errors", []), *rotary.get("motions", [])]
 
 
 def plain_markdown(value: Any) -> str:
@@ -780,7 +833,8 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
             [item["error"], item["meaning"], f"{item['largest']:+.3f}", at, number_text(item["U"]), item["unit"]]
         )
     errors = _table(["error", "meaning", "largest", "at (mm)", "U (k = 2)", "unit"], rows)
-    lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *errors])
+    turned = _rotary_lines(dossier["rotary_axes"])
+    lines += _section("3. Identification", [*_pairs(dossier["identification"]), "", *errors, *turned])
     tables: list[str] = []
     for item in dossier["tables"]:
         tables += [f"### {plain_markdown(item['name'])}", ""]
@@ -790,6 +844,10 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
     lines += _section("4. Tables", tables)
     verified: list[str] = []
     for item in dossier["verification"]:
+        if item["rotary"]:
+            verified += [f"### {plain_markdown(item['name'])}: {item['state']}", ""]
+            verified += [f"- {plain_markdown(text)}" for text in (*item["rotary"]["lines"], *item["reasons"])] + [""]
+            continue
         verified += [f"### {plain_markdown(item['name'])}: {item['state']}, {item['points']} points", ""]
         parts = ("before", "after", "before_rigid", "after_rigid")
         figures = [[text, *(um(item[part].get(key)) for part in parts)] for key, text in FIGURES]
@@ -818,6 +876,35 @@ def dossier_text(dossier: Mapping[str, Any]) -> str:
     lines += _section("7. Limits", [f"- {plain_markdown(text)}" for text in dossier["limits"]])
     lines += _section("8. Provenance", _pairs(dossier["provenance"]))
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _rotary_lines(rotary: Mapping[str, Any]) -> list[str]:
+    """The rotary axes in the dossier; empty without them."""
+    if not rotary:
+        return []
+    head = ["error", "ISO 230-7", "meaning", "value", "U (k = 2)", "unit", ""]
+    rows = [
+        [row["error"], row["axis_name"], row["meaning"], f"{row['largest']:+.3f}", number_text(row["U"]), row["unit"]]
+        + ["" if row["determined"] else "not determined"]
+        for row in rotary["errors"]
+    ]
+    motions = [
+        [
+            row["error"],
+            row["meaning"],
+            f"{row['largest']:+.3f}",
+            f"{row['at_deg']:g}",
+            number_text(row["U"]),
+            row["unit"],
+        ]
+        for row in rotary["motions"]
+    ]
+    apart = [f"cannot be told apart: {row['errors']}; {row['separated_by']}" for row in rotary["not_told_apart"]]
+    return [
+        *_table(head, rows),
+        *_table(["error", "meaning", "largest", "at (degrees)", "U (k = 2)", "unit"], motions),
+        *(f"- {plain_markdown(text)}" for text in (*rotary["fit"], *apart, *rotary["notes"])),
+    ]
 
 
 def _section(title: str, lines: list[str]) -> list[str]:
@@ -881,7 +968,7 @@ def _statements(data: Mapping[str, Any]) -> list[str]:
 #: Share of values within the expanded uncertainty, for k = 2 and a normal distribution.
 PROBABILITY = 0.9545
 #: Units in the notation of the D-SI metadata model.
-UNITS = {"um": "\\micro\\metre", "urad": "\\micro\\radian", "mm": "\\milli\\metre"}
+UNITS = {"um": "\\micro\\metre", "urad": "\\micro\\radian", "mm": "\\milli\\metre", "deg": "\\degree"}
 
 STATEMENT = (
     "Documented JSON in the order of a Digital Calibration Certificate; not a DCC and not signed. Fields that only a "
@@ -895,11 +982,13 @@ def calibration_record(data: Mapping[str, Any]) -> dict[str, Any]:
         {
             "name": item["error"],
             "meaning": item["meaning"],
-            "known_in_part": item["in_part"],
-            "positions": _list(item["position_mm"], "mm"),
+            "known_in_part": item.get("in_part", False),
+            "positions": _list(item["position_deg"], "deg")
+            if "position_deg" in item
+            else _list(item["position_mm"], "mm"),
             "values": _list(item["value"], item["unit"], item["u"]),
         }
-        for item in data["errors"]
+        for item in all_errors(data)
     ]
     method = data["measurement"].get("method")
     errors = {"name": "geometric errors (ISO 230-1)", "usedMethod": method, "results": results}
@@ -947,6 +1036,8 @@ def _verification(item: Mapping[str, Any]) -> dict[str, Any]:
     what = "error of the tool tip over the volume"
     if not item["volumetric"]:
         what = "effect of the measured errors alone on the tool tip"
+    if item["rotary"]:
+        what = "error of the tool tip over the travel, all angles and tools of 0 to 200 mm, with the part set up"
     return {
         "name": f"{what}, tables of {item['name']}",
         "usedMethod": "emulation of the files that were read back; computed, not measured",
