@@ -104,6 +104,26 @@ def backlash(q, approach, time):
     return approach * np.array([0.0, 1.5 * MICROMETRE, 0.0])
 
 
+def test_one_tracer_that_goes_from_station_to_station_repeats_nothing(gantry):
+    """Each place is read four times, by four stations: no two readings of one station differ by noise alone."""
+    own = session(6, repeats=1)
+    order = np.argsort(own.station, kind="stable")
+    moved = replace(
+        own,
+        station=own.station[order],
+        point=[str(k) for k in range(len(order))],
+        position_mm=own.position_mm[order],
+        length_mm=own.length_mm[order],
+        tool_mm=own.tool_mm[order],
+        approach=own.approach[order],
+        labels={name: values[order] for name, values in own.labels.items()},
+        covariates={"time_s": 9.0 * np.arange(len(order))},
+    )
+    data = diagnose(gantry, moved).to_dict()
+    assert not any(effect["grade"] == "confirmed" for effect in data["effects"])
+    assert data["noise"]["source"] == "assumed"
+
+
 def test_rotation_is_orthonormal_and_its_first_row_takes_the_mean():
     for channels in (1, 2, 4, 7):
         matrix = rotation(channels)
