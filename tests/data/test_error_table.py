@@ -184,7 +184,8 @@ HEADER = "error,position_mm,value,u_value\n"
 @pytest.mark.parametrize(
     ("rows", "says"),
     [
-        ("EXX,0,1,\nEXA,0,1,\n", ":3: column error: 'EXA' is not an error of ISO 230-1 here; did you mean"),
+        ("EXX,0,1,\nEXQ,0,1,\n", ":3: column error: 'EXQ' is not an error of ISO 230-1 here; did you mean"),
+        ("EXX,0,1,\nEXA,0,1,\n", ":3: column error: 'EXA' is an error of a rotary axis"),
         ("exx,0,1,\n", ":2: column error: 'exx' is not an error of ISO 230-1 here; did you mean 'EXX'"),
         ("EXX,0,1,\nEXX,10,2,\nEXX,0.0,3,\n", ":4: column position_mm: EXX has a value at 0 mm already in line 2"),
         ("EXX,,1,\n", ":2: column position_mm: is empty; EXX is a function"),
