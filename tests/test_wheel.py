@@ -95,12 +95,9 @@ def test_the_wheel_names_both_licences_and_holds_their_texts(wheel, wheel_names)
         metadata = archive.read(f"{folder}/METADATA").decode()
         texts = {name: archive.read(name).decode() for name in wheel_names if "/licenses/" in name}
     assert "\nLicense-Expression: BSD-3-Clause AND GPL-2.0-or-later\n" in metadata
-    copying = "templates/linuxcnc-volumetric/COPYING"
-    assert texts == {
-        f"{folder}/licenses/LICENSE": (ROOT / "LICENSE").read_text(),
-        f"{folder}/licenses/{copying}": (ROOT / copying).read_text(),
-    }
-    assert f"compgen/_data/{copying}" in wheel_names  # beside the sources that it belongs to
+    copying = [f"templates/{name}/COPYING" for name in ("linuxcnc-volumetric", "linuxcnc-heat")]
+    assert texts == {f"{folder}/licenses/{name}": (ROOT / name).read_text() for name in ("LICENSE", *copying)}
+    assert {f"compgen/_data/{name}" for name in copying} <= set(wheel_names)  # beside the sources that they belong to
 
 
 def pins(name):
@@ -129,7 +126,9 @@ def test_every_dependency_is_pinned_with_the_hashes_of_its_files():
     kinds = ("", "-extras", "-dev", "-docs", "-release")
     base, extras, dev, docs, release = (pins(f"requirements{kind}.txt") for kind in kinds)
     assert named([*project["project"]["dependencies"], *project["build-system"]["requires"]]) <= set(base)
-    assert named(optional) - {"compgen"} <= set(extras) - set(base)
+    # the demo draws: matplotlib is an extra of the package, and among the pins of `make demo`
+    assert named(optional) - {"compgen", "matplotlib"} <= set(extras) - set(base)
+    assert "matplotlib" in base
     run = base | extras
     assert all(extras[name] == base[name] for name in base.keys() & extras.keys())
     assert {"pytest", "ruff", "mypy"} <= set(dev) - set(run)

@@ -36,7 +36,7 @@ _OTHER = re.compile(
     r"(?i)\b(?:max|min|limits?|grenz\w*|tol\w*|upper|lower|ober\w*|unter\w*|diamet\w*|durchm\w*|width|breite|angle|winkel|radius|"
     r"date|time|datum|zeit|uhrzeit|program\w*|messprogramm|height|h\u00f6he|maximum\w*|minimum\w*)\b|gr\u00f6\u00dft|kleinst"
 )
-_STAMP = re.compile(r"(?i)[\s,;|]*\b(?:date|time|datum|zeit|uhrzeit)\b.*$")
+_STAMP = re.compile(r"(?i)(?<![\s,;|])[\s,;|]*+\b(?:date|time|datum|zeit|uhrzeit)\b.*$")
 _UNIT = re.compile(r"(?i)[.,]\d{1,9}\s?(mm|inch|in|\")(?!\w)")
 
 

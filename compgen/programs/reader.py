@@ -979,7 +979,7 @@ class Reader:
                 return name.end()
             if code in dialect.codes and not name[2]:
                 words.append((code, "", at, at))
-                assigned = re.compile(rf"\s*+=\s*+{VALUE}").match(body, name.end(1)) if code == "DISC" else None
+                assigned = re.compile(rf"(?<!\s)\s*+=\s*+{VALUE}").match(body, name.end(1)) if code == "DISC" else None
                 return assigned.end() if assigned else name.end(1)
             if code in dialect.refused:
                 self._fail(f"{code}: {dialect.refused[code]}")

@@ -55,7 +55,7 @@ def runs(machine, axes=(0, 1, 2), deviation_um=0.0, temperatures=False):
     axis, at, direction, run = np.array(rows).T
     reference = dict(zip(("line_x_mm", "line_y_mm", "line_z_mm"), machine.reference_point_mm, strict=True))
     covariates = {name: np.full(len(rows), value) for name, value in reference.items()}
-    covariates |= {"temp_x_c": np.full(len(rows), 20.0)} if temperatures else {}
+    covariates |= {f"temp_{name}_c": np.full(len(rows), 20.0) for name in "xyz"} if temperatures else {}
     deviation_mm = 1e-3 * (deviation_um * np.sin(at / 90.0) + 0.5 * rng.standard_normal(len(rows)))
     whole = (item.astype(np.int64) for item in (axis, direction, run))
     axis, direction, run = whole
