@@ -1,7 +1,7 @@
 """Programs that probe spheres at poses of rotary axes, and what their logs contain.
 
 The program logs raw contacts: positions of X, Y, Z with the pose and the angles of the machine file. Nothing is calculated on
-the control; :mod:`compgen.foreign.sphere_log` finds the centres. Every motion is in positions of the axes, without a
+the control; :mod:`compgen.foreign.probe_logs` finds the centres. Every motion is in positions of the axes, without a
 transformation.
 """
 
