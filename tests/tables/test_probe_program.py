@@ -199,6 +199,7 @@ def whole_log(small_machine, errors):
     [
         (lambda text: text.replace("END", ""), "has no END"),
         (lambda text: text + text, "contains 2 runs"),
+        (lambda text: re.sub(r"(VOLCOMP \w+ LOG 1)", r"\1 copy", text), "was it edited"),
         (lambda text: re.sub(r"P1 F001 .* X- .*\n", "", text), "feature F001 of pose 1 lacks the contacts X-"),
         (lambda text: re.sub(r"(P1 F002 .*X\+ ).*", r"\1 12 mm", text), "is not a contact of the program"),
         (lambda text: re.sub(r"(P1 F002 .*X\+ ).*", r"\g<1>-180.0", text), "was the probe elsewhere"),

@@ -205,6 +205,7 @@ def test_linuxcnc_itself_runs_the_program(tmp_path, planned):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda text: re.sub(r"(VOLCOMP \w+ LOG 1)", r"\1 copy", text), "was it edited"),
         (lambda text: text.replace("END", ""), "has no END"),
         (lambda text: text + text, "contains 2 runs"),
         (lambda text: re.sub(r"P1 .* N 3 .*\n", "", text), "pose 1 lacks the contacts 3"),
