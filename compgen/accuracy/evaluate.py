@@ -95,9 +95,9 @@ def _check(position_mm: FloatArray, line: str) -> None:
         raise InputError(
             Message(
                 "reference-line-unknown",
-                "{line!r} is not a reference line; use one of {value}",
+                "{line!r} is not a reference line; use one of {known}",
                 line=line,
-                value=", ".join(LINES),
+                known=", ".join(LINES),
             )
         )
     if len(position_mm) < 2:

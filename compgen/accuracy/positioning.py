@@ -299,9 +299,9 @@ def positioning_test(
         raise InputError(
             Message(
                 "edition-unknown",
-                "edition {edition} of ISO 230-2 is not available; use {str}",
+                "edition {edition} of ISO 230-2 is not available; use {editions}",
                 edition=edition,
-                str=" or ".join(map(str, EDITIONS)),
+                editions=" or ".join(map(str, EDITIONS)),
             )
         )
     k = EDITIONS[edition]

@@ -244,9 +244,9 @@ def compare_sides(before: Side, after: Side, options: CompareOptions) -> Compari
             raise InputError(
                 Message(
                     "compare-kinds-differ",
-                    "BEFORE contains {kind}, AFTER {kind2}; {name} can only be compared with {name2}",
-                    kind=before.kind,
-                    kind2=after.kind,
+                    "BEFORE contains {before}, AFTER {after}; {name} can only be compared with {name2}",
+                    before=before.kind,
+                    after=after.kind,
                     name=name,
                     name2=name,
                 )
@@ -402,10 +402,10 @@ def _predicted_at(predicted: Side, measured: ErrorField) -> ErrorField:
             Message(
                 "points-not-predicted",
                 "has no prediction for {missing} of {points} measured points, the first is "
-                "{missing2} mm; predict at the measured points",
+                "{first} mm; predict at the measured points",
                 missing=len(missing),
                 points=len(points),
-                missing2=missing[0],
+                first=missing[0],
             ),
             file=predicted.path,
         )

@@ -716,9 +716,9 @@ def number(value: Any) -> float:
         raise ValueError(
             Message(
                 "value-magnitude",
-                "expected a finite number: 0, or a magnitude from {value:g} to {value2:g}",
-                value=SMALLEST,
-                value2=LARGEST,
+                "expected a finite number: 0, or a magnitude from {smallest:g} to {largest:g}",
+                smallest=SMALLEST,
+                largest=LARGEST,
             )
         )
     return float(value)

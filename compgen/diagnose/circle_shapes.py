@@ -216,7 +216,7 @@ def _each(shape: Callable[[Path], FloatArray]) -> Callable[[Path], FloatArray]:
     return columns
 
 
-def _lobes(both: bool, n: float, opposite: float) -> Named:  # noqa: FBT001 - one argument of many
+def _lobes(both: bool, n: float, opposite: float) -> Named:
     """Waves of a turn that no name has; of 1, 3 and 4 only those that are opposite in both directions."""
 
     def columns(p: Path) -> FloatArray:

@@ -546,9 +546,9 @@ def curve_covariances(errors: ErrorTable, covariance: Covariance | Mapping[str, 
             raise InputError(
                 Message(
                     "covariance-curve-unknown",
-                    "{name!r} is not one of the 18 curves; {name2}",
+                    "{name!r} is not one of the 18 curves; {suggestion}",
                     name=name,
-                    name2=nearest(name, CURVE_NAMES),
+                    suggestion=nearest(name, CURVE_NAMES),
                 ),
                 field="covariance",
             )

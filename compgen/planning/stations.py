@@ -215,9 +215,9 @@ def regions_of(machine: Machine, stations: PlannedStations, boxes: Mapping[str, 
             raise InputError(
                 Message(
                     "box-without-station",
-                    "the box {name!r} belongs to no station; {name2}",
+                    "the box {name!r} belongs to no station; {suggestion}",
                     name=one_line(name),
-                    name2=nearest(name, stations.names),
+                    suggestion=nearest(name, stations.names),
                 )
             )
     shell = shell_around(machine)

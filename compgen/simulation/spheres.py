@@ -41,9 +41,9 @@ def _constants(value: Any) -> dict[str, float]:
             raise ValueError(
                 Message(
                     "rotary-error-unknown",
-                    "{name!r} is no position error of a rotary axis; {name2}",
+                    "{name!r} is no position error of a rotary axis; {suggestion}",
                     name=name,
-                    name2=nearest(name, ROTARY_NAMES),
+                    suggestion=nearest(name, ROTARY_NAMES),
                 )
             )
     return {name: toml_files.number(number) for name, number in found.items()}
@@ -96,9 +96,9 @@ class RotaryTruth:
                 raise InputError(
                     Message(
                         "error-of-lacking-axis",
-                        "{name} is an error of an axis that the machine {name2} lacks",
+                        "{name} is an error of an axis that the machine {machine} lacks",
                         name=name,
-                        name2=machine.name,
+                        machine=machine.name,
                     ),
                     field="rotary_errors",
                 )

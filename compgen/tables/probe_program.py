@@ -1,7 +1,7 @@
 """Programs that measure an artefact with the machine's own probe, for controls whose probing motion is documented.
 
 The program logs raw contacts: position of the one axis that moved, with feature and side. Nothing is calculated on the control;
-:mod:`compgen.foreign.detect` finds the centres. Every motion is in machine coordinates, along one axis while probing.
+:mod:`compgen.foreign.probe_logs` finds the centres. Every motion is in machine coordinates, along one axis while probing.
 """
 
 from __future__ import annotations
